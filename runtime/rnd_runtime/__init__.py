@@ -1,0 +1,18 @@
+"""Formats, conventions and kernels of RnD-Avatar; plays an avatar without torch.
+
+Conventions, stated once and tested in ``tests/conventions_test.py``:
+
+* **World**: metres, Y up, right-handed. At rest a person faces +Z.
+* **Cameras**: OpenCV. +X right, +Y down, +Z forward; ``world_to_camera`` is 4×4; the centre of the top left
+  pixel lies at (0.5, 0.5); principal points may be off-centre.
+* **Rotations**: axis-angle in radians in files, matrices inside; quaternions are wxyz.
+* **Posing**: ``G_k = G_parent(k) · [R_k | rest_k − rest_parent]``; the root turns about its rest position and
+  is then translated.
+* **Radiance** is linear Rec.709. Images are premultiplied by alpha. One function (``images.linear_to_srgb``)
+  makes sRGB of it, one (``images.to_bytes``) rounds to 8 bit.
+* **Light probes**: lat-long 2:1, linear; ``u = 0.5 + atan2(z, x) / 2π``, ``v = acos(y) / π``: the image's centre
+  is +X, to its right +Z, its top +Y.
+* **Covariances** are stored as their upper triangle (xx, xy, xz, yy, yz, zz) in m².
+"""
+
+__version__ = "0.1.0"

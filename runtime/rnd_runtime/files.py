@@ -1,0 +1,54 @@
+"""Writing files so that a final name never holds half a file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .errors import InputError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary name beside ``path``; rename it to ``path`` when the block succeeds.
+
+    The temporary keeps the suffix (writers choose a format by it) and starts with a dot. When the block
+    raises, the temporary is removed and what stood under ``path`` before stays.
+    """
+    path = Path(path)
+    output_folder(path.parent)
+    if path.is_dir():
+        raise InputError("cannot be written: it is a folder", file=path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        temporary.chmod(0o644)  # mkstemp makes 0600; results are meant to be shared
+        yield temporary
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def output_folder(path: str | Path) -> Path:
+    """Create ``path`` if needed and make sure that it can be written, or raise :class:`InputError`."""
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("output folder cannot be made", got=error.strerror, file=path) from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError("output folder cannot be written", file=path)
+    return path
+
+
+def existing_file(path: str | Path, *, what: str) -> Path:
+    """Return ``path`` if it is a file, else raise :class:`InputError` naming ``what`` it should have been."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{what} not found", got="a folder" if path.is_dir() else None, file=path)
+    return path
