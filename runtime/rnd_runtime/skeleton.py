@@ -1,0 +1,129 @@
+"""Joint trees and how they are posed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+
+Floats = NDArray[np.float64]
+
+SMPL_NAMES: tuple[str, ...] = (
+    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
+    *("right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head"),
+    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+    *("left_hand", "right_hand"),
+)
+"""SMPL's 24 joints in SMPL's order: the default skeleton."""
+
+SMPL_PARENTS: tuple[int, ...] = (
+    *(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8),
+    *(9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A joint tree in its rest pose.
+
+    Attributes:
+        names: J joint names, the root first, each once.
+        parents: [J] index of the parent; −1 for the root; a parent comes before its children.
+        rest_joints: [J, 3] m, joint positions in the rest pose.
+
+    Raises:
+        InputError: when the arrays do not describe one tree rooted at joint 0.
+    """
+
+    names: tuple[str, ...]
+    parents: NDArray[np.int32]
+    rest_joints: Floats
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(str(name) for name in self.names))
+        object.__setattr__(self, "parents", np.asarray(self.parents, np.int32))
+        object.__setattr__(self, "rest_joints", np.asarray(self.rest_joints, np.float64))
+        count = len(self.names)
+        if count == 0 or self.parents.shape != (count,) or self.rest_joints.shape != (count, 3):
+            raise InputError(
+                "skeleton",
+                expected=f"parents [{count}] and rest joints [{count}, 3] for {count} names, at least one",
+                got=f"{list(self.parents.shape)} and {list(self.rest_joints.shape)}",
+            )
+        if len(set(self.names)) != count:
+            twice = sorted({name for name in self.names if self.names.count(name) > 1})
+            raise InputError("skeleton joint names", expected="each name once", got=", ".join(twice))
+        if self.parents[0] != -1 or (self.parents[1:] < 0).any() or (self.parents >= np.arange(count)).any():
+            raise InputError(
+                "skeleton parents",
+                expected="-1 first, then for every joint the index of an earlier one",
+                got=self.parents.tolist(),
+            )
+        if not np.isfinite(self.rest_joints).all():
+            raise InputError("skeleton rest joints", expected="finite metres")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def joint_transforms(self, rotations: ArrayLike, translation: ArrayLike) -> Floats:
+        """World transforms ``G`` [..., J, 4, 4] of the posed joints (DESIGN.md section 8).
+
+        ``G_k = G_parent(k) · [R_k | rest_k − rest_parent]``; the root turns about its rest position and is
+        then translated.
+
+        Args:
+            rotations: [..., J, 3, 3] local rotations relative to the rest pose.
+            translation: [..., 3] m.
+        """
+        rotations, translation = np.asarray(rotations, np.float64), np.asarray(translation, np.float64)
+        count = len(self)
+        if rotations.shape[-3:] != (count, 3, 3) or translation.shape[-1:] != (3,):
+            raise InputError(
+                "pose",
+                expected=f"rotations [..., {count}, 3, 3] and a translation [..., 3]",
+                got=f"{list(rotations.shape)} and {list(translation.shape)}",
+            )
+        batch = np.broadcast_shapes(rotations.shape[:-3], translation.shape[:-1])
+        posed = np.zeros((*batch, count, 4, 4))
+        posed[..., 3, 3] = 1
+        posed[..., 0, :3, :3] = rotations[..., 0, :, :]
+        posed[..., 0, :3, 3] = self.rest_joints[0] + translation
+        for joint in range(1, count):
+            parent = int(self.parents[joint])
+            turn = posed[..., parent, :3, :3]
+            offset = self.rest_joints[joint] - self.rest_joints[parent]
+            posed[..., joint, :3, :3] = turn @ rotations[..., joint, :, :]
+            posed[..., joint, :3, 3] = turn @ offset + posed[..., parent, :3, 3]
+        return posed
+
+
+def smpl_skeleton(rest_joints: ArrayLike) -> Skeleton:
+    """SMPL's tree with its joints at ``rest_joints`` [24, 3] m."""
+    return Skeleton(SMPL_NAMES, np.array(SMPL_PARENTS, np.int32), np.asarray(rest_joints, np.float64))
+
+
+def bone_transforms(
+    skeleton: Skeleton,
+    rotations: ArrayLike,
+    translation: ArrayLike,
+    canonical_rotations: ArrayLike | None = None,
+) -> NDArray[np.float32]:
+    """What moves a canonical point with each bone: ``G(pose) · G(canonical)⁻¹`` as [..., J, 3, 4] float32.
+
+    Args:
+        skeleton: J joints.
+        rotations: [..., J, 3, 3] local rotations of the pose.
+        translation: [..., 3] m.
+        canonical_rotations: [J, 3, 3] local rotations of the canonical pose, whose translation is 0;
+            None for the rest pose.
+    """
+    if canonical_rotations is None:
+        canonical_rotations = np.broadcast_to(np.eye(3), (len(skeleton), 3, 3))
+    posed = skeleton.joint_transforms(rotations, translation)
+    canonical = skeleton.joint_transforms(canonical_rotations, np.zeros(3))
+    turn = posed[..., :3, :3] @ np.swapaxes(canonical[..., :3, :3], -1, -2)
+    shift = posed[..., :3, 3] - (turn @ canonical[..., :3, 3:])[..., 0]
+    return np.concatenate([turn, shift[..., None]], -1).astype(np.float32)
