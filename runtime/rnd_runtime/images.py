@@ -1,0 +1,158 @@
+"""Image files and the two roundings between radiance and bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .files import atomic_path, existing_file
+
+Floats = NDArray[np.floating[Any]]  # float32 or float64, as given
+Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+def linear_to_srgb(linear: ArrayLike) -> Floats:
+    """sRGB's transfer function (IEC 61966-2-1, piecewise) of linear values; negative ones become 0.
+
+    Values above 1 are continued by the curve; :func:`to_bytes` clips them. float32 stays float32.
+    """
+    x = np.maximum(_floats(linear), 0)
+    srgb: Floats = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
+    return srgb
+
+
+def srgb_to_linear(srgb: ArrayLike) -> Floats:
+    """The inverse of :func:`linear_to_srgb`, for values in [0, 1]. float32 stays float32."""
+    x = np.maximum(_floats(srgb), 0)
+    linear: Floats = np.where(x <= 0.04045, x / 12.92, np.power((x + 0.055) / 1.055, 2.4))
+    return linear
+
+
+def to_bytes(values: ArrayLike) -> NDArray[np.uint8]:
+    """8-bit values of numbers in [0, 1]: clipped, halves rounded up, NaN becomes 0."""
+    x = np.nan_to_num(np.asarray(values), nan=0.0, posinf=1.0, neginf=0.0)
+    rounded: NDArray[np.uint8] = np.floor(np.clip(x, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return rounded
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file says about itself before its pixels are read."""
+
+    width: int
+    height: int
+    channels: tuple[str, ...]
+    pixel_type: str  # uint8, uint16, half, float, …
+
+
+def read_header(path: str | Path) -> ImageHeader:
+    """The size and channel names of an image file, without decoding it."""
+    source = _open(path)
+    try:
+        return _checked_header(source.spec(), path)
+    finally:
+        source.close()
+
+
+def read_image(path: str | Path) -> Image:
+    """The pixels [H, W, C] exactly as the file stores them: uint8, uint16, or float32 for HALF and FLOAT.
+
+    Nothing is converted: no colour management, no multiplication by alpha (OpenImageIO does that to PNGs
+    unless told not to). Only the first picture of a file is read.
+
+    Raises:
+        InputError: not a file, not an image, cut short, turned by EXIF, or a crop of a larger canvas.
+    """
+    source = _open(path)
+    try:
+        spec = source.spec()
+        _checked_header(spec, path)
+        kind = str(spec.format)
+        pixels = source.read_image(0, 0, 0, spec.nchannels, kind if kind in ("uint8", "uint16") else "float")
+        if pixels is None:
+            raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
+    finally:
+        source.close()
+    return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str, ...] | None = None) -> None:
+    """Write [H, W] or [H, W, C] pixels as they are: uint8 or uint16 to PNG, float32 to EXR as FLOAT.
+
+    FLOAT and not HALF, because sun texels exceed HALF's 65 504. Equal pixels give equal bytes. A PNG's
+    alpha is straight by its specification, so hand over colours that are not multiplied by it.
+
+    Args:
+        channel_names: C names for an EXR's channels, such as ``("albedo.R", "albedo.G", "albedo.B")``.
+    """
+    path, pixels = Path(path), np.asarray(array)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    suffix = path.suffix.lower()
+    kinds = {".png": ("uint8", "uint16"), ".exr": ("float32",)}
+    if suffix not in kinds:
+        raise InputError("image format", expected=" or ".join(kinds), got=suffix or "no suffix", file=path)
+    assert pixels.ndim == 3 and pixels.dtype.name in kinds[suffix], (pixels.shape, pixels.dtype)
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "float" if suffix == ".exr" else pixels.dtype.name)
+    if channel_names is not None:
+        assert len(channel_names) == channels, (channel_names, channels)
+        spec.channelnames = channel_names
+    if suffix == ".exr":
+        spec.attribute("compression", "zip")
+        spec.attribute("DateTime", "1970:01:01 00:00:00")  # otherwise the time of writing gets in
+    else:
+        spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are divided by alpha
+    with atomic_path(path) as temporary:
+        target: Any = oiio.ImageOutput.create(str(temporary))
+        written = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
+        reason = target.geterror()
+        if not (target.close() and written):
+            raise InputError("image cannot be written", got=_reason(reason or target.geterror()), file=path)
+
+
+def _floats(values: ArrayLike) -> Floats:
+    array = np.asarray(values)
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _open(path: str | Path) -> Any:
+    existing_file(path, what="image")
+    settings = oiio.ImageSpec()
+    settings.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(str(path), settings)
+    if source is None:
+        raise InputError("image cannot be read", got=_reason(oiio.geterror()), file=path)
+    return source
+
+
+def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
+    turned = spec.get_int_attribute("Orientation", 1)
+    if turned != 1:
+        raise InputError(
+            "image is stored turned",
+            expected="EXIF orientation 1",
+            got=turned,
+            file=path,
+            hint="save it upright: cameras are calibrated to the pixels as stored",
+        )
+    stored = (spec.x, spec.y, spec.width, spec.height)
+    canvas = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
+    if stored != canvas or spec.deep or spec.depth != 1:
+        raise InputError(
+            "image layout",
+            expected="one flat picture that fills its canvas",
+            got=f"pixels {stored} of canvas {canvas}" + (", deep" if spec.deep else ""),
+            file=path,
+        )
+    return ImageHeader(spec.width, spec.height, tuple(spec.channelnames), str(spec.format))
+
+
+def _reason(message: str) -> str:
+    """OpenImageIO's words in one line."""
+    return " ".join(message.split()) or "no reason given by OpenImageIO"
