@@ -1,0 +1,165 @@
+"""Motions: local joint rotations and a root translation over time, in metres, Y up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .motion_files import SMPL_REST_ROOT, read_motion_file
+from .npz import save_npz
+from .rotations import matrix_to_axis_angle, slerp_matrices
+from .skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""(x, y, z) of a Z-up world is (x, z, −y) of ours: a quarter turn about X."""
+
+# SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
+_STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """F poses of J joints.
+
+    Attributes:
+        rotations: [F, J, 3, 3] local rotations relative to the rest pose, the root first.
+        translations: [F, 3] m, added to the root's rest position.
+        fps: frames per second; frame f happens at f / fps seconds.
+        joint_names: J names.
+        source: where it came from, for messages.
+        notes: what the reader assumed or left out, one sentence each, for the user to see.
+    """
+
+    rotations: Floats
+    translations: Floats
+    fps: float
+    joint_names: tuple[str, ...]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        frames, joints = len(self.translations), len(self.joint_names)
+        assert self.rotations.shape == (frames, joints, 3, 3), self.rotations.shape
+        assert self.translations.shape == (frames, 3) and frames > 0, self.translations.shape
+        assert self.fps > 0, self.fps
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.translations)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return (self.frame_count - 1) / self.fps
+
+    def at(self, times_s: ArrayLike) -> Motion:
+        """The poses at ``times_s`` [T] seconds: slerp between frames, the end poses beyond the ends.
+
+        ``fps`` of the result is still that of the recording and says nothing about ``times_s``.
+        """
+        place = np.clip(np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps, 0, self.frame_count - 1)
+        before = np.floor(place).astype(np.int64)
+        after = np.minimum(before + 1, self.frame_count - 1)
+        t = (place - before)[:, None]
+        rotations = slerp_matrices(self.rotations[before], self.rotations[after], t)
+        translations = (1 - t) * self.translations[before] + t * self.translations[after]
+        return Motion(rotations, translations, self.fps, self.joint_names, self.source, self.notes)
+
+
+def load_motion(
+    path: str | Path,
+    skeleton: Skeleton,
+    *,
+    up: Literal["auto", "y", "z"] = "auto",
+    fps: float | None = None,
+    joint_names: tuple[str, ...] | None = None,
+) -> Motion:
+    """Read a motion file (layouts: :func:`motion_files.read_motion_file`) for ``skeleton``, Y up.
+
+    Joints are matched by name; the root is always the root. Joints of ``skeleton`` that the file lacks stay
+    at rest and are noted; joints of the file that ``skeleton`` lacks are left out. Z-up files are of the
+    SMPL family: they place the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever
+    the avatar's own rest position. In Y-up files ``trans`` is an offset from the avatar's rest position.
+
+    Args:
+        up: the axis that points up in the file; "auto" goes by the layout and the file's ``up_axis``.
+        fps: overrides the file's frame rate.
+        joint_names: what the columns are, for files that are known to follow a skeleton's order.
+
+    Raises:
+        InputError: with the file, the field and, where there is one, the frame.
+    """
+    record = read_motion_file(path, joint_names)
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise InputError("fps", expected="a positive number", got=fps)
+    z_up = (record.up if up == "auto" else up) == "z"
+    rotations, notes = _match_joints(record.rotations, record.joint_names, skeleton, path)
+    translations, rest_root = record.translations, record.rest_root
+    if z_up and rest_root is None:
+        rest_root = SMPL_REST_ROOT
+    if rest_root is not None:
+        root_positions = rest_root + translations
+        if z_up:
+            root_positions = root_positions @ Z_UP_TO_Y_UP.T
+            rotations[:, 0] = Z_UP_TO_Y_UP @ rotations[:, 0]
+        translations = root_positions - skeleton.rest_joints[0]
+    file_notes = tuple(note for note in record.notes if fps is None or "frame rate" not in note)
+    return Motion(
+        rotations,
+        translations,
+        record.fps if fps is None else float(fps),
+        skeleton.names,
+        str(path),
+        file_notes + notes,
+    )
+
+
+def save_motion(path: str | Path, motion: Motion) -> None:
+    """Write ``motion`` as an AMASS-like .npz that :func:`load_motion` reads back for any skeleton.
+
+    Members: ``poses`` (F, 3J) axis-angle rad, ``trans`` (F, 3) m, ``mocap_framerate``, ``joint_names``,
+    ``up_axis`` "y".
+    """
+    save_npz(
+        path,
+        {
+            "poses": matrix_to_axis_angle(motion.rotations).reshape(motion.frame_count, -1),
+            "trans": motion.translations,
+            "mocap_framerate": np.array(motion.fps, np.float64),
+            "joint_names": np.array(motion.joint_names),
+            "up_axis": np.array("y"),
+        },
+    )
+
+
+def _match_joints(
+    rotations: Floats, names: tuple[str, ...], skeleton: Skeleton, path: str | Path
+) -> tuple[Floats, tuple[str, ...]]:
+    """``rotations`` [F, ·, 3, 3] of ``names`` in the order of ``skeleton``, and a note on what is missing."""
+    columns = {name: column for column, name in enumerate(names)}
+    for hand, finger in _STAND_INS.items():
+        if hand not in columns and finger in columns:
+            columns[hand] = columns[finger]
+    columns[skeleton.names[0]] = 0
+    matched = [name in columns for name in skeleton.names]
+    if sum(matched) < min(2, len(skeleton)):
+        raise InputError(
+            "joints of the motion",
+            expected=f"some of the avatar's ({', '.join(skeleton.names[:4])}, …)",
+            got=f"{', '.join(names[:4])}, …",
+            file=path,
+        )
+    result = np.broadcast_to(np.eye(3), (len(rotations), len(skeleton), 3, 3)).copy()
+    for joint, name in enumerate(skeleton.names):
+        if name in columns:
+            result[:, joint] = rotations[:, columns[name]]
+    missing = [name for name, found in zip(skeleton.names, matched) if not found]
+    notes = (f"joints that the motion lacks stay at rest: {', '.join(missing)}",) if missing else ()
+    return result, notes
