@@ -1,0 +1,215 @@
+"""Light probes: lat-long maps of linear radiance, and what keeps their energy right."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .images import read_header, read_image
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Up = Literal["y", "z", "-y"]
+
+_TO_Y_UP: dict[str, Floats] = {
+    "y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # (x, y, z) → (x, z, −y)
+    "-y": np.diag([1.0, -1.0, -1.0]),  # OpenCV camera axes
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Distant light all around, as a lat-long map.
+
+    Column and row of a direction (x, y, z) **in the light's frame**: ``u = 0.5 + atan2(z, x) / 2π``,
+    ``v = acos(y) / π``; texel centres at (i + 0.5) / N. Only :attr:`rotation` knows how that frame lies in
+    the world, so turning a light never touches its texels.
+
+    Attributes:
+        radiance: [H, W, 3] linear Rec.709, finite and not negative, W = 2 H.
+        yaw: turns the light about +Y, radians: what the map has at azimuth φ = atan2(z, x) appears at
+            φ + yaw, so it moves from +X towards +Z.
+        up: which axis of the map's frame points up in the world it was made for.
+        repaired: texels that had to be filled in when it was read.
+    """
+
+    radiance: Floats32
+    yaw: float = 0.0
+    up: Up = "y"
+    repaired: int = 0
+
+    def __post_init__(self) -> None:
+        radiance = np.ascontiguousarray(self.radiance, np.float32)
+        if radiance.ndim != 3 or radiance.shape[2] != 3 or radiance.shape[1] != 2 * radiance.shape[0]:
+            raise InputError("light", expected="[H, 2H, 3]", got=list(radiance.shape))
+        if not np.isfinite(radiance).all() or radiance.min() < 0:
+            raise InputError("light", expected="finite radiance, not negative")
+        if not np.isfinite(self.yaw):
+            raise InputError("light yaw", expected="finite radians", got=self.yaw)
+        if self.up not in _TO_Y_UP:
+            raise InputError("light up", expected=" or ".join(_TO_Y_UP), got=self.up)
+        object.__setattr__(self, "radiance", radiance)
+
+    @property
+    def rotation(self) -> Floats:
+        """[3, 3], light's frame → world."""
+        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
+        turn: Floats = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+        return np.asarray(turn @ _TO_Y_UP[self.up])
+
+    @property
+    def maximum(self) -> float:
+        """The largest radiance of any channel; a map that cannot light anything shows here."""
+        return float(self.radiance.max())
+
+    @property
+    def mean_radiance(self) -> Floats:
+        """[3], the radiance averaged over the sphere; π times it is the irradiance averaged over normals."""
+        height, width = self.radiance.shape[:2]
+        weights = texel_solid_angles(height, width) / (4 * np.pi)
+        return np.asarray(np.einsum("hwc,hw->c", self.radiance.astype(np.float64), weights))
+
+    def resized(self, height: int, width: int) -> Light:
+        """The same light on another grid, by :func:`downsize`."""
+        return replace(self, radiance=downsize(self.radiance, height, width))
+
+    def scaled(self, scale: ArrayLike) -> Light:
+        """The same light times ``scale``, a number or one per channel."""
+        return replace(self, radiance=_finite_float32(self.radiance * np.asarray(scale, np.float64)))
+
+    def sample(self, directions: ArrayLike) -> Floats32:
+        """Radiance [..., 3] seen towards world ``directions`` [..., 3], of any length but zero.
+
+        Bilinear between texel centres; wraps around horizontally, clamps at the poles.
+        """
+        local = np.asarray(directions, np.float64) @ self.rotation  # Rᵀ d
+        x, y, z = local[..., 0], local[..., 1], local[..., 2]
+        height, width = self.radiance.shape[:2]
+        column = (0.5 + np.arctan2(z, x) / (2 * np.pi)) * width - 0.5
+        row = np.clip(np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5, 0, height - 1)
+        left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
+        s, t = (column - left)[..., None], (row - top)[..., None]
+        right, bottom = (left + 1) % width, np.minimum(top + 1, height - 1)
+        left = left % width
+        upper = (1 - s) * self.radiance[top, left] + s * self.radiance[top, right]
+        lower = (1 - s) * self.radiance[bottom, left] + s * self.radiance[bottom, right]
+        return np.asarray((1 - t) * upper + t * lower, np.float32)
+
+
+def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: float = 0.0) -> Light:
+    """Read a lat-long .exr or .hdr as a :class:`Light`.
+
+    NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them.
+
+    Args:
+        up: the axis that points up in the world the map was made for: "y"; "z" for a Z-up world; "-y" for
+            camera axes that point down. The map's own layout is always that of :class:`Light`.
+        yaw: radians about +Y.
+        exposure: in stops; radiance is multiplied by 2^exposure.
+
+    Raises:
+        InputError: unreadable, not 2:1, fewer than three channels, 8-bit, or without one valid texel.
+    """
+    if Path(path).suffix.lower() not in (".exr", ".hdr"):
+        raise InputError("light probe", expected="an .exr or .hdr file", got=Path(path).suffix, file=path)
+    if not np.isfinite(exposure):
+        raise InputError("exposure", expected="a finite number of stops", got=exposure)
+    names = read_header(path).channels
+    if len(names) < 3:
+        raise InputError("light probe", expected="R, G and B", got=", ".join(names), file=path)
+    channels = [names.index(name) for name in "RGB"] if set("RGB") <= set(names) else [0, 1, 2]
+    radiance = read_image(path)[..., channels].astype(np.float32)
+    height, width = radiance.shape[:2]
+    if width != 2 * height:
+        raise InputError("light probe", expected="a 2:1 lat-long map", got=f"{width} x {height}", file=path)
+    try:
+        radiance, repaired = repair(radiance)
+    except InputError as error:
+        raise InputError(error.what, expected=error.expected, got=error.got, file=path) from error
+    radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure))
+    return Light(radiance, yaw=yaw, up=up, repaired=repaired)
+
+
+def repair(radiance: Floats32) -> tuple[Floats32, int]:
+    """``radiance`` [H, W, 3] with NaN, infinite and negative values filled in, and how many texels had one.
+
+    Each bad channel value becomes the mean of its valid neighbours among the eight around it (wrapping
+    horizontally); holes fill from their rim inwards.
+
+    Raises:
+        InputError: a channel has no valid value at all.
+    """
+    valid = np.isfinite(radiance) & (radiance >= 0)
+    repaired = int((~valid.all(-1)).sum())
+    if repaired == 0:
+        return radiance, 0
+    if not valid.any((0, 1)).all():
+        raise InputError("light probe", expected="finite radiance, not negative", got="none in some channel")
+    height, width = radiance.shape[:2]
+    values = np.where(valid, radiance, 0).astype(np.float64)
+    row, column, channel = np.nonzero(~valid)
+    while len(row):
+        total, count = np.zeros(len(row)), np.zeros(len(row))
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                near = (np.clip(row + down, 0, height - 1), (column + right) % width, channel)
+                total += np.where(valid[near], values[near], 0)
+                count += valid[near]
+        rim = count > 0
+        filled = (row[rim], column[rim], channel[rim])
+        values[filled], valid[filled] = total[rim] / count[rim], True
+        row, column, channel = row[~rim], column[~rim], channel[~rim]
+    return values.astype(np.float32), repaired
+
+
+def texel_directions(height: int, width: int) -> Floats:
+    """[H, W, 3], the unit direction of every texel's centre in the light's frame."""
+    azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    polar = ((np.arange(height) + 0.5) / height * np.pi)[:, None]
+    ring = np.sin(polar)
+    return np.stack(
+        [ring * np.cos(azimuth), np.broadcast_to(np.cos(polar), (height, width)), ring * np.sin(azimuth)], -1
+    )
+
+
+def texel_solid_angles(height: int, width: int) -> Floats:
+    """[H, W] sr, exact: a row between polar angles a and b covers 2π (cos a − cos b). The sum is 4π."""
+    rows = -np.diff(_heights(height)) * 2 * np.pi / width
+    return np.broadcast_to(rows[:, None], (height, width)).copy()
+
+
+def downsize(radiance: ArrayLike, height: int, width: int) -> Floats32:
+    """``radiance`` [H, W, C] as the mean over each of ``height`` × ``width`` texels, weighted by solid angle.
+
+    Exact for any two sizes, whole ratio or not, so Σ radiance · solid angle stays: bilinear resizing loses a
+    small sun altogether. Larger grids repeat texels.
+    """
+    source = np.asarray(radiance, np.float64)
+    # solid angle is uniform in azimuth and in y = cos(polar angle): both axes are one-dimensional overlaps
+    vertical = _overlaps(1 - _heights(source.shape[0]), 1 - _heights(height))
+    horizontal = _overlaps(np.arange(source.shape[1] + 1) / source.shape[1], np.arange(width + 1) / width)
+    rows = np.tensordot(vertical, source, (1, 0))
+    return np.ascontiguousarray(np.tensordot(horizontal, rows, (1, 1)).swapaxes(0, 1), np.float32)
+
+
+def _heights(rows: int) -> Floats:
+    """y = cos(polar angle) [rows + 1] of the edges between rows, from 1 down to −1."""
+    return np.cos(np.linspace(0, np.pi, rows + 1))
+
+
+def _overlaps(source: Floats, target: Floats) -> Floats:
+    """[targets, sources], the fraction of each target interval each source interval covers; edges given."""
+    low = np.maximum(target[:-1, None], source[None, :-1])
+    high = np.minimum(target[1:, None], source[None, 1:])
+    return np.asarray(np.maximum(high - low, 0) / np.diff(target)[:, None])
+
+
+def _finite_float32(radiance: NDArray[np.floating]) -> Floats32:
+    """To float32, clipped to what it can hold: a huge exposure must not make an infinity."""
+    return np.asarray(np.clip(radiance, 0, np.finfo(np.float32).max), np.float32)
