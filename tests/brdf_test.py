@@ -103,8 +103,8 @@ def test_rough_specular_reflects_less_than_f0():
 
 @pytest.mark.parametrize("albedo", [0.0, 0.8, pytest.param(1.0, marks=pytest.mark.xfail(strict=True))])
 def test_white_furnace_from_all_sides(albedo):
-    # Lambert and GGX are added uncoupled as in the paper: white gives back more than it gets (1.02 to 1.09), at
-    # every roughness. Trained albedo ends at 0.80.
+    # Lambert and GGX are added uncoupled as in the paper: white gives back more than it gets (1.02 to 1.09,
+    # the smoother the more). Trained albedo ends at 0.80.
     for roughness in ROUGHNESSES:
         nodes, weights = np.polynomial.legendre.leggauss(24)
         cosines = (nodes + 1) / 2
