@@ -1,0 +1,123 @@
+"""The CPU rasteriser: numba, float32 with float64 projection, forward and backward, any number of channels.
+
+The rule is :class:`rnd_runtime.gaussians.Rasterizer`'s. Besides, a Gaussian with a number that is not finite,
+a covariance of trace zero or a projection that is not positive definite is not drawn and gets zero gradients.
+
+The result does not depend on the number of threads, to the bit. Kernels compile on first use (seconds) and are
+cached beside the package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import ArrayLike, NDArray
+
+from ._raster_blend import blend, blend_backward
+from ._raster_project import Splats, View, project, project_backward, view_of
+from .camera import Camera
+from .errors import InputError
+from .gaussians import Floats32, Raster
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What :func:`backward` needs of a forward pass; hold it, do not look into it."""
+
+    means: Floats32
+    covariances: Floats32
+    opacities: Floats32
+    view: View
+    splats: Splats
+    image: Floats32  # [H, W, K] features, then depth
+    coverage: Floats32  # [H, W]
+    channels: int
+
+
+def rasterize(
+    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+) -> Raster:
+    """Splat N Gaussians.
+
+    Args:
+        means: [N, 3] m, world.
+        covariances: [N, 6] m², world, upper triangle (xx, xy, xz, yy, yz, zz).
+        opacities: [N].
+        features: [N, C], any C.
+        camera: the view; skew in K is not modelled.
+
+    Raises:
+        InputError: an array has the wrong shape.
+    """
+    return forward(means, covariances, opacities, features, camera)[0]
+
+
+def forward(
+    means: Floats32,
+    covariances: Floats32,
+    opacities: Floats32,
+    features: Floats32,
+    camera: Camera,
+    *,
+    depth: bool = True,
+) -> tuple[Raster, State]:
+    """:func:`rasterize` that also returns what :func:`backward` needs.
+
+    Without ``depth`` the depth picture is all zero and costs nothing.
+    """
+    means, covariances = _floats(means), _floats(covariances)
+    opacities, features = _floats(opacities), _floats(features)
+    count = means.shape[0] if means.ndim else 0
+    for name, array, shape in (
+        ("means", means, (count, 3)),
+        ("covariances", covariances, (count, 6)),
+        ("opacities", opacities, (count,)),
+        ("features", features, (count, features.shape[-1] if features.ndim else 0)),
+    ):
+        if array.shape != shape:
+            raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
+    view = view_of(camera)
+    splats = Splats(*project(means, covariances, opacities, features, view, depth))
+    image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
+    channels = features.shape[1]
+    depths = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)
+    raster = Raster(image[..., :channels], coverage, depths)
+    return raster, State(means, covariances, opacities, view, splats, image, coverage, channels)
+
+
+def backward(
+    state: State, grad_image: ArrayLike, grad_alpha: ArrayLike, grad_depth: ArrayLike | None = None
+) -> tuple[Floats32, Floats32, Floats32, Floats32]:
+    """Gradients of means [N, 3], covariances [N, 6], opacities [N] and features [N, C].
+
+    Args:
+        state: of :func:`forward`.
+        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's pictures, [H, W, C], [H, W] and [H, W]; the
+            last is ignored where the forward pass was run without depth.
+
+    Zero where α is clamped at 0.99 and for what was not drawn.
+    """
+    wanted = _floats(grad_image)
+    if state.image.shape[2] > state.channels:
+        height, width = state.coverage.shape
+        depth = np.zeros((height, width), np.float32) if grad_depth is None else _floats(grad_depth)
+        wanted = np.concatenate([wanted, depth[..., None]], axis=2)
+    threads = get_num_threads()
+    slots = blend_backward(state.splats, state.image, state.coverage, wanted, _floats(grad_alpha), threads)
+    grads: tuple[Floats32, Floats32, Floats32, Floats32] = project_backward(
+        state.means,
+        state.covariances,
+        state.opacities,
+        state.channels,
+        state.view,
+        state.splats,
+        slots,
+        threads,
+    )
+    return grads
+
+
+def _floats(array: ArrayLike) -> NDArray[np.float32]:
+    return np.ascontiguousarray(array, np.float32)
