@@ -1,0 +1,99 @@
+"""``assets/body.npz``: the unclothed template with SMPL's 24 joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rnd_runtime.files import atomic_path
+from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS
+
+from .figure import JOINTS, person
+from .remesh import Floats, Ints, mirror, remesh
+from .sdf import project, surface
+from .weights import skinning_weights
+
+MARCHING_STEP = 0.006  # m
+REMESH_ROUNDS = 7
+
+
+def rest_joints() -> Floats:
+    """Joint positions [24, 3] m of the T-pose in SMPL's order."""
+    sides = {
+        f"right_{name[5:]}": (-x, y, z) for name, (x, y, z) in JOINTS.items() if name.startswith("left_")
+    }
+    return np.array([{**JOINTS, **sides}[name] for name in SMPL_NAMES], np.float64)
+
+
+def edge_length(points: Floats) -> Floats:
+    """Wanted edge length [N] m: 17.5 mm on the body, finer where the form is: face, hands, feet."""
+    x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
+
+    def ramp(t: Floats) -> Floats:
+        return np.clip(t, 0, 1)
+
+    head = 0.0065 * ramp((y - 1.46) / 0.06) + 0.003 * ramp((y - 1.5) / 0.03) * ramp((z - 0.03) / 0.04)
+    hand = 0.010 * ramp((x - 0.62) / 0.14)
+    foot = 0.0065 * ramp((0.13 - y) / 0.06)
+    return 0.0175 - np.maximum(head, np.maximum(hand, foot))
+
+
+def template() -> tuple[Floats, Ints, Floats]:
+    """Vertices [V, 3], faces [F, 3] and skinning weights [V, 24]; exactly symmetric, watertight."""
+    figure = person()
+    half = surface(figure.distance, (0, -0.02, -0.16), (0.92, 1.78, 0.24), MARCHING_STEP)
+    half = remesh(*half, edge_length, lambda points: project(figure.distance, points, 2), REMESH_ROUNDS)
+    vertices, faces = mirror(*half)
+    return vertices, faces, skinning_weights(vertices, faces, _bones(rest_joints()), list(SMPL_NAMES))
+
+
+def _bones(joints: Floats) -> list[tuple[int, Floats, Floats, float]]:
+    """Capsules (joint, a, b, radius): the bones of the skeleton, and a trunk that is as wide as its ribs."""
+    at = dict(zip(SMPL_NAMES, joints))
+    bones = []
+
+    def bone(name: str, a, b, radius: float) -> None:
+        bones.append((SMPL_NAMES.index(name), np.array(a, float), np.array(b, float), radius))
+
+    for name, y, half, z, radius in [
+        ("pelvis", 0.930, 0.085, -0.010, 0.085),
+        ("spine1", 1.080, 0.060, -0.005, 0.080),
+        ("spine2", 1.205, 0.065, -0.004, 0.085),
+        ("spine3", 1.320, 0.070, -0.010, 0.085),
+    ]:
+        bone(name, (-half, y, z), (half, y, z), radius)
+    bone("neck", at["neck"], at["head"], 0.050)
+    bone("head", at["head"] + [0, 0.03, 0.02], (0, 1.66, 0), 0.080)
+    for side in ("left_", "right_"):
+        sign = 1 if side == "left_" else -1
+        chain = ["hip", "knee", "ankle", "foot"]
+        for name, child, radius in zip(chain, chain[1:], (0.075, 0.050, 0.034)):
+            bone(side + name, at[side + name], at[side + child], radius)
+        bone(side + "ankle", at[side + "ankle"], (sign * 0.130, 0.035, -0.05), 0.03)
+        bone(side + "foot", at[side + "foot"], (sign * 0.148, 0.018, 0.18), 0.02)
+        bone(
+            side + "collar",
+            at[side + "collar"] + [sign * 0.04, 0.03, 0],
+            at[side + "shoulder"] - [sign * 0.03, 0, 0],
+            0.035,
+        )
+        chain = ["shoulder", "elbow", "wrist", "hand"]
+        for name, child, radius in zip(chain, chain[1:], (0.042, 0.036, 0.022)):
+            bone(side + name, at[side + name], at[side + child], radius)
+        bone(side + "hand", at[side + "hand"], (sign * 0.870, 1.400, -0.016), 0.022)
+    return bones
+
+
+def make_body(path: Path) -> None:
+    """Write the template to ``path``."""
+    vertices, faces, weights = template()
+    with atomic_path(path) as temporary:
+        np.savez_compressed(
+            temporary,
+            vertices=vertices.astype(np.float32),
+            faces=faces.astype(np.int32),
+            skinning_weights=weights.astype(np.float32),
+            joint_names=np.array(SMPL_NAMES),
+            joint_parents=np.array(SMPL_PARENTS, np.int32),
+            rest_joints=rest_joints().astype(np.float32),
+        )
