@@ -1,8 +1,8 @@
 """Sixteen float32 lanes as one value inside numba: the registers the CPU rasteriser is written in.
 
 ``Lanes`` maps to LLVM's ``<16 x float>`` and ``Mask`` to ``<16 x i1>``. A kernel then reads like scalar code
-while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NEON: LLVM splits what the machine
-lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``); no
+while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NEON: LLVM splits what the
+machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``); no
 other liberty is taken, so a NaN fails every comparison.
 
 numba's cache looks only at the file of the kernel it stored: after editing this file, touch its importers.

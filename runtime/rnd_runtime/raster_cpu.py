@@ -3,8 +3,8 @@
 The rule is :class:`rnd_runtime.gaussians.Rasterizer`'s. Besides, a Gaussian with a number that is not finite,
 a covariance of trace zero or a projection that is not positive definite is not drawn and gets zero gradients.
 
-The result does not depend on the number of threads, to the bit. Kernels compile on first use (seconds) and are
-cached beside the package.
+The result does not depend on the number of threads, to the bit. Kernels compile on first use (seconds) and
+are cached beside the package.
 """
 
 from __future__ import annotations

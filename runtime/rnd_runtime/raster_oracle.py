@@ -71,7 +71,8 @@ def alphas(offsets: Floats, covariance: Floats, opacity: float) -> Floats:
     """min(0.99, o·exp(−½ dᵀ Σ'⁻¹ d)) at pixel offsets d [..., 2] from the mean; 0 below 1/255."""
     distance = np.einsum("...i,ij,...j", offsets, np.linalg.inv(covariance), offsets)
     alpha = np.minimum(ALPHA_MAX, opacity * np.exp(-0.5 * distance))
-    return np.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    kept: Floats = np.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    return kept
 
 
 def reach(covariance: Floats, opacity: float) -> Floats:
@@ -97,7 +98,8 @@ def drawn(
         in_front = camera_points(means, camera)[:, 2] >= NEAR
         flat = image_covariances(means, covariances, camera)
         definite = (flat[:, 0, 0] > 0) & (flat[:, 1, 1] > 0) & (np.linalg.det(flat) > 0)
-    return finite & in_front & definite
+    kept: NDArray[np.bool_] = finite & in_front & definite
+    return kept
 
 
 def front_to_back(depths: Floats) -> NDArray[np.intp]:
@@ -123,27 +125,23 @@ def rasterize(
 
     Each Gaussian meets every pixel of the box outside of which its α is below 1/255.
     """
-    indices = np.flatnonzero(drawn(means, covariances, opacities, features, camera))
-    means, covariances = np.asarray(means, np.float64)[indices], np.asarray(covariances, np.float64)[indices]
-    opacities, features = (
-        np.asarray(opacities, np.float64)[indices],
-        np.asarray(features, np.float64)[indices],
-    )
-    points = camera_points(means, camera)
-    pixels, shapes = image_points(points, camera), image_covariances(means, covariances, camera)
-    attributes = np.concatenate([features, np.ones((len(means), 1)), points[:, 2:]], axis=1)
+    kept = drawn(means, covariances, opacities, features, camera)
+    points = camera_points(means[kept], camera)
+    pixels, shapes = image_points(points, camera), image_covariances(means[kept], covariances[kept], camera)
+    peaks = opacities[kept].astype(np.float64)
+    attributes = np.concatenate([features[kept], np.ones((len(points), 1)), points[:, 2:]], axis=1)
     size = np.array([camera.width, camera.height])
     picture = np.zeros((camera.height, camera.width, attributes.shape[1]))
     transmittance = np.ones((camera.height, camera.width))
     for i in front_to_back(points[:, 2]):
-        half = reach(shapes[i], opacities[i])
+        half = reach(shapes[i], peaks[i])
         x0, y0 = np.clip(np.floor(pixels[i] - half - 1), 0, size).astype(int)
         x1, y1 = np.clip(np.ceil(pixels[i] + half + 1), 0, size).astype(int)
         if x0 == x1 or y0 == y1:
             continue
         box = np.s_[y0:y1, x0:x1]
         centres = np.stack(np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5), axis=-1)
-        alpha = alphas(centres - pixels[i], shapes[i], opacities[i])
+        alpha = alphas(centres - pixels[i], shapes[i], peaks[i])
         weights, transmittance[box] = blend(transmittance[box], alpha)
         picture[box] += weights[..., None] * attributes[i]
-    return Raster(picture[..., :-2], picture[..., -2], picture[..., -1])
+    return Raster(picture[..., :-2], picture[..., -2], picture[..., -1])  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""The rasteriser in plain torch, to be read: 16-pixel tiles, autograd does the gradient, any dtype and device.
+"""The rasteriser in plain torch, to be read: 16-pixel tiles, gradients by autograd, any dtype and device.
 
 In float64 it is the gradient oracle of the numba kernel; in float32 it is the peer that the benchmark times.
 The rule is :class:`rnd_runtime.gaussians.Rasterizer`'s; each step names the function of
