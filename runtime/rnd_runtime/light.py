@@ -16,6 +16,8 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Up = Literal["y", "z", "-y"]
 
+_MAX_STOPS = 64  # beyond it radiance leaves float32
+
 _TO_Y_UP: dict[str, Floats] = {
     "y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),  # (x, y, z) → (x, z, −y)
@@ -114,16 +116,16 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         exposure: in stops; radiance is multiplied by 2^exposure.
 
     Raises:
-        InputError: unreadable, not 2:1, fewer than three channels, 8-bit, or without one valid texel.
+        InputError: unreadable, not 2:1, without channels R, G, B, or without one valid texel.
     """
     if Path(path).suffix.lower() not in (".exr", ".hdr"):
         raise InputError("light probe", expected="an .exr or .hdr file", got=Path(path).suffix, file=path)
-    if not np.isfinite(exposure):
-        raise InputError("exposure", expected="a finite number of stops", got=exposure)
-    names = read_header(path).channels
-    if len(names) < 3:
-        raise InputError("light probe", expected="R, G and B", got=", ".join(names), file=path)
-    channels = [names.index(name) for name in "RGB"] if set("RGB") <= set(names) else [0, 1, 2]
+    if not abs(exposure) <= _MAX_STOPS:
+        raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
+    names = [name.split(".")[-1] for name in read_header(path).channels]  # layers read "view.R"
+    if not set("RGB") <= set(names):
+        raise InputError("light probe", expected="channels R, G and B", got=", ".join(names), file=path)
+    channels = [names.index(name) for name in "RGB"]
     radiance = read_image(path)[..., channels].astype(np.float32)
     height, width = radiance.shape[:2]
     if width != 2 * height:
