@@ -25,6 +25,7 @@ class Body:
         faces: [F, 3] vertex indices, counter-clockwise seen from outside.
         skinning_weights: [V, J], not negative, rows sum to 1.
         skeleton: J joints.
+        license: of the template's shape, for whoever gets an avatar made from it.
 
     Raises:
         InputError: when the arrays do not fit together. Weights within 1 % of summing to 1 are normalised.
@@ -34,6 +35,7 @@ class Body:
     faces: NDArray[np.int32]
     skinning_weights: NDArray[np.float32]
     skeleton: Skeleton
+    license: str = "unknown"
 
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices, np.float64)
@@ -82,6 +84,7 @@ class Body:
                     archive.numbers("faces", (None, 3)),  # type: ignore[arg-type]  # checked to be whole
                     archive.numbers("skinning_weights", (None, joints)),  # type: ignore[arg-type]
                     skeleton,
+                    archive.strings("license")[0] if "license" in archive.names else "unknown",
                 )
             except InputError as error:
                 if error.file is not None:
@@ -99,5 +102,6 @@ class Body:
                 "joint_names": np.array(self.skeleton.names),
                 "joint_parents": self.skeleton.parents,
                 "rest_joints": self.skeleton.rest_joints,
+                "license": np.array([self.license]),
             },
         )

@@ -26,8 +26,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     os.close(handle)
     temporary = Path(name)
     try:
-        temporary.chmod(0o644)  # mkstemp makes 0600; results are meant to be shared
         yield temporary
+        temporary.chmod(0o644)  # mkstemp makes 0600; results are meant to be shared
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -1,0 +1,121 @@
+"""Checkpoints in safetensors: tensors and one JSON string, nothing that could be executed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, existing_file
+from rnd_runtime.skeleton import Skeleton
+
+from .config import TrainConfig, from_dict, to_dict
+from .light import LightProbe
+from .model import AvatarModel
+from .template import Template
+
+SCHEMA = "rnd-checkpoint/1"
+_KEY = "rnd_checkpoint"
+
+
+@dataclass
+class Checkpoint:
+    """A trained avatar: the model, the probe it was lit by, its skeleton, and where it came from."""
+
+    model: AvatarModel
+    probe: Tensor  # [32, 64, 3] linear radiance
+    skeleton: Skeleton
+    config: TrainConfig
+    info: dict[str, Any]
+
+
+def save_checkpoint(
+    path: Path,
+    model: AvatarModel,
+    probe: LightProbe | Tensor,
+    skeleton: Skeleton,
+    config: TrainConfig,
+    info: dict[str, Any],
+) -> None:
+    """Write ``avatar.ckpt`` atomically. ``info``: step, capture, body licence and such, JSON values."""
+    radiance = probe.radiance() if isinstance(probe, LightProbe) else probe
+    tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
+    tensors["probe"] = radiance.detach().cpu().contiguous()
+    tensors["skeleton.rest_joints"] = torch.as_tensor(np.asarray(skeleton.rest_joints), dtype=torch.float64)
+    header = {
+        "schema": SCHEMA,
+        "config": to_dict(config),
+        "skeleton": {"names": list(skeleton.names), "parents": [int(p) for p in skeleton.parents]},
+        "info": info,
+    }
+    write_tensors(path, tensors, header)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read ``avatar.ckpt``; anything missing, cut short, unknown or of a newer schema is an InputError."""
+    tensors, header = read_tensors(path, SCHEMA)
+    try:
+        config = from_dict(header["config"])
+        tree = header["skeleton"]
+        skeleton = Skeleton(
+            tuple(tree["names"]),
+            np.array(tree["parents"]),
+            tensors["skeleton.rest_joints"].numpy().astype(np.float64),
+        )
+        state = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+        model = rebuild_model(config, state)
+        probe = tensors["probe"]
+    except (KeyError, TypeError, RuntimeError, IndexError, ValueError, AttributeError) as error:
+        raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
+    if not all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point()):
+        raise InputError("checkpoint", expected="finite numbers", got="NaN or infinity", file=path)
+    return Checkpoint(model, probe, skeleton, config, header.get("info", {}))
+
+
+def rebuild_model(config: TrainConfig, state: dict[str, Tensor]) -> AvatarModel:
+    """A model of ``config`` with the tensors of ``state``."""
+    neighbours = state["interpolate.neighbours"]
+    if int(neighbours.min()) < 0 or int(neighbours.max()) >= config.model.nodes:
+        raise ValueError("interpolation neighbours out of range")
+    template = Template(
+        points=state["points"].numpy(),
+        normals=state["rest_normals"].numpy(),
+        codes=state["codes"].numpy(),
+        weights=state["log_weights"].exp().numpy(),
+        spacing=float(state["spacing"]),
+        neighbours=neighbours.numpy(),
+        neighbour_weights=state["interpolate.weights"].numpy(),
+        nodes=config.model.nodes,
+    )
+    model = AvatarModel(config.model, template)
+    model.load_state_dict(state)
+    return model.eval()
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    """One safetensors file with ``header`` as JSON, under a temporary name until it is whole."""
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={_KEY: json.dumps(header, sort_keys=True)})
+
+
+def read_tensors(path: str | Path, schema: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and JSON header of one of our safetensors files, its schema checked."""
+    path = existing_file(path, what="checkpoint")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(_KEY, "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, json.JSONDecodeError, OSError, ValueError, RecursionError) as error:
+        raise InputError("not a whole safetensors file", got=str(error).splitlines()[0], file=path) from error
+    found = header.get("schema") if isinstance(header, dict) else None
+    if found != schema:
+        raise InputError("schema", expected=schema, got=found, file=path)
+    return tensors, header

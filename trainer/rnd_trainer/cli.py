@@ -1,0 +1,238 @@
+"""rnd-train and rnd-eval."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.files import atomic_path, output_folder
+
+if TYPE_CHECKING:
+    from .train import Training
+
+PREVIEWS = 3
+"""rows of a preview picture: views spread over the training frames"""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """Learn an avatar from one monocular capture."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """folder with capture.json"""
+    out: Path = Path("runs/avatar")
+    """folder for avatar.ckpt, previews/, metrics.jsonl and config.json"""
+    preset: Literal["quick", "standard", "full"] = "standard"
+    """schedule: minutes, half an hour, hours"""
+    resume: bool = False
+    """continue a stopped training in OUT"""
+    steps: int | None = None
+    """instead of the preset's"""
+    gaussians: int | None = None
+    """instead of the preset's; a quarter of them are nodes"""
+    image_scale: float | None = None
+    """shrink the pictures by this factor"""
+    seed: int = 0
+    """of every random draw"""
+    light: Literal["learn", "capture"] = "learn"
+    """'capture': train under the capture's own light map (an oracle, for studies)"""
+    motion: str | None = None
+    """another motion file of the capture, such as motion_noisy.npz"""
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """Score a trained avatar on the held-out splits of a capture."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """folder of rnd-train, or an avatar.ckpt"""
+    capture: Annotated[Path, tyro.conf.Positional]
+    """folder with capture.json"""
+    json: Path | None = None
+    """write the rows here as JSON"""
+    pictures: Path | None = None
+    """folder for strips: truth, render, normals, albedo"""
+    shade: str = "table+sun"
+    """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
+
+
+def main() -> None:
+    """Entry point of ``rnd-train``."""
+    options = tyro.cli(TrainOptions, prog="rnd-train")
+    sys.exit(run_command("rnd-train", lambda: _train(options)))
+
+
+def main_eval() -> None:
+    """Entry point of ``rnd-eval``."""
+    options = tyro.cli(EvalOptions, prog="rnd-eval")
+    sys.exit(run_command("rnd-eval", lambda: _evaluate(options)))
+
+
+def _need_extra() -> None:
+    for package in ("torch", "safetensors", "scipy"):
+        if importlib.util.find_spec(package) is None:
+            raise InputError(
+                f"{package} is not installed", hint='training needs the extra: pip install "rnd-avatar[train]"'
+            )
+
+
+def _train(options: TrainOptions) -> None:
+    _need_extra()
+    from rnd_runtime.capture import load_capture
+
+    from .config import preset, to_dict
+    from .train import Training, run
+
+    config = preset(options.preset)
+    model = config.model
+    if options.gaussians is not None:
+        model = dataclasses.replace(model, gaussians=options.gaussians, nodes=max(16, options.gaussians // 4))
+    changes = {"steps": options.steps, "image_scale": options.image_scale}
+    changes = {name: value for name, value in changes.items() if value is not None}
+    config = dataclasses.replace(config, model=model, seed=options.seed, light=options.light, **changes)
+    _check(config.steps >= 1, "--steps", "at least 1", config.steps)
+    _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
+    _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
+
+    capture = load_capture(options.capture, motion_file=options.motion)
+    folder = output_folder(options.out)
+    state = folder / "training.state"
+    if state.exists() and not options.resume:
+        raise InputError(
+            "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
+        )
+    training = Training(capture, config)
+    if options.resume:
+        training.resume(state)
+    with atomic_path(folder / "config.json") as temporary:
+        temporary.write_text(json.dumps(to_dict(config), indent=1) + "\n", encoding="utf-8")
+    for frame in training.bad_masks:
+        print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
+    interrupted = _run_with_progress(training, folder, run)
+    print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
+    if interrupted:
+        print(f"rnd-train: stopped; continue with --resume --out {folder}", file=sys.stderr)  # noqa: T201
+        raise KeyboardInterrupt
+    _score_after_training(folder, options)
+
+
+def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
+    """Train with a progress bar; True when Ctrl-C ended it."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from .preview import save_preview
+
+    chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
+    shown = [(training.views[k], training.poses[k]) for k in dict.fromkeys(chosen)]
+    columns = (
+        TextColumn("stage {task.fields[stage]}"), BarColumn(), MofNCompleteColumn(),
+        TextColumn("image loss {task.fields[loss]:.4f}"), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=60) as progress:
+        task = progress.add_task(
+            "training", total=training.config.steps, completed=training.step_index, stage=1, loss=float("nan")
+        )
+        smooth = [float("nan")]
+
+        def on_step(step: Any) -> None:
+            loss = step.terms["image"]
+            smooth[0] = loss if smooth[0] != smooth[0] else 0.98 * smooth[0] + 0.02 * loss
+            progress.update(task, completed=step.index + 1, stage=step.stage, loss=smooth[0])
+            if step.skipped:
+                progress.console.print(f"step {step.index}: not finite, skipped")
+
+        def on_preview() -> None:
+            name = f"step_{training.step_index:06d}.png"
+            save_preview(folder / "previews" / name, training.model, training.light(), shown)
+
+        return bool(run(training, folder, on_step=on_step, on_preview=on_preview))
+
+
+def _score_after_training(folder: Path, options: TrainOptions) -> None:
+    from rnd_runtime.capture import load_capture
+
+    from .evaluate import HELD_OUT
+
+    capture = load_capture(options.capture, motion_file=options.motion)
+    if any(capture.split(split) for split in HELD_OUT):
+        _evaluate(EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval"))
+
+
+def _evaluate(options: EvalOptions) -> None:
+    _need_extra()
+    from rich.console import Console
+    from rich.table import Table
+
+    from rnd_runtime.capture import load_capture
+    from rnd_runtime.images import write_image
+
+    from .checkpoint import load_checkpoint
+    from .evaluate import HELD_OUT, albedo_scale, evaluate
+    from .preview import strip
+
+    path = options.run / "avatar.ckpt" if options.run.is_dir() else options.run
+    checkpoint = load_checkpoint(path)
+    capture = load_capture(options.capture)
+    scale = albedo_scale(checkpoint, capture)
+    jobs = [(split, None) for split in HELD_OUT if capture.split(split)]
+    if scale is not None and capture.split("relight"):
+        jobs.append(("relight", scale))
+    if not jobs:
+        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=options.capture)
+
+    table = Table("split", "frames", "PSNR", "SSIM", "PSNR box", "SSIM box", "normals °", title=str(path))
+    rows = []
+    for split, factor in jobs:
+        name = split if factor is None else f"{split}, albedo scaled"
+
+        def keep(
+            frame: Any, rendered: Any, target: Any, folder: str = name.replace(", ", "_").replace(" ", "_")
+        ) -> None:
+            if options.pictures is not None:
+                file = options.pictures / folder / Path(frame.image).name
+                write_image(file, strip(rendered, target.numpy()))
+
+        score = evaluate(checkpoint, capture, split, mode=options.shade, albedo_scale=factor, on_frame=keep)
+        row = {**dataclasses.asdict(score), "split": name, "shade": options.shade} | _provenance(checkpoint)
+        rows.append(row)
+        table.add_row(
+            name, str(score.frames), f"{score.psnr:.2f}", f"{score.ssim:.4f}", f"{score.psnr_box:.2f}",
+            f"{score.ssim_box:.4f}", f"{score.normal_deg:.1f}",
+        )  # fmt: skip
+    Console().print(table)
+    if options.json is not None:
+        with atomic_path(options.json) as temporary:
+            temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def _provenance(checkpoint: Any) -> dict[str, Any]:
+    from rnd_runtime.doctor import machine
+
+    info, config = checkpoint.info, checkpoint.config
+    return {
+        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps, "seed": config.seed,
+        "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
+        "machine": machine(),
+    }  # fmt: skip
+
+
+def _check(good: bool, what: str, expected: str, got: object) -> None:
+    if not good:
+        raise InputError(what, expected=expected, got=got)

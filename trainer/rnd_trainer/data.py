@@ -1,0 +1,130 @@
+"""Training pictures, cropped to the person, and the pose that goes with each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rnd_runtime.camera import Camera
+from rnd_runtime.capture import Capture, Frame
+from rnd_runtime.errors import InputError
+from rnd_runtime.images import srgb_to_linear
+from rnd_runtime.motion import Motion
+from rnd_runtime.skeleton import Skeleton, bone_transforms
+from rnd_runtime.window import motion_window
+
+from .config import ModelConfig
+from .metrics import mask_box
+from .model import PoseInput
+
+CROP_MARGIN = 16
+"""pixels around the mask's box: what spills over the silhouette must be seen to be punished"""
+MASK_COVERAGE = (0.001, 0.95)
+"""share of the picture that a usable mask covers"""
+MAX_BAD_MASKS = 0.2
+"""share of empty or full masks above which training stops"""
+
+_TO_LINEAR = torch.as_tensor(srgb_to_linear(np.arange(256) / 255), dtype=torch.float32)
+
+
+@dataclass
+class View:
+    """One training picture: a crop, kept in 8 bits until it is used.
+
+    image [h, w, 3] sRGB premultiplied on black, mask [h, w], normal [h, w, 3] as (n + 1)/2 or None.
+    """
+
+    frame: Frame
+    camera: Camera
+    image: NDArray[np.uint8]
+    mask: NDArray[np.uint8]
+    normal: NDArray[np.uint8] | None
+
+    def target(self, background: Tensor) -> tuple[Tensor, Tensor]:
+        """Linear image [h, w, 3] over ``background`` [3] (linear), and the mask [h, w] in 0…1."""
+        mask = torch.from_numpy(self.mask).float() / 255
+        return _TO_LINEAR[torch.from_numpy(self.image).int()] + (1 - mask[..., None]) * background, mask
+
+    def normals(self) -> Tensor | None:
+        """Estimated normals [h, w, 3], camera axes, zero outside the mask; None where there are none."""
+        if self.normal is None:
+            return None
+        covered = torch.from_numpy(self.mask > 127)[..., None]
+        return (torch.from_numpy(self.normal).float() / 127.5 - 1) * covered
+
+
+def load_views(capture: Capture, split: str, scale: float = 1.0) -> tuple[list[View], list[int]]:
+    """The usable views of a split, and the motion frames whose masks were empty or full.
+
+    Raises :class:`InputError` when the split is empty or more than a fifth of its masks are unusable.
+    """
+    frames = [frame for frame in capture.frames if frame.split == split]
+    if not frames:
+        raise InputError(f"split {split!r}", expected="at least one frame", got="none", file=capture.folder)
+    views, bad = [], []
+    for frame in frames:
+        data = capture.load_frame(frame)
+        low, high = MASK_COVERAGE
+        if not low < float(data.mask.mean()) < high:
+            bad.append(frame.frame)
+            continue
+        views.append(
+            _crop(frame, capture.cameras[frame.camera], data.image_srgb, data.mask, data.normal, scale)
+        )
+    if len(bad) > MAX_BAD_MASKS * len(frames):
+        raise InputError(
+            "masks", expected=f"at most {MAX_BAD_MASKS:.0%} empty or full", got=f"{len(bad)} of {len(frames)}",
+            file=capture.folder, frame=bad[0],
+        )  # fmt: skip
+    return views, bad
+
+
+def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> View:  # type: ignore[no-untyped-def]
+    if scale != 1.0:
+        image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
+    rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
+    rows, columns = (
+        slice(rows.start, min(rows.stop, camera.height)),
+        slice(columns.start, min(columns.stop, camera.width)),
+    )
+    K = camera.K.copy()
+    K[0, 2] -= columns.start
+    K[1, 2] -= rows.start
+    crop = replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
+    return View(
+        frame,
+        crop,
+        np.round(image[rows, columns] * 255).astype(np.uint8),
+        np.round(mask[rows, columns] * 255).astype(np.uint8),
+        None if normal is None else np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8),
+    )
+
+
+def _shrink(image, mask, normal, camera: Camera, scale: float):  # type: ignore[no-untyped-def]
+    """Area-averaged to ``scale``; colours are averaged as light, not as sRGB."""
+    import cv2
+
+    from rnd_runtime.images import linear_to_srgb
+
+    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    size = (small.width, small.height)
+
+    def area(x):  # type: ignore[no-untyped-def]
+        return cv2.resize(np.ascontiguousarray(x, np.float32), size, interpolation=cv2.INTER_AREA)
+
+    normal = None if normal is None else area(normal)
+    return linear_to_srgb(area(srgb_to_linear(image))), area(mask), normal, small
+
+
+def pose_input(motion: Motion, skeleton: Skeleton, time: float, config: ModelConfig) -> PoseInput:
+    """Window, velocities and bone transforms of ``motion`` at ``time`` seconds, as tensors."""
+    window, velocity = motion_window(motion, time, poses=config.window_poses, seconds=config.window_seconds)
+    now = motion.at(np.array([time]))
+    bones = bone_transforms(skeleton, now.rotations[0], now.translations[0])
+    return PoseInput(
+        *(torch.as_tensor(np.asarray(x), dtype=torch.float32) for x in (window, velocity, bones))
+    )

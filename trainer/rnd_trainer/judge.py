@@ -1,0 +1,53 @@
+"""Pictures of a model by the runtime's shading and rasteriser, so that what is judged is what is played."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from rnd_runtime.shading import Shader
+from torch import Tensor
+
+from rnd_runtime.camera import Camera
+from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.raster_cpu import rasterize
+
+from .model import AvatarModel, Posed, PoseInput
+
+
+@torch.no_grad()
+def to_gaussians(posed: Posed, pose: PoseInput) -> Gaussians:
+    """Posed Gaussians as the runtime's arrays."""
+    static = posed.attributes
+    tensors = (
+        posed.means, posed.covariances, static.opacity, posed.normals,
+        static.albedo, static.roughness, posed.visibility, pose.bones[0, :, :3],
+    )  # fmt: skip
+    return Gaussians(*(np.ascontiguousarray(t.cpu().numpy(), np.float32) for t in tensors))
+
+
+@dataclass
+class Rendered:
+    """What the player would show, before any background: premultiplied linear image, camera normals, albedo, alpha."""
+
+    image: Tensor
+    normals: Tensor
+    albedo: Tensor
+    alpha: Tensor
+
+
+@torch.no_grad()
+def render_runtime(
+    model: AvatarModel, pose: PoseInput, camera: Camera, shader: Shader, albedo_scale: Tensor | None = None
+) -> Rendered:
+    """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional."""
+    gaussians = to_gaussians(model(pose), pose)
+    if albedo_scale is not None:
+        gaussians = replace(gaussians, albedo=gaussians.albedo * albedo_scale.numpy())
+    radiance = shader.shade(gaussians, camera.position)
+    normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
+    features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
+    raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
+    image, normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
+    return Rendered(image, normals, albedo, torch.from_numpy(raster.alpha))

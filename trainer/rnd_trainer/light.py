@@ -1,0 +1,93 @@
+"""The learnable light probe and the texels a training step sums over."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rnd_runtime.light import texel_directions, texel_solid_angles
+
+PROBE_SHAPE = (32, 64)
+"""rows and columns of the probe (paper, section 3.2)"""
+UNIFORM_SHARE = 0.2
+"""of the drawing probability: dark texels must be drawn too, or they could never brighten"""
+
+
+@dataclass
+class Texels:
+    """K directions of incident light: directions [K, 3] towards the light, power [K, 3] = L Δω / probability."""
+
+    directions: Tensor
+    power: Tensor
+
+
+class LightProbe(nn.Module):
+    """L(ω): 32×64 texels of linear RGB through softplus, mean luminance over the sphere fixed at 1.
+
+    Albedo and light are known up to a common factor only; the fixed mean chooses it.
+    """
+
+    directions: Tensor
+    solid_angles: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.raw = nn.Parameter(torch.full((*PROBE_SHAPE, 3), math.log(math.e - 1)))  # softplus gives 1
+        self.register_buffer(
+            "directions", torch.as_tensor(texel_directions(*PROBE_SHAPE), dtype=torch.float32)
+        )
+        self.register_buffer(
+            "solid_angles", torch.as_tensor(texel_solid_angles(*PROBE_SHAPE), dtype=torch.float32)
+        )
+
+    def radiance(self) -> Tensor:
+        """[32, 64, 3] linear."""
+        light = nn.functional.softplus(self.raw)
+        return light / (luminance(light) * self.solid_angles).sum() * (4 * math.pi)
+
+
+def luminance(rgb: Tensor) -> Tensor:
+    """Rec.709 luminance of linear RGB [..., 3]."""
+    return rgb @ rgb.new_tensor([0.2126, 0.7152, 0.0722])
+
+
+def all_texels(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Texels:
+    """Every texel once: the full sum."""
+    return Texels(directions.reshape(-1, 3), (radiance * solid_angles[..., None]).reshape(-1, 3))
+
+
+def draw_texels(
+    radiance: Tensor, directions: Tensor, solid_angles: Tensor, count: int, generator: torch.Generator
+) -> Texels:
+    """About ``count`` texels by systematic sampling with inclusion probability min(1, c · importance).
+
+    A texel whose share exceeds 1/count (a sun) is always in, with its exact power; the rest are unbiased by
+    the inverse of their probability (Horvitz & Thompson 1952). Brightest first.
+    """
+    importance = (luminance(radiance.detach()) * solid_angles).flatten()
+    importance = (
+        1 - UNIFORM_SHARE
+    ) * importance / importance.sum() + UNIFORM_SHARE * solid_angles.flatten() / (4 * math.pi)
+    inclusion = importance * count
+    for _ in range(4):  # what exceeds 1 is handed to the rest
+        sure = inclusion >= 1
+        rest = importance * (count - int(sure.sum())) / importance[~sure].sum()
+        inclusion = torch.where(sure, 1.0, rest)
+    offset = torch.rand((), generator=generator).to(inclusion)
+    ticks = torch.floor(torch.cumsum(inclusion.clamp(max=1).double(), 0) + offset.double())
+    drawn = torch.diff(ticks, prepend=ticks.new_zeros(1)) > 0
+    drawn = (drawn | (inclusion >= 1)).nonzero()[:, 0]
+    drawn = drawn[torch.argsort(importance[drawn], descending=True, stable=True)]
+    power = (radiance * solid_angles[..., None]).reshape(-1, 3)[drawn] / inclusion[drawn].clamp(max=1)[
+        :, None
+    ]
+    return Texels(directions.reshape(-1, 3)[drawn], power)
+
+
+def as_probe(radiance: np.ndarray) -> Tensor:
+    """A light map [32, 64, 3] as a tensor, for training under a known light."""
+    return torch.as_tensor(np.ascontiguousarray(radiance), dtype=torch.float32)

@@ -1,0 +1,138 @@
+"""Gaussians' places on the body template: even samples, nodes among them, interpolation between the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.skeleton import bone_transforms
+
+Floats = NDArray[np.float64]
+
+NEIGHBOURS = 4
+"""nodes that a Gaussian interpolates between; more only smooths"""
+OVERSAMPLING = 6
+"""candidates per sample for farthest point sampling: spacing within 10 % of the best at 6, no better at 12"""
+WEIGHT_FLOOR = 1e-5
+"""smallest template weight before the logarithm: moves a point by less than 0.1 mm, yet lets Δ raise a bone"""
+SPREAD = {
+    "left_hip": (0, 0, 0.35),
+    "right_hip": (0, 0, -0.35),
+    "left_shoulder": (0, 0, -0.35),
+    "right_shoulder": (0, 0, 0.35),
+}
+"""the pose in which points are *encoded* (axis-angle, radians): legs apart, arms off the torso"""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """N surface points of a body in its rest pose, farthest first; the first M of them are the nodes.
+
+    Attributes:
+        points: [N, 3] m, rest pose.
+        normals: [N, 3] unit, rest pose.
+        codes: [N, 3] m, the points in the spread pose, where armpit and crotch neighbours are apart: the
+            networks see these, the skinning starts from ``points`` so that it is exactly the template's.
+        weights: [N, J] the template's skinning weights.
+        spacing: mean distance between neighbouring Gaussians, m.
+        neighbours, neighbour_weights: [N, 4] nodes that a Gaussian interpolates between, rows sum to 1.
+        nodes: M.
+    """
+
+    points: Floats
+    normals: Floats
+    codes: Floats
+    weights: Floats
+    spacing: float
+    neighbours: NDArray[np.int64]
+    neighbour_weights: Floats
+    nodes: int
+
+
+def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
+    """Spread ``count`` points evenly over the surface of ``body``.
+
+    Farthest point sampling (Eldar et al. 1997) of uniform candidates, so that any prefix covers the body too.
+    """
+    if not 16 <= nodes <= count:
+        raise InputError("nodes", expected=f"16 to {count} (the number of Gaussians)", got=nodes)
+    vertices = np.asarray(body.vertices, np.float64)
+    triangles = vertices[body.faces]
+    crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = 0.5 * np.linalg.norm(crosses, axis=1)
+    rng = np.random.default_rng(seed)
+    face = rng.choice(len(areas), size=OVERSAMPLING * count, p=areas / areas.sum())
+    u, v = rng.random((2, len(face)))
+    flip = u + v > 1
+    u[flip], v[flip] = 1 - u[flip], 1 - v[flip]
+    barycentric = np.stack([1 - u - v, u, v], axis=1)  # [C, 3]
+
+    def interpolate(values: Floats) -> Floats:
+        return np.einsum("ck,ck...->c...", barycentric, values[body.faces[face]])
+
+    weights = interpolate(np.asarray(body.skinning_weights, np.float64))
+    candidates = interpolate(vertices)
+    spread = np.zeros((len(body.skeleton.names), 3))
+    for joint, rotation in SPREAD.items():
+        if joint in body.skeleton.names:  # another skeleton is encoded in its rest pose
+            spread[body.skeleton.names.index(joint)] = rotation
+    bones = bone_transforms(body.skeleton, axis_angle_to_matrix(spread), np.zeros(3)).astype(np.float64)
+    codes = skin(candidates, weights, bones)
+
+    chosen = _farthest_points(codes.astype(np.float32), count, int(rng.integers(len(codes))))
+    codes, points, weights = codes[chosen], candidates[chosen], weights[chosen]
+    normals = interpolate(_vertex_normals(vertices, body.faces, crosses))[chosen]
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+    distances, neighbours = cKDTree(codes[:nodes]).query(codes, k=min(NEIGHBOURS, nodes))
+    node_spacing = float(np.sqrt(areas.sum() / nodes))
+    kernel = 1.0 / (distances**2 + (0.3 * node_spacing) ** 2)
+    return Template(
+        points=points,
+        normals=normals,
+        codes=codes,
+        weights=weights / weights.sum(axis=1, keepdims=True),
+        spacing=float(np.sqrt(areas.sum() / count)),
+        neighbours=neighbours.astype(np.int64),
+        neighbour_weights=kernel / kernel.sum(axis=1, keepdims=True),
+        nodes=nodes,
+    )
+
+
+def skin(points: Floats, weights: Floats, bones: Floats) -> Floats:
+    """Linear blend skinning of ``points`` [N, 3] by ``weights`` [N, J] and ``bones`` [J, 3, 4]."""
+    blend = np.einsum("nj,jrc->nrc", weights, bones)
+    return np.einsum("nrc,nc->nr", blend[:, :, :3], points) + blend[:, :, 3]
+
+
+def _vertex_normals(vertices: Floats, faces: NDArray[np.int32], crosses: Floats) -> Floats:
+    """Area-weighted vertex normals [V, 3]; not normalised where a vertex has no face."""
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], crosses)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+@numba.njit(cache=True)
+def _farthest_points(points, count, first):  # type: ignore[no-untyped-def]
+    """Indices [count] of a farthest point ordering of points [C, 3], starting with ``first``."""
+    candidates = points.shape[0]
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    nearest = np.full(candidates, np.float32(np.inf))
+    order = np.empty(count, np.int64)
+    current = first
+    for k in range(count):
+        order[k] = current
+        cx, cy, cz = x[current], y[current], z[current]
+        for i in range(candidates):  # two loops: the first one vectorises
+            dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
+            nearest[i] = min(nearest[i], dx * dx + dy * dy + dz * dz)
+        current = np.argmax(nearest)
+    return order
