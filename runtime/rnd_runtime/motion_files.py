@@ -85,14 +85,14 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
         names = _names(archive, axis_angles, joint_names)
         _check_angles(axis_angles, names, path)
         rotations = axis_angle_to_matrix(axis_angles)
-        family = len(names) in (52, 55) and joint_names is None and "joint_names" not in archive.names
-        rest_root = (SMPLX_REST_ROOT if len(names) == 55 else SMPL_REST_ROOT) if family or easymocap else None
+        named = joint_names is not None or "joint_names" in archive.names
+        amass = len(names) in (52, 55) and not named
+        smpl_root = SMPLX_REST_ROOT if len(names) == 55 else SMPL_REST_ROOT
         if easymocap:
-            assert rest_root is not None
             turn = axis_angle_to_matrix(_per_frame(archive, "Rh", "Rh_all", frames=len(rotations)))
             rotations[:, 0] = turn @ rotations[:, 0]
             # Rh turns about the origin: transl = Th + R·J0 − J0
-            shift = turn @ rest_root - rest_root
+            shift = turn @ smpl_root - smpl_root
             translations = _per_frame(archive, "Th", "Th_all", frames=len(rotations)) + shift
         elif archive.first_of("trans", "transl") is not None:
             translations = _per_frame(archive, "trans", "transl", frames=len(rotations))
@@ -102,10 +102,10 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
         _check_translations(translations, path)
         if "betas" in archive.names:
             notes.append("the file's betas are ignored: the avatar keeps its own shape")
-        up = _up_axis(archive, default="z" if family or easymocap else "y")
-        return MotionRecord(
-            rotations, translations, rest_root, names, _frame_rate(archive, notes), up, tuple(notes)
-        )
+        fps = _frame_rate(archive, notes)
+        up = _up_axis(archive, default="z" if amass or easymocap else "y")
+        rest_root = smpl_root if amass or easymocap else None
+        return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
 
 
 def _axis_angles(archive: Npz, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
@@ -119,13 +119,14 @@ def _axis_angles(archive: Npz, notes: list[str], joint_names: tuple[str, ...] | 
             file=archive.path,
         )
     poses = archive.numbers(member)
-    joints = {2: poses.shape[-1] / 3, 3: poses.shape[1] if poses.shape[-1] == 3 else 0.5}.get(poses.ndim, 0.5)
-    if joints != int(joints):
-        shape = "×".join(map(str, poses.shape))
-        raise InputError(f"shape of {member}", expected="F×3J or F×J×3", got=shape, file=archive.path)
-    if len(poses) == 0:
+    shape = poses.shape
+    flat, by_joint = len(shape) == 2 and shape[1] % 3 == 0, len(shape) == 3 and shape[2] == 3
+    if not (flat or by_joint):
+        got = "×".join(map(str, shape)) or "a single number"
+        raise InputError(f"shape of {member}", expected="F×3J or F×J×3", got=got, file=archive.path)
+    if shape[0] == 0:
         raise InputError(member, expected="at least one frame", got="none", file=archive.path)
-    poses = poses.reshape(len(poses), int(joints), 3)
+    poses = poses.reshape(shape[0], shape[1] // 3 if flat else shape[1], 3)
     rootless = joint_names is None and "joint_names" not in archive.names and poses.shape[1] in (21, 23)
     if not rootless:
         return poses

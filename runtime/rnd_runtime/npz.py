@@ -30,12 +30,15 @@ class Npz:
 
     def __init__(self, path: str | Path, *, what: str) -> None:
         self.path = existing_file(path, what=what)
+        self._stream = self.path.open("rb")  # ours to close: numpy leaves its own open when a file is cut
         try:
-            archive = np.load(self.path, allow_pickle=False)
+            archive = np.load(self._stream, allow_pickle=False)
         except _UNREADABLE as error:
+            self._stream.close()
             raise InputError(f"{what} cannot be read", expected="an .npz archive", file=path) from error
         if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise InputError(f"{what}", expected="an .npz archive", got="a single array", file=path)
+            self._stream.close()
+            raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
         self._archive = archive
         self.names: tuple[str, ...] = tuple(archive.files)
 
@@ -44,6 +47,7 @@ class Npz:
 
     def __exit__(self, *_: object) -> None:
         self._archive.close()
+        self._stream.close()
 
     def first_of(self, *names: str) -> str | None:
         """The first of ``names`` that the archive holds."""
