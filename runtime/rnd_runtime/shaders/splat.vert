@@ -1,0 +1,33 @@
+// One triangle around the ellipse α = 1/255 of each Gaussian, from gl_VertexID alone.
+// Before these lines the program states GLSL's version, TEXELS, ATTRIBUTES and ROW_GAUSSIANS.
+
+uniform sampler2D records;  // TEXELS texels for each Gaussian, back to front; see raster_gl.py
+uniform vec2 size;          // px
+
+noperspective out vec3 whitened;  // u, v with log2 α = peak − u² − v²; peak
+flat out vec4 attributes[(ATTRIBUTES + 3) / 4];
+
+const vec2 CORNERS[3] = vec2[3](vec2(0.0, 2.0), vec2(-1.7320508, -1.0), vec2(1.7320508, -1.0));
+const float MARGIN = 1.001;  // the rasteriser snaps corners to 1/256 px
+
+void main() {
+    int gaussian = gl_VertexID / 3, corner = gl_VertexID % 3;
+    ivec2 texel = ivec2(gaussian % ROW_GAUSSIANS * TEXELS, gaussian / ROW_GAUSSIANS);
+    vec4 place = texelFetch(records, texel, 0);                // centre x, y px; reach in u, v; peak
+    vec3 shape = texelFetch(records, texel + ivec2(1, 0), 0).xyz;  // u = shape.x (dx − shape.z dy), v = shape.y dy
+    for (int k = 0; k < (ATTRIBUTES + 3) / 4; k++)
+        attributes[k] = texelFetch(records, texel + ivec2(2 + k, 0), 0);
+
+    vec2 uv = place.z * MARGIN * CORNERS[corner];
+    float dy = uv.y / shape.y;
+    vec2 position = place.xy + vec2(uv.x / shape.x + shape.z * dy, dy);
+    // Around an ellipse much larger than the picture clipping would lose precision: cover the picture instead.
+    float extent = 2.0 * place.z * ((1.0 + abs(shape.z)) / shape.y + 1.0 / shape.x);
+    if (!(extent < 8.0 * max(size.x, size.y))) {
+        position = vec2(corner == 1 ? 2.0 * size.x : 0.0, corner == 2 ? 2.0 * size.y : 0.0);
+        vec2 d = position - place.xy;
+        uv = vec2(shape.x * (d.x - shape.z * d.y), shape.y * d.y);
+    }
+    whitened = vec3(uv, place.w);
+    gl_Position = vec4(2.0 * position / size - 1.0, 0.0, 1.0);
+}
