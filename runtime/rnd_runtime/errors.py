@@ -38,8 +38,20 @@ class InputError(Exception):
             line += f"{', ' if expected is not None else ': '}got {got}"
         if hint is not None:
             line += f" ({hint})"
-        self.what, self.expected, self.got, self.file, self.frame = what, expected, got, file, frame
+        self.what, self.expected, self.got, self.hint = what, expected, got, hint
+        self.file, self.frame = file, frame
         super().__init__(" ".join(line.split()))
+
+    def at(self, *, file: str | Path | None = None, frame: int | None = None) -> InputError:
+        """The same mistake with the place it lacked, for callers who know the file or the frame."""
+        return InputError(
+            self.what,
+            expected=self.expected,
+            got=self.got,
+            file=file if self.file is None else self.file,
+            frame=frame if self.frame is None else self.frame,
+            hint=self.hint,
+        )
 
 
 def run_command(name: str, main: Callable[[], int | None]) -> int:

@@ -133,7 +133,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     try:
         radiance, repaired = repair(radiance)
     except InputError as error:
-        raise InputError(error.what, expected=error.expected, got=error.got, file=path) from error
+        raise error.at(file=path) from error
     radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure))
     return Light(radiance, yaw=yaw, up=up, repaired=repaired)
 
