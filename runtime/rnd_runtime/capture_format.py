@@ -88,9 +88,10 @@ def read_record(file: Path) -> CaptureRecord:
         record = msgspec.json.decode(content, type=CaptureRecord)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise InputError("capture.json does not follow the format", got=str(error), file=file) from error
-    for name in (record.body, record.motion, *(light.file for light in record.lights.values())):
-        existing_file(_inside(file, name), what="file of the capture")
+    for name in (record.body, record.motion):
+        _inside(file, name)
     for name, light in record.lights.items():
+        existing_file(_inside(file, light.file), what=f"light {name}")
         if min(light.scale) < 0:
             raise InputError(f"lights.{name}.scale", expected="not negative", got=light.scale, file=file)
     for frame in record.frames:
