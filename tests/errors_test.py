@@ -1,0 +1,52 @@
+"""One line that names what, expected, got, file and frame; and the exit codes of commands."""
+
+from pathlib import Path
+
+import pytest
+
+from rnd_runtime.errors import InputError, run_command
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (InputError("poses"), "poses"),
+        (InputError("poses", expected="numbers", got="NaN"), "poses: expected numbers, got NaN"),
+        (InputError("poses", got=0), "poses: got 0"),
+        (InputError("poses", expected=24), "poses: expected 24"),
+        (
+            InputError("poses", expected="numbers", got="NaN", file=Path("a/walk.npz"), frame=17),
+            "a/walk.npz: frame 17: poses: expected numbers, got NaN",
+        ),
+        (InputError("poses", frame=0, hint="are these degrees?"), "frame 0: poses (are these degrees?)"),
+        (InputError("poses", got="two\n  lines\t"), "poses: got two lines"),
+    ],
+)
+def test_message(error, line):
+    assert str(error) == line
+
+
+def test_a_place_found_later_is_added_once():
+    error = InputError("size", expected=1, got=2, hint="resize it").at(file="a.png", frame=3)
+    assert str(error) == "a.png: frame 3: size: expected 1, got 2 (resize it)"
+    assert str(error.at(file="b.png", frame=9)) == str(error)
+    assert str(InputError("size").at(frame=0).at(frame=5)) == "frame 0: size"
+
+
+def _raise(error: BaseException):
+    raise error
+
+
+def test_commands_report_in_one_line_and_by_exit_code(capsys):
+    assert run_command("rnd-x", lambda: _raise(InputError("no such thing", file="a.npz"))) == 2
+    assert capsys.readouterr().err == "rnd-x: a.npz: no such thing\n"
+    assert run_command("rnd-x", lambda: _raise(KeyboardInterrupt())) == 130
+    assert capsys.readouterr().err == "rnd-x: interrupted\n"
+    assert run_command("rnd-x", lambda: None) == 0
+    assert run_command("rnd-x", lambda: 7) == 7
+    assert capsys.readouterr() == ("", "")
+
+
+def test_our_own_mistakes_keep_their_traceback():
+    with pytest.raises(ZeroDivisionError):
+        run_command("rnd-x", lambda: 1 // 0)
