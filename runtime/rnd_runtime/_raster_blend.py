@@ -15,12 +15,15 @@ from ._raster_lanes import (
     WIDTH,
     aligned_floats,
     any_lane,
+    bits,
     block_x,
     block_y,
     exp2,
     fetch_add,
     lanes,
     load,
+    lowest_bit,
+    magnitude,
     select,
     store,
     total,
@@ -28,85 +31,83 @@ from ._raster_lanes import (
 from ._raster_project import TILE
 
 BLOCK = 4
+HALF_BLOCK = np.float32(1.5)  # from a block's centre to its outer pixel centres
 BLOCKS = TILE // BLOCK
 PIXELS = TILE * TILE
+ALL_BLOCKS = (1 << (BLOCKS * BLOCKS)) - 1
 LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
+LOG2_ALPHA_NEARLY_MIN = LOG2_ALPHA_MIN - np.float32(1e-3)  # no block is lost to rounding
 LOG2_ALPHA_MAX = np.float32(math.log2(0.99))
 TRANSMITTANCE_MIN = np.float32(1e-4)
 LN2 = np.float32(math.log(2.0))
 ZERO = np.float32(0)
 ONE = np.float32(1)
 MOMENTS = 6
-CHECK_EVERY = 32  # Gaussians between two looks at whether the tile is saturated
 
 
 @njit(inline="always")
-def _block_range(box, tile_x, tile_y):  # type: ignore[no-untyped-def]
-    """First and last block of the tile that the pixel box touches: x0, x1, y0, y1."""
-    return (
-        max(box[0] - tile_x, 0) // BLOCK,
-        min(box[2] - tile_x, TILE - 1) // BLOCK,
-        max(box[1] - tile_y, 0) // BLOCK,
-        min(box[3] - tile_y, TILE - 1) // BLOCK,
-    )
-
-
-@njit(inline="always")
-def _start_transmittance(transmittance, tile_x, tile_y, width, height):  # type: ignore[no-untyped-def]
-    """1 inside the picture, 0 (as if saturated) outside."""
-    for by in range(BLOCKS):
-        for bx in range(BLOCKS):
-            inside_x = block_x() + np.float32(tile_x + bx * BLOCK) < np.float32(width)
-            inside_y = block_y() + np.float32(tile_y + by * BLOCK) < np.float32(height)
-            store(transmittance, (by * BLOCKS + bx) * WIDTH, select(inside_x & inside_y, ONE, ZERO))
-
-
-@njit(inline="always")
-def _saturated(transmittance):  # type: ignore[no-untyped-def]
-    left = lanes(ZERO)
+def _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance):  # type: ignore[no-untyped-def]
+    """Pixel centres in the tile; transmittance 1 inside the picture, 0 (as if saturated) outside."""
     for block in range(BLOCKS * BLOCKS):
-        left += load(transmittance, block * WIDTH)
-    return not any_lane(left > ZERO)
+        x = block_x() + np.float32(block % BLOCKS * BLOCK + 0.5)
+        y = block_y() + np.float32(block // BLOCKS * BLOCK + 0.5)
+        store(columns, block * WIDTH, x)
+        store(rows, block * WIDTH, y)
+        inside = (x < np.float32(width - tile_x)) & (y < np.float32(height - tile_y))
+        store(transmittance, block * WIDTH, select(inside, ONE, ZERO))
 
 
-@njit
-def _blend_tile(tile_x, tile_y, first, last, splats, width, height, transmittance, sums):  # type: ignore[no-untyped-def]
-    """Fill ``sums``: for each block K blended attributes, then alpha (sixteen lanes each)."""
-    channels = splats.attributes.shape[1]
+@njit(inline="always")
+def _reached_blocks(x, y, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
+    """Blocks of a tile in which α may reach 1/255, one bit each; all sixteen are tested at once.
+
+    Pixel centres lie within 1.5 px of their block's centre, so |dy| and |dx − shear·dy| are at least what the
+    centre has less 1.5 and 1.5·(1 + |shear|).
+    """
+    dy = block_y() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - y)
+    d = magnitude(block_x() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - x) - shear * dy)
+    dy = magnitude(dy) - HALF_BLOCK
+    d = d - (HALF_BLOCK + HALF_BLOCK * abs(shear))
+    dy, d = select(dy > ZERO, dy, ZERO), select(d > ZERO, d, ZERO)
+    return bits(peak - fall_y * dy * dy - fall_x * d * d >= LOG2_ALPHA_NEARLY_MIN)
+
+
+@njit(error_model="numpy")
+def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[no-untyped-def]
+    """Add up, for each block, K blended attributes, then alpha (sixteen lanes each)."""
+    columns, rows, transmittance, sums = buffers
+    centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
+    pair_gaussians = splats.pair_gaussians
+    channels = attributes.shape[1]
     stride = (channels + 1) * WIDTH
-    _start_transmittance(transmittance, tile_x, tile_y, width, height)
-    sums[: BLOCKS * BLOCKS * stride] = ZERO
-    x_in_block, y_in_block = block_x() + np.float32(0.5), block_y() + np.float32(0.5)
+    open_blocks = ALL_BLOCKS
     for pair in range(first, last):
-        if (pair - first) % CHECK_EVERY == CHECK_EVERY - 1 and _saturated(transmittance):
-            return
-        g = splats.pair_gaussians[pair]
-        x = np.float32(splats.centers[g, 0] - tile_x)
-        y = np.float32(splats.centers[g, 1] - tile_y)
-        shear, fall_y, fall_x, peak = splats.shapes[g]
-        bx0, bx1, by0, by1 = _block_range(splats.boxes[g], tile_x, tile_y)
-        for by in range(by0, by1 + 1):
-            dy = y_in_block + (np.float32(by * BLOCK) - y)
-            top = peak - fall_y * dy * dy
-            dx = x_in_block - x - shear * dy
-            for bx in range(bx0, bx1 + 1):
-                block = by * BLOCKS + bx
-                before = load(transmittance, block * WIDTH)
-                d = dx + np.float32(bx * BLOCK)
-                power = top - fall_x * d * d
-                hit = (power >= LOG2_ALPHA_MIN) & (before > ZERO)
-                if any_lane(hit):
-                    alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
-                    weight = before * select(hit, alpha, ZERO)
-                    after = before - weight
-                    open_ = after >= TRANSMITTANCE_MIN
-                    weight = select(open_, weight, ZERO)
-                    store(transmittance, block * WIDTH, select(open_, after, ZERO))
-                    at = block * stride
-                    for c in range(channels):
-                        store(sums, at, load(sums, at) + weight * splats.attributes[g, c])
-                        at += WIDTH
-                    store(sums, at, load(sums, at) + weight)
+        g = pair_gaussians[pair]
+        x, y = np.float32(centers[g, 0] - tile_x), np.float32(centers[g, 1] - tile_y)
+        shear, fall_y, fall_x, peak = shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3]
+        reached = _reached_blocks(x, y, shear, fall_y, fall_x, peak) & open_blocks
+        while reached != 0:
+            block = lowest_bit(reached)
+            reached &= reached - 1
+            dy = load(rows, block * WIDTH) - y
+            d = load(columns, block * WIDTH) - x - shear * dy
+            power = peak - fall_y * dy * dy - fall_x * d * d
+            alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
+            before = load(transmittance, block * WIDTH)
+            weight = before * select(power >= LOG2_ALPHA_MIN, alpha, ZERO)
+            after = before - weight
+            unfinished = after >= TRANSMITTANCE_MIN
+            weight = select(unfinished, weight, ZERO)
+            store(transmittance, block * WIDTH, select(unfinished, after, ZERO))
+            if not any_lane(unfinished):
+                open_blocks &= ~(1 << block)
+            at = block * stride
+            for c in range(channels):
+                store(sums, at, load(sums, at) + weight * attributes[g, c])
+                at += WIDTH
+            store(sums, at, load(sums, at) + weight)
+        if open_blocks == 0:
+            break
 
 
 @njit(inline="always")
@@ -124,17 +125,18 @@ def blend(splats, width, height, threads):  # type: ignore[no-untyped-def]
     tiles = _fullest_first(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
-        transmittance = aligned_floats(PIXELS)
+        columns, rows, transmittance = aligned_floats(PIXELS), aligned_floats(PIXELS), aligned_floats(PIXELS)
         sums = aligned_floats((channels + 1) * PIXELS)
+        buffers = (columns, rows, transmittance, sums)
         while True:
             n = fetch_add(counter)
             if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-            _blend_tile(
-                tile_x, tile_y, starts[tile], starts[tile + 1], splats, width, height, transmittance, sums
-            )
+            _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance)
+            sums[:] = ZERO
+            _blend_tile(tile_x, tile_y, starts[tile], starts[tile + 1], splats, buffers)
             for y in range(min(TILE, height - tile_y)):
                 for x in range(min(TILE, width - tile_x)):
                     block, lane = y // BLOCK * BLOCKS + x // BLOCK, y % BLOCK * BLOCK + x % BLOCK
@@ -145,68 +147,67 @@ def blend(splats, width, height, threads):  # type: ignore[no-untyped-def]
     return image, coverage
 
 
-@njit
+@njit(error_model="numpy")
 def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  # type: ignore[no-untyped-def]
     """Replay the tile front to back; one scalar a pixel (what is still to come behind, weighted by the
     incoming gradients) replaces the transmittance's recovery by division.
 
     ``wanted`` holds, for each block, the incoming gradients of K attributes, then of alpha.
     """
-    transmittance, behind, wanted, gathered = buffers
-    channels = splats.attributes.shape[1]
+    columns, rows, transmittance, behind, wanted, gathered = buffers
+    centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
+    pair_gaussians, pair_slots = splats.pair_gaussians, splats.pair_slots
+    channels = attributes.shape[1]
     stride = (channels + 1) * WIDTH
-    x_in_block, y_in_block = block_x() + np.float32(0.5), block_y() + np.float32(0.5)
+    open_blocks = ALL_BLOCKS
     for pair in range(first, last):
-        slot = splats.pair_slots[pair]
-        if (pair - first) % CHECK_EVERY == CHECK_EVERY - 1 and _saturated(transmittance):
-            for rest in range(pair, last):
-                slots[splats.pair_slots[rest]] = ZERO
-            return
-        g = splats.pair_gaussians[pair]
-        x = np.float32(splats.centers[g, 0] - tile_x)
-        y = np.float32(splats.centers[g, 1] - tile_y)
-        shear, fall_y, fall_x, peak = splats.shapes[g]
-        bx0, bx1, by0, by1 = _block_range(splats.boxes[g], tile_x, tile_y)
+        g, slot = pair_gaussians[pair], pair_slots[pair]
+        x, y = np.float32(centers[g, 0] - tile_x), np.float32(centers[g, 1] - tile_y)
+        shear, fall_y, fall_x, peak = shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3]
+        reached = _reached_blocks(x, y, shear, fall_y, fall_x, peak) & open_blocks
+        if reached == 0:
+            for k in range(MOMENTS + channels):
+                slots[slot, k] = ZERO
+            continue
         s, sd, sdd = lanes(ZERO), lanes(ZERO), lanes(ZERO)
         sy, syy, sdy = lanes(ZERO), lanes(ZERO), lanes(ZERO)
         for c in range(channels):
             store(gathered, c * WIDTH, lanes(ZERO))
-        for by in range(by0, by1 + 1):
-            dy = y_in_block + (np.float32(by * BLOCK) - y)
-            top = peak - fall_y * dy * dy
-            dx = x_in_block - x - shear * dy
-            for bx in range(bx0, bx1 + 1):
-                block = by * BLOCKS + bx
-                before = load(transmittance, block * WIDTH)
-                d = dx + np.float32(bx * BLOCK)
-                power = top - fall_x * d * d
-                hit = (power >= LOG2_ALPHA_MIN) & (before > ZERO)
-                if any_lane(hit):
-                    alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
-                    weight = before * select(hit, alpha, ZERO)
-                    after = before - weight
-                    open_ = after >= TRANSMITTANCE_MIN
-                    weight = select(open_, weight, ZERO)
-                    store(transmittance, block * WIDTH, select(open_, after, ZERO))
-                    at = block * stride
-                    value = load(wanted, at + channels * WIDTH)
-                    for c in range(channels):
-                        gradient = load(wanted, at)
-                        value += gradient * splats.attributes[g, c]
-                        store(gathered, c * WIDTH, load(gathered, c * WIDTH) + weight * gradient)
-                        at += WIDTH
-                    rest = load(behind, block * WIDTH) - weight * value
-                    store(behind, block * WIDTH, rest)
-                    # ∂L/∂log2 α = ln2·(w·value − rest·α/(1 − α)), the second by every Gaussian behind
-                    gradient = LN2 * (weight * value - rest * (alpha / (ONE - alpha)))
-                    gradient = select(hit & open_ & (power < LOG2_ALPHA_MAX), gradient, ZERO)
-                    s += gradient
-                    gd, gy = gradient * d, gradient * dy
-                    sd += gd
-                    sdd += gd * d
-                    sy += gy
-                    syy += gy * dy
-                    sdy += gd * dy
+        while reached != 0:
+            block = lowest_bit(reached)
+            reached &= reached - 1
+            dy = load(rows, block * WIDTH) - y
+            d = load(columns, block * WIDTH) - x - shear * dy
+            power = peak - fall_y * dy * dy - fall_x * d * d
+            alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
+            before = load(transmittance, block * WIDTH)
+            hit = power >= LOG2_ALPHA_MIN
+            weight = before * select(hit, alpha, ZERO)
+            after = before - weight
+            unfinished = after >= TRANSMITTANCE_MIN
+            weight = select(unfinished, weight, ZERO)
+            store(transmittance, block * WIDTH, select(unfinished, after, ZERO))
+            if not any_lane(unfinished):
+                open_blocks &= ~(1 << block)
+            at = block * stride
+            value = load(wanted, at + channels * WIDTH)
+            for c in range(channels):
+                gradient = load(wanted, at)
+                value += gradient * attributes[g, c]
+                store(gathered, c * WIDTH, load(gathered, c * WIDTH) + weight * gradient)
+                at += WIDTH
+            rest = load(behind, block * WIDTH) - weight * value
+            store(behind, block * WIDTH, rest)
+            # ∂L/∂log2 α = ln2·(w·value − rest·α/(1 − α)): all that lies behind shrinks by 1 − α
+            gradient = LN2 * (weight * value - rest * (alpha / (ONE - alpha)))
+            gradient = select(hit & unfinished & (power < LOG2_ALPHA_MAX), gradient, ZERO)
+            gd, gy = gradient * d, gradient * dy
+            s += gradient
+            sd += gd
+            sdd += gd * d
+            sy += gy
+            syy += gy * dy
+            sdy += gd * dy
         slots[slot, 0], slots[slot, 1], slots[slot, 2] = total(s), total(sd), total(sdd)
         slots[slot, 3], slots[slot, 4], slots[slot, 5] = total(sy), total(syy), total(sdy)
         for c in range(channels):
@@ -227,16 +228,17 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
     tiles = _fullest_first(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
-        transmittance, behind = aligned_floats(PIXELS), aligned_floats(PIXELS)
+        columns, rows, transmittance = aligned_floats(PIXELS), aligned_floats(PIXELS), aligned_floats(PIXELS)
+        behind = aligned_floats(PIXELS)
         wanted, gathered = aligned_floats((channels + 1) * PIXELS), aligned_floats(channels * WIDTH)
-        buffers = (transmittance, behind, wanted, gathered)
+        buffers = (columns, rows, transmittance, behind, wanted, gathered)
         while True:
             n = fetch_add(counter)
             if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-            _start_transmittance(transmittance, tile_x, tile_y, width, height)
+            _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance)
             wanted[:] = ZERO
             behind[:] = ZERO
             for y in range(min(TILE, height - tile_y)):

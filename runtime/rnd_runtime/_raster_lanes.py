@@ -2,8 +2,8 @@
 
 ``Lanes`` maps to LLVM's ``<16 x float>`` and ``Mask`` to ``<16 x i1>``. A kernel then reads like scalar code
 while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NEON: LLVM splits what the
-machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``); no
-other liberty is taken, so a NaN fails every comparison.
+machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``);
+no other liberty is taken, so a NaN fails every comparison.
 
 numba's cache looks only at the file of the kernel it stored: after editing this file, touch its importers.
 """
@@ -151,10 +151,36 @@ def any_lane(context, mask):  # type: ignore[no-untyped-def]
     return types.boolean(mask), emit
 
 
+@intrinsic
+def bits(context, mask):  # type: ignore[no-untyped-def]
+    """The mask as an integer, lane i in bit i."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.zext(builder.bitcast(args[0], ir.IntType(WIDTH)), ir.IntType(64))
+
+    return types.int64(mask), emit
+
+
+@intrinsic
+def lowest_bit(context, value):  # type: ignore[no-untyped-def]
+    """Index of the lowest bit of an int64 that is not zero."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), emit
+
+
 def _call(builder: Any, name: str, result: Any, *args: Any) -> Any:
     kind = ir.FunctionType(result, [arg.type for arg in args])
     function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
     return builder.call(function, args)
+
+
+@intrinsic
+def magnitude(context, values):  # type: ignore[no-untyped-def]
+    """|values|."""
+    return LANES(values), lambda ctx, builder, sig, args: _call(builder, "llvm.fabs.v16f32", _FLOATS, args[0])
 
 
 @intrinsic

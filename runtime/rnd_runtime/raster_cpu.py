@@ -16,7 +16,8 @@ from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from ._raster_blend import blend, blend_backward
-from ._raster_project import Splats, View, project, project_backward, view_of
+from ._raster_project import View, project, project_backward, view_of
+from ._raster_tiles import Splats, sort_into_tiles
 from .camera import Camera
 from .errors import InputError
 from .gaussians import Floats32, Raster
@@ -79,11 +80,15 @@ def forward(
         if array.shape != shape:
             raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
     view = view_of(camera)
-    splats = Splats(*project(means, covariances, opacities, features, view, depth))
+    centers, shapes, boxes, attributes, depths, slot_starts = project(
+        means, covariances, opacities, features, view, depth
+    )
+    pairs = sort_into_tiles(boxes, depths, slot_starts, camera.width, camera.height)
+    splats = Splats(centers, shapes, attributes, slot_starts, *pairs)
     image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
     channels = features.shape[1]
-    depths = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)
-    raster = Raster(image[..., :channels], coverage, depths)
+    far = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)
+    raster = Raster(image[..., :channels], coverage, far)
     return raster, State(means, covariances, opacities, view, splats, image, coverage, channels)
 
 
@@ -104,20 +109,16 @@ def backward(
         height, width = state.coverage.shape
         depth = np.zeros((height, width), np.float32) if grad_depth is None else _floats(grad_depth)
         wanted = np.concatenate([wanted, depth[..., None]], axis=2)
-    threads = get_num_threads()
-    slots = blend_backward(state.splats, state.image, state.coverage, wanted, _floats(grad_alpha), threads)
+    splats = state.splats
+    slots = blend_backward(
+        splats, state.image, state.coverage, wanted, _floats(grad_alpha), get_num_threads()
+    )
+    arrays = state.means, state.covariances, state.opacities
     grads: tuple[Floats32, Floats32, Floats32, Floats32] = project_backward(
-        state.means,
-        state.covariances,
-        state.opacities,
-        state.channels,
-        state.view,
-        state.splats,
-        slots,
-        threads,
+        *arrays, state.channels, state.view, splats.slot_starts, slots
     )
     return grads
 
 
 def _floats(array: ArrayLike) -> NDArray[np.float32]:
-    return np.ascontiguousarray(array, np.float32)
+    return np.require(array, np.float32, ["C", "A", "W"])

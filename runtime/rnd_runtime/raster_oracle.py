@@ -77,7 +77,8 @@ def alphas(offsets: Floats, covariance: Floats, opacity: float) -> Floats:
 
 def reach(covariance: Floats, opacity: float) -> Floats:
     """Half the width and height [2] px of the box around the ellipse α = 1/255."""
-    return np.sqrt(2.0 * np.log(opacity / ALPHA_MIN) * np.diagonal(covariance))
+    half: Floats = np.sqrt(2.0 * np.log(opacity / ALPHA_MIN) * np.diagonal(covariance))
+    return half
 
 
 def drawn(

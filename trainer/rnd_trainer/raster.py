@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
+
 from rnd_runtime import raster_cpu
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
-from torch import Tensor
 
 NEAR = 0.01  # m
 

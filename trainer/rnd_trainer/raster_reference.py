@@ -8,9 +8,10 @@ The rule is :class:`rnd_runtime.gaussians.Rasterizer`'s; each step names the fun
 from __future__ import annotations
 
 import torch
+from torch import Tensor
+
 from rnd_runtime import raster_oracle as oracle
 from rnd_runtime.camera import Camera
-from torch import Tensor
 
 TILE = 16  # pixels
 
