@@ -1,0 +1,205 @@
+"""The command rnd-play: files it leaves, refusals, Ctrl-C. The avatar is a fake; the rest is real."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rnd_viewer.play
+from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.images import read_image, write_image
+from rnd_runtime.motion import save_motion
+from rnd_viewer.cli import main
+from rnd_viewer.player import Player
+
+FRAMES = 6
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch) -> dict[str, Path]:
+    """Input files, and an avatar that needs none."""
+    monkeypatch.setattr(rnd_viewer.play.Avatar, "load", lambda path, threads=None: FakeAvatar())
+    save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
+    rng = np.random.default_rng(0)
+    write_image(tmp_path / "sky.exr", rng.uniform(0.2, 1, (16, 32, 3)).astype(np.float32))
+    write_image(tmp_path / "black.exr", np.zeros((16, 32, 3), np.float32))
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    (tmp_path / "torn.exr").write_bytes((tmp_path / "sky.exr").read_bytes()[:200])
+    poses = {"poses": np.full((4, 72), np.nan), "trans": np.zeros((4, 3)), "mocap_framerate": 30.0}
+    np.savez(tmp_path / "nan.npz", **poses)
+    return {file.name: file for file in tmp_path.iterdir()}
+
+
+def _arguments(files: dict[str, Path], folder: Path, **changes: object) -> list[str]:
+    inputs = {"motion": files["walk.npz"], "hdr": files["sky.exr"], "out": folder}
+    options: dict[str, object] = inputs | {"size": 48, "raster": "cpu"}
+    options |= {"shade": "ao", "format": "png"} | changes
+    named = [
+        (f"--{key.replace('_', '-')}", str(value)) for key, value in options.items() if value is not None
+    ]
+    return ["avatar.onnx", *(word for pair in named for word in pair)]
+
+
+def _tree(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
+    arguments = _arguments(files, tmp_path / "out", format="png,exr,mp4", aov="normal,depth")
+    assert main(arguments) == 0
+    names = {f"{k:06d}" for k in range(FRAMES)}
+    expected = {f"frames/{name}.png" for name in names} | {f"frames_exr/{name}.exr" for name in names}
+    expected |= {f"aov/{aov}/{name}.png" for aov in ("normal", "depth") for name in names}
+    assert set(_tree(tmp_path / "out")) == expected | {"play.mp4", "play.json"}
+    report = json.loads((tmp_path / "out/play.json").read_text())
+    assert report["frames"] == [0, FRAMES] and report["size"] == [48, 48] and report["fps"] == 30
+    assert {"load", "encoders", "shading", "tonemap", "write"} <= set(report["times"])
+    assert report["times"]["encoders"]["runs"] == FRAMES
+    printed = capsys.readouterr()
+    assert "median ms" in printed.out and "p95 ms" in printed.out and "frames/s" in printed.out
+    assert printed.err == ""  # no terminal, no progress bar, nothing to warn of
+
+
+def test_the_same_run_gives_the_same_bytes(files, tmp_path):
+    trees = []
+    for name in ("a", "b"):
+        assert main(_arguments(files, tmp_path / name, format="png,exr,mp4", camera="orbit")) == 0
+        tree = _tree(tmp_path / name)
+        report = json.loads(tree.pop("play.json"))
+        del report["times"]
+        trees.append((tree, report))
+    assert trees[0] == trees[1]
+
+
+def test_a_part_of_a_run_has_the_pixels_of_the_whole(files, tmp_path):
+    options = {
+        "camera": "orbit",
+        "orbit_seconds": "0.4",
+        "background": "hdr",
+        "fps": "45",
+        "shade": "table+sun",
+    }
+    assert main(_arguments(files, tmp_path / "whole", **options)) == 0
+    assert main(_arguments(files, tmp_path / "part", frames="3:5", **options)) == 0
+    whole, part = _tree(tmp_path / "whole"), _tree(tmp_path / "part")
+    assert len([name for name in whole if name.startswith("frames/")]) == 8  # 5/30 s at 45 frames/s
+    pictures = {name for name in part if name.startswith("frames/")}
+    assert pictures == {"frames/000003.png", "frames/000004.png"}
+    assert all(part[name] == whole[name] for name in pictures)
+    assert part["frames/000003.png"] != part["frames/000004.png"]
+
+
+def test_without_hdr_the_light_of_the_avatar_shines(files, tmp_path):
+    for name, changes in (("a", {}), ("b", {"exposure": "-1"})):
+        assert main(_arguments(files, tmp_path / name, hdr=None, frames=":1", **changes)) == 0
+    bright, dark = (read_image(tmp_path / name / "frames/000000.png") for name in ("a", "b"))
+    assert 0 < dark[..., :3].max() < bright[..., :3].max()
+    assert json.loads((tmp_path / "b/play.json").read_text())["light"]["maximum"] == 0.25
+
+
+def test_background_colour_fills_the_corner(files, tmp_path):
+    assert main(_arguments(files, tmp_path / "out", background="#204060", frames=":1")) == 0
+    picture = read_image(tmp_path / "out/frames/000000.png")
+    assert picture.shape == (48, 48, 3) and picture[0, 0].tolist() == [0x20, 0x40, 0x60]
+
+
+def test_warnings_name_what_was_found(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", hdr=files["nan.exr"], frames=":1")) == 0
+    assert "1 texels of the light were NaN" in capsys.readouterr().err
+    assert main(_arguments(files, tmp_path / "out", hdr=files["black.exr"], frames=":1")) == 0
+    assert "the light is dark: its largest radiance is 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"motion": "none.npz"}, "none.npz"),
+        ({"motion": "nan.npz"}, "nan.npz"),
+        ({"hdr": "none.exr"}, "none.exr"),
+        ({"hdr": "torn.exr"}, "torn.exr"),
+        ({"shade": "fancy"}, "fancy"),
+        ({"frames": "4:4"}, "--frames: expected START:END within 0:6"),
+        ({"frames": "4:40"}, "--frames"),
+        ({"size": "0"}, "--size"),
+        ({"fov": "180"}, "--fov"),
+        ({"fps": "nan"}, "--fps"),
+        ({"orbit_seconds": "0"}, "--orbit-seconds"),
+        ({"background": "blue"}, "--background"),
+        ({"aov": "albedo,beauty"}, "--aov"),
+        ({"format": "gif"}, "--format"),
+        ({"camera": "above"}, "--camera"),
+        ({"camera": "none.json"}, "camera file not found"),
+        ({"threads": "0"}, "--threads"),
+        ({"motion": None, "out": None}, "missing --motion, --out"),
+    ],
+)
+def test_unusable_input_is_one_line_and_exit_2(files, tmp_path, capsys, changes, message):
+    here = {name: tmp_path / value for name, value in changes.items() if name in ("motion", "hdr") and value}
+    assert main(_arguments(files, tmp_path / "out", **(changes | here))) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("rnd-play: ") and message in printed.err
+    assert printed.err.count("\n") == 1 and printed.out == ""
+    assert not _tree(tmp_path / "out")
+
+
+def test_avatar_that_is_not_there(tmp_path, capsys):
+    assert main([str(tmp_path / "a.onnx"), "--motion", "x.npz", "--out", str(tmp_path / "out")]) == 2
+    assert "a.onnx: avatar not found" in capsys.readouterr().err
+
+
+def test_output_folder_that_cannot_be_written(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("rnd_runtime.files.os.access", lambda path, mode: False)  # root may write everywhere
+    assert main(_arguments(files, tmp_path / "out")) == 2
+    assert "out: output folder cannot be written" in capsys.readouterr().err
+
+
+def test_output_folder_that_is_a_file(files, tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert main(_arguments(files, tmp_path / "out")) == 2
+    assert "out: output folder cannot be made" in capsys.readouterr().err
+
+
+def test_avatar_out_of_view_is_an_error_that_says_so(files, tmp_path, capsys):
+    camera = {"width": 32, "height": 32, "K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]]}
+    camera["world_to_camera"] = np.eye(4).tolist()  # at the feet, looking past the body
+    camera["world_to_camera"][2][3] = -4.0
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    assert main(_arguments(files, tmp_path / "out", camera=tmp_path / "camera.json", size=None)) == 2
+    assert "frame 0: nothing of the avatar is in view in the first frame" in capsys.readouterr().err
+    assert not _tree(tmp_path / "out")
+
+
+def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
+    rendered = []
+
+    def render(self, motion, time_s, camera):
+        rendered.append(time_s)
+        if len(rendered) == 3:
+            raise KeyboardInterrupt
+        return original(self, motion, time_s, camera)
+
+    original = Player.render
+    monkeypatch.setattr(Player, "render", render)
+    assert main(_arguments(files, tmp_path / "out", format="png,exr,mp4")) == 130
+    assert "interrupted" in capsys.readouterr().err
+    left = _tree(tmp_path / "out")
+    assert set(left) == {
+        f"{folder}/{k:06d}.{kind}"
+        for folder, kind in (("frames", "png"), ("frames_exr", "exr"))
+        for k in (0, 1)
+    }
+    for name in left:
+        assert read_image(tmp_path / "out" / name).shape[:2] == (48, 48)
+
+
+def test_help_explains_every_option(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    for option in ("--hdr-yaw", "--exposure", "--aov", "--frames", "--shade", "--raster", "--doctor"):
+        assert option in text

@@ -1,0 +1,36 @@
+"""The command ``rnd-play``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import tyro
+from rnd_runtime.errors import run_command
+
+from .options import PlayOptions
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rnd-play`` with ``arguments`` (the process's own when None) and return its exit code.
+
+    0 when all frames are written, 2 for unusable input (one line on stderr), 130 after Ctrl-C.
+    """
+
+    def command() -> int:
+        options = tyro.cli(PlayOptions, prog="rnd-play", args=arguments)
+        if options.doctor:
+            return _doctor()
+        from .play import play  # here, so that --help and --doctor work where a library does not load
+
+        return play(options)
+
+    return run_command("rnd-play", command)
+
+
+def _doctor() -> int:
+    from rnd_runtime.doctor import report
+
+    from .report import print_text
+
+    print_text(report())
+    return 0

@@ -1,0 +1,121 @@
+"""The options of ``rnd-play``; each comment is the option's help."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rnd_runtime.errors import InputError
+
+LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
+
+
+# Help without "{None}|PATH" and "(default: None)": the text says what happens when an option is left out.
+def _option(metavar: str) -> Any:
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Animate, relight and splat an avatar, with no GPU and no display needed.
+
+    rnd-play avatar.onnx --motion walk.npz --hdr sky.exr --out out/
+    """
+
+    avatar: Annotated[tyro.conf.Positional[Path | None], _option("AVATAR.onnx")] = None
+    """The avatar, a file that rnd-export wrote."""
+    motion: Annotated[Path | None, _option("FILE")] = None
+    """Body poses over time: AMASS (.npz), SMPL or AIST++."""
+    hdr: Annotated[Path | None, _option("FILE")] = None
+    """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
+    out: Annotated[Path | None, _option("FOLDER")] = None
+    """Folder for frames/, frames_exr/, aov/, play.mp4 and play.json."""
+
+    size: Annotated[str | None, _option("N|WxH")] = None
+    """Picture size: N or WIDTHxHEIGHT pixels. Default: 512, or the camera file's own size."""
+    fps: Annotated[float | None, _option("FLOAT")] = None
+    """Frames per second. Default: the motion's."""
+    frames: Annotated[str | None, _option("START:END")] = None
+    """Frames to render, START:END with END left out; same pixels as in the whole run. Default: all."""
+    format: Annotated[str | None, _option("LIST")] = None
+    """Some of png,exr,mp4. Default: png, and mp4 where PyAV is installed."""
+
+    camera: str = "front"
+    """front, orbit, FILE.json or FILE.json:NAME. The first two frame the whole motion."""
+    orbit_seconds: float = 8.0
+    """Time of one turn of --camera orbit, in seconds; negative turns the other way."""
+    distance: Annotated[float | None, _option("FLOAT")] = None
+    """Metres from the middle of the motion to the camera. Default: the least that shows all."""
+    elevation: float = 5.0
+    """Degrees by which the camera stands above the horizon."""
+    fov: float = 35.0
+    """Vertical field of view in degrees."""
+
+    hdr_yaw: float = 0.0
+    """Turn the light about the vertical axis, in degrees; positive from +X towards +Z."""
+    hdr_up: Literal["y", "z"] = "y"
+    """Which axis points up in the probe's file."""
+    exposure: float = 0.0
+    """Stops by which the light is made brighter."""
+    background: str = "none"
+    """none (transparent), hdr, #rrggbb (sRGB) or r,g,b (linear radiance)."""
+    shade: str = "table+sun"
+    """Shading, from fast to exact: ao, table, table+sun, lights:K, brute."""
+
+    aov: Annotated[str, _option("LIST")] = ""
+    """Also write some of albedo,normal,roughness,visibility,depth. Normals in the camera's OpenCV axes."""
+    raster: Literal["auto", "gl", "cpu"] = "auto"
+    """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
+    motion_up: Literal["auto", "y", "z"] = "auto"
+    """Which axis points up in the motion's file."""
+    threads: Annotated[int | None, _option("INT")] = None
+    """CPU threads. Default: all."""
+    doctor: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")] = False
+    """Print renderer, providers, threads, versions and what to install for what is missing."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no later step could explain."""
+        limits = {
+            "fps": (1e-3, 1000),
+            "orbit_seconds": (-1e6, 1e6),
+            "distance": (1e-3, 1e4),
+            "elevation": (-89, 89),
+            "fov": (1, 170),
+            "hdr_yaw": (-1e6, 1e6),
+            "exposure": (-30, 30),
+        }
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:  # false for NaN
+                raise InputError(f"--{name.replace('_', '-')}", expected=f"{low:g} to {high:g}", got=value)
+        if self.orbit_seconds == 0:
+            raise InputError("--orbit-seconds", expected="not 0", got=0)
+
+
+def parse_size(text: str | None) -> tuple[int, int | None] | None:
+    """``512`` → (512, None); ``640x480`` → (640, 480); None stays None."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,6})(?:x(\d{1,6}))?", text)
+    sides = [int(side) for side in match.groups() if side] if match else [0]
+    if not all(1 <= side <= LARGEST_SIDE for side in sides):
+        raise InputError("--size", expected=f"N or WxH, 1 to {LARGEST_SIDE}", got=text)
+    return sides[0], sides[1] if len(sides) > 1 else None
+
+
+def parse_frames(text: str | None, count: int) -> range:
+    """``10:50``, ``:50`` or ``10:`` out of ``count`` frames."""
+    match = re.fullmatch(r"(\d*):(\d*)", text if text is not None else ":")
+    start, end = (int(match[1] or 0), int(match[2] or count)) if match else (0, 0)
+    if not 0 <= start < end <= count:
+        raise InputError("--frames", expected=f"START:END within 0:{count}, START before END", got=text)
+    return range(start, end)
+
+
+def frame_count(duration_s: float, fps: float) -> int:
+    """How many frames at ``fps`` a motion of ``duration_s`` has, its first and last pose included."""
+    return math.floor(duration_s * fps + 1e-6) + 1

@@ -1,0 +1,164 @@
+"""One run of ``rnd-play``: from options to files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numba
+import numpy as np
+from rnd_runtime import __version__
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import output_folder
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import load_motion
+from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.shading import Shader
+
+from .aov import parse_aovs
+from .background import Background
+from .cameras import CameraPath, Framing, View, file_path, frame_motion, front_path, orbit_path
+from .options import PlayOptions, frame_count, parse_frames, parse_size
+from .player import Player
+from .report import FRAME, print_summary, warn, with_progress
+from .timing import StageTimes
+from .writers import frame_writer, parse_formats, write_report
+
+DEFAULT_SIZE = 512
+DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
+
+
+def play(options: PlayOptions) -> int:
+    """Render the run that ``options`` describe into ``options.out`` and print a summary.
+
+    Raises:
+        InputError: for whatever cannot be used; what was finished before stays.
+    """
+    avatar_file, motion_file, out = _required(options)
+    background, aovs = Background.parse(options.background), parse_aovs(options.aov)
+    formats, size = parse_formats(options.format), parse_size(options.size)
+    _set_threads(options.threads)
+
+    times = StageTimes()
+    with times.stage("load"):
+        avatar = Avatar.load(avatar_file, threads=options.threads)
+        motion = load_motion(motion_file, avatar.skeleton, up=options.motion_up)
+        light = _light(options, avatar)
+        shader = Shader(light, mode=options.shade)
+        rasterizer = make_rasterizer(options.raster)
+    player = Player(avatar, light, shader, rasterizer, background, aovs, times)
+
+    fps = options.fps or motion.fps
+    frames = parse_frames(options.frames, frame_count(motion.duration, fps))
+    framing = frame_motion(avatar.skeleton, motion)
+    camera_at = _camera_path(options, size, framing)
+    notes = [*motion.notes, *_light_notes(light)]
+    for note in notes:
+        warn(note)
+
+    with frame_writer(out, formats, fps=fps, times=times) as write:
+        for number in with_progress(frames):
+            with times.stage(FRAME):
+                time_s = number / fps
+                camera = camera_at(number, time_s)
+                frame = player.render(motion, time_s, camera)
+                if number == frames.start and not frame.alpha.any():
+                    raise _out_of_view(framing, camera, number)
+                write(number, frame, _reach(framing, camera))
+
+    report = {
+        "version": __version__,
+        "settings": _settings(options),
+        "frames": [frames.start, frames.stop],
+        "fps": fps,
+        "size": [camera.width, camera.height],
+        "raster": rasterizer.name,
+        "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
+        "notes": notes,
+        "times": times.summary(),
+    }
+    write_report(out, report)
+    rate = 1e3 / report["times"][FRAME]["median_ms"]
+    headline = f"{len(frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
+    print_summary(times, headline=f"{headline} ({rasterizer.name}, {options.shade}) in {out}")
+    return 0
+
+
+def _settings(options: PlayOptions) -> dict[str, object]:
+    """The options as JSON has them, without the folder: two runs into two folders give the same report."""
+    values = {
+        name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()
+    }
+    return {name: value for name, value in values.items() if name not in ("out", "doctor")}
+
+
+def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
+    """The three files without which there is nothing to play."""
+    given = {"AVATAR.onnx": options.avatar, "--motion": options.motion, "--out": options.out}
+    if missing := [name for name, value in given.items() if value is None]:
+        raise InputError(
+            f"missing {', '.join(missing)}", hint="rnd-play AVATAR.onnx --motion FILE --out FOLDER"
+        )
+    assert options.avatar and options.motion and options.out
+    return options.avatar, options.motion, output_folder(options.out)
+
+
+def _set_threads(threads: int | None) -> None:
+    if threads is None:
+        return
+    most = numba.config.NUMBA_NUM_THREADS
+    if not 1 <= threads <= most:
+        raise InputError("--threads", expected=f"1 to {most}", got=threads)
+    numba.set_num_threads(threads)
+
+
+def _light(options: PlayOptions, avatar: Avatar) -> Light:
+    """The light named by ``--hdr``, or the one that was learnt with the avatar."""
+    yaw = math.radians(options.hdr_yaw)
+    if options.hdr is None:
+        return replace(Light(avatar.trained_light).scaled(2.0**options.exposure), yaw=yaw)
+    return load_light(options.hdr, up=options.hdr_up, yaw=yaw, exposure=options.exposure)
+
+
+def _light_notes(light: Light) -> list[str]:
+    notes = []
+    if light.repaired:
+        notes.append(
+            f"{light.repaired} texels of the light were NaN, infinite or negative and were filled in"
+        )
+    if light.maximum < DIM:
+        notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
+    return notes
+
+
+def _camera_path(options: PlayOptions, size: tuple[int, int | None] | None, framing: Framing) -> CameraPath:
+    if options.camera not in ("front", "orbit"):
+        if ".json" not in options.camera:
+            raise InputError("--camera", expected="front, orbit or FILE.json", got=options.camera)
+        return file_path(options.camera, size)
+    width, height = size or (DEFAULT_SIZE, None)
+    view = View(
+        width, height or width, math.radians(options.fov), math.radians(options.elevation), options.distance
+    )
+    if options.camera == "orbit":
+        return orbit_path(framing, view, options.orbit_seconds)
+    return front_path(framing, view)
+
+
+def _reach(framing: Framing, camera: Camera) -> tuple[float, float]:
+    """Nearest and farthest depth in metres at which ``camera`` can see the body at any time."""
+    depth = float((camera.world_to_camera @ [*framing.centre, 1.0])[2])
+    return max(depth - framing.radius, 0.0), depth + framing.radius
+
+
+def _out_of_view(framing: Framing, camera: Camera, number: int) -> InputError:
+    centre = (camera.world_to_camera @ [*framing.centre, 1.0])[:3]
+    return InputError(
+        "nothing of the avatar is in view in the first frame",
+        got=f"a motion about {np.round(centre, 2).tolist()} m right of, below and in front of the camera",
+        frame=number,
+        hint="check --camera, --distance and --motion-up",
+    )

@@ -1,0 +1,124 @@
+"""Poses, relights and splats one frame at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.gaussians import Rasterizer
+from rnd_runtime.images import linear_to_srgb, to_bytes
+from rnd_runtime.light import Light
+from rnd_runtime.motion import Motion
+from rnd_runtime.shading import Shader
+
+from .aov import CHANNELS, aov_values, splat_features
+from .background import Background
+from .timing import StageTimes
+
+Floats32 = NDArray[np.float32]
+STRIP = 64  # rows
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One rendered frame: linear light, premultiplied, nothing behind it yet.
+
+    Attributes:
+        radiance: [H, W, 3] linear Rec.709, premultiplied by alpha.
+        alpha: [H, W].
+        behind: linear radiance of the background, [H, W, 3] or [3]; None leaves the picture transparent.
+        aovs: what the EXR layers hold, [H, W, C] for each name (see :mod:`rnd_viewer.aov`).
+    """
+
+    radiance: Floats32
+    alpha: Floats32
+    behind: Floats32 | None
+    aovs: dict[str, Floats32]
+
+    def linear(self) -> Floats32:
+        """Linear R, G, B, A [H, W, 4], premultiplied; over a background alpha is 1."""
+        if self.behind is None:
+            return np.dstack([self.radiance, self.alpha])
+        return np.dstack([self._over(self.behind), np.ones_like(self.alpha)])
+
+    @cached_property
+    def srgb(self) -> NDArray[np.uint8]:
+        """The picture to look at: 8-bit sRGB [H, W, 3], on black when there is no background.
+
+        Splats are blended in linear light and coded at the end, as in training.
+        """
+        return coded(self._over(np.zeros(3, np.float32) if self.behind is None else self.behind))
+
+    @cached_property
+    def srgb_alpha(self) -> NDArray[np.uint8]:
+        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied, as PNG has it."""
+        opaque = np.where(self.alpha > 0, self.alpha, np.float32(1))[..., None]
+        return np.dstack([coded(self.radiance / opaque), to_bytes(self.alpha)])
+
+    def _over(self, behind: Floats32) -> Floats32:
+        return self.radiance + (1 - self.alpha)[..., None] * behind
+
+
+def coded(linear: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """8-bit sRGB of linear [H, W, 3], in strips that stay in the cache: 3 ms instead of 12 at 512²."""
+    image = np.empty(linear.shape, np.uint8)
+    for top in range(0, len(linear), STRIP):
+        image[top : top + STRIP] = to_bytes(linear_to_srgb(linear[top : top + STRIP]))
+    return image
+
+
+@dataclass(eq=False)
+class Player:
+    """An avatar under a light, ready to be rendered at any time of any motion from any camera.
+
+    Frames depend on nothing but the arguments of :meth:`render`. ``times`` collects how long each stage took.
+    """
+
+    avatar: Avatar
+    light: Light
+    shader: Shader
+    rasterizer: Rasterizer
+    background: Background = field(default_factory=Background)
+    aovs: tuple[str, ...] = ()
+    times: StageTimes = field(default_factory=StageTimes)
+    _behind: tuple[Camera, Floats32] | None = field(default=None, init=False, repr=False)
+
+    def render(self, motion: Motion, time_s: float, camera: Camera) -> Frame:
+        """The avatar at ``time_s`` seconds of ``motion``, seen by ``camera``."""
+        with self.times.stage("encoders"):
+            gaussians = self.avatar.pose(motion, time_s)
+        with self.times.stage("shading"):
+            radiance = self.shader.shade(gaussians, camera.position)
+        with self.times.stage("raster"):
+            features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
+            raster = self.rasterizer(
+                gaussians.means,
+                gaussians.covariances,
+                gaussians.opacities,
+                features.astype(np.float32),
+                camera,
+            )
+        with self.times.stage("background"):
+            behind = self._radiance_behind(camera)
+        aovs, start = {}, 3
+        for name in self.aovs:
+            if name == "depth":
+                splatted = raster.depth[..., None]
+            else:
+                splatted = raster.image[..., start : start + len(CHANNELS[name])]
+                start += len(CHANNELS[name])
+            aovs[name] = aov_values(name, splatted, raster.alpha)
+        return Frame(raster.image[..., :3], raster.alpha, behind, aovs)
+
+    def _radiance_behind(self, camera: Camera) -> Floats32 | None:
+        """The background, kept for as long as the camera stands still."""
+        if self.background.kind == "none":
+            return None
+        if self._behind is None or self._behind[0] is not camera:
+            self._behind = (camera, self.background.radiance(camera, self.light))
+        return self._behind[1]

@@ -1,0 +1,49 @@
+"""What ``rnd-play`` says: progress and warnings on stderr, the summary on stdout."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .timing import StageTimes
+
+FRAME = "whole frame"
+_stderr = Console(stderr=True)
+
+
+def warn(message: str) -> None:
+    """One warning line on stderr."""
+    _stderr.print(f"rnd-play: warning: {message}", markup=False, highlight=False, soft_wrap=True)
+
+
+def with_progress(frames: range) -> Iterable[int]:
+    """``frames``, with a bar and the time left on stderr where that is a terminal."""
+    with Progress(
+        TextColumn("rendering"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=_stderr,
+        disable=not _stderr.is_terminal,
+    ) as progress:
+        yield from progress.track(frames)
+
+
+def print_summary(times: StageTimes, *, headline: str) -> None:
+    """The table of stages, then one line that says what was made and how fast."""
+    table = Table("stage", box=None, pad_edge=False)
+    for heading in ("median ms", "p95 ms", "total s"):
+        table.add_column(heading, justify="right")
+    for name, row in times.summary().items():
+        table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
+    console = Console()
+    console.print(table)
+    console.print(headline, markup=False, highlight=False, soft_wrap=True)
+
+
+def print_text(text: str) -> None:
+    """``text`` as it is, on stdout."""
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,94 @@
+"""What a run leaves in its folder. Every file is whole or absent, also after Ctrl-C.
+
+::
+
+    out/frames/000010.png        the picture: 8-bit sRGB, with straight alpha when there is no background
+    out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV
+    out/aov/normal/000010.png    AOVs to look at
+    out/play.mp4
+    out/play.json                settings, what was found in the inputs, stage times
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.images import write_image
+
+from .aov import CHANNELS, aov_picture
+from .player import Frame
+from .timing import StageTimes
+from .video import load_pyav, mp4_writer
+
+FORMATS = ("png", "exr", "mp4")
+FrameWriter = Callable[[int, Frame, tuple[float, float]], None]
+
+
+def parse_formats(text: str | None) -> tuple[str, ...]:
+    """``png,exr`` → names; None → png and, where PyAV is installed, mp4."""
+    if text is None:
+        return ("png", "mp4") if importlib.util.find_spec("av") else ("png",)
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    if not names or names - set(FORMATS):
+        raise InputError("--format", expected=f"some of {','.join(FORMATS)}", got=text or "nothing")
+    if "mp4" in names:
+        load_pyav()
+    return tuple(name for name in FORMATS if name in names)
+
+
+@contextmanager
+def frame_writer(
+    folder: Path, formats: tuple[str, ...], *, fps: float, times: StageTimes
+) -> Iterator[FrameWriter]:
+    """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
+
+    ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
+    one, and into pictures of their own if PNG is asked for or there is no EXR. The mp4 appears at the end.
+    """
+    output_folder(folder)
+    video = mp4_writer(folder / "play.mp4", fps=fps) if "mp4" in formats else nullcontext(None)
+    with video as append:
+
+        def write(number: int, frame: Frame, reach: tuple[float, float]) -> None:
+            files: dict[Path, NDArray[np.uint8]] = {}
+            name = f"{number:06d}"
+            with times.stage("tonemap"):
+                if "png" in formats:
+                    files[folder / f"frames/{name}.png"] = (
+                        frame.srgb_alpha if frame.behind is None else frame.srgb
+                    )
+                if "png" in formats or "exr" not in formats:
+                    for aov, values in frame.aovs.items():
+                        files[folder / f"aov/{aov}/{name}.png"] = aov_picture(aov, values, frame.alpha, reach)
+                if append:
+                    frame.srgb  # noqa: B018  (kept by the frame: its time belongs here)
+            with times.stage("write"):
+                for path, pixels in files.items():
+                    write_image(path, pixels)
+                if "exr" in formats:
+                    _write_exr(folder / f"frames_exr/{name}.exr", frame)
+                if append:
+                    append(frame.srgb)
+
+        yield write
+
+
+def _write_exr(path: Path, frame: Frame) -> None:
+    layers = [frame.linear(), *frame.aovs.values()]
+    names = ("R", "G", "B", "A", *(channel for aov in frame.aovs for channel in CHANNELS[aov]))
+    write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)
+
+
+def write_report(folder: Path, report: dict[str, Any]) -> None:
+    """Write ``play.json``."""
+    with atomic_path(folder / "play.json") as temporary:
+        temporary.write_text(json.dumps(report, indent=1) + "\n")
