@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from play_fakes import fake_motion, fake_skeleton
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError

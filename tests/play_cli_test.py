@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 import rnd_viewer.play
 from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.doctor import Finding
 from rnd_runtime.images import read_image, write_image
 from rnd_runtime.motion import save_motion
 from rnd_viewer.cli import main
@@ -203,3 +205,16 @@ def test_help_explains_every_option(capsys):
     text = capsys.readouterr().out
     for option in ("--hdr-yaw", "--exposure", "--aov", "--frames", "--shade", "--raster", "--doctor"):
         assert option in text
+
+
+def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):
+    found = [Finding("rasteriser", "cpu", None), Finding("OpenGL, EGL", "missing", "apt install libegl1")]
+    monkeypatch.setattr("rnd_runtime.doctor.report", lambda: found)
+    assert main(["--doctor"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[:3] == [
+        ["rasteriser", "cpu"],
+        ["OpenGL,", "EGL", "missing"],
+        ["→", "apt", "install", "libegl1"],
+    ]
+    assert lines[3][:2] == ["PyAV", "(mp4)"]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from play_fakes import FakeAvatar, fake_motion, white_light
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError

@@ -7,6 +7,7 @@ import sys
 import av
 import numpy as np
 import pytest
+
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb, read_header, read_image, to_bytes
 from rnd_viewer.aov import aov_picture, aov_values

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.gaussians import Gaussians

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear

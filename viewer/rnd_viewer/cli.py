@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import tyro
+
 from rnd_runtime.errors import run_command
 
 from .options import PlayOptions
@@ -30,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _doctor() -> int:
     from rnd_runtime.doctor import report
 
-    from .report import print_text
+    from .report import print_findings
+    from .video import finding
 
-    print_text(report())
+    print_findings([*report(), finding()])
     return 0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+
 from rnd_runtime.errors import InputError
 
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from rnd_runtime.shading import Shader
+
 from rnd_runtime import __version__
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
@@ -16,7 +18,6 @@ from rnd_runtime.files import output_folder
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import load_motion
 from rnd_runtime.raster import make_rasterizer
-from rnd_runtime.shading import Shader
 
 from .aov import parse_aovs
 from .background import Background
@@ -59,7 +60,7 @@ def play(options: PlayOptions) -> int:
     for note in notes:
         warn(note)
 
-    with frame_writer(out, formats, fps=fps, times=times) as write:
+    with rasterizer, frame_writer(out, formats, fps=fps, times=times) as write:
         for number in with_progress(frames):
             with times.stage(FRAME):
                 time_s = number / fps
@@ -69,6 +70,7 @@ def play(options: PlayOptions) -> int:
                     raise _out_of_view(framing, camera, number)
                 write(number, frame, _reach(framing, camera))
 
+    summary = times.summary()
     report = {
         "version": __version__,
         "settings": _settings(options),
@@ -78,12 +80,12 @@ def play(options: PlayOptions) -> int:
         "raster": rasterizer.name,
         "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
         "notes": notes,
-        "times": times.summary(),
+        "times": summary,
     }
     write_report(out, report)
-    rate = 1e3 / report["times"][FRAME]["median_ms"]
+    rate = 1e3 / summary[FRAME]["median_ms"]
     headline = f"{len(frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
-    print_summary(times, headline=f"{headline} ({rasterizer.name}, {options.shade}) in {out}")
+    print_summary(summary, headline=f"{headline} ({rasterizer.name}, {options.shade}) in {out}")
     return 0
 
 

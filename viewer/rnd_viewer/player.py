@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rnd_runtime.shading import Shader
+
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
 from rnd_runtime.gaussians import Rasterizer
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
-from rnd_runtime.shading import Shader
 
 from .aov import CHANNELS, aov_values, splat_features
 from .background import Background

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from .timing import StageTimes
+from rnd_runtime.doctor import Finding
 
 FRAME = "whole frame"
 _stderr = Console(stderr=True)
@@ -32,18 +32,23 @@ def with_progress(frames: range) -> Iterable[int]:
         yield from progress.track(frames)
 
 
-def print_summary(times: StageTimes, *, headline: str) -> None:
-    """The table of stages, then one line that says what was made and how fast."""
+def print_summary(summary: dict[str, dict[str, float]], *, headline: str) -> None:
+    """The table of :meth:`StageTimes.summary`, then one line that says what was made and how fast."""
     table = Table("stage", box=None, pad_edge=False)
     for heading in ("median ms", "p95 ms", "total s"):
         table.add_column(heading, justify="right")
-    for name, row in times.summary().items():
+    for name, row in summary.items():
         table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
     console = Console()
     console.print(table)
     console.print(headline, markup=False, highlight=False, soft_wrap=True)
 
 
-def print_text(text: str) -> None:
-    """``text`` as it is, on stdout."""
-    Console().print(text, markup=False, highlight=False, soft_wrap=True)
+def print_findings(findings: Iterable[Finding]) -> None:
+    """What the doctor found: one line each, and below it what to do where something can be done."""
+    console = Console()
+    for finding in findings:
+        lines = [f"{finding.label:<14} {finding.value}"]
+        if finding.advice is not None:
+            lines.append(f"{'':<14} → {finding.advice}")
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)

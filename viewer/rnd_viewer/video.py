@@ -15,6 +15,8 @@ from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
+
+from rnd_runtime.doctor import Finding
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
 
@@ -36,15 +38,26 @@ PRIMARIES_BT709, TRANSFER_SRGB, MATRIX_BT709, RANGE_LIMITED = 1, 13, 1, 1
 X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtree=0"}
 
 
+INSTALL = "pip install 'rnd-avatar[video]'"
+
+
 def load_pyav() -> ModuleType:
     """Import PyAV or say which extra brings it."""
     try:
         import av
     except ImportError as error:
         raise InputError(
-            "mp4 needs PyAV, which is not installed", hint="pip install 'rnd-avatar[video]', or --format png"
+            "mp4 needs PyAV, which is not installed", hint=f"{INSTALL}, or --format png"
         ) from error
     return av
+
+
+def finding() -> Finding:
+    """What the doctor says of mp4."""
+    try:
+        return Finding("PyAV (mp4)", str(load_pyav().__version__), None)
+    except InputError:
+        return Finding("PyAV (mp4)", "missing", INSTALL)
 
 
 def rgb_to_yuv420(image_srgb: Bytes) -> Bytes:

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path, output_folder
 from rnd_runtime.images import write_image
