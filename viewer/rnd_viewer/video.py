@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,10 +84,9 @@ def rgb_to_yuv420(image_srgb: Bytes) -> Bytes:
     return flat.reshape(height * 3 // 2, width)
 
 
-def _luma(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+def _luma(rgb: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """Y' [...] of R'G'B' [..., 3]. Written out, because BLAS may round by where an array lies in memory."""
-    luma: NDArray[np.float32] = RED * rgb[..., 0] + GREEN * rgb[..., 1] + BLUE * rgb[..., 2]
-    return luma
+    return RED * rgb[..., 0] + GREEN * rgb[..., 1] + BLUE * rgb[..., 2]
 
 
 @contextmanager
