@@ -25,9 +25,10 @@ INSTALL = {
     "egl": "apt-get install libegl1 libgl1-mesa-dri",
     "osmesa": "apt-get install libosmesa6",
 }
+OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 GL_VERSION = 330  # core; all that the rasteriser needs
 SOFTWARE_RENDERERS = re.compile(
-    r"llvmpipe|softpipe|swrast|swiftshader|software rasterizer|basic render", re.I
+    r"llvmpipe|softpipe|swrast|swiftshader|software render|software raster|basic render", re.I
 )
 
 
@@ -131,7 +132,7 @@ class OSMesa:
     )
 
     def __init__(self) -> None:
-        self._library = _first_library("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+        self._library = _first_library(*OSMESA_LIBRARIES)
         pointer = ctypes.c_void_p
         self._library.OSMesaCreateContextAttribs.restype = pointer
         self._library.OSMesaCreateContextAttribs.argtypes = [pointer, pointer]

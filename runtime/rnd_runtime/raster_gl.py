@@ -19,7 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from ._raster_project import View, _front_to_back, _project_range, view_of
+from ._raster_project import View, _project_range, view_of
+from ._raster_tiles import _front_to_back
 from .camera import Camera
 from .errors import InputError
 from .gaussians import Floats32, Raster
@@ -49,7 +50,8 @@ class GlRasterizer:
 
     Args:
         backend: see :func:`rnd_runtime.gl_context.create_context`.
-        context: draw in this context instead, which stays the caller's.
+        context: draw in this context of :func:`rnd_runtime.gl_context.create_context` instead, which is released by
+            :meth:`close` all the same.
 
     Raises:
         InputError: no context; arrays of the wrong shape; a picture or a number of Gaussians above GL's limits.
@@ -57,7 +59,6 @@ class GlRasterizer:
 
     def __init__(self, backend: Backend = "auto", *, context: moderngl.Context | None = None) -> None:
         self.context = create_context(backend) if context is None else context
-        self._owns_context = context is None
         self._programs: dict[int, tuple[moderngl.Program, moderngl.VertexArray]] = {}
         self._targets: dict[tuple[int, int, int], _Targets] = {}
         self._records: moderngl.Texture | None = None
@@ -82,7 +83,7 @@ class GlRasterizer:
         return _assembled(pictures, channels)
 
     def close(self) -> None:
-        """Release everything, the context too if it was made here."""
+        """Release everything, the context too."""
         with self.context:
             for targets in self._targets.values():
                 targets.release()
@@ -92,8 +93,7 @@ class GlRasterizer:
             if self._records is not None:
                 self._records.release()
         self._targets, self._programs, self._records = {}, {}, None
-        if self._owns_context:
-            self.context.release()
+        self.context.release()
 
     def __enter__(self) -> GlRasterizer:
         return self

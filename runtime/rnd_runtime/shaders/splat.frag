@@ -2,7 +2,7 @@
 // The program's head defines OUTPUTS and WRITES, one statement for each target: with an array of outputs, or an
 // attribute picked in a loop, llvmpipe goes through memory for every pixel (260 ms instead of 17).
 
-noperspective in vec3 whitened;
+in vec3 whitened;
 flat in vec4 attributes[(ATTRIBUTES + 3) / 4];
 
 OUTPUTS

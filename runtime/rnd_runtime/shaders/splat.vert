@@ -4,7 +4,9 @@
 uniform sampler2D records;  // TEXELS texels for each Gaussian, back to front; see raster_gl.py
 uniform vec2 size;          // px
 
-noperspective out vec3 whitened;  // u, v with log2 α = peak − u² − v²; peak
+// u, v with log2 α = peak − u² − v²; peak. Not `noperspective`, though w is 1: Mesa 22 clips such varyings wrongly when an
+// edge lies on the border (α 0.01 instead of 0.9).
+out vec3 whitened;
 flat out vec4 attributes[(ATTRIBUTES + 3) / 4];
 
 const vec2 CORNERS[3] = vec2[3](vec2(0.0, 2.0), vec2(-1.7320508, -1.0), vec2(1.7320508, -1.0));

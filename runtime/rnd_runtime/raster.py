@@ -1,0 +1,71 @@
+"""Choosing between the OpenGL rasteriser and the CPU kernel."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Literal, get_args
+
+from . import raster_cpu
+from .camera import Camera
+from .errors import InputError
+from .gaussians import Floats32, Raster
+from .gl_context import Backend, create_context, is_software, renderer
+from .raster_gl import GlRasterizer
+
+Kind = Literal["auto", "gl", "cpu"]
+
+
+class ChosenRasterizer:
+    """A :class:`rnd_runtime.gaussians.Rasterizer` that knows its ``name`` and can be closed (or used with ``with``).
+
+    Attributes:
+        name: such as ``gl (egl, llvmpipe (LLVM 15.0.6, 256 bits))`` or ``cpu``.
+    """
+
+    def __init__(self, name: str, gl: GlRasterizer | None = None) -> None:
+        self.name = name
+        self._gl = gl
+        self._rasterize = raster_cpu.rasterize if gl is None else gl
+
+    def __call__(
+        self, means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+    ) -> Raster:
+        return self._rasterize(means, covariances, opacities, features, camera)
+
+    def close(self) -> None:
+        if self._gl is not None:
+            self._gl.close()
+
+    def __enter__(self) -> ChosenRasterizer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> ChosenRasterizer:
+    """Make the rasteriser ``kind``.
+
+    "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too, which
+    takes three times as long there.
+
+    Raises:
+        InputError: "gl" and no OpenGL, or no such kind.
+    """
+    if kind not in get_args(Kind):
+        raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))
+    if kind == "cpu":
+        return ChosenRasterizer("cpu")
+    try:
+        context = create_context(gl_backend)
+    except InputError:
+        if kind == "gl":
+            raise
+        return ChosenRasterizer("cpu")
+    if kind == "auto" and is_software(context):
+        context.release()
+        return ChosenRasterizer("cpu")
+    name = f"gl ({context.extra.backend}, {renderer(context)})"
+    return ChosenRasterizer(name, GlRasterizer(context=context))
