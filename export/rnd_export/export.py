@@ -44,6 +44,7 @@ class Drift:
     position_m: float
     normal: float
     visibility: float
+    covariance_relative: float
 
 
 def export(checkpoint_path: Path, out: Path, motion: Motion | None = None) -> Drift:
@@ -62,7 +63,7 @@ def export(checkpoint_path: Path, out: Path, motion: Motion | None = None) -> Dr
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
     with atomic_path(out) as temporary:
         onnx.save_model(model, str(temporary))
-        drift = measure_drift(Avatar.load(temporary), temporary, checkpoint, motion)
+        drift = measure_drift(Avatar.load(temporary), checkpoint, motion)
         for what, got, bound in (
             ("skinning weights", drift.weights, MAX_WEIGHT_ERROR),
             ("positions", drift.position_m, MAX_POSITION_ERROR_M),
@@ -76,24 +77,19 @@ def export(checkpoint_path: Path, out: Path, motion: Motion | None = None) -> Dr
 
 
 @torch.no_grad()
-def measure_drift(avatar: Avatar, path: Path, checkpoint: Checkpoint, motion: Motion) -> Drift:
+def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion) -> Drift:
     """Compare the written file with the checkpoint's model on every frame of ``motion``."""
-    worst = dict.fromkeys(("weights", "position_m", "normal", "visibility"), 0.0)
+    outputs = ("skinning_weights", "means", "normals", "visibility", "covariances")
+    worst = np.zeros(len(outputs))
     for frame in range(motion.frame_count):
         pose = pose_input(motion, checkpoint.skeleton, frame / motion.fps, checkpoint.config.model)
         posed = checkpoint.model(pose)
-        inputs = (pose.window.numpy(), pose.velocity.numpy(), pose.bones.numpy())
-        means, normals, visibility, weights = avatar.run(
-            inputs, ("means", "normals", "visibility", "skinning_weights")
-        )
-        for name, ours, theirs in (
-            ("weights", weights, posed.weights),
-            ("position_m", means, posed.means),
-            ("normal", normals, posed.normals),
-            ("visibility", visibility, posed.visibility),
-        ):
-            worst[name] = max(worst[name], float(np.abs(ours - theirs.numpy()).max()))
-    return Drift(motion.frame_count, **worst)
+        ours = avatar.run((pose.window.numpy(), pose.velocity.numpy(), pose.bones.numpy()), outputs)
+        theirs = (posed.weights, posed.means, posed.normals, posed.visibility, posed.covariances)
+        errors = [np.abs(a - b.numpy()) for a, b in zip(ours, theirs)]
+        errors[-1] /= posed.covariances.numpy()[:, [0, 3, 5]].max(axis=1, keepdims=True)  # of its largest axis
+        worst = np.maximum(worst, [float(error.max()) for error in errors])
+    return Drift(motion.frame_count, *(float(error) for error in worst))
 
 
 def random_motion(skeleton: Skeleton, *, frames: int, seed: int) -> Motion:

@@ -20,7 +20,7 @@ NEIGHBOURS = 4
 """nodes that a Gaussian interpolates between; more only smooths"""
 OVERSAMPLING = 6
 """candidates per sample for farthest point sampling: spacing within 10 % of the best at 6, no better at 12"""
-WEIGHT_FLOOR = 1e-5
+WEIGHT_FLOOR = 1e-6
 """smallest template weight before the logarithm: moves a point by less than 0.1 mm, yet lets Δ raise a bone"""
 SPREAD = {
     "left_hip": (0, 0, 0.35),

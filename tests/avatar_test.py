@@ -1,0 +1,101 @@
+"""Reading avatar.onnx: the honest file, and the refusals."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import onnx
+import pytest
+from rnd_runtime.avatar import METADATA_KEY, Avatar
+from rnd_runtime.errors import InputError
+from tiny import body, motion
+
+
+def _changed(path, target, change):
+    model = onnx.load(path)
+    change(model)
+    onnx.save_model(model, str(target))
+    return target
+
+
+def _metadata(model, **changes) -> None:
+    entry = next(prop for prop in model.metadata_props if prop.key == METADATA_KEY)
+    entry.value = msgspec.json.encode({**msgspec.json.decode(entry.value), **changes}).decode()
+
+
+def test_an_avatar_poses_itself(tiny_avatar) -> None:
+    avatar = Avatar.load(tiny_avatar, threads=1)
+    gaussians = avatar.pose(motion(body()), 0.1)
+    assert gaussians.means.shape == (800, 3) and gaussians.covariances.shape == (800, 6)
+    assert np.isfinite(gaussians.means).all()
+    assert np.abs(np.linalg.norm(gaussians.normals, axis=1) - 1).max() < 1e-4
+    assert avatar.trained_light.shape == (32, 64, 3)
+    assert avatar.skeleton.names == body().skeleton.names
+
+
+def test_threads_do_not_change_a_frame(tiny_avatar) -> None:
+    one, two = (Avatar.load(tiny_avatar, threads=n).pose(motion(body()), 0.1) for n in (1, 2))
+    assert np.abs(one.means - two.means).max() < 1e-6
+    assert np.abs(one.visibility - two.visibility).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"schema": "rnd-avatar/2"}, "schema: expected rnd-avatar/1, got rnd-avatar/2"),
+        ({"surprise": 1}, "unknown field `surprise`"),
+        ({"gaussians": "many"}, "Expected `int`"),
+        ({"gaussians": 801}, "graph outputs: expected"),
+        ({"window_poses": 6}, "graph inputs: expected"),
+        ({"trained_light": "AAAA"}, "trained_light: expected float32 of shape"),
+        ({"trained_light": "?"}, "trained_light: expected float32 of shape"),
+    ],
+)
+def test_metadata_we_do_not_know_is_refused(tiny_avatar, tmp_path, changes, line) -> None:
+    path = _changed(tiny_avatar, tmp_path / "odd.onnx", lambda model: _metadata(model, **changes))
+    with pytest.raises(InputError) as caught:
+        Avatar.load(path)
+    assert line in str(caught.value) and "odd.onnx" in str(caught.value)
+
+
+def test_a_foreign_model_is_refused(tiny_avatar, tmp_path) -> None:
+    path = _changed(tiny_avatar, tmp_path / "foreign.onnx", lambda model: model.ClearField("metadata_props"))
+    with pytest.raises(InputError, match="not an RnD avatar"):
+        Avatar.load(path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+def test_a_file_cut_short_is_refused(tiny_avatar, tmp_path, share) -> None:
+    whole = tiny_avatar.read_bytes()
+    path = tmp_path / "cut.onnx"
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(InputError, match=r"cut\.onnx: not a"):
+        Avatar.load(path)
+
+
+def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:
+    secret = tmp_path / "secret.bin"
+    secret.write_bytes(b"\0" * 4 * 800)
+
+    def point_outside(model) -> None:
+        tensor = next(t for t in model.graph.initializer if t.name == "static/opacities")
+        tensor.ClearField("raw_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        entry = tensor.external_data.add()
+        entry.key, entry.value = "location", "../secret.bin"
+
+    folder = tmp_path / "in"
+    folder.mkdir()
+    path = folder / "outside.onnx"
+    model = onnx.load(tiny_avatar)
+    point_outside(model)
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(InputError):
+        Avatar.load(path)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.onnx: avatar not found"):
+        Avatar.load(tmp_path / "nowhere.onnx")
+    with pytest.raises(InputError, match="avatar not found: got a folder"):
+        Avatar.load(tmp_path)

@@ -1,0 +1,123 @@
+"""The training loop on a tiny capture: it learns, it resumes on the same curve, it survives what it may meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+from rnd_runtime.capture import load_capture
+from rnd_runtime.errors import InputError
+from rnd_runtime.images import write_image
+from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.train import MAX_BAD_STEPS, Training, run
+
+
+def _nothing(*_: object) -> None:
+    pass
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
+    config = dataclasses.replace(tiny_config, steps=120, stage1_fraction=0.5)
+    training = Training(tiny_capture, config)
+    losses = [training.step().terms["image"] for _ in range(config.steps)]
+    first, stage1, end = (np.mean(part) for part in (losses[:6], losses[54:60], losses[-6:]))
+    assert stage1 < 0.6 * first
+    assert end < 0.6 * first  # shaded: the light is learned from white in sixty steps
+
+
+def test_both_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
+    rows = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == list(range(12))
+    assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6
+    assert "grey" in rows[-1] and "grey" not in rows[0]
+    assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 12
+
+
+def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    whole = Training(tiny_capture, tiny_config)
+    expected = [whole.step().terms for _ in range(12)]
+    half = Training(tiny_capture, tiny_config)
+    for _ in range(7):
+        half.step()
+    half.save(tmp_path)
+    resumed = Training(tiny_capture, tiny_config)
+    resumed.resume(tmp_path / "training.state")
+    assert [resumed.step().terms for _ in range(5)] == expected[7:]
+    for ours, theirs in zip(whole.model.parameters(), resumed.model.parameters()):
+        assert torch.equal(ours, theirs)
+
+
+def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
+    other = Training(tiny_capture, dataclasses.replace(tiny_config, seed=5))
+    with pytest.raises(InputError, match=r"--resume: expected the configuration .* got other \['seed'\]"):
+        other.resume(tiny_run / "training.state")
+
+
+def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path) -> None:
+    def press(step: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    training = Training(tiny_capture, tiny_config)
+    assert run(training, tmp_path, on_step=press, on_preview=_nothing)
+    assert training.step_index == 1
+    assert load_checkpoint(tmp_path / "avatar.ckpt").info["step"] == 1
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_log_forgets_steps_that_are_done_again(tiny_capture, tiny_config, tmp_path) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, steps=2))
+    (tmp_path / "metrics.jsonl").write_text('{"step": 0}\n{"step": 1}\n{"step": 2}\n')
+    training.step_index = 1
+    run(training, tmp_path, on_step=_nothing, on_preview=_nothing)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [0, 1]
+    assert "image" in rows[1]
+
+
+def test_steps_that_are_not_finite_are_skipped_and_end_the_run(tiny_capture, tiny_config) -> None:
+    training = Training(tiny_capture, tiny_config)
+    training.step()
+    with torch.no_grad():
+        training.model.appearance_residual[0, 0] = float("nan")
+    kept = training.model.geometry_residual.detach().clone()
+    assert training.step().skipped
+    assert torch.equal(training.model.geometry_residual, kept)
+    with pytest.raises(InputError, match=f"{MAX_BAD_STEPS} steps in a row were not finite"):
+        for _ in range(MAX_BAD_STEPS):
+            training.step()
+
+
+def test_empty_masks_are_counted_and_too_many_stop(tiny_capture, tiny_config, tmp_path) -> None:
+    import shutil
+
+    folder = tmp_path / "capture"
+    shutil.copytree(tiny_capture.folder, folder)
+    frames = tiny_capture.split("train")
+    empty = np.zeros((64, 64, 1), np.uint8)
+    write_image(folder / frames[2].mask, empty)
+    training = Training(load_capture(folder), tiny_config)
+    assert training.bad_masks == [2] and len(training.views) == 5
+    write_image(folder / frames[4].mask, empty + 255)
+    with pytest.raises(InputError, match="masks: expected at most 20% empty or full, got 2 of 6"):
+        Training(load_capture(folder), tiny_config)
+
+
+def test_training_under_the_captures_light_keeps_it(tiny_capture, tiny_config) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, light="capture"))
+    for _ in range(12):
+        training.step()
+    assert torch.allclose(training.light(), torch.ones(32, 64, 3), atol=1e-5)
