@@ -19,7 +19,8 @@ NEAR = 0.01  # m: what lies nearer is not drawn
 DILATION = 0.3  # px² added to both variances: 3DGS's low-pass filter
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
-TRANSMITTANCE_MIN = 1e-4
+# 1e-4, less a hair: two Gaussians clamped at 0.99 leave 1e-4 exactly, which rounding must not decide
+TRANSMITTANCE_MIN = 0.9999e-4
 FIELD_OF_VIEW_MARGIN = (
     0.3  # gsplat's 1.3 × field of view, the margin measured from each border of the picture
 )
@@ -89,12 +90,12 @@ def drawn(
     All numbers finite, at least 0.01 m in front of the camera, opacity at least 1/255, a covariance that is
     not zero and whose projection is positive definite.
     """
-    rows = [
-        np.asarray(array, np.float64).reshape(len(np.asarray(array)), -1) for array in (means, covariances)
-    ]
-    rows += [np.asarray(opacities, np.float64)[:, None], np.asarray(features, np.float64)]
-    finite = np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows])
-    finite &= (np.trace(symmetric(covariances), axis1=1, axis2=2) > 0) & (rows[2][:, 0] >= ALPHA_MIN)
+    rows = [np.asarray(array, np.float64) for array in (means, covariances, features)]
+    opacities = np.asarray(opacities, np.float64)
+    finite = np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows]) & np.isfinite(
+        opacities
+    )
+    finite &= (np.trace(symmetric(covariances), axis1=1, axis2=2) > 0) & (opacities >= ALPHA_MIN)
     with np.errstate(all="ignore"):  # rows that are not finite are refused whatever comes of them
         in_front = camera_points(means, camera)[:, 2] >= NEAR
         flat = image_covariances(means, covariances, camera)
