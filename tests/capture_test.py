@@ -349,6 +349,7 @@ def _save_body(folder: Path, **changes: object) -> None:
         ({"joint_names": ["a", "a"]}, ["names", "each name once"]),
         ({"joint_names": np.array([{}, {}], object)}, ["joint_names", "Python objects"]),
         ({"rest_joints": np.zeros((2, 2))}, ["rest_joints", "2×3", "2×2"]),
+        ({"rest_joints": np.zeros(2)}, ["shape of rest_joints", "2×3", "got 2"]),
     ],
 )
 def test_broken_bodies_are_refused(folder, changes, words):

@@ -257,6 +257,8 @@ def test_save_and_load_give_the_same_motion_for_any_skeleton(tmp_path):
         back = load_motion(tmp_path / "a.npz", skeleton)
         assert_allclose(back.rotations, motion.rotations, atol=ROUND_OFF)
         assert (back.translations == TRANS).all() and (back.fps, back.notes) == (29.97, ())
+        with np.load(tmp_path / "a.npz") as members:  # what other readers go by
+            assert members["poses"].shape == (FRAMES, 3 * joints) and members["up_axis"] == "y"
         first = (tmp_path / "a.npz").read_bytes()
         save_motion(tmp_path / "a.npz", motion)
         assert (tmp_path / "a.npz").read_bytes() == first
