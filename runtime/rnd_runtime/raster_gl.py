@@ -156,14 +156,17 @@ class GlRasterizer:
     def _targets_for(self, attributes: int, camera: Camera) -> _Targets:
         key = (attributes, camera.width, camera.height)
         if key not in self._targets:
-            for other in [key for key in self._targets if key[1:] != (camera.width, camera.height)]:
-                self._targets.pop(other).release()
             textures = []
             for first in range(0, attributes, PER_TARGET):
                 left = attributes - first
                 components = 4 if first == 0 or left >= PER_TARGET else left
                 textures.append(self.context.texture((camera.width, camera.height), components, dtype="f4"))
             self._targets[key] = _Targets(textures, self.context.framebuffer(textures))
+            self._targets[
+                key
+            ].framebuffer.use()  # moderngl binds the one before again, which must not be gone then
+            for other in [old for old in self._targets if old[1:] != key[1:]]:
+                self._targets.pop(other).release()
         return self._targets[key]
 
     def _program_for(self, attributes: int) -> tuple[moderngl.Program, moderngl.VertexArray]:
