@@ -188,6 +188,15 @@ def test_what_is_broken_or_behind_leaves_no_trace(rasterize):
     _assert_same_bits(rasterize(*broken, camera), expected)
 
 
+def test_one_gaussian_never_covers_a_pixel_whole(rasterize):
+    wide = np.float32([[1, 0, 0, 1, 0, 1]])
+    for opacity in (1.0, 7.0):  # an opacity above 1 makes a plateau of 0.99
+        alpha = rasterize(
+            np.zeros((1, 3), np.float32), wide, np.float32([opacity]), np.ones((1, 3)), _camera()
+        ).alpha
+        assert alpha.max() == np.float32(0.99)
+
+
 def test_equal_depths_are_drawn_by_index(rasterize):
     means, covariances = np.zeros((2, 3), np.float32), np.tile(np.float32([0.1, 0, 0, 0.1, 0, 0.1]), (2, 1))
     camera = Camera.look_at([0, 0, 3], [0, 0, 0], width=9, height=9, fov_y=0.5)

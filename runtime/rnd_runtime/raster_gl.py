@@ -1,8 +1,8 @@
 """The OpenGL rasteriser: one triangle per Gaussian, blended back to front in float32, any number of channels.
 
 Against :class:`rnd_runtime.gaussians.Rasterizer`'s rule there is one difference: blending cannot stop at a pixel, so
-what lies behind the last Gaussian drawn there still adds its share (its weight is below 1e-4 of the Gaussian's own,
-or below the share of the Gaussian that would have crossed 1e-4: at most 0.01).
+the Gaussian that would have taken the transmittance below 1e-4, and those behind it, still add what is left: less than
+0.01 of their features, and that only where α is near its clamp.
 
 Projection, order and culling are the CPU rasteriser's own, in float64. On one Mesa, EGL and OSMesa and any number of
 threads give the same bits.
@@ -162,9 +162,7 @@ class GlRasterizer:
                 components = 4 if first == 0 or left >= PER_TARGET else left
                 textures.append(self.context.texture((camera.width, camera.height), components, dtype="f4"))
             self._targets[key] = _Targets(textures, self.context.framebuffer(textures))
-            self._targets[
-                key
-            ].framebuffer.use()  # moderngl binds the one before again, which must not be gone then
+            # only now: making a framebuffer, moderngl binds the one in use before again, which must still be there
             for other in [old for old in self._targets if old[1:] != key[1:]]:
                 self._targets.pop(other).release()
         return self._targets[key]
@@ -228,7 +226,7 @@ def _sorted_splats(
     return _Splats(*_project_and_sort(means, covariances, opacities, features, view))
 
 
-# One thread: numba's others would still spin, waiting for more, when llvmpipe's want the cores (14 of 62 ms CPU time).
+# One thread: numba's others would still spin, waiting for more, when llvmpipe's want the cores (14 of 62 ms).
 @njit(error_model="numpy", nogil=True, cache=True)
 def _project_and_sort(means, covariances, opacities, features, view):  # type: ignore[no-untyped-def]
     count = means.shape[0]
