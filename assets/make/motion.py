@@ -10,11 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
+
 from rnd_runtime.motion import Motion, save_motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
-from scipy.interpolate import CubicSpline, PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
 
 from .remesh import Floats
 
@@ -35,7 +36,7 @@ GAIT = np.array([
 
 # seconds; each arm: raised above the horizontal, swept forward, swung forward when hanging, elbow, twist
 ARMS = [
-    (0.0, (-50, 0, 0, 12, 0), (-50, 0, 0, 12, 0)), (0.4, (-50, 0, 0, 12, 0), (-50, 0, 0, 12, 0)),
+    (0.0, (-50, 0, 0, 12, 0), (-50, 0, 0, 12, 0)), (0.2, (-50, 0, 0, 12, 0), (-50, 0, 0, 12, 0)),
     (1.0, (10, 0, 0, 20, 0), (-68, 0, 20, 40, 0)), (1.5, (48, 0, 0, 30, 0), (-68, 0, -20, 30, 0)),
     (2.0, (0, 10, 0, 90, -75), (0, 10, 0, 90, -75)), (2.5, (-58, 0, 30, 80, 0), (-58, 0, 30, 80, 0)),
     (3.0, (-68, 0, -25, 20, 0), (48, 0, 0, 30, 0)), (3.5, (-12, 65, 0, 30, 0), (-12, 65, 0, 30, 0)),
@@ -111,7 +112,7 @@ def dance(skeleton: Skeleton) -> Motion:
     pose.set("neck", ("x", -0.2 * bend), ("z", 0.2 * tilt))
     pose.set("head", ("x", -0.25 * bend), ("y", -0.4 * twist), ("z", 0.2 * tilt))
     lean = 0.10 * (lift_right - lift_left)
-    turn = PchipInterpolator([0, 0.3, TRAIN_SECONDS, DANCE_SECONDS], [0, 0, TURN, TURN + 160])(times)
+    turn = PchipInterpolator([0, TRAIN_SECONDS, DANCE_SECONDS], [0, TURN, TURN + 160])(times)
     pose.set("pelvis", ("y", turn), ("z", -lean), ("x", 0.12 * bend))
     across = 0.0016 * (lift_right - lift_left)  # weight over the standing leg
     heading = np.radians(turn)

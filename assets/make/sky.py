@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 from rnd_runtime.images import write_image
 from rnd_runtime.light import texel_directions
 

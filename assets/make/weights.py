@@ -15,7 +15,6 @@ from scipy.sparse.linalg import splu
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MIDDLE = 0.03  # m: over this distance beyond the middle line the other side's influence ends
 NEGLIGIBLE = 0.01  # weights below this are dropped, so that most vertices follow two or three bones
 
 
@@ -24,12 +23,13 @@ def skinning_weights(
     faces: Ints,
     bones: list[tuple[int, Floats, Floats, float]],
     names: list[str],
-    heat: float = 1.0,
+    middle: Floats,
 ) -> Floats:
     """Weights [V, J], rows summing to one.
 
     ``bones``: (joint, end a [3], end b [3], radius m): a bone is a capsule whose surface is what a vertex is near to,
-    so that a thick chest is not lost to the thin bones of the arm. ``heat``: larger follows the bones more tightly.
+    so that a thick chest is not lost to the thin bones of the arm. ``middle`` [V] m: how far beyond the middle line
+    the influence of the other side's joints ends.
     """
     gaps = np.stack([_segment_distance(vertices, a, b) - radius for _, a, b, radius in bones], axis=1)
     depths = np.stack([_segment_distance(vertices, a, b) for _, a, b, _ in bones], axis=1)
@@ -39,13 +39,13 @@ def skinning_weights(
     nearest = np.argmin(gaps, axis=1)
     source = np.zeros((len(vertices), len(names)))
     source[np.arange(len(vertices)), joints[nearest]] = 1.0
-    conductance = heat / np.maximum(depths[np.arange(len(vertices)), nearest], 0.01) ** 2
+    conductance = 1.0 / np.maximum(depths[np.arange(len(vertices)), nearest], 0.01) ** 2
 
     stiffness, area = _laplacian(vertices, faces)
     held = diags_array(conductance * area)
     weights = splu(csc_array(stiffness + held)).solve(held @ source)
 
-    across = np.clip(0.5 + side[None, :] * vertices[:, :1] / (2 * MIDDLE), 0, 1)
+    across = np.clip(0.5 + side[None, :] * vertices[:, :1] / (2 * middle[:, None]), 0, 1)
     weights *= across * across * (3 - 2 * across)
     weights /= weights.sum(axis=1, keepdims=True)
     weights = np.maximum(weights - NEGLIGIBLE, 0.0)

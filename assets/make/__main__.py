@@ -1,0 +1,40 @@
+"""``python -m assets.make [body] [walk] [sky] [capture] [contact]``: remakes the named assets, or all of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rnd_runtime.body import Body
+
+from . import sky
+from .body import make_body
+from .motion import make_walk
+
+ASSETS = Path(__file__).parents[1]
+STEPS = ("body", "walk", "sky", "capture", "contact")
+
+
+def main(steps: list[str]) -> None:
+    """Run ``steps`` in the order in which one needs the other."""
+    unknown = set(steps) - set(STEPS)
+    if unknown:
+        raise SystemExit(f"assets.make: expected {', '.join(STEPS)}, got {', '.join(sorted(unknown))}")
+    steps = steps or list(STEPS)
+    if "body" in steps:
+        make_body(ASSETS / "body.npz")
+    body = Body.load(ASSETS / "body.npz")
+    if "walk" in steps:
+        make_walk(ASSETS / "walk.npz", body.skeleton)
+    if "sky" in steps:
+        sky.make_light(ASSETS / "sky.exr", sky.noon())
+    if {"capture", "contact"} & set(steps):
+        from . import capture  # needs mitsuba
+
+        if "capture" in steps:
+            capture.make_capture(ASSETS / "capture", body)
+        capture.contact_sheet(ASSETS / "capture")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
