@@ -103,6 +103,28 @@ def test_without_hdr_the_light_of_the_avatar_shines(files, tmp_path):
     assert json.loads((tmp_path / "b/play.json").read_text())["light"]["maximum"] == 0.25
 
 
+def test_light_options_reach_the_light(files, tmp_path):
+    half = np.zeros((16, 32, 3), np.float32)
+    half[:, 8:24] = 1.0  # shines from +X, the right of what a front camera sees
+    write_image(tmp_path / "half.exr", half)
+    pictures, maxima = {}, {}
+    for name, value in (("exposure", "0"), ("exposure", "1"), ("hdr_yaw", "180"), ("hdr_up", "z")):
+        folder = tmp_path / f"{name}{value}"
+        options = {"hdr": tmp_path / "half.exr", "frames": ":1", "background": "0,0,0", name: value}
+        assert main(_arguments(files, folder, **options)) == 0
+        pictures[folder.name] = read_image(folder / "frames/000000.png").astype(int).sum(axis=2)
+        maxima[folder.name] = json.loads((folder / "play.json").read_text())["light"]["maximum"]
+    assert maxima == {"exposure0": 1, "exposure1": 2, "hdr_yaw180": 1, "hdr_upz": 1}
+    assert (pictures["exposure1"] >= pictures["exposure0"]).all()
+    columns = {
+        name: picture.sum(axis=0) @ np.arange(48) / picture.sum() for name, picture in pictures.items()
+    }
+    assert (
+        columns["hdr_yaw180"] < columns["exposure0"] - 0.1
+    )  # lit from the picture's right, then from its left
+    assert (pictures["hdr_upz"] != pictures["exposure0"]).any()
+
+
 def test_background_colour_fills_the_corner(files, tmp_path):
     assert main(_arguments(files, tmp_path / "out", background="#204060", frames=":1")) == 0
     picture = read_image(tmp_path / "out/frames/000000.png")

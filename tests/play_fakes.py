@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion

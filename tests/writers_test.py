@@ -84,7 +84,9 @@ def test_mp4_of_the_same_frames_has_the_same_bytes(tmp_path):
     for k in range(20):  # a shaded ball crosses the black picture
         x, y = columns - 8 - 1.6 * k, rows - 24 - 8 * np.sin(k / 3)
         height = np.sqrt(np.maximum(100 - x * x - y * y, 0))
-        frames.append((height[..., None] * np.array([25, 18, 9]) + (height > 0)[..., None] * 4).astype(np.uint8))
+        frames.append(
+            (height[..., None] * np.array([25, 18, 9]) + (height > 0)[..., None] * 4).astype(np.uint8)
+        )
     contents = set()
     for _ in range(40):
         scattered = [
