@@ -1,0 +1,161 @@
+"""Relighting posed Gaussians, at whatever price per frame one is willing to pay.
+
+============  =====================================================================================
+ao            sixteen harmonics of light times ambient occlusion
+table         the whole map through tables over the normal; soft shadows from the visibility
+table+sun     the same, with the sun taken out, its own highlight and a hard shadow from a depth map
+lights:K      K lights of equal luminance (median cut), each with the whole BRDF
+brute         every texel of the downsized map: what the avatar was trained with
+============  =====================================================================================
+
+All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_reference.shade_reference`.
+``table+sun`` is nearer to the truth than that sum, whose shadows and highlights blur the sun.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .brdf import ggx32, roughness_to_alpha
+from .errors import InputError
+from .gaussians import Gaussians
+from .light import Light
+from .shading_ambient import AmbientLight
+from .shading_sum import DistantLights
+from .shading_tables import SkyTables
+from .shadow import directional_visibility
+from .sun import Sun, extract_suns
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+SHADE_MODES = ("ao", "table", "table+sun", "lights:K", "brute")
+_MOST_LIGHTS = 8192
+_SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
+_DISC_SIGMAS = 2.0  # a Gaussian's disc in the depth map, in standard deviations
+_CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
+
+_ZERO, _TINY = np.float32(0), np.float32(1e-12)
+_ONE_OVER_PI = np.float32(1 / np.pi)
+
+
+class Shader:
+    """Shades Gaussians under one light; built once for a light, called for every frame.
+
+    Args:
+        light: the probe. Its yaw can change later by :meth:`turned` at no cost.
+        mode: one of SHADE_MODES, with a number for K.
+        texels: (height, width) the probe is downsized to, suns excepted. An avatar's visibility has degree 3
+            and was trained on 32 × 64; more changes highlights below roughness 0.4 only.
+
+    Attributes:
+        suns: what ``table+sun`` took out of the map; empty when nothing in it is bright and compact enough.
+
+    Raises:
+        InputError: the mode is none of SHADE_MODES.
+    """
+
+    def __init__(self, light: Light, mode: str = "table+sun", *, texels: tuple[int, int] = (32, 64)) -> None:
+        self.light, self.mode = light, mode
+        self.suns: tuple[Sun, ...] = ()
+        self._sky: AmbientLight | SkyTables | DistantLights
+        if mode == "ao":
+            self._sky = AmbientLight.project(light, texels)
+        elif mode == "table":
+            self._sky = SkyTables.build(light, texels)
+        elif mode == "table+sun":
+            sky, self.suns = extract_suns(light)
+            self._sky = SkyTables.build(sky, texels)
+        elif mode == "brute":
+            self._sky = DistantLights.all_texels(light, texels)
+        else:
+            self._sky = DistantLights.median_cut(light, _light_count(mode))
+
+    def turned(self, yaw: float) -> Shader:
+        """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
+        shader = copy.copy(self)
+        shader.light = replace(self.light, yaw=yaw)
+        return shader
+
+    def shade(self, gaussians: Gaussians, camera_position: ArrayLike) -> Floats32:
+        """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m, world.
+
+        Gaussians that face away from the camera are shaded too: at a silhouette they are seen.
+        """
+        light_to_world = self.light.rotation
+        radiance = self._sky.shade(gaussians, camera_position, light_to_world)
+        if self.suns and len(radiance):
+            directions = np.array([sun.direction for sun in self.suns]) @ light_to_world.T
+            visibility = directional_visibility(
+                gaussians.means,
+                gaussians.normals,
+                directions,
+                radii=_shadow_radii(gaussians),
+                resolution=_SHADOW_RESOLUTION,
+            )
+            _add_suns(
+                *(
+                    np.array(a, np.float32, order="C")
+                    for a in (gaussians.means, gaussians.normals, gaussians.albedo)
+                ),
+                np.array(roughness_to_alpha(gaussians.roughness), np.float32),
+                np.array(visibility, order="C"),
+                np.array(camera_position, np.float32),
+                tuple(np.array(a, np.float32, order="C") for a in (directions, *self._sun_arrays())),
+                radiance,
+            )
+        return radiance
+
+    def _sun_arrays(self) -> tuple[Floats, Floats]:
+        """Irradiance [S, 3], and α² [S] that a lamp's size adds: half vectors move half as far as lights do."""
+        spread = np.array([sun.spread for sun in self.suns])
+        return np.array([sun.irradiance for sun in self.suns]), (spread / 2) ** 2
+
+
+def _light_count(mode: str) -> int:
+    name, _, count = mode.partition(":")
+    if name != "lights" or not count.isdecimal() or not 1 <= int(count) <= _MOST_LIGHTS:
+        raise InputError(
+            "shading mode", expected=f"one of {', '.join(SHADE_MODES)} (K from 1 to {_MOST_LIGHTS})", got=mode
+        )
+    return int(count)
+
+
+def _shadow_radii(gaussians: Gaussians) -> Floats32:
+    """Disc radius [N] m of each Gaussian in a depth map; flat ones have σ² twice in the trace."""
+    sigma = np.sqrt(gaussians.covariances[:, [0, 3, 5]].sum(-1) / 2)
+    return np.asarray(np.where(gaussians.opacities > _CASTING_OPACITY, _DISC_SIGMAS * sigma, 0), np.float32)
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy")
+def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, radiance):  # type: ignore[no-untyped-def]
+    directions, irradiance, added = suns
+    for i in numba.prange(len(means)):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
+        distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)
+        vx, vy, vz = vx / distance, vy / distance, vz / distance
+        for sun in range(len(directions)):
+            lx, ly, lz = directions[sun, 0], directions[sun, 1], directions[sun, 2]
+            arriving = visibility[i, sun] * (nx * lx + ny * ly + nz * lz)
+            if not arriving > _ZERO:
+                continue
+            hx, hy, hz = lx + vx, ly + vy, lz + vz
+            half_squared = max(hx * hx + hy * hy + hz * hz, _TINY)
+            cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
+            sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
+            shine = ggx32(
+                alpha[i] * alpha[i] + added[sun],
+                nx * lx + ny * ly + nz * lz,
+                nx * vx + ny * vy + nz * vz,
+                sine_squared,
+                half_squared,
+            )
+            for channel in range(3):
+                reflectance = albedo[i, channel] * _ONE_OVER_PI + shine
+                radiance[i, channel] += arriving * reflectance * irradiance[sun, channel]

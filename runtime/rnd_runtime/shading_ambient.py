@@ -1,0 +1,103 @@
+"""The cheapest shading: a light of sixteen harmonics and one number of occlusion per Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .gaussians import Gaussians
+from .light import Light, texel_directions, texel_solid_angles
+from .sh import sh_basis, sh_columns, sh_rotation
+from .shading_tables import lobe_at, transposed
+from .specular_lobe import lobe_table
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+_ZERO = np.float32(0)
+_TINY = np.float32(1e-12)
+# max(cos, 0)/π leaves of degree 0 to 2 (Ramamoorthi, Hanrahan 2001); of degree 3 it leaves nothing
+_COSINE = np.array([1, 2 / 3, 1 / 4], np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class AmbientLight:
+    """A light probe as spherical harmonics of degree 3.
+
+    Attributes:
+        coefficients: [16, 3] linear radiance, in the light probe's frame.
+    """
+
+    coefficients: Floats
+
+    @classmethod
+    def project(cls, light: Light, texels: tuple[int, int]) -> AmbientLight:
+        """From ``light`` downsized to ``texels`` (height, width)."""
+        flux = light.resized(*texels).radiance * texel_solid_angles(*texels)[..., None]
+        return cls(np.einsum("hwj,hwc->jc", sh_basis(texel_directions(*texels)), flux))
+
+    def shade(self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats) -> Floats32:
+        """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + specular of the bare light) · occlusion.
+
+        Occlusion is the visibility's mean over the upper hemisphere, weighted by the cosine. Both it and E(n)
+        are exact up to degree 2 and know nothing of each other: light from the open side counts no more than
+        from the blocked one.
+        """
+        root = np.asarray(gaussians.root_rotation, np.float64)
+        in_root = sh_rotation(root.T @ light_to_world) @ self.coefficients
+        radiance = np.empty((len(gaussians.means), 3), np.float32)
+        _ambient(
+            *(
+                np.array(a, np.float32, order="C")
+                for a in (gaussians.means, gaussians.normals, gaussians.albedo)
+            ),
+            np.array(gaussians.roughness, np.float32),
+            np.array(gaussians.visibility, np.float32, order="C"),
+            np.array(camera_position, np.float32),
+            np.array(root, np.float32, order="C"),
+            (np.array(in_root, np.float32, order="C"), lobe_table()),
+            radiance,
+        )
+        return radiance
+
+
+_sh_columns = numba.njit(sh_columns)
+
+
+@numba.njit(parallel=True, cache=True, error_model="numpy")
+def _ambient(  # type: ignore[no-untyped-def]
+    means, normals, albedo, roughness, visibility, camera, root_rotation, tables, radiance
+):
+    light, lobes = tables
+    for i in numba.prange(len(means)):
+        nx, ny, nz = transposed(root_rotation, normals[i, 0], normals[i, 1], normals[i, 2])
+        vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
+        vx, vy, vz = transposed(root_rotation, vx, vy, vz)
+        distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)
+        vx, vy, vz = vx / distance, vy / distance, vz / distance
+        n_dot_v = nx * vx + ny * vy + nz * vz
+        energy, mx, my, mz, _, shrink1, shrink2, shrink3 = lobe_at(
+            lobes, roughness[i], n_dot_v, nx, ny, nz, vx, vy, vz
+        )
+        at_normal, at_lobe = _sh_columns(nx, ny, nz), _sh_columns(mx, my, mz)
+        occlusion, diffuse_r, diffuse_g, diffuse_b = _ZERO, _ZERO, _ZERO, _ZERO
+        shine_r, shine_g, shine_b = _ZERO, _ZERO, _ZERO
+        for j in range(16):
+            shrink = np.float32(1) if j < 1 else (shrink1 if j < 4 else (shrink2 if j < 9 else shrink3))
+            weight = shrink * np.float32(at_lobe[j])
+            shine_r += weight * light[j, 0]
+            shine_g += weight * light[j, 1]
+            shine_b += weight * light[j, 2]
+            if j < 9:
+                weight = _COSINE[0 if j < 1 else (1 if j < 4 else 2)] * np.float32(at_normal[j])
+                occlusion += weight * visibility[i, j]
+                diffuse_r += weight * light[j, 0]
+                diffuse_g += weight * light[j, 1]
+                diffuse_b += weight * light[j, 2]
+        occlusion = max(occlusion, _ZERO)
+        radiance[i, 0] = occlusion * (albedo[i, 0] * max(diffuse_r, _ZERO) + energy * max(shine_r, _ZERO))
+        radiance[i, 1] = occlusion * (albedo[i, 1] * max(diffuse_g, _ZERO) + energy * max(shine_g, _ZERO))
+        radiance[i, 2] = occlusion * (albedo[i, 2] * max(diffuse_b, _ZERO) + energy * max(shine_b, _ZERO))
