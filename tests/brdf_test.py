@@ -1,6 +1,7 @@
 import numba
 import numpy as np
 import pytest
+
 from rnd_runtime.brdf import F0, ROUGHNESS_RANGE, brdf, ggx, ggx32, roughness_to_alpha, specular
 
 ROUGHNESSES = [0.0, 0.09, 0.2, 0.4, 0.6, 0.8, 0.99, 1.0]

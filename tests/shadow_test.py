@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from rnd_runtime.errors import InputError
 from rnd_runtime.shadow import directional_visibility
 

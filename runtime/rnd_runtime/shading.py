@@ -112,9 +112,13 @@ class Shader:
         return radiance
 
     def _sun_arrays(self) -> tuple[Floats, Floats]:
-        """Irradiance [S, 3], and α² [S] that a lamp's size adds: half vectors move half as far as lights do."""
+        """Irradiance [S, 3] and what the size of each sun adds to α² [S].
+
+        A mirror shows a disc of radius ρ at its own radiance: E·D/4 = L with E = πρ²L and D = 1/(πα²) asks for
+        α² = ρ²/4, and the mean square angle of a disc is ρ²/2.
+        """
         spread = np.array([sun.spread for sun in self.suns])
-        return np.array([sun.irradiance for sun in self.suns]), (spread / 2) ** 2
+        return np.array([sun.irradiance for sun in self.suns]), spread**2 / 2
 
 
 def _light_count(mode: str) -> int:

@@ -39,7 +39,7 @@ class Sun:
 
 
 def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...]]:
-    """``light`` without its suns, and the suns, strongest peak first.
+    """``light`` without its suns, and the suns, strongest first.
 
     A sun is what rises above the median of the ring around the brightest texel, within 6° of its own centre,
     if that is at least 5 % of the map's luminance. An overcast sky or a wide window has none. Maps of more than
@@ -65,6 +65,7 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
         radiance[rows] = sky
         luminance[rows] = sky @ _LUMINANCE
         suns.append(sun)
+    suns.sort(key=lambda sun: -float(sun.irradiance @ _LUMINANCE))
     return replace(light, radiance=radiance.astype(np.float32)), tuple(suns)
 
 
