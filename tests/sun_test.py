@@ -58,6 +58,7 @@ def test_a_sun_is_found_whole_and_where_it_is(place, peak):
     assert np.linalg.norm(suns[0].direction - direction) < HALF_TEXEL
     assert np.isclose(np.linalg.norm(suns[0].direction), 1)
     assert rest.radiance.max() < 3  # nothing of it is left behind
+    assert (rest.radiance <= light.radiance).all()  # what is darker than the background stays dark
     np.testing.assert_allclose(
         energy(rest.radiance) + suns[0].irradiance, energy(light.radiance), rtol=ENERGY
     )

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rnd_trainer.encoders import JointAttention, PoseConditioned
 from rnd_trainer.model import AvatarModel
+from rnd_trainer.skinning import small_rotation
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def bake(model: AvatarModel) -> BakedAvatar:
         neighbour_weights=_array(model.interpolate.weights),
         log_weights=_array(model.log_weights),
         points=_array(static.points),
-        frames=_array(static.frames),
+        frames=_array(model.tangents @ small_rotation(static.rotation)),
         scales=_array(static.scales),
         normals=_array(static.normals),
         opacities=_array(static.opacity),

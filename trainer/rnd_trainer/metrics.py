@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+from .blur import SeparableFilter
+
 SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
 """of Wang et al. 2004, as scikit-image with gaussian_weights=True, use_sample_covariance=False"""
 
@@ -25,17 +27,23 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """
     assert min(image.shape[:2]) >= SSIM_WINDOW, "SSIM needs at least 11 × 11 pixels"
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)  # [C, H, W]
-    stack = torch.cat([x, y, x * x, y * y, x * y])[:, None]
+    stack = torch.cat([x, y, x * x, y * y, x * y])
     ramp = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
     window = torch.exp(-0.5 * (ramp / SSIM_SIGMA) ** 2)
     window = window / window.sum()
-    blurred = torch.nn.functional.conv2d(stack, window[None, None, :, None])
-    blurred = torch.nn.functional.conv2d(blurred, window[None, None, None, :])
-    mean_x, mean_y, xx, yy, xy = blurred[:, 0].chunk(5)
+    mean_x, mean_y, xx, yy, xy = _blur(stack, window).chunk(5)
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * (xy - mean_x * mean_y) + c2)
     similarity = similarity / ((mean_x**2 + mean_y**2 + c1) * ((xx - mean_x**2) + (yy - mean_y**2) + c2))
     return similarity.permute(1, 2, 0)
+
+
+def _blur(images: Tensor, taps: Tensor) -> Tensor:
+    """[C, H, W] filtered along both axes by ``taps``, where they fit."""
+    if not images.is_cuda and images.dtype == torch.float32:
+        return SeparableFilter.apply(images, taps)
+    blurred = torch.nn.functional.conv2d(images[:, None], taps[None, None, :, None])
+    return torch.nn.functional.conv2d(blurred, taps[None, None, None, :])[:, 0]
 
 
 def ssim(image: Tensor, target: Tensor) -> float:

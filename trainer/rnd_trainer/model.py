@@ -17,14 +17,8 @@ from .encoders import (
     positional_encoding,
 )
 from .interpolate import NodeInterpolation
-from .skinning import (
-    blend_transforms,
-    covariances,
-    small_rotation,
-    tangent_frames,
-    transform_normals,
-    transform_points,
-)
+from .posing import pose_gaussians
+from .skinning import blend_transforms, tangent_frames, transform_normals
 from .template import WEIGHT_FLOOR, Template
 
 ALBEDO_RANGE = (0.03, 0.80)
@@ -55,12 +49,12 @@ class PoseInput:
 class Attributes:
     """Activated attributes in the rest pose: valid for any weights of the networks.
 
-    opacity [N], frames [N, 3, 3] (rotation R), scales [N, 3] m, normals [N, 3] unit, points [N, 3] m with
+    opacity [N], rotation [N, 3] (R as a rotation vector in the tangent frame), scales [N, 3] m, normals [N, 3] unit, points [N, 3] m with
     the static offset, colour / albedo [N, 3] linear, roughness [N].
     """
 
     opacity: Tensor
-    frames: Tensor
+    rotation: Tensor
     scales: Tensor
     normals: Tensor
     points: Tensor
@@ -96,6 +90,7 @@ class AvatarModel(nn.Module):
     codes: Tensor
     log_weights: Tensor
     spacing: Tensor
+    tangents: Tensor
 
     def __init__(self, config: ModelConfig, template: Template) -> None:
         super().__init__()
@@ -106,6 +101,7 @@ class AvatarModel(nn.Module):
             "rest_normals": template.normals,
             "codes": template.codes,
             "log_weights": _log_weights(template.weights),
+            "tangents": tangent_frames(torch.as_tensor(template.normals)),
             "spacing": template.spacing,
         }
         for name, value in buffers.items():
@@ -137,7 +133,6 @@ class AvatarModel(nn.Module):
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
         part = dict(zip(columns, raw.split(list(columns.values()), dim=-1)))
         normals = nn.functional.normalize(self.rest_normals + 0.8 * torch.tanh(part["normal"]), dim=-1)
-        frames = tangent_frames(self.rest_normals) @ small_rotation(torch.tanh(part["rotation"]))
         tangents, across = part["scale"].split([2, 1], dim=-1)
         scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
         offset = self.config.max_static_offset * torch.tanh(part["offset"])
@@ -145,7 +140,7 @@ class AvatarModel(nn.Module):
         smooth, rough = ROUGHNESS_RANGE
         return Attributes(
             opacity=torch.sigmoid(part["opacity"][:, 0] + START_OPACITY),
-            frames=frames,
+            rotation=torch.tanh(part["rotation"]),
             scales=self.spacing * scales,
             normals=normals,
             points=self.points + offset,
@@ -173,15 +168,21 @@ class AvatarModel(nn.Module):
         logits, offset, turn, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
 
         weights = torch.softmax(self.log_weights + logits, dim=-1)
-        blend = blend_transforms(weights, pose.bones)
         offset = torch.tanh(offset)
-        points = static.points + self.config.max_offset * offset
-        turned = small_rotation(torch.tanh(turn)) @ static.frames
-        factors = blend[:, :, :3] @ (turned * static.scales[:, None, :])
+        means, upper, normals = pose_gaussians(
+            weights,
+            pose.bones,
+            static.points + self.config.max_offset * offset,
+            torch.tanh(turn),
+            self.tangents,
+            static.rotation,
+            static.scales,
+            static.normals,
+        )
         return Posed(
-            means=transform_points(blend, points),
-            covariances=covariances(factors),
-            normals=transform_normals(blend, static.normals),
+            means=means,
+            covariances=upper,
+            normals=normals,
             visibility=visibility,
             weights=weights,
             offset=offset,

@@ -13,6 +13,7 @@ from rnd_runtime.sh import sh_columns
 from rnd_runtime.shadow import directional_visibility
 
 from .light import Texels
+from .shading_kernel import FusedShade
 
 BACK_FACING = -0.2
 """cosine between normal and view below which a Gaussian is not shaded: it lies behind the silhouette"""
@@ -50,8 +51,13 @@ def shade(
 ) -> Tensor:
     """Outgoing linear radiance [n, 3]: Σ_k v_k f(ω_k, ω_o) max(n·ω_k, 0) power_k (paper, eq. 3 and 4).
 
-    normals, view [n, 3] unit; albedo [n, 3]; roughness [n]; visibility [n, K].
+    normals, view [n, 3] unit; albedo [n, 3]; roughness [n]; visibility [n, K]. Float32 on the CPU takes the
+    compiled kernel, which has no gradient by view and visibility.
     """
+    if not normals.is_cuda and normals.dtype == torch.float32:
+        return FusedShade.apply(
+            normals, view, albedo, roughness, visibility, texels.directions, texels.power
+        )
     n_dot_l = normals @ texels.directions.T  # [n, K]; nothing here is ever [n, K, 3]
     arriving = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)

@@ -1,0 +1,37 @@
+"""Contact sheet of a demo run: the last training preview above frames of the played clip.
+
+Usage: contact_sheet.py RUN OUT.png
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from rnd_runtime.images import read_image, write_image
+
+COLUMNS = 6
+
+
+def main(run: Path, out: Path) -> None:
+    """Tile six evenly spaced frames of RUN/play/frames under the newest picture of RUN/previews."""
+    frames = sorted((run / "play" / "frames").glob("*.png"))
+    chosen = [frames[k * len(frames) // COLUMNS] for k in range(COLUMNS)]
+    played = np.concatenate([_on_grey(read_image(path)) for path in chosen], axis=1)
+    preview = _on_grey(read_image(max((run / "previews").glob("*.png"))))
+    width = max(played.shape[1], preview.shape[1])
+    rows = [np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0))) for picture in (preview, played)]
+    write_image(out, np.concatenate(rows))
+
+
+def _on_grey(picture: np.ndarray) -> np.ndarray:
+    """[H, W, 3 or 4] uint8 → [H, W, 3]; straight alpha goes over dark grey."""
+    if picture.shape[2] == 3:
+        return picture
+    alpha = picture[..., 3:] / 255
+    return np.round(picture[..., :3] * alpha + 40 * (1 - alpha)).astype(np.uint8)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
