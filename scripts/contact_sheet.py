@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+
 from rnd_runtime.images import read_image, write_image
 
 COLUMNS = 6

@@ -10,17 +10,18 @@ import pytest
 
 from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
-from rnd_runtime.capture import Capture, Frame, load_capture
+from rnd_runtime.capture import Capture, Frame, Split, load_capture
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import downsize, load_light, texel_directions, texel_solid_angles
 from rnd_runtime.motion import load_motion
-from rnd_runtime.rotations import matrix_to_axis_angle
+from rnd_runtime.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS, bone_transforms
 
 ASSETS = Path(__file__).parents[1] / "assets"
 BUDGET = 8 * 1024 * 1024  # bytes for all of them, avatar.onnx apart
 HUMAN_SPEED = 15.0  # rad/s; sprinters' knees reach about 12
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+MIRROR_X, MIRROR_Z = np.diag([-1.0, 1, 1]), np.diag([1.0, 1, -1])
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +88,7 @@ def test_body_has_human_measures(body: Body) -> None:
 
 
 def test_body_is_symmetric(body: Body) -> None:
-    order = np.lexsort(np.round(body.vertices * [1, 1, 1], 6).T)
+    order = np.lexsort(np.round(body.vertices, 6).T)
     mirrored = body.vertices * [-1, 1, 1]
     other = np.lexsort(np.round(mirrored, 6).T)
     np.testing.assert_allclose(body.vertices[order], mirrored[other], atol=1e-6)
@@ -193,7 +194,7 @@ def test_template_fits_the_masks(capture: Capture) -> None:
         mask = capture.load_frame(frame).mask > 0.5
         vertices = posed(body, motion.rotations[index], motion.translations[index])
         template = silhouette(vertices, body.faces, capture.cameras[camera])
-        assert (mask & template).sum() / (mask | template).sum() > 0.75, (camera, index)
+        assert (mask & template).sum() / (mask | template).sum() > 0.80, (camera, index)  # 0.86 measured
         assert (mask & template).sum() / template.sum() > 0.97, (camera, index)  # clothes lie outside
         assert not mask[[0, -1]].any() and not mask[:, [0, -1]].any(), (camera, index)  # nothing is cut off
 
@@ -221,16 +222,20 @@ def test_pictures_are_exposed_as_promised(capture: Capture) -> None:
         assert images.image_srgb[images.mask == 0].max() == 0.0  # black outside
 
 
-@pytest.mark.parametrize("split", ["novel_view", "relight"])
-def test_light_camera_and_normals_agree(capture: Capture, split: str) -> None:
-    """Irradiance × albedo explains the picture, and does so worse with the light turned or mirrored."""
-    for frame in capture.split(split)[::3]:  # type: ignore[arg-type]
+@pytest.mark.parametrize("split", ["novel_view", "novel_pose", "relight"])
+def test_light_camera_and_normals_agree(capture: Capture, split: Split) -> None:
+    """Albedo × unshadowed irradiance explains every picture better than with the light turned or mirrored.
+
+    Cast shadows keep the correlation from being higher; the studio's boxes stand nearly symmetrically.
+    """
+    margins = []
+    for frame in capture.split(split):
         right = _explained(capture, frame, np.eye(3))
-        for turn in (90, 180, 270):
-            c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-            wrong = _explained(capture, frame, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
-            assert right > wrong + 0.03, (frame.image, turn)
-        assert right > 0.85, frame.image
+        turns = [axis_angle_to_matrix([0.0, np.radians(angle), 0.0]) for angle in (90, 180, 270)]
+        wrong = max(_explained(capture, frame, turn) for turn in [*turns, MIRROR_X, MIRROR_Z])
+        assert right > max(wrong, 0.5), frame.image
+        margins.append(right - wrong)
+    assert np.mean(margins) > 0.15
 
 
 def _explained(capture: Capture, frame: Frame, turn: np.ndarray) -> float:

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import onnx
 import pytest
+
 from rnd_runtime.avatar import METADATA_KEY, Avatar
 from rnd_runtime.errors import InputError
 from tiny import body, motion

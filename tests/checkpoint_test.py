@@ -7,6 +7,7 @@ import json
 
 import pytest
 import torch
+
 from rnd_runtime.errors import InputError
 from rnd_trainer import checkpoint as checkpoints
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
@@ -50,7 +51,9 @@ def test_a_missing_tensor_and_a_nan_are_refused(tiny_checkpoint, tmp_path) -> No
     with pytest.raises(InputError, match="not an avatar checkpoint"):
         load_checkpoint(path)
     path = _rewritten(
-        tiny_checkpoint, tmp_path / "nan.ckpt", change_tensors=lambda t: t | {"probe": t["probe"] * float("nan")}
+        tiny_checkpoint,
+        tmp_path / "nan.ckpt",
+        change_tensors=lambda t: t | {"probe": t["probe"] * float("nan")},
     )
     with pytest.raises(InputError, match="expected finite numbers"):
         load_checkpoint(path)

@@ -41,13 +41,16 @@ def tiny_run(tiny_capture, tiny_config, tmp_path_factory) -> Path:
 def tiny_checkpoint(tmp_path_factory) -> Path:
     """avatar.ckpt of an untrained model with random weights: every network says something, unlike after 12 steps."""
     import torch
+
     from rnd_trainer.checkpoint import save_checkpoint
     from rnd_trainer.config import ModelConfig, TrainConfig
     from rnd_trainer.model import AvatarModel
     from rnd_trainer.template import sample_template
     from tiny import body
 
-    config = TrainConfig(model=ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, window_poses=5))
+    config = TrainConfig(
+        model=ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, window_poses=5)
+    )
     template = body()
     torch.manual_seed(1)
     model = AvatarModel(config.model, sample_template(template, 800, 200, seed=1))
@@ -55,7 +58,9 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
         for parameter in model.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     path = tmp_path_factory.mktemp("checkpoint") / "avatar.ckpt"
-    save_checkpoint(path, model, torch.ones(32, 64, 3), template.skeleton, config, {"body_license": "CC0-1.0"})
+    save_checkpoint(
+        path, model, torch.ones(32, 64, 3), template.skeleton, config, {"body_license": "CC0-1.0"}
+    )
     return path
 
 

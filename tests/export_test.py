@@ -8,6 +8,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+
 from rnd_export import export as exports
 from rnd_export.export import MAX_POSITION_ERROR_M, MAX_WEIGHT_ERROR, export, measure_drift, random_motion
 from rnd_runtime.avatar import Avatar

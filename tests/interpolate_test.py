@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+
 from rnd_trainer.interpolate import NodeInterpolation
 
 FLOAT32_SUM = 1e-6  # four products of numbers near 1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import skimage.metrics
 import torch
+
 from rnd_runtime import images
 from rnd_trainer.losses import grey_prior, image_loss, linear_to_srgb, skinning_divergence
 from rnd_trainer.metrics import mask_box, normal_degrees, psnr, ssim, ssim_map

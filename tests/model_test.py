@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.data import pose_input

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+
 from rnd_trainer.posing import pose_gaussians
 
 RELATIVE = 2e-5  # float32 against float64: products of five 3×3 matrices

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+
 from rnd_trainer.blur import SeparableFilter
 from rnd_trainer.light import Texels
 from rnd_trainer.shading import shade

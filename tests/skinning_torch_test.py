@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.skinning import (
     THICKNESS_FLOOR,
@@ -36,9 +37,7 @@ def _twist(degrees: float) -> torch.Tensor:
 
 def test_blending_is_the_weighted_sum_of_bones() -> None:
     weights, bones, points = _random(7, 3).softmax(-1), _random(3, 3, 4, seed=1), _random(7, 3, seed=2)
-    expected = sum(
-        weights[:, j : j + 1] * (points @ bones[j, :, :3].T + bones[j, :, 3]) for j in range(3)
-    )
+    expected = sum(weights[:, j : j + 1] * (points @ bones[j, :, :3].T + bones[j, :, 3]) for j in range(3))
     posed = transform_points(blend_transforms(weights, bones), points)
     assert torch.allclose(posed, expected, atol=EXACT, rtol=0)
 

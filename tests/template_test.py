@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
+
 from rnd_runtime.errors import InputError
 from rnd_trainer.template import sample_template, skin
-from scipy.spatial import cKDTree
 from tiny import body
 
 
@@ -38,7 +39,9 @@ def test_weights_are_partitions_of_one(template) -> None:
 def test_interpolation_is_smooth(template) -> None:
     heights = template.codes[: template.nodes, 1]
     interpolated = (heights[template.neighbours] * template.neighbour_weights).sum(1)
-    assert np.abs(interpolated - template.codes[:, 1]).max() < 2 * template.spacing * 2  # within two node spacings
+    assert (
+        np.abs(interpolated - template.codes[:, 1]).max() < 2 * template.spacing * 2
+    )  # within two node spacings
 
 
 def test_same_seed_same_points(template) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+
 from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, CaptureLight, Frame, load_capture, save_capture
@@ -41,7 +42,9 @@ def write_capture(folder: Path, *, size: int = 64, frames: int = FRAMES) -> Capt
     camera = Camera.look_at([0, 1.0, 3.2], [0, 0.95, 0], width=size, height=size, fov_y=0.7)
     side = Camera.look_at([3.2, 1.0, 0.1], [0, 0.95, 0], width=size, height=size, fov_y=0.7)
     records = [_write_frame(folder, template, moves, camera, "front", k, "train") for k in range(frames)]
-    records += [_write_frame(folder, template, moves, side, "side", k, "novel_view") for k in (0, frames // 2)]
+    records += [
+        _write_frame(folder, template, moves, side, "side", k, "novel_view") for k in (0, frames // 2)
+    ]
     write_image(folder / "lights" / "white.exr", np.ones((16, 32, 3), np.float32))
     lights = {"white": CaptureLight("lights/white.exr")}
     capture = Capture(folder, {"front": camera, "side": side}, lights, template, moves, tuple(records))

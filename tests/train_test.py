@@ -10,6 +10,7 @@ import signal
 import numpy as np
 import pytest
 import torch
+
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import torch
+
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light
 from rnd_runtime.shading_reference import shade_reference

@@ -87,7 +87,9 @@ def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion) -> Dri
         ours = avatar.run((pose.window.numpy(), pose.velocity.numpy(), pose.bones.numpy()), outputs)
         theirs = (posed.weights, posed.means, posed.normals, posed.visibility, posed.covariances)
         errors = [np.abs(a - b.numpy()) for a, b in zip(ours, theirs)]
-        errors[-1] /= posed.covariances.numpy()[:, [0, 3, 5]].max(axis=1, keepdims=True)  # of its largest axis
+        errors[-1] /= posed.covariances.numpy()[:, [0, 3, 5]].max(
+            axis=1, keepdims=True
+        )  # of its largest axis
         worst = np.maximum(worst, [float(error.max()) for error in errors])
     return Drift(motion.frame_count, *(float(error) for error in worst))
 

@@ -1,4 +1,4 @@
-"""Time and error of the CPU rasterisers, of the same calls, in one run.
+"""Time and error of the rasterisers, of the same calls, in one run.
 
 **The scene** (:func:`body_scene`): N Gaussians spread evenly over a person 1.75 m tall in an A pose, a union of
 capsules seen from the front, 20° to the side, filling 70 % of the picture's height. They are discs: their standard
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba
@@ -24,6 +25,8 @@ from torch import Tensor
 from rnd_runtime import raster_oracle
 from rnd_runtime.camera import Camera
 from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
+from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
 Array = NDArray[np.float64]
@@ -125,7 +128,7 @@ class Result(NamedTuple):
 def bench_raster(
     n: int = 30_000, size: int = 512, repeats: int = 40, threads: int | None = None, *, warmup: int = 3
 ) -> list[Row]:
-    """Measure every CPU rasteriser on the scene above; one row for each kernel and pass.
+    """Measure every rasteriser on the scene above; one row for each kernel and pass.
 
     Keys: kernel, pass (forward | forward+backward), n, size, ms_median, ms_p95, ms_min, psnr_db (image and alpha
     against the float64 oracle), grad_rel_l2 (the worst of the four gradients against the float64 reference; None
@@ -151,6 +154,7 @@ def measure(
             ("torch tiles", raster_reference.rasterize, 1, max(3, repeats // 10)),
         ]
         cases = [(*kernel, wanted) for wanted in (None, incoming) for kernel in kernels]
+        cases += [(name, gl, warmup, repeats, None) for name, gl in _gl_rasterizers()]
         times: list[list[float]] = [[] for _ in cases]
         results: list[Result] = [Result(torch.empty(0), torch.empty(0))] * len(cases)
         for turn in range(max(case[2] + case[3] for case in cases)):
@@ -182,6 +186,26 @@ def measure(
     finally:
         numba.set_num_threads(before[0])
         torch.set_num_threads(before[1])
+
+
+def _gl_rasterizers() -> list[tuple[str, Callable[..., Any]]]:
+    """OpenGL on every backend that this machine has; it has no backward pass."""
+    found: list[tuple[str, Callable[..., Any]]] = []
+    for backend in ("egl", "osmesa"):
+        try:
+            rasterizer = GlRasterizer(backend)
+        except InputError:
+            continue
+        found.append((f"gl-{backend}", partial(_through_gl, rasterizer)))
+    return found
+
+
+def _through_gl(rasterizer: GlRasterizer, *arguments: Any) -> tuple[Tensor, Tensor, None]:
+    means, covariances, opacities, features = (tensor.numpy() for tensor in arguments[:4])
+    raster = rasterizer(means, covariances, opacities, features, arguments[4])
+    # a copy where GL hands out views of one strided array: the time of a picture one can use
+    image, alpha = np.ascontiguousarray(raster.image), np.ascontiguousarray(raster.alpha)
+    return torch.from_numpy(image), torch.from_numpy(alpha), None
 
 
 def _incoming(camera: Camera, channels: int) -> tuple[Tensor, Tensor]:

@@ -16,6 +16,10 @@ from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path, output_folder
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from rnd_runtime.capture_format import Split
+
     from .train import Training
 
 PREVIEWS = 3
@@ -76,16 +80,17 @@ def main_eval() -> None:
     sys.exit(run_command("rnd-eval", lambda: _evaluate(options)))
 
 
-def _need_extra() -> None:
+def need_extra() -> None:
     for package in ("torch", "safetensors", "scipy"):
         if importlib.util.find_spec(package) is None:
             raise InputError(
-                f"{package} is not installed", hint='training needs the extra: pip install "rnd-avatar[train]"'
+                f"{package} is not installed",
+                hint='training needs the extra: pip install "rnd-avatar[train]"',
             )
 
 
 def _train(options: TrainOptions) -> None:
-    _need_extra()
+    need_extra()
     from rnd_runtime.capture import load_capture
 
     from .config import preset, to_dict
@@ -95,9 +100,14 @@ def _train(options: TrainOptions) -> None:
     model = config.model
     if options.gaussians is not None:
         model = dataclasses.replace(model, gaussians=options.gaussians, nodes=max(16, options.gaussians // 4))
-    changes = {"steps": options.steps, "image_scale": options.image_scale}
-    changes = {name: value for name, value in changes.items() if value is not None}
-    config = dataclasses.replace(config, model=model, seed=options.seed, light=options.light, **changes)
+    config = dataclasses.replace(
+        config,
+        model=model,
+        seed=options.seed,
+        light=options.light,
+        steps=config.steps if options.steps is None else options.steps,
+        image_scale=config.image_scale if options.image_scale is None else options.image_scale,
+    )
     _check(config.steps >= 1, "--steps", "at least 1", config.steps)
     _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
     _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
@@ -176,7 +186,7 @@ def _score_after_training(folder: Path, options: TrainOptions) -> None:
 
 
 def _evaluate(options: EvalOptions) -> None:
-    _need_extra()
+    need_extra()
     from rich.console import Console
     from rich.table import Table
 
@@ -191,7 +201,7 @@ def _evaluate(options: EvalOptions) -> None:
     checkpoint = load_checkpoint(path)
     capture = load_capture(options.capture)
     scale = albedo_scale(checkpoint, capture)
-    jobs = [(split, None) for split in HELD_OUT if capture.split(split)]
+    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
     if scale is not None and capture.split("relight"):
         jobs.append(("relight", scale))
     if not jobs:

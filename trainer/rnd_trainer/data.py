@@ -83,7 +83,7 @@ def load_views(capture: Capture, split: str, scale: float = 1.0) -> tuple[list[V
     return views, bad
 
 
-def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> View:  # type: ignore[no-untyped-def]
+def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> View:
     if scale != 1.0:
         image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
     rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
@@ -104,7 +104,7 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
     )
 
 
-def _shrink(image, mask, normal, camera: Camera, scale: float):  # type: ignore[no-untyped-def]
+def _shrink(image, mask, normal, camera: Camera, scale: float):
     """Area-averaged to ``scale``; colours are averaged as light, not as sRGB."""
     import cv2
 
@@ -113,7 +113,7 @@ def _shrink(image, mask, normal, camera: Camera, scale: float):  # type: ignore[
     small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     size = (small.width, small.height)
 
-    def area(x):  # type: ignore[no-untyped-def]
+    def area(x):
         return cv2.resize(np.ascontiguousarray(x, np.float32), size, interpolation=cv2.INTER_AREA)
 
     normal = None if normal is None else area(normal)

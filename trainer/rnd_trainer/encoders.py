@@ -46,14 +46,13 @@ class AttributeEncoder(nn.Module):
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs)
-        )
-        nn.init.zeros_(self.layers[-1].weight)
-        nn.init.zeros_(self.layers[-1].bias)
+        self.first, self.hidden = nn.Linear(inputs, width), nn.Linear(width, width)
+        self.out = nn.Linear(width, outputs)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
 
     def forward(self, encoded: Tensor) -> Tensor:
-        return self.layers(encoded)
+        return self.out(torch.relu(self.hidden(torch.relu(self.first(encoded)))))
 
 
 class JointAttention(nn.Module):

@@ -7,19 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from rnd_runtime.shading import Shader
 from torch import Tensor
 
 from rnd_runtime.capture import Capture, Frame
+from rnd_runtime.capture_format import Split
 from rnd_runtime.images import linear_to_srgb, srgb_to_linear
 from rnd_runtime.light import Light
+from rnd_runtime.shading import Shader
 
 from .checkpoint import Checkpoint
 from .data import pose_input
 from .judge import Rendered, render_runtime
 from .metrics import mask_box, normal_degrees, psnr, ssim
 
-HELD_OUT = ("novel_view", "novel_pose", "relight")
+HELD_OUT: tuple[Split, ...] = ("novel_view", "novel_pose", "relight")
 BOX_MARGIN = 8
 """pixels around the mask's box in which the second figure of each pair is computed"""
 
@@ -43,7 +44,7 @@ class SplitScore:
 def evaluate(
     checkpoint: Checkpoint,
     capture: Capture,
-    split: str,
+    split: Split,
     *,
     mode: str = "table+sun",
     albedo_scale: Tensor | None = None,
@@ -60,8 +61,10 @@ def evaluate(
     trained = {frame.light for frame in capture.split("train")}
     for frame in capture.split(split):
         if frame.light not in shaders:
-            known = frame.light in trained or frame.light is None
-            light = Light(checkpoint.probe.numpy()) if known else capture.load_light(frame.light)
+            if frame.light is None or frame.light in trained:
+                light = Light(checkpoint.probe.numpy())
+            else:
+                light = capture.load_light(frame.light)
             shaders[frame.light] = Shader(light, mode)
         pose = pose_input(
             capture.motion, checkpoint.skeleton, frame.frame / capture.motion.fps, checkpoint.config.model
@@ -103,13 +106,13 @@ def albedo_scale(checkpoint: Checkpoint, capture: Capture) -> Tensor | None:
     ours, theirs = [], []
     shader = Shader(Light(checkpoint.probe.numpy()), "ao")
     for frame in capture.split("train"):
-        if frame.albedo is None:
+        truth = capture.load_frame(frame)
+        if truth.albedo_srgb is None:
             continue
         pose = pose_input(
             capture.motion, checkpoint.skeleton, frame.frame / capture.motion.fps, checkpoint.config.model
         )
         rendered = render_runtime(checkpoint.model, pose, capture.cameras[frame.camera], shader)
-        truth = capture.load_frame(frame)
         inside = (torch.from_numpy(truth.mask) > 0.99) & (rendered.alpha > 0.99)
         ours.append(rendered.albedo[inside])
         theirs.append(torch.from_numpy(srgb_to_linear(truth.albedo_srgb)).float()[inside])

@@ -38,13 +38,13 @@ class NodeInterpolation(nn.Module):
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values: Tensor, plan: NodeInterpolation) -> Tensor:  # type: ignore[override]
+    def forward(ctx, values: Tensor, plan: NodeInterpolation) -> Tensor:
         ctx.plan = plan
         table = np.ascontiguousarray(values.detach().numpy())
         return torch.from_numpy(_gather(table, plan.neighbours.numpy(), plan.weights.numpy()))
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
         plan: NodeInterpolation = ctx.plan
         starts, order = plan._transpose
         weights = plan.weights.numpy().reshape(-1)

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from rnd_runtime.shading import Shader
 from torch import Tensor
 
 from rnd_runtime.camera import Camera
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.shading import Shader
 
 from .model import AvatarModel, Posed, PoseInput
 
@@ -49,5 +49,5 @@ def render_runtime(
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
     raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
-    image, normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
-    return Rendered(image, normals, albedo, torch.from_numpy(raster.alpha))
+    image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
+    return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))

@@ -49,8 +49,8 @@ class PoseInput:
 class Attributes:
     """Activated attributes in the rest pose: valid for any weights of the networks.
 
-    opacity [N], rotation [N, 3] (R as a rotation vector in the tangent frame), scales [N, 3] m, normals [N, 3] unit, points [N, 3] m with
-    the static offset, colour / albedo [N, 3] linear, roughness [N].
+    opacity [N], rotation [N, 3] (R as a rotation vector in the tangent frame), scales [N, 3] m, normals [N, 3]
+    unit, points [N, 3] m with the static offset, colour / albedo [N, 3] linear, roughness [N].
     """
 
     opacity: Tensor
@@ -195,7 +195,7 @@ class AvatarModel(nn.Module):
         return transform_normals(blend_transforms(weights, bones), normals) @ bones[0, :, :3]
 
 
-def _log_weights(weights) -> Tensor:  # type: ignore[no-untyped-def]
+def _log_weights(weights) -> Tensor:
     floored = torch.as_tensor(weights, dtype=torch.float64).clamp(min=WEIGHT_FLOOR)
     return torch.log(floored / floored.sum(dim=-1, keepdim=True))
 

@@ -16,7 +16,9 @@ from torch import Tensor
 from .skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
-_inline = numba.njit(fastmath=_FAST, error_model="numpy")  # LLVM inlines these; numba's own inlining chokes on tuples
+_inline = numba.njit(
+    fastmath=_FAST, error_model="numpy"
+)  # LLVM inlines these; numba's own inlining chokes on tuples
 
 
 class PoseGaussians(torch.autograd.Function):
@@ -41,13 +43,16 @@ class PoseGaussians(torch.autograd.Function):
 
 
 @_inline
+def _row(x, y, z, b):
+    """(x, y, z) B."""
+    return (x * b[0] + y * b[3] + z * b[6], x * b[1] + y * b[4] + z * b[7], x * b[2] + y * b[5] + z * b[8])
+
+
+@_inline
 def _multiply(a, b):
     """A B."""
-    return (
-        a[0] * b[0] + a[1] * b[3] + a[2] * b[6], a[0] * b[1] + a[1] * b[4] + a[2] * b[7], a[0] * b[2] + a[1] * b[5] + a[2] * b[8],
-        a[3] * b[0] + a[4] * b[3] + a[5] * b[6], a[3] * b[1] + a[4] * b[4] + a[5] * b[7], a[3] * b[2] + a[4] * b[5] + a[5] * b[8],
-        a[6] * b[0] + a[7] * b[3] + a[8] * b[6], a[6] * b[1] + a[7] * b[4] + a[8] * b[7], a[6] * b[2] + a[7] * b[5] + a[8] * b[8],
-    )  # fmt: skip
+    p, q, r = _row(a[0], a[1], a[2], b), _row(a[3], a[4], a[5], b), _row(a[6], a[7], a[8], b)
+    return (p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2])
 
 
 @_inline
@@ -241,7 +246,9 @@ def _pose_backward(
         gx, gy, gz = by_normal[n, 0], by_normal[n, 1], by_normal[n, 2]
         along = x * gx + y * gy + z * gz
         gx, gy, gz = (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
-        by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = _apply(_transpose(matrix), gx, gy, gz)
+        by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = _apply(
+            _transpose(matrix), gx, gy, gz
+        )
         outer = (gx * nx, gx * ny, gx * nz, gy * nx, gy * ny, gy * nz, gz * nx, gz * ny, gz * nz)
         k = _normal_matrix_backward(linear, outer)
 

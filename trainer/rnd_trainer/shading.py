@@ -55,9 +55,7 @@ def shade(
     compiled kernel, which has no gradient by view and visibility.
     """
     if not normals.is_cuda and normals.dtype == torch.float32:
-        return FusedShade.apply(
-            normals, view, albedo, roughness, visibility, texels.directions, texels.power
-        )
+        return FusedShade.apply(normals, view, albedo, roughness, visibility, texels.directions, texels.power)
     n_dot_l = normals @ texels.directions.T  # [n, K]; nothing here is ever [n, K, 3]
     arriving = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)

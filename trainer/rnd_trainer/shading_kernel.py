@@ -11,8 +11,9 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from rnd_runtime.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
 from torch import Tensor
+
+from rnd_runtime.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
 
 CHUNKS = 16
 """parts of the Gaussians whose sums over texels are kept apart: the same bits for any number of threads"""
@@ -153,7 +154,9 @@ def _sum_backward(normals, view, albedo, roughness, visibility, directions, powe
                 n_dot_l = nx * lx + ny * ly + nz * lz
                 cosine = max(n_dot_l, zero)
                 arriving = visibility[i, k] * cosine
-                value, by_alpha, by_light, by_view = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
+                value, by_alpha, by_light, by_view = _specular(
+                    alpha_squared, n_dot_l, n_dot_v, half_squared[i, k]
+                )
                 p0, p1, p2 = power[0, k], power[1, k], power[2, k]
                 gloss = g0 * p0 + g1 * p1 + g2 * p2
                 matt = a0 * p0 + a1 * p1 + a2 * p2

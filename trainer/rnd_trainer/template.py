@@ -121,7 +121,7 @@ def _vertex_normals(vertices: Floats, faces: NDArray[np.int32], crosses: Floats)
 
 
 @numba.njit(cache=True)
-def _farthest_points(points, count, first):  # type: ignore[no-untyped-def]
+def _farthest_points(points, count, first):
     """Indices [count] of a farthest point ordering of points [C, 3], starting with ``first``."""
     candidates = points.shape[0]
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()

@@ -188,7 +188,7 @@ class Training:
         sizes = list(APPEARANCE_COLUMNS.values())
         start = [sum(sizes[:k]) for k in range(len(sizes))]
         colour, albedo = (slice(start[k], start[k] + 3) for k in map(columns.index, ("colour", "albedo")))
-        last = self.model.appearance.layers[-1]
+        last = self.model.appearance.out
         with torch.no_grad():
             last.weight[albedo] = last.weight[colour]
             last.bias[albedo] = last.bias[colour] + 1.0  # undoes the −1 of the albedo's activation
@@ -212,10 +212,12 @@ class Training:
         return pose_input(self.capture.motion, self.capture.body.skeleton, time_s, self.config.model)
 
     def _capture_light(self) -> Tensor:
-        names = {view.frame.light for view in self.views}
+        names = {view.frame.light or "unknown" for view in self.views}
         if len(names) != 1:
             raise InputError("training light", expected="one light in the train split", got=sorted(names))
-        return as_probe(downsize(self.capture.load_light(names.pop()).radiance, *PROBE_SHAPE))
+        light = self.capture.load_light(names.pop())
+        upright = light.sample(self.probe.directions.numpy()) if light.yaw else None
+        return as_probe(downsize(light.radiance, *PROBE_SHAPE) if upright is None else upright)
 
     # -- saving and resuming -------------------------------------------------------------------------------
 
@@ -343,7 +345,7 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _brightest_first(texels):  # type: ignore[no-untyped-def]
+def _brightest_first(texels):
     order = torch.argsort(texels.power.detach().sum(-1), descending=True, stable=True)
     return type(texels)(texels.directions[order], texels.power[order])
 
