@@ -151,15 +151,12 @@ class Wardrobe:
                 * np.sin(175 * s + 20 * (y - 1.41))
             )
             raised = np.linalg.norm(turn[side + "shoulder"] + turn[side + "collar"])
-            s = np.sqrt((x - 0.135) ** 2 + (y - 1.345) ** 2 + (0.5 * z) ** 2)
-            around = np.arctan2(y - 1.345, x - 0.135)
-            shirt += (
-                here
-                * 0.0045
-                * np.minimum(raised, 1.6)
-                * np.exp(-((s / 0.11) ** 2))
-                * np.sin(7 * around + 40 * s)
-            )
+            reach = np.hypot(x - 0.135, y - 1.345)
+            near = np.exp(-((reach / 0.11) ** 2)) - np.exp(
+                -((reach / 0.06) ** 2)
+            )  # not where spokes would meet
+            spokes = np.sin(6 * np.arctan2(y - 1.345, x - 0.135) + 40 * reach)
+            shirt += here * 0.0060 * np.minimum(raised, 1.6) * near * spokes
             bend = np.minimum(np.linalg.norm(turn[side + "knee"]), 2.0)
             s = y - 0.49
             behind = 0.45 - 0.55 * np.clip(normal[:, 2], -1, 0.5)
