@@ -40,7 +40,7 @@ _SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 _DISC_SIGMAS = 2.0  # a Gaussian's disc in the depth map, in standard deviations
 _CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
 
-_ZERO, _TINY = np.float32(0), np.float32(1e-12)
+_ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-12)
 _ONE_OVER_PI = np.float32(1 / np.pi)
 
 
@@ -112,13 +112,8 @@ class Shader:
         return radiance
 
     def _sun_arrays(self) -> tuple[Floats, Floats]:
-        """Irradiance [S, 3] and what the size of each sun adds to α² [S].
-
-        A mirror shows a disc of radius ρ at its own radiance: E·D/4 = L with E = πρ²L and D = 1/(πα²) asks for
-        α² = ρ²/4, and the mean square angle of a disc is ρ²/2.
-        """
-        spread = np.array([sun.spread for sun in self.suns])
-        return np.array([sun.irradiance for sun in self.suns]), spread**2 / 2
+        """Irradiance [S, 3] and mean square angle [S]."""
+        return np.array([sun.irradiance for sun in self.suns]), np.array([sun.spread**2 for sun in self.suns])
 
 
 def _light_count(mode: str) -> int:
@@ -138,7 +133,9 @@ def _shadow_radii(gaussians: Gaussians) -> Floats32:
 
 @numba.njit(parallel=True, cache=True, error_model="numpy")
 def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, radiance):  # type: ignore[no-untyped-def]
-    directions, irradiance, added = suns
+    # A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks
+    # for α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own.
+    directions, irradiance, spread_squared = suns
     for i in numba.prange(len(means)):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
@@ -153,8 +150,9 @@ def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, radiance)
             half_squared = max(hx * hx + hy * hy + hz * hz, _TINY)
             cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
             sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
+            blur = spread_squared[sun] / np.sqrt(half_squared)
             shine = ggx32(
-                alpha[i] * alpha[i] + added[sun],
+                min(alpha[i] * alpha[i] + blur, _ONE),
                 nx * lx + ny * ly + nz * lz,
                 nx * vx + ny * vy + nz * vz,
                 sine_squared,

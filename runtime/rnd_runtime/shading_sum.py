@@ -1,6 +1,6 @@
 """The sum over distant lights, each with the whole BRDF and the spherical-harmonic visibility.
 
-With every texel of a 64 × 32 map this is ``shade_reference`` in float32: 147 dB apart, 0.18 s for 30 000
+With every texel of a 64 × 32 map this is ``shade_reference`` in float32, 145 dB apart, in 84 ms for 30 000
 Gaussians on two cores. With K lights out of a median cut it is the cheap kind of relighting it is compared with.
 """
 
