@@ -102,6 +102,7 @@ def test_triangles_are_even(body: Body) -> None:
 
 
 def test_skeleton_is_smpl_and_lies_inside(body: Body) -> None:
+    assert body.license == "CC0-1.0"
     assert body.skeleton.names == SMPL_NAMES
     assert tuple(body.skeleton.parents) == SMPL_PARENTS
     inside = winding_numbers(body.skeleton.rest_joints, body.vertices, body.faces)
