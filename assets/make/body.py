@@ -90,4 +90,4 @@ def make_body(path: Path) -> None:
     """Write the template to ``path``."""
     vertices, faces, weights = template()
     rounded = vertices.astype(np.float32)  # half the file; 0.1 µm
-    Body(rounded, faces, weights, smpl_skeleton(rest_joints())).save(path)
+    Body(rounded, faces, weights, smpl_skeleton(rest_joints()), license="CC0-1.0").save(path)
