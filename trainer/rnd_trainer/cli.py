@@ -170,7 +170,8 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
 
         def on_preview() -> None:
             name = f"step_{training.step_index:06d}.png"
-            save_preview(folder / "previews" / name, training.model, training.light(), shown)
+            light = training.light() if training.stage == 2 else None
+            save_preview(folder / "previews" / name, training.model, light, shown)
 
         return bool(run(training, folder, on_step=on_step, on_preview=on_preview))
 

@@ -39,13 +39,18 @@ class Rendered:
 
 @torch.no_grad()
 def render_runtime(
-    model: AvatarModel, pose: PoseInput, camera: Camera, shader: Shader, albedo_scale: Tensor | None = None
+    model: AvatarModel,
+    pose: PoseInput,
+    camera: Camera,
+    shader: Shader | None,
+    albedo_scale: Tensor | None = None,
 ) -> Rendered:
     """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional."""
-    gaussians = to_gaussians(model(pose), pose)
+    posed = model(pose)
+    gaussians = to_gaussians(posed, pose)
     if albedo_scale is not None:
         gaussians = replace(gaussians, albedo=gaussians.albedo * albedo_scale.numpy())
-    radiance = shader.shade(gaussians, camera.position)
+    radiance = posed.attributes.colour.numpy() if shader is None else shader.shade(gaussians, camera.position)
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
     raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)

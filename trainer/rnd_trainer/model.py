@@ -127,17 +127,22 @@ class AvatarModel(nn.Module):
         return positional_encoding(self.codes[: self.config.nodes], self.config.frequencies)
 
     def attributes(self, encoded: Tensor) -> Attributes:
-        """D_g and D_a with residuals, activated."""
-        raw = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
-        raw = raw + torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
+        """D_g and D_a with residuals, activated.
+
+        The surface as a whole may leave the template by ``max_static_offset``; a Gaussian may stray from that
+        surface by one spacing and no more: farther ones would show as spikes and as speckled shadows.
+        """
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
-        part = dict(zip(columns, raw.split(list(columns.values()), dim=-1)))
+        smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
+        residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
+        part = _by_name(smooth + residual, columns)
+        place, stray = _by_name(smooth, columns)["offset"], _by_name(residual, columns)["offset"]
         normals = nn.functional.normalize(self.rest_normals + 0.8 * torch.tanh(part["normal"]), dim=-1)
         tangents, across = part["scale"].split([2, 1], dim=-1)
         scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
-        offset = self.config.max_static_offset * torch.tanh(part["offset"])
+        offset = self.config.max_static_offset * torch.tanh(place) + self.spacing * torch.tanh(stray)
         low, high = ALBEDO_RANGE
-        smooth, rough = ROUGHNESS_RANGE
+        glossy, rough = ROUGHNESS_RANGE
         return Attributes(
             opacity=torch.sigmoid(part["opacity"][:, 0] + START_OPACITY),
             rotation=torch.tanh(part["rotation"]),
@@ -146,7 +151,7 @@ class AvatarModel(nn.Module):
             points=self.points + offset,
             colour=torch.sigmoid(part["colour"]),
             albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # 0.24 at the start
-            roughness=smooth + (rough - smooth) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
+            roughness=glossy + (rough - glossy) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
             raw_geometry_residual=self.geometry_residual,
         )
 
@@ -193,6 +198,11 @@ class AvatarModel(nn.Module):
         """Posed normals of the nodes [M, 3] in the root's frame, by the template's skinning."""
         weights = torch.softmax(self.log_weights[: len(normals)], dim=-1)
         return transform_normals(blend_transforms(weights, bones), normals) @ bones[0, :, :3]
+
+
+def _by_name(values: Tensor, columns: dict[str, int]) -> dict[str, Tensor]:
+    """[N, C] cut into named columns."""
+    return dict(zip(columns, values.split(list(columns.values()), dim=-1)))
 
 
 def _log_weights(weights) -> Tensor:

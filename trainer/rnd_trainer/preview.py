@@ -29,10 +29,13 @@ def strip(rendered: Rendered, target_srgb: np.ndarray) -> np.ndarray:
 
 
 def save_preview(
-    path: Path, model: AvatarModel, probe: torch.Tensor, views: list[tuple[View, PoseInput]]
+    path: Path, model: AvatarModel, probe: torch.Tensor | None, views: list[tuple[View, PoseInput]]
 ) -> None:
-    """A picture with one row for each view: what the player would show of the training so far."""
-    shader = Shader(Light(probe.detach().numpy()), "table+sun")
+    """A picture with one row for each view: what the player would show of the training so far.
+
+    Without a ``probe`` [32, 64, 3] (in the first stage) the plain colours are shown.
+    """
+    shader = None if probe is None else Shader(Light(probe.detach().numpy()), "table+sun")
     rows = []
     for view, pose in views:
         target = view.image.astype(np.float32) / 255

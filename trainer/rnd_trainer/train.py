@@ -75,7 +75,7 @@ class Training:
     def step(self) -> Step:
         """Optimise on the next picture. Raises :class:`InputError` after ten non-finite steps in a row."""
         started = time.perf_counter()
-        stage = 1 if self.step_index < self.stage1_steps else 2
+        stage = self.stage
         if self.step_index == self.stage1_steps:
             self._start_albedo_from_colour()
         self._set_rates()
@@ -156,6 +156,11 @@ class Training:
     def stage1_steps(self) -> int:
         """Steps of the first stage."""
         return round(self.config.stage1_fraction * self.config.steps)
+
+    @property
+    def stage(self) -> int:
+        """Of the next step: 1 geometry under plain colours, 2 the light."""
+        return 1 if self.step_index < self.stage1_steps else 2
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the capture's own."""
