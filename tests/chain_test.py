@@ -61,6 +61,9 @@ def test_the_chain_leaves_what_it_promises(played) -> None:
     covered = (picture[..., 3] > 127).mean()
     assert 0.02 < covered < 0.5  # a person, not nothing and not everything
     assert not list(played.rglob(".*"))  # no temporary is left
+    stages = json.loads((played / "out" / "play.json").read_text())["times"]
+    assert {"load", "encoders", "shading", "projection+sort", "raster", "write"} <= set(stages)
+    assert stages["encoders"]["runs"] == 3 and stages["load"]["runs"] == 1
 
 
 def test_evaluation_rows_say_what_they_are(played) -> None:

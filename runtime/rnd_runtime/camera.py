@@ -33,7 +33,9 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise InputError("camera size", expected="at least 1 x 1", got=f"{self.width} x {self.height}")
         if self.K.shape != (3, 3) or not np.isfinite(self.K).all() or min(self.K[0, 0], self.K[1, 1]) <= 0:
-            raise InputError("camera K", expected="finite 3 x 3 with positive focal lengths", got=self.K.tolist())
+            raise InputError(
+                "camera K", expected="finite 3 x 3 with positive focal lengths", got=self.K.tolist()
+            )
         rotation = self.world_to_camera[:3, :3] if self.world_to_camera.shape == (4, 4) else np.zeros((3, 3))
         if (
             not np.isfinite(self.world_to_camera).all()
@@ -41,7 +43,9 @@ class Camera:
             or np.linalg.det(rotation) < 0
         ):
             raise InputError(
-                "camera world_to_camera", expected="a 4 x 4 rigid transform", got=self.world_to_camera.tolist()
+                "camera world_to_camera",
+                expected="a 4 x 4 rigid transform",
+                got=self.world_to_camera.tolist(),
             )
 
     @property

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -47,11 +48,13 @@ class Raster:
         image: [H, W, C], Σ w_i feature_i.
         alpha: [H, W], Σ w_i.
         depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
+        seconds: how long each stage took: "projection+sort", "raster" and, from a GL target, "read-back".
     """
 
     image: Floats32
     alpha: Floats32
     depth: Floats32
+    seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 class Rasterizer(Protocol):

@@ -10,6 +10,7 @@ are cached beside the package.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from time import perf_counter
 
 import numpy as np
 from numba import get_num_threads
@@ -79,16 +80,19 @@ def forward(
     ):
         if array.shape != shape:
             raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
+    started = perf_counter()
     view = view_of(camera)
     centers, shapes, boxes, attributes, depths, slot_starts = project(
         means, covariances, opacities, features, view, depth
     )
     pairs = sort_into_tiles(boxes, depths, slot_starts, camera.width, camera.height)
     splats = Splats(centers, shapes, attributes, slot_starts, *pairs)
+    sorted_at = perf_counter()
     image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
+    seconds = {"projection+sort": sorted_at - started, "raster": perf_counter() - sorted_at}
     channels = features.shape[1]
     far = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)
-    raster = Raster(image[..., :channels], coverage, far)
+    raster = Raster(image[..., :channels], coverage, far, seconds)
     return raster, State(means, covariances, opacities, view, splats, image, coverage, channels)
 
 

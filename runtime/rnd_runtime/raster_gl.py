@@ -11,6 +11,7 @@ threads give the same bits.
 from __future__ import annotations
 
 from importlib import resources
+from time import perf_counter
 from types import TracebackType
 from typing import NamedTuple
 
@@ -73,14 +74,21 @@ class GlRasterizer:
         means, covariances, opacities, features = _checked(means, covariances, opacities, features)
         self._check_limits(len(means), camera)
         channels = features.shape[1]
+        started = perf_counter()
         splats = _sorted_splats(means, covariances, opacities, features, view_of(camera))
+        seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
         pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
             for first in range(0, channels + 1, self._max_attributes):
                 attributes = min(channels + 1 - first, self._max_attributes)
+                started = perf_counter()
                 self._draw(splats, first, attributes, camera)
+                self.context.finish()  # else the read-back would be charged with the drawing
+                drawn = perf_counter()
                 pictures += self._read(attributes, camera)
-        return _assembled(pictures, channels)
+                seconds["raster"] += drawn - started
+                seconds["read-back"] += perf_counter() - drawn
+        return _assembled(pictures, channels, seconds)
 
     def close(self) -> None:
         """Release everything, the context too."""
@@ -268,7 +276,7 @@ def _fill_records(records, order, centers, shapes, values, first, attributes):  
             records[k, 8 + c] = values[i, first + c]
 
 
-def _assembled(pictures: list[Floats32], channels: int) -> Raster:
+def _assembled(pictures: list[Floats32], channels: int, seconds: dict[str, float]) -> Raster:
     """Targets [H, W, ≤ 4] → the raster; what needs no copy is a view."""
     if channels <= PER_TARGET:
         image = pictures[0][..., :channels]
@@ -277,7 +285,7 @@ def _assembled(pictures: list[Floats32], channels: int) -> Raster:
         for index, picture in enumerate(pictures):
             _copy_channels(image, PER_TARGET * index, picture)
     depth = pictures[channels // PER_TARGET][..., channels % PER_TARGET]
-    return Raster(image, pictures[0][..., 3], depth)
+    return Raster(image, pictures[0][..., 3], depth, seconds)
 
 
 @njit(error_model="numpy", nogil=True, cache=True)

@@ -73,6 +73,8 @@ class PlayOptions:
     """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
     motion_up: Literal["auto", "y", "z"] = "auto"
     """Which axis points up in the motion's file."""
+    motion_fps: Annotated[float | None, _option("FLOAT")] = None
+    """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
     threads: Annotated[int | None, _option("INT")] = None
     """CPU threads. Default: all."""
     doctor: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")] = False

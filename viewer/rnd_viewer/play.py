@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numba
 import numpy as np
-from rnd_runtime.shading import Shader
 
 from rnd_runtime import __version__
 from rnd_runtime.avatar import Avatar
@@ -18,6 +17,7 @@ from rnd_runtime.files import output_folder
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import load_motion
 from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.shading import Shader
 
 from .aov import parse_aovs
 from .background import Background
@@ -46,7 +46,7 @@ def play(options: PlayOptions) -> int:
     times = StageTimes()
     with times.stage("load"):
         avatar = Avatar.load(avatar_file, threads=options.threads)
-        motion = load_motion(motion_file, avatar.skeleton, up=options.motion_up)
+        motion = load_motion(motion_file, avatar.skeleton, up=options.motion_up, fps=options.motion_fps)
         light = _light(options, avatar)
         shader = Shader(light, mode=options.shade)
         rasterizer = make_rasterizer(options.raster)

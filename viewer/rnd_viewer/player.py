@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rnd_runtime.shading import Shader
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
@@ -16,6 +15,7 @@ from rnd_runtime.gaussians import Rasterizer
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
+from rnd_runtime.shading import Shader
 
 from .aov import CHANNELS, aov_values, splat_features
 from .background import Background
@@ -95,15 +95,12 @@ class Player:
             gaussians = self.avatar.pose(motion, time_s)
         with self.times.stage("shading"):
             radiance = self.shader.shade(gaussians, camera.position)
-        with self.times.stage("raster"):
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
-            raster = self.rasterizer(
-                gaussians.means,
-                gaussians.covariances,
-                gaussians.opacities,
-                features.astype(np.float32),
-                camera,
-            )
+        raster = self.rasterizer(
+            gaussians.means, gaussians.covariances, gaussians.opacities, features.astype(np.float32), camera
+        )
+        for stage, seconds in raster.seconds.items():
+            self.times.add(stage, seconds)
         with self.times.stage("background"):
             behind = self._radiance_behind(camera)
         aovs, start = {}, 3
