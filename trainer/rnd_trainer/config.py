@@ -42,7 +42,7 @@ class TrainConfig:
     """Schedule, losses and rates. `preset()` gives the three that are offered."""
 
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
-    steps: int = 9_000
+    steps: int = 4_500
     """optimisation steps, one picture each"""
     stage1_fraction: float = 0.25
     """share of the steps spent on geometry with a plain colour before the light is learned"""
@@ -100,7 +100,7 @@ def preset(name: str) -> TrainConfig:
     if name == "standard":
         return standard
     if name == "full":
-        return dataclasses.replace(standard, steps=45_000)
+        return dataclasses.replace(standard, steps=5 * standard.steps)
     if name == "quick":
         small = dataclasses.replace(standard.model, gaussians=12_000, nodes=3_000)
         return dataclasses.replace(standard, model=small, steps=2_500, preview_every=250, save_every=250)

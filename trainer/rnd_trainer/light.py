@@ -56,8 +56,10 @@ def luminance(rgb: Tensor) -> Tensor:
 
 
 def all_texels(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Texels:
-    """Every texel once: the full sum."""
-    return Texels(directions.reshape(-1, 3), (radiance * solid_angles[..., None]).reshape(-1, 3))
+    """Every texel once, the full sum. Brightest first."""
+    power = (radiance * solid_angles[..., None]).reshape(-1, 3)
+    order = torch.argsort(luminance(power.detach()), descending=True, stable=True)
+    return Texels(directions.reshape(-1, 3)[order], power[order])
 
 
 def draw_texels(

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rnd_runtime.shading import Shader
 
 from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.light import Light
+from rnd_runtime.shading import Shader
 
 from .data import View
 from .judge import Rendered, render_runtime

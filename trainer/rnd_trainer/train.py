@@ -120,8 +120,6 @@ class Training:
             maps = (light, self.probe.directions, self.probe.solid_angles)
             full = self.step_index >= config.steps * (1 - config.full_light_fraction)
             texels = all_texels(*maps) if full else draw_texels(*maps, config.light_texels, self.generator)
-            # the full sum keeps map order, so nothing says that its first texels are the bright ones
-            texels = _brightest_first(texels) if full else texels
             radiance = shade_visible(
                 posed, pose, texels, view.camera, float(model.spacing), config.traced_texels
             )
@@ -348,11 +346,6 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         yield lambda: pressed
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def _brightest_first(texels):
-    order = torch.argsort(texels.power.detach().sum(-1), descending=True, stable=True)
-    return type(texels)(texels.directions[order], texels.power[order])
 
 
 def _strip(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
