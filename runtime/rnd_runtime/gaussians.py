@@ -72,4 +72,6 @@ class Rasterizer(Protocol):
         opacities: Floats32,  # [N]
         features: Floats32,  # [N, C]
         camera: Camera,
+        *,
+        depth: bool = True,  # False: the depth picture is all zero, and costs nothing
     ) -> Raster: ...

@@ -28,9 +28,16 @@ class ChosenRasterizer:
         self._rasterize = raster_cpu.rasterize if gl is None else gl
 
     def __call__(
-        self, means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+        self,
+        means: Floats32,
+        covariances: Floats32,
+        opacities: Floats32,
+        features: Floats32,
+        camera: Camera,
+        *,
+        depth: bool = True,
     ) -> Raster:
-        return self._rasterize(means, covariances, opacities, features, camera)
+        return self._rasterize(means, covariances, opacities, features, camera, depth=depth)
 
     def close(self) -> None:
         if self._gl is not None:

@@ -39,7 +39,13 @@ class State:
 
 
 def rasterize(
-    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+    means: Floats32,
+    covariances: Floats32,
+    opacities: Floats32,
+    features: Floats32,
+    camera: Camera,
+    *,
+    depth: bool = True,
 ) -> Raster:
     """Splat N Gaussians.
 
@@ -49,11 +55,12 @@ def rasterize(
         opacities: [N].
         features: [N, C], any C.
         camera: the view; skew in K is not modelled.
+        depth: False leaves the depth picture all zero and saves its time.
 
     Raises:
         InputError: an array has the wrong shape.
     """
-    return forward(means, covariances, opacities, features, camera)[0]
+    return forward(means, covariances, opacities, features, camera, depth=depth)[0]
 
 
 def forward(

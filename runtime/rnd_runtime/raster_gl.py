@@ -68,9 +68,19 @@ class GlRasterizer:
         self._max_attributes = PER_TARGET * info["GL_MAX_DRAW_BUFFERS"]
 
     def __call__(
-        self, means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+        self,
+        means: Floats32,
+        covariances: Floats32,
+        opacities: Floats32,
+        features: Floats32,
+        camera: Camera,
+        *,
+        depth: bool = True,
     ) -> Raster:
-        """Splat N Gaussians: means [N, 3] m, covariances [N, 6] m², opacities [N], features [N, C]."""
+        """Splat N Gaussians: means [N, 3] m, covariances [N, 6] m², opacities [N], features [N, C].
+
+        Up to three channels without ``depth`` need one target; each three more attributes need another.
+        """
         means, covariances, opacities, features = _checked(means, covariances, opacities, features)
         self._check_limits(len(means), camera)
         channels = features.shape[1]
@@ -79,8 +89,9 @@ class GlRasterizer:
         seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
         pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
-            for first in range(0, channels + 1, self._max_attributes):
-                attributes = min(channels + 1 - first, self._max_attributes)
+            total = channels + 1 if depth or channels == 0 else channels  # something must carry α
+            for first in range(0, total, self._max_attributes):
+                attributes = min(total - first, self._max_attributes)
                 started = perf_counter()
                 self._draw(splats, first, attributes, camera)
                 self.context.finish()  # else the read-back would be charged with the drawing
@@ -88,7 +99,7 @@ class GlRasterizer:
                 pictures += self._read(attributes, camera)
                 seconds["raster"] += drawn - started
                 seconds["read-back"] += perf_counter() - drawn
-        return _assembled(pictures, channels, seconds)
+        return _assembled(pictures, channels, depth, seconds)
 
     def close(self) -> None:
         """Release everything, the context too."""
@@ -276,7 +287,7 @@ def _fill_records(records, order, centers, shapes, values, first, attributes):  
             records[k, 8 + c] = values[i, first + c]
 
 
-def _assembled(pictures: list[Floats32], channels: int, seconds: dict[str, float]) -> Raster:
+def _assembled(pictures: list[Floats32], channels: int, depth: bool, seconds: dict[str, float]) -> Raster:
     """Targets [H, W, ≤ 4] → the raster; what needs no copy is a view."""
     if channels <= PER_TARGET:
         image = pictures[0][..., :channels]
@@ -284,8 +295,9 @@ def _assembled(pictures: list[Floats32], channels: int, seconds: dict[str, float
         image = np.empty((*pictures[0].shape[:2], channels), np.float32)
         for index, picture in enumerate(pictures):
             _copy_channels(image, PER_TARGET * index, picture)
-    depth = pictures[channels // PER_TARGET][..., channels % PER_TARGET]
-    return Raster(image, pictures[0][..., 3], depth, seconds)
+    alpha = pictures[0][..., 3]
+    far = pictures[channels // PER_TARGET][..., channels % PER_TARGET] if depth else np.zeros_like(alpha)
+    return Raster(image, alpha, far, seconds)
 
 
 @njit(error_model="numpy", nogil=True, cache=True)

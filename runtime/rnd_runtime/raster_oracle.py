@@ -121,7 +121,13 @@ def blend(transmittance: Floats, alpha: Floats) -> tuple[Floats, Floats]:
 
 
 def rasterize(
-    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, camera: Camera
+    means: Floats32,
+    covariances: Floats32,
+    opacities: Floats32,
+    features: Floats32,
+    camera: Camera,
+    *,
+    depth: bool = True,
 ) -> Raster:
     """Splat N Gaussians; shapes as :class:`rnd_runtime.gaussians.Rasterizer`, results in float64.
 
@@ -146,4 +152,5 @@ def rasterize(
         alpha = alphas(centres - pixels[i], shapes[i], peaks[i])
         weights, transmittance[box] = blend(transmittance[box], alpha)
         picture[box] += weights[..., None] * attributes[i]
-    return Raster(picture[..., :-2], picture[..., -2], picture[..., -1])  # type: ignore[arg-type]
+    far = picture[..., -1] if depth else np.zeros_like(picture[..., -1])
+    return Raster(picture[..., :-2], picture[..., -2], far)  # type: ignore[arg-type]

@@ -202,7 +202,7 @@ def _gl_rasterizers() -> list[tuple[str, Callable[..., Any]]]:
 
 def _through_gl(rasterizer: GlRasterizer, *arguments: Any) -> tuple[Tensor, Tensor, None]:
     means, covariances, opacities, features = (tensor.numpy() for tensor in arguments[:4])
-    raster = rasterizer(means, covariances, opacities, features, arguments[4])
+    raster = rasterizer(means, covariances, opacities, features, arguments[4], depth=False)
     # a copy where GL hands out views of one strided array: the time of a picture one can use
     image, alpha = np.ascontiguousarray(raster.image), np.ascontiguousarray(raster.alpha)
     return torch.from_numpy(image), torch.from_numpy(alpha), None

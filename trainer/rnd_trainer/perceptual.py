@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
@@ -102,8 +101,8 @@ class Backbone:
     blocks: tuple[tuple[Conv | Fire | Pool, ...], ...]
     smallest: tuple[int, ...]  # pixels along a side from which the first k blocks give one cell
 
-    def shapes(self, layers: int) -> Shapes:
-        """Names and shapes of the tensors of the first ``layers`` blocks."""
+    def shapes(self, layers: int | None = None) -> Shapes:
+        """Names and shapes of the tensors of all blocks, or of the first ``layers``."""
         steps = [step for block in self.blocks[:layers] for step in block]
         return {name: shape for step in steps for name, shape in step.shapes().items()}
 
@@ -158,7 +157,7 @@ BACKBONES = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Perceptual:
     """A distance between sRGB images; what it may be called is :attr:`backbone` and :attr:`is_lpips`."""
 
@@ -278,24 +277,22 @@ def load_perceptual(path: str | Path) -> Perceptual:
 def _read(path: Path) -> Tensors:
     suffix = path.suffix.lower()
     if suffix not in (".safetensors", ".pth"):
-        raise InputError("perceptual weights", expected=".safetensors or .pth", got=suffix or "no suffix", file=path)
+        raise InputError(
+            "perceptual weights", expected=".safetensors or .pth", got=suffix or "no suffix", file=path
+        )
     try:
         if suffix == ".safetensors":
             return load_file(path)
         # torchvision publishes its networks as nothing else; weights_only builds tensors and runs no code
         state = torch.load(path, map_location="cpu", weights_only=True)  # noqa: TID251
-    except (SafetensorError, OSError) as error:
-        raise _unreadable(path, error) from error
-    except Exception as error:  # the unpickler meets hostile bytes with whatever they make it stumble over
-        raise _unreadable(path, error) from error
+    except Exception as error:  # an unpickler answers broken bytes with whatever it stumbles over
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"not a whole {suffix} file of weights", got=reason, file=path) from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise InputError("perceptual weights", expected="a dictionary of tensors", got=type(state).__name__, file=path)
+        raise InputError(
+            "perceptual weights", expected="a dictionary of tensors", got=type(state).__name__, file=path
+        )
     return {str(name): value for name, value in state.items()}
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return InputError(f"not a whole {path.suffix} file of weights", got=reason, file=path)
 
 
 def _recognised(weights: Tensors, path: Path) -> tuple[Backbone, int]:
@@ -305,8 +302,8 @@ def _recognised(weights: Tensors, path: Path) -> tuple[Backbone, int]:
         for layers in range(1, len(network.blocks) + 1):
             if found == network.shapes(layers):
                 return network, layers
-    nearest = max(BACKBONES, key=lambda network: len(found.items() & network.shapes(99).items()))
-    expected = nearest.shapes(len(nearest.blocks))
+    nearest = max(BACKBONES, key=lambda network: len(found.items() & network.shapes().items()))
+    expected = nearest.shapes()
     wrong = next((n for n in [*found, *expected] if found.get(n) != expected.get(n)), "none")
     raise InputError(
         "perceptual weights",

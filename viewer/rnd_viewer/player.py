@@ -97,7 +97,12 @@ class Player:
             radiance = self.shader.shade(gaussians, camera.position)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
         raster = self.rasterizer(
-            gaussians.means, gaussians.covariances, gaussians.opacities, features.astype(np.float32), camera
+            gaussians.means,
+            gaussians.covariances,
+            gaussians.opacities,
+            features.astype(np.float32),
+            camera,
+            depth="depth" in self.aovs,
         )
         for stage, seconds in raster.seconds.items():
             self.times.add(stage, seconds)
