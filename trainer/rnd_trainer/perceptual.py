@@ -205,5 +205,4 @@ def _layer_distance(a: Tensor, b: Tensor, head: Tensor) -> Tensor:
 
 
 def _unit(features: Tensor) -> Tensor:
-    # vector_norm has gradient 0 at 0, where the square root of a sum has none
     return features / (torch.linalg.vector_norm(features, dim=0, keepdim=True) + EPSILON)
