@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _raster(options: Raster) -> None:
-    from .cli import need_extra
+    from .eval_cli import need_extra
 
     need_extra()
     from rich.console import Console

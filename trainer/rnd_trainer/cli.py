@@ -1,9 +1,8 @@
-"""rnd-train and rnd-eval."""
+"""rnd-train: the command around :mod:`rnd_trainer.train`."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import json
 import sys
 from dataclasses import dataclass
@@ -15,11 +14,9 @@ import tyro
 from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path, output_folder
 
+from .eval_cli import EvalOptions, evaluate_run, need_extra
+
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from rnd_runtime.capture_format import Split
-
     from .train import Training
 
 PREVIEWS = 3
@@ -52,41 +49,10 @@ class TrainOptions:
     """another motion file of the capture, such as motion_noisy.npz"""
 
 
-@dataclass(frozen=True)
-class EvalOptions:
-    """Score a trained avatar on the held-out splits of a capture."""
-
-    run: Annotated[Path, tyro.conf.Positional]
-    """folder of rnd-train, or an avatar.ckpt"""
-    capture: Annotated[Path, tyro.conf.Positional]
-    """folder with capture.json"""
-    json: Path | None = None
-    """write the rows here as JSON"""
-    pictures: Path | None = None
-    """folder for strips: truth, render, normals, albedo"""
-    shade: str = "table+sun"
-    """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
-
-
 def main() -> None:
     """Entry point of ``rnd-train``."""
     options = tyro.cli(TrainOptions, prog="rnd-train")
     sys.exit(run_command("rnd-train", lambda: _train(options)))
-
-
-def main_eval() -> None:
-    """Entry point of ``rnd-eval``."""
-    options = tyro.cli(EvalOptions, prog="rnd-eval")
-    sys.exit(run_command("rnd-eval", lambda: _evaluate(options)))
-
-
-def need_extra() -> None:
-    for package in ("torch", "safetensors", "scipy"):
-        if importlib.util.find_spec(package) is None:
-            raise InputError(
-                f"{package} is not installed",
-                hint='training needs the extra: pip install "rnd-avatar[train]"',
-            )
 
 
 def _train(options: TrainOptions) -> None:
@@ -183,65 +149,9 @@ def _score_after_training(folder: Path, options: TrainOptions) -> None:
 
     capture = load_capture(options.capture, motion_file=options.motion)
     if any(capture.split(split) for split in HELD_OUT):
-        _evaluate(EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval"))
-
-
-def _evaluate(options: EvalOptions) -> None:
-    need_extra()
-    from rich.console import Console
-    from rich.table import Table
-
-    from rnd_runtime.capture import load_capture
-    from rnd_runtime.images import write_image
-
-    from .checkpoint import load_checkpoint
-    from .evaluate import HELD_OUT, albedo_scale, evaluate
-    from .preview import strip
-
-    path = options.run / "avatar.ckpt" if options.run.is_dir() else options.run
-    checkpoint = load_checkpoint(path)
-    capture = load_capture(options.capture)
-    scale = albedo_scale(checkpoint, capture)
-    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
-    if scale is not None and capture.split("relight"):
-        jobs.append(("relight", scale))
-    if not jobs:
-        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=options.capture)
-
-    table = Table("split", "frames", "PSNR", "SSIM", "PSNR box", "SSIM box", "normals °", title=str(path))
-    rows = []
-    for split, factor in jobs:
-        name = split if factor is None else f"{split}, albedo scaled"
-
-        def keep(
-            frame: Any, rendered: Any, target: Any, folder: str = name.replace(", ", "_").replace(" ", "_")
-        ) -> None:
-            if options.pictures is not None:
-                file = options.pictures / folder / Path(frame.image).name
-                write_image(file, strip(rendered, target.numpy()))
-
-        score = evaluate(checkpoint, capture, split, mode=options.shade, albedo_scale=factor, on_frame=keep)
-        row = {**dataclasses.asdict(score), "split": name, "shade": options.shade} | _provenance(checkpoint)
-        rows.append(row)
-        table.add_row(
-            name, str(score.frames), f"{score.psnr:.2f}", f"{score.ssim:.4f}", f"{score.psnr_box:.2f}",
-            f"{score.ssim_box:.4f}", f"{score.normal_deg:.1f}",
-        )  # fmt: skip
-    Console().print(table)
-    if options.json is not None:
-        with atomic_path(options.json) as temporary:
-            temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
-
-
-def _provenance(checkpoint: Any) -> dict[str, Any]:
-    from rnd_runtime.doctor import machine
-
-    info, config = checkpoint.info, checkpoint.config
-    return {
-        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps, "seed": config.seed,
-        "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
-        "machine": machine(),
-    }  # fmt: skip
+        evaluate_run(
+            EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
+        )
 
 
 def _check(good: bool, what: str, expected: str, got: object) -> None:

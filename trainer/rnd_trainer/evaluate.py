@@ -19,6 +19,7 @@ from .checkpoint import Checkpoint
 from .data import pose_input
 from .judge import Rendered, render_runtime
 from .metrics import mask_box, normal_degrees, psnr, ssim
+from .perceptual import Perceptual
 
 HELD_OUT: tuple[Split, ...] = ("novel_view", "novel_pose", "relight")
 BOX_MARGIN = 8
@@ -29,7 +30,8 @@ BOX_MARGIN = 8
 class SplitScore:
     """Means over the frames of one split; ``*_box`` inside the mask's bounding box only.
 
-    The full frame is nine tenths black background, so its figures flatter everybody.
+    The full frame is nine tenths black background, so its figures flatter everybody. ``lpips`` is of the full
+    frame, None where no weights were given.
     """
 
     split: str
@@ -39,6 +41,7 @@ class SplitScore:
     psnr_box: float
     ssim_box: float
     normal_deg: float
+    lpips: float | None
 
 
 def evaluate(
@@ -48,12 +51,14 @@ def evaluate(
     *,
     mode: str = "table+sun",
     albedo_scale: Tensor | None = None,
+    perceptual: Perceptual | None = None,
     on_frame: Callable[[Frame, Rendered, Tensor], None] | None = None,
 ) -> SplitScore:
     """Score one split. Unknown lights come from the capture, the training light from the learned probe.
 
     Args:
         albedo_scale: [3] factor on the albedo, for relighting with the albedo–light ambiguity taken out.
+        perceptual: LPIPS of these weights is reported too.
         on_frame: called with each frame, its rendering and the true image [H, W, 3] (sRGB).
     """
     shaders: dict[str | None, Shader] = {}
@@ -83,18 +88,20 @@ def evaluate(
             if normal is None
             else normal_degrees(rendered.normals, torch.from_numpy(normal), inside)
         )
-        rows.append(
-            (
-                psnr(image, target),
-                ssim(image, target),
-                psnr(image[box], target[box]),
-                ssim(image[box], target[box]),
-                angle,
-            )
-        )
+        row = [
+            psnr(image, target),
+            ssim(image, target),
+            psnr(image[box], target[box]),
+            ssim(image[box], target[box]),
+        ]
+        distance = None if perceptual is None else float(perceptual(image, target))
+        rows.append((*row, angle, *([] if distance is None else [distance])))
         if on_frame is not None:
             on_frame(frame, rendered, target)
-    return SplitScore(split, len(rows), *(float(x) for x in np.mean(rows, axis=0)))
+    means = [float(x) for x in np.mean(rows, axis=0)]
+    lpips = means.pop() if perceptual is not None else None
+    image_psnr, image_ssim, box_psnr, box_ssim, angle = means
+    return SplitScore(split, len(rows), image_psnr, image_ssim, box_psnr, box_ssim, angle, lpips)
 
 
 def albedo_scale(checkpoint: Checkpoint, capture: Capture) -> Tensor | None:
