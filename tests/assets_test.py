@@ -1,4 +1,4 @@
-"""The embedded assets: a person, a walk, a sky and a capture that agree with one another and with DESIGN.md."""
+"""The embedded assets: a person, a walk, a sky and a capture that agree with one another."""
 
 from __future__ import annotations
 

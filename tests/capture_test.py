@@ -153,7 +153,7 @@ def test_another_motion_can_take_the_place(folder):
 
 
 def test_motion_columns_follow_the_body_without_names(folder):
-    """DESIGN.md section 8 has no joint names in motion.npz: its columns are the body's joints."""
+    """motion.npz has no joint names: its columns are the body's joints."""
     axis_angles = np.random.default_rng(1).normal(size=(FRAMES, 6))
     np.savez(folder / "motion.npz", poses=axis_angles, trans=np.zeros((FRAMES, 3)), mocap_framerate=30)
     motion = load_capture(folder).motion

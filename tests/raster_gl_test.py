@@ -19,7 +19,7 @@ from rnd_runtime.raster_gl import GlRasterizer
 
 BACKENDS = ("egl", "osmesa")
 AGREEMENT_DB = (
-    85.0  # DESIGN §7's figure for dense scenes; what is missing is blending that cannot stop at T < 1e-4
+    85.0  # the figure asked for on dense scenes; what is missing is blending that cannot stop at T < 1e-4
 )
 MAX_DIFFERENCE = 2 / 255  # FAILURES G10
 EXACT = 2e-5  # where no pixel saturates: Mesa's exp2 and float32 blending of ≤ 100 layers

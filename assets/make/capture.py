@@ -1,4 +1,4 @@
-"""``assets/capture``: the dressed figure, path-traced, in the capture format (DESIGN.md section 8)."""
+"""``assets/capture``: the dressed figure, path-traced, in the capture format."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from rnd_runtime.camera import Camera
 
 from .remesh import Floats, Ints
 
-mi.set_variant("scalar_rgb")  # needs no LLVM; DESIGN.md section 5
+mi.set_variant("scalar_rgb")  # needs no LLVM
 
 MAX_DEPTH = 4
 # Mitsuba's map has u = atan2(x, −z)/2π. A quarter turn about Y makes that our u = 0.5 + atan2(z, x)/2π.

@@ -36,7 +36,7 @@ def _export(options: Options) -> None:
     except ModuleNotFoundError as error:
         raise InputError(
             f"{error.name} is not installed",
-            hint='rnd-export needs the extra: pip install "rnd-avatar[export]"',
+            hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint

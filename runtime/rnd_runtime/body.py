@@ -70,7 +70,7 @@ class Body:
 
     @classmethod
     def load(cls, path: str | Path) -> Body:
-        """Read ``body.npz`` (DESIGN.md section 8)."""
+        """Read ``body.npz`` (arrays: :meth:`save`)."""
         with Npz(path, what="body") as archive:
             names = archive.strings("joint_names")
             joints = len(names)

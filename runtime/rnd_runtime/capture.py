@@ -1,4 +1,4 @@
-"""Captures: a directory of images, masks, normals, cameras, a body and its motion (DESIGN.md section 8)."""
+"""Captures: a directory of images, masks, normals, cameras, a body and its motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``capture.json`` as it is written down (DESIGN.md section 8), and its pictures' encodings."""
+"""``capture.json`` (schema ``rnd-capture/1``) field by field, and its pictures' encodings."""
 
 from __future__ import annotations
 

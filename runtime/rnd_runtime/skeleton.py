@@ -69,7 +69,7 @@ class Skeleton:
         return len(self.names)
 
     def joint_transforms(self, rotations: ArrayLike, translation: ArrayLike) -> Floats:
-        """World transforms ``G`` [..., J, 4, 4] of the posed joints (DESIGN.md section 8).
+        """World transforms ``G`` [..., J, 4, 4] of the posed joints.
 
         ``G_k = G_parent(k) · [R_k | rest_k − rest_parent]``; the root turns about its rest position and is
         then translated.

@@ -51,7 +51,7 @@ def need_extra() -> None:
         if importlib.util.find_spec(package) is None:
             raise InputError(
                 f"{package} is not installed",
-                hint='training needs the extra: pip install "rnd-avatar[train]"',
+                hint='needs the extra: pip install "rnd-avatar[train]", in a clone ".[train]"',
             )
 
 

@@ -56,7 +56,7 @@ def covariances(factors: Tensor) -> Tensor:
 def small_rotation(w: Tensor) -> Tensor:
     """Rotation matrices [N, 3, 3] of the quaternions normalize(1, w/2), w [N, 3]: axis-angle to second order.
 
-    Multiplies a rotation, so q and −q give the same result; the paper's sum r_c + Δr does not (DESIGN.md 4).
+    Multiplies a rotation, so q and −q give the same result; the paper's sum r_c + Δr does not.
     """
     q = torch.nn.functional.normalize(torch.cat([torch.ones_like(w[:, :1]), 0.5 * w], dim=-1), dim=-1)
     s, x, y, z = q.unbind(-1)

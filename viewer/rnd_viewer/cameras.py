@@ -127,7 +127,7 @@ def _fitting_distance(framing: Framing, view: View, azimuths: Floats) -> float:
 
 
 class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
-    """One camera as captures store it (DESIGN.md section 8)."""
+    """One camera as captures store it."""
 
     width: int
     height: int

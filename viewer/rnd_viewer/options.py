@@ -30,7 +30,7 @@ class PlayOptions:
     avatar: Annotated[tyro.conf.Positional[Path | None], _option("AVATAR.onnx")] = None
     """The avatar, a file that rnd-export wrote."""
     motion: Annotated[Path | None, _option("FILE")] = None
-    """Body poses over time: AMASS (.npz), SMPL or AIST++."""
+    """Body poses over time: an .npz of AMASS, SMPL or EasyMocap."""
     hdr: Annotated[Path | None, _option("FILE")] = None
     """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
     out: Annotated[Path | None, _option("FOLDER")] = None
@@ -41,7 +41,7 @@ class PlayOptions:
     fps: Annotated[float | None, _option("FLOAT")] = None
     """Frames per second. Default: the motion's."""
     frames: Annotated[str | None, _option("START:END")] = None
-    """Frames to render, START:END with END left out; same pixels as in the whole run. Default: all."""
+    """Frames to render, END excluded, either may be missing; same pixels as in the whole run. Default: all."""
     format: Annotated[str | None, _option("LIST")] = None
     """Some of png,exr,mp4. Default: png, and mp4 where PyAV is installed."""
 
@@ -65,7 +65,8 @@ class PlayOptions:
     background: str = "none"
     """none (transparent), hdr, #rrggbb (sRGB) or r,g,b (linear radiance)."""
     shade: str = "table+sun"
-    """Shading, from fast to exact: ao, table, table+sun, lights:K, brute."""
+    """Shading: ao (fastest), table, table+sun (the only one with hard sun shadows), lights:K of 1 to 8192
+    lights, brute (every texel of the map, shadows as soft as the avatar learned them)."""
 
     aov: Annotated[str, _option("LIST")] = ""
     """Also write some of albedo,normal,roughness,visibility,depth. Normals in the camera's OpenCV axes."""

@@ -1,7 +1,7 @@
 """mp4 files whose colours survive: BT.709 done by our own matrix, and said so in the file.
 
 A player that finds no tags guesses BT.601 for small pictures, and ffmpeg's converter assumes BT.601 unless
-told; either one alone costs 16 dB (DESIGN.md section 7). So the conversion is written out here and tested
+told; either one alone costs 16 dB. So the conversion is written out here and tested
 through a decoder.
 """
 
