@@ -14,13 +14,13 @@ from time import perf_counter
 
 import numpy as np
 from numba import get_num_threads
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ._raster_blend import blend, blend_backward
+from ._raster_input import checked, floats
 from ._raster_project import View, project, project_backward, view_of
 from ._raster_tiles import Splats, sort_into_tiles
 from .camera import Camera
-from .errors import InputError
 from .gaussians import Floats32, Raster
 
 
@@ -76,17 +76,7 @@ def forward(
 
     Without ``depth`` the depth picture is all zero and costs nothing.
     """
-    means, covariances = _floats(means), _floats(covariances)
-    opacities, features = _floats(opacities), _floats(features)
-    count = means.shape[0] if means.ndim else 0
-    for name, array, shape in (
-        ("means", means, (count, 3)),
-        ("covariances", covariances, (count, 6)),
-        ("opacities", opacities, (count,)),
-        ("features", features, (count, features.shape[-1] if features.ndim else 0)),
-    ):
-        if array.shape != shape:
-            raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
+    means, covariances, opacities, features = checked(means, covariances, opacities, features)
     started = perf_counter()
     view = view_of(camera)
     centers, shapes, boxes, attributes, depths, slot_starts = project(
@@ -115,21 +105,15 @@ def backward(
 
     Zero where α is clamped at 0.99 and for what was not drawn.
     """
-    wanted = _floats(grad_image)
+    wanted = floats(grad_image)
     if state.image.shape[2] > state.channels:
         height, width = state.coverage.shape
-        depth = np.zeros((height, width), np.float32) if grad_depth is None else _floats(grad_depth)
+        depth = np.zeros((height, width), np.float32) if grad_depth is None else floats(grad_depth)
         wanted = np.concatenate([wanted, depth[..., None]], axis=2)
     splats = state.splats
-    slots = blend_backward(
-        splats, state.image, state.coverage, wanted, _floats(grad_alpha), get_num_threads()
-    )
+    slots = blend_backward(splats, state.image, state.coverage, wanted, floats(grad_alpha), get_num_threads())
     arrays = state.means, state.covariances, state.opacities
     grads: tuple[Floats32, Floats32, Floats32, Floats32] = project_backward(
         *arrays, state.channels, state.view, splats.slot_starts, slots
     )
     return grads
-
-
-def _floats(array: ArrayLike) -> NDArray[np.float32]:
-    return np.require(array, np.float32, ["C", "A", "W"])

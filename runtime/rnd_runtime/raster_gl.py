@@ -18,8 +18,9 @@ from typing import NamedTuple
 import moderngl
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from ._raster_input import checked
 from ._raster_project import View, _project_range, view_of
 from ._raster_tiles import _front_to_back
 from .camera import Camera
@@ -81,7 +82,7 @@ class GlRasterizer:
 
         Up to three channels without ``depth`` need one target; each three more attributes need another.
         """
-        means, covariances, opacities, features = _checked(means, covariances, opacities, features)
+        means, covariances, opacities, features = checked(means, covariances, opacities, features)
         self._check_limits(len(means), camera)
         channels = features.shape[1]
         started = perf_counter()
@@ -223,20 +224,6 @@ class _Splats(NamedTuple):
     centers: NDArray[np.float64]
     shapes: Floats32
     attributes: Floats32  # [N, C + 1] features, depth
-
-
-def _checked(*arrays: ArrayLike) -> tuple[Floats32, ...]:
-    means, covariances, opacities, features = (np.ascontiguousarray(array, np.float32) for array in arrays)
-    count = len(means) if means.ndim else 0
-    for name, array, shape in (
-        ("means", means, (count, 3)),
-        ("covariances", covariances, (count, 6)),
-        ("opacities", opacities, (count,)),
-        ("features", features, (count, features.shape[-1] if features.ndim else 0)),
-    ):
-        if array.shape != shape:
-            raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
-    return means, covariances, opacities, features
 
 
 def _sorted_splats(

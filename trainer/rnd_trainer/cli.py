@@ -97,7 +97,7 @@ def _train(options: TrainOptions) -> None:
     if interrupted:
         print(f"rnd-train: stopped; continue with --resume --out {folder}", file=sys.stderr)  # noqa: T201
         raise KeyboardInterrupt
-    _score_after_training(folder, options)
+    _score_after_training(training, folder, options)
 
 
 def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
@@ -142,13 +142,10 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
         return bool(run(training, folder, on_step=on_step, on_preview=on_preview))
 
 
-def _score_after_training(folder: Path, options: TrainOptions) -> None:
-    from rnd_runtime.capture import load_capture
-
+def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
     from .evaluate import HELD_OUT
 
-    capture = load_capture(options.capture, motion_file=options.motion)
-    if any(capture.split(split) for split in HELD_OUT):
+    if any(training.capture.split(split) for split in HELD_OUT):
         evaluate_run(
             EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
         )

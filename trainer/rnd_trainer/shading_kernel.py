@@ -38,11 +38,15 @@ class FusedShade(torch.autograd.Function):
         power: Tensor,  # [K, 3]
     ) -> Tensor:
         tensors = (normals, view, albedo, roughness, visibility, directions, power)
-        ctx.arrays = tuple(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in tensors)
-        ctx.half = _half_vectors(ctx.arrays[1], ctx.arrays[5])
-        diffuse, glossy = _sum(*ctx.arrays[:5], ctx.arrays[5].T.copy(), ctx.arrays[6].T.copy(), ctx.half)
-        ctx.diffuse = diffuse
-        radiance = ctx.arrays[2] * diffuse * np.float32(1 / np.pi) + glossy
+        n, v, ctx.albedo, gamma, visible, towards, strength = (
+            np.ascontiguousarray(t.detach().numpy(), np.float32) for t in tensors
+        )
+        half_squared = np.maximum(
+            2 + 2 * (v @ towards.T), np.float32(1e-8)
+        )  # light and camera may be opposite
+        ctx.scene = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
+        ctx.diffuse, glossy = _sum(*ctx.scene)
+        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + glossy
         ctx.lit = radiance > 0
         return torch.from_numpy(np.maximum(radiance, 0))
 
@@ -50,19 +54,10 @@ class FusedShade(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         incoming = np.ascontiguousarray(grad.numpy() * ctx.lit)
-        albedo, directions, power = ctx.arrays[2], ctx.arrays[5], ctx.arrays[6]
-        grad_normals, grad_roughness, grad_power = _sum_backward(
-            *ctx.arrays[:5], directions.T.copy(), power.T.copy(), ctx.half, incoming
-        )
+        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.scene, ctx.albedo, incoming)
         grad_albedo = incoming * ctx.diffuse * np.float32(1 / np.pi)
-        assert grad_albedo.shape == albedo.shape
         results = (grad_normals, None, grad_albedo, grad_roughness, None, None, grad_power)
         return tuple(None if r is None else torch.from_numpy(r) for r in results)
-
-
-def _half_vectors(view: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """|l + v|² [n, K], never zero: light and camera may be opposite."""
-    return np.maximum(2 + 2 * (view @ directions.T), np.float32(1e-8))
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -107,8 +102,11 @@ def _alpha_squared(roughness):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _sum(normals, view, albedo, roughness, visibility, directions, power, half_squared):
-    """Σ_k v (n·l) power and Σ_k v (n·l) specular power, each [n, 3]; directions and power come as [3, K]."""
+def _sum(normals, view, roughness, visibility, directions, power, half_squared):
+    """Σ_k v (n·l) power and Σ_k v (n·l) specular power, each [n, 3].
+
+    directions and power come as [3, K]; half_squared [n, K] is |l + v|².
+    """
     count, texels = visibility.shape
     zero = np.float32(0)
     diffuse, glossy = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
@@ -133,7 +131,7 @@ def _sum(normals, view, albedo, roughness, visibility, directions, power, half_s
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _sum_backward(normals, view, albedo, roughness, visibility, directions, power, half_squared, grad):
+def _sum_backward(normals, view, roughness, visibility, directions, power, half_squared, albedo, grad):
     """Gradients by normals [n, 3], roughness [n] and power [K, 3], given that of the radiance."""
     count, texels = visibility.shape
     zero, over_pi = np.float32(0), np.float32(1 / np.pi)

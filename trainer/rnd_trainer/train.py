@@ -20,7 +20,7 @@ from torch import Tensor
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
-from rnd_runtime.light import downsize
+from rnd_runtime.light import texel_directions
 
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
@@ -218,9 +218,10 @@ class Training:
         names = {view.frame.light or "unknown" for view in self.views}
         if len(names) != 1:
             raise InputError("training light", expected="one light in the train split", got=sorted(names))
-        light = self.capture.load_light(names.pop())
-        upright = light.sample(self.probe.directions.numpy()) if light.yaw else None
-        return as_probe(downsize(light.radiance, *PROBE_SHAPE) if upright is None else upright)
+        light = self.capture.load_light(names.pop()).resized(
+            *PROBE_SHAPE
+        )  # before turning: a sun stays whole
+        return as_probe(light.sample(texel_directions(*PROBE_SHAPE)))
 
     # -- saving and resuming -------------------------------------------------------------------------------
 

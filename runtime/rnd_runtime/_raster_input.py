@@ -1,0 +1,33 @@
+"""What every compiled rasteriser asks of the arrays it is given."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .errors import InputError
+from .gaussians import Floats32
+
+
+def floats(array: ArrayLike) -> Floats32:
+    """``array`` as the kernels are compiled for: float32, contiguous, aligned, writable; copied only if needed."""
+    return np.require(array, np.float32, ["C", "A", "W"])
+
+
+def checked(
+    means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, features: ArrayLike
+) -> tuple[Floats32, Floats32, Floats32, Floats32]:
+    """The four arrays through :func:`floats`: [N, 3], [N, 6], [N] and [N, C], or an :class:`InputError`."""
+    arrays = floats(means), floats(covariances), floats(opacities), floats(features)
+    count = len(arrays[0]) if arrays[0].ndim else 0
+    channels = arrays[3].shape[-1] if arrays[3].ndim else 0
+    shapes = {
+        "means": (count, 3),
+        "covariances": (count, 6),
+        "opacities": (count,),
+        "features": (count, channels),
+    }
+    for array, (name, shape) in zip(arrays, shapes.items()):
+        if array.shape != shape:
+            raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
+    return arrays
