@@ -20,6 +20,9 @@ need_system_packages() {
     fi
 }
 
+# numba's cache knows a kernel by its own file: constants and helpers from other files would stay as they were
+export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/numba-$(cat runtime/rnd_runtime/*.py trainer/rnd_trainer/*.py | sha256sum | cut -c1-12)}
+
 # $1: extras of rnd-avatar to install, such as dev
 need_python_packages() {
     local python=${PYTHON:-python3}
@@ -49,4 +52,13 @@ install_cpu_torch() {
     else
         pip install --quiet "torch==2.13.0"
     fi
+}
+
+# viewer/web/dist, the page that needs no server
+need_web_page() {
+    command -v npm >/dev/null || need_system_packages npm
+    local stamp
+    stamp="viewer/web/node_modules/installed-$(sha256sum viewer/web/package-lock.json | cut -c1-16)"
+    [ -e "$stamp" ] || (cd viewer/web && npm ci --silent --no-audit --no-fund) && touch "$stamp"
+    (cd viewer/web && npm run --silent build)
 }

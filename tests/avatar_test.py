@@ -46,6 +46,9 @@ def test_threads_do_not_change_a_frame(tiny_avatar) -> None:
         ({"schema": "rnd-avatar/2"}, "schema: expected rnd-avatar/1, got rnd-avatar/2"),
         ({"surprise": 1}, "unknown field `surprise`"),
         ({"gaussians": "many"}, "Expected `int`"),
+        ({"variant": {"encoder": "sparse"}}, "Invalid enum value 'sparse'"),
+        ({"variant": {"precision": "int4"}}, "Invalid enum value 'int4'"),
+        ({"variant": {"shape": 1}}, "unknown field `shape`"),
         ({"gaussians": 801}, "graph outputs: expected"),
         ({"window_poses": 6}, "graph inputs: expected"),
         ({"trained_light": "AAAA"}, "trained_light: expected float32 of shape"),
@@ -79,7 +82,7 @@ def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:
     secret.write_bytes(b"\0" * 4 * 800)
 
     def point_outside(model) -> None:
-        tensor = next(t for t in model.graph.initializer if t.name == "static/opacities")
+        tensor = next(t for t in model.graph.initializer if t.name == "rest/opacities")
         tensor.ClearField("raw_data")
         tensor.data_location = onnx.TensorProto.EXTERNAL
         entry = tensor.external_data.add()

@@ -6,14 +6,26 @@ import dataclasses
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 import torch
 
 from rnd_export import export as exports
-from rnd_export.export import MAX_POSITION_ERROR_M, MAX_WEIGHT_ERROR, export, measure_drift, random_motion
-from rnd_runtime.avatar import Avatar
+from rnd_export.export import (
+    MAX_P99_M,
+    MAX_POSITION_ERROR_M,
+    MAX_WEIGHT_ERROR,
+    export,
+    measure_drift,
+    random_motion,
+)
+from rnd_export.variant import Variant, line_through
+from rnd_runtime.avatar import POSED_OUTPUTS, Avatar
 from rnd_runtime.errors import InputError
-from rnd_trainer.checkpoint import load_checkpoint, save_checkpoint
+from rnd_runtime.motion import Motion
+from rnd_runtime.skeleton import bone_transforms
+from rnd_runtime.window import motion_window
+from rnd_trainer.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
 from rnd_trainer.model import AvatarModel
 from rnd_trainer.template import sample_template
 from tiny import body, motion
@@ -43,7 +55,7 @@ def test_the_file_is_plain_onnx(tiny_avatar) -> None:
     assert b"/work" not in tiny_avatar.read_bytes() and b".py" not in tiny_avatar.read_bytes()
     names = [node.name for node in model.graph.node]
     assert len(set(names)) == len(names)
-    assert "skinning/temporal/cross_scores" in names
+    assert "skinning/cross_scores" in names
 
 
 def test_nothing_stays_when_the_drift_is_too_large(tiny_checkpoint, tmp_path, monkeypatch) -> None:
@@ -72,3 +84,133 @@ def test_bones_alone_move_an_avatar_rigidly(tiny_avatar) -> None:
     bones[:, :, 3] = [1.0, 2.0, 3.0]
     moved = avatar.run((window, np.zeros((23, 3)), bones), ["means"])[0]
     assert np.abs(moved - still - [1, 2, 3]).max() < 1e-5
+
+
+@pytest.mark.parametrize("precision", ["f16", "int8"])
+def test_fewer_bits_make_a_smaller_file_that_drifts_little(
+    tiny_checkpoint, tiny_avatar, tmp_path, precision
+) -> None:
+    out = tmp_path / "small.onnx"
+    drift = export(tiny_checkpoint, out, motion(body()), Variant(precision=precision))
+    assert drift.position_m > MAX_POSITION_ERROR_M / 10 and drift.position_p99_m < MAX_P99_M[precision] / 2
+    assert out.stat().st_size < 0.8 * tiny_avatar.stat().st_size
+    assert Avatar.load(out).metadata.variant.precision == precision
+    first = out.read_bytes()
+    export(tiny_checkpoint, out, motion(body()), Variant(precision=precision))
+    assert out.read_bytes() == first
+
+
+def test_precision_is_refused_where_it_costs_too_much(tiny_checkpoint, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(MAX_P99_M, "int8", 1e-6)
+    with pytest.raises(InputError, match=r"positions \(99 %\) of onnxruntime and torch differ"):
+        export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(precision="int8"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
+    """With as many nodes as the checkpoint nothing changes; with fewer, the nodes themselves stay right."""
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    whole, half = tmp_path / "whole.onnx", tmp_path / "half.onnx"
+    drift = export(tiny_checkpoint, whole, motion(body()), Variant("coarse", nodes=200))
+    assert drift.position_m < MAX_POSITION_ERROR_M / 10
+    export(tiny_checkpoint, half, motion(body()), Variant("coarse"))
+    variant = Avatar.load(half).metadata.variant
+    assert (variant.encoder, variant.nodes) == ("coarse", 50)
+    moved = _weights(half, motion(body()), checkpoint)[:50]
+    truth = _weights(whole, motion(body()), checkpoint)
+    near, far = np.abs(moved - truth[:50]), np.abs(truth[:50] - truth[50:100])
+    assert np.median(near) < 0.2 * np.median(far)
+
+
+def _weights(path, moves: Motion, checkpoint) -> np.ndarray:
+    avatar = Avatar.load(path)
+    pose = exports.pose_input(moves, checkpoint.skeleton, 0.1, checkpoint.config.model)
+    inputs = (pose.window.numpy(), pose.velocity.numpy(), pose.bones.numpy())
+    return avatar.run(inputs, ["skinning_weights"])[0]
+
+
+def test_static_is_the_template(tiny_checkpoint, tmp_path) -> None:
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant("static"))
+    template = checkpoint.model.log_weights.softmax(-1).numpy()
+    weights = _weights(tmp_path / "a.onnx", motion(body()), checkpoint)
+    assert np.abs(weights - template).max() < MAX_WEIGHT_ERROR / 10
+    names = {node.name for node in onnx.load(tmp_path / "a.onnx").graph.node}
+    assert not any("temporal" in name for name in names)
+
+
+def test_a_shorter_window_sees_a_steady_motion_alike(tiny_checkpoint, tmp_path) -> None:
+    """Poses on a line in 6D are what the interpolation assumes: a still figure is on one."""
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    still = dataclasses.replace(motion(body()), rotations=motion(body()).rotations[[3] * 6])
+    drift = export(tiny_checkpoint, tmp_path / "a.onnx", still, Variant(window_poses=2))
+    assert drift.position_m < MAX_POSITION_ERROR_M / 10
+    assert Avatar.load(tmp_path / "a.onnx").window_poses == 2
+    moving = export(tiny_checkpoint, tmp_path / "a.onnx", random_motion(checkpoint.skeleton, frames=4, seed=0),
+                    Variant(window_poses=2))  # fmt: skip
+    assert moving.position_m > drift.position_m
+    assert np.allclose(line_through(5, 3), [[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]])
+
+
+def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar, tmp_path) -> None:
+    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(visibility_degree=1))
+    less, whole = (
+        Avatar.load(p).pose(motion(body()), 0.1).visibility for p in (tmp_path / "a.onnx", tiny_avatar)
+    )
+    assert np.abs(less[:, :4] - whole[:, :4]).max() < 1e-5
+    assert (less[:, 4:] == 0).all() and np.abs(whole[:, 4:]).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("variant", "line"),
+    [
+        (Variant("coarse", nodes=201), "--nodes: expected 4 to 200, got 201"),
+        (Variant(nodes=100), "--nodes: expected --encoder coarse, got --encoder full"),
+        (Variant(window_poses=6), "--window-poses: expected 2 to 5, got 6"),
+        (Variant(visibility_degree=4), "--visibility-degree: expected 0 to 3, got 4"),
+    ],
+)
+def test_what_no_file_can_be_is_refused(tiny_checkpoint, tmp_path, variant, line) -> None:
+    with pytest.raises(InputError, match=line):
+        export(tiny_checkpoint, tmp_path / "a.onnx", variant=variant)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_constants_are_unpacked_when_the_file_is_loaded_not_at_every_frame(tiny_checkpoint, tmp_path) -> None:
+    """onnxruntime's own optimised graph: nothing is left of what depends on no input."""
+    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(precision="f16"))
+    options = ort.SessionOptions()
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
+    ort.InferenceSession(tmp_path / "a.onnx", options, providers=["CPUExecutionProvider"])
+    kinds = {node.op_type for node in onnx.load(tmp_path / "optimised.onnx").graph.node}
+    assert not kinds & {"Cast", "ScatterElements", "CumSum", "ConstantOfShape", "Sin", "Cos"}
+
+
+@pytest.mark.parametrize(
+    "variant", [Variant(), Variant("static", "int8", visibility_degree=2), Variant("coarse", "f16")]
+)
+def test_the_compiled_posing_says_what_the_graph_says(tiny_checkpoint, tmp_path, variant) -> None:
+    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), variant)
+    avatar, moves, time = Avatar.load(tmp_path / "a.onnx"), motion(body()), 0.1
+    assert {"node_offsets", "rest_limbs", "neighbours"} <= {
+        o.name for o in onnx.load(tmp_path / "a.onnx").graph.output
+    }
+    window, velocity = motion_window(moves, time, poses=avatar.window_poses, seconds=avatar.window_seconds)
+    now = moves.at(np.array([time]))
+    bones = bone_transforms(avatar.skeleton, now.rotations[0], now.translations[0])
+    posed = avatar.pose(moves, time)
+    for name, value in zip(POSED_OUTPUTS, avatar.run((window, velocity, bones), POSED_OUTPUTS)):
+        ours = getattr(posed, name)
+        assert np.abs(ours - value).max() < 1e-5 * max(1.0, np.abs(value).max()), name
+
+
+def test_ablations_are_not_exported(tiny_checkpoint, tmp_path) -> None:
+    tensors, header = read_tensors(tiny_checkpoint, SCHEMA)
+    header["config"]["model"]["visibility"] = "paper"
+    write_tensors(tmp_path / "paper.ckpt", tensors, header)
+    with pytest.raises(
+        InputError, match="an ablation, which is not exported: visibility: expected pose, got paper"
+    ):
+        export(tmp_path / "paper.ckpt", tmp_path / "paper.onnx")
+    assert not (tmp_path / "paper.onnx").exists()

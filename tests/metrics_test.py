@@ -10,7 +10,15 @@ import skimage.metrics
 import torch
 
 from rnd_runtime import images
-from rnd_trainer.losses import grey_prior, image_loss, linear_to_srgb, skinning_divergence
+from rnd_trainer.light import LightProbe, natural_sky
+from rnd_trainer.losses import (
+    grey_prior,
+    image_loss,
+    linear_to_srgb,
+    multiscale_dssim,
+    skinning_divergence,
+    sky_prior,
+)
 from rnd_trainer.metrics import mask_box, normal_degrees, psnr, ssim, ssim_map
 
 SSIM_AGREEMENT = 1e-6  # float64 on both sides; the border is cut on both sides
@@ -93,3 +101,29 @@ def test_grey_prior_sees_colour_not_brightness() -> None:
     red = torch.tensor([3.0, 0.0, 0.0]).expand(4, 8, 3)
     assert float(grey_prior(red, torch.ones(4, 8))) == pytest.approx(4 / 3)
     assert float(grey_prior(7 * red, torch.ones(4, 8))) == pytest.approx(4 / 3)
+
+
+def test_grey_prior_lets_a_low_sun_be_orange_and_the_sky_blue() -> None:
+    sky = torch.tensor([0.6, 0.8, 1.0]).repeat(4, 8, 1)
+    sky[0, 0] = torch.tensor([1 + 31 * 0.4, 1 + 31 * 0.2, 1.0])
+    assert float(grey_prior(sky, torch.ones(4, 8))) == pytest.approx(0, abs=1e-6)
+
+
+def test_sky_prior_is_zero_for_a_natural_sky_and_a_sun_costs_little() -> None:
+    probe = LightProbe()
+    sky = natural_sky(probe.directions[..., 1])[..., None].expand(-1, -1, 3)
+    maps = probe.directions, probe.solid_angles
+    assert float(sky_prior(3 * sky, *maps)) == pytest.approx(0, abs=1e-6)
+    assert float(sky_prior(sky.flip(0), *maps)) > 0.05
+    sunny = sky.clone()
+    sunny[10, 20] *= 1e4
+    share = float(probe.solid_angles[10, 20] / probe.solid_angles.sum())
+    assert 0 < float(sky_prior(sunny, *maps)) < share
+
+
+def test_multiscale_dssim_averages_the_scales_that_fit() -> None:
+    image, noisy = _pair()  # 40 × 50: halves to 20 × 25, whose half is smaller than the window
+    small = [x.unflatten(0, (20, 2)).unflatten(2, (25, 2)).mean((1, 3)) for x in (image, noisy)]
+    expected = [1 - ssim(image, noisy), 1 - ssim(*small)]
+    assert float(multiscale_dssim(image, noisy, 1)) == pytest.approx(expected[0])
+    assert float(multiscale_dssim(image, noisy, 5)) == pytest.approx(np.mean(expected))

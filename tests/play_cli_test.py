@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +49,9 @@ def _arguments(files: dict[str, Path], folder: Path, **changes: object) -> list[
 
 
 def _tree(folder: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    """What is there, without the mark that says whose folder it is."""
+    files = (file for file in folder.rglob("*") if file.is_file() and not file.name.startswith(".run-"))
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
 def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
@@ -95,12 +99,57 @@ def test_a_part_of_a_run_has_the_pixels_of_the_whole(files, tmp_path):
     assert part["frames/000003.png"] != part["frames/000004.png"]
 
 
+def test_one_thread_and_three_leave_the_same_files(files, tmp_path):
+    trees = []
+    for flag in ("--pipeline", "--no-pipeline"):
+        folder = tmp_path / flag.strip("-")
+        assert main([*_arguments(files, folder, format="png,exr,mp4", aov="normal"), flag]) == 0
+        trees.append(_tree(folder))
+        del trees[-1]["play.json"]  # has the flag and the times
+    assert trees[0] == trees[1] and len(trees[0]) == 3 * FRAMES + 1
+
+
+def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
+    """Real processes, at the same time, over the frames of another, longer run."""
+    stale = _arguments(files, tmp_path / "out", fps="60", background="#ff0000")
+    assert main(stale) == 0 and (tmp_path / "out/frames/000010.png").exists()
+    (tmp_path / "out/frames/mine.png").write_bytes(b"a user's own")
+    assert main(_arguments(files, tmp_path / "whole")) == 0
+    code = "import sys; sys.path.insert(0, 'tests'); import play_fakes, rnd_viewer.play, rnd_viewer.cli\n"
+    code += "rnd_viewer.play.Avatar.load = lambda path, threads=None: play_fakes.FakeAvatar()\n"
+    code += "sys.exit(rnd_viewer.cli.main(sys.argv[1:]))"
+    parts = [_arguments(files, tmp_path / "out", frames=part) for part in (":2", "2:")]
+    root = Path(__file__).parent.parent
+    processes = [subprocess.Popen([sys.executable, "-c", code, *part], cwd=root) for part in parts]
+    assert [process.wait(120) for process in processes] == [0, 0]
+    whole, parts = _tree(tmp_path / "whole"), _tree(tmp_path / "out")
+    names = {f"frames/{k:06d}.png" for k in range(FRAMES)}
+    assert {name for name in parts if name.startswith("frames/")} == names | {"frames/mine.png"}
+    assert all(parts[name] == whole[name] for name in names)
+    assert {"play_000000-000002.json", "play_000002-000006.json"} <= parts.keys()
+
+
+def test_a_floor_that_no_machine_holds_lowers_the_quality_and_drops_no_frame(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", fps_floor=1000)) == 0
+    assert len([name for name in _tree(tmp_path / "out") if name.startswith("frames/")]) == FRAMES
+    assert "2 of 6 frames at less than full quality, for 1000 frames/s" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out/play.json").read_text())["notes"][0].startswith("2 of 6 frames")
+
+
+def test_the_same_run_again_takes_nothing_away(files, tmp_path):
+    assert main(_arguments(files, tmp_path / "out", frames=":2")) == 0
+    assert main(_arguments(files, tmp_path / "out", frames="4:")) == 0
+    assert {f"frames/{k:06d}.png" for k in (0, 1, 4, 5)} <= _tree(tmp_path / "out").keys()
+    assert main(_arguments(files, tmp_path / "out", frames="2:3", exposure=1)) == 0
+    assert {name for name in _tree(tmp_path / "out") if name.startswith("frames/")} == {"frames/000002.png"}
+
+
 def test_without_hdr_the_light_of_the_avatar_shines(files, tmp_path):
     for name, changes in (("a", {}), ("b", {"exposure": "-1"})):
         assert main(_arguments(files, tmp_path / name, hdr=None, frames=":1", **changes)) == 0
     bright, dark = (read_image(tmp_path / name / "frames/000000.png") for name in ("a", "b"))
     assert 0 < dark[..., :3].max() < bright[..., :3].max()
-    assert json.loads((tmp_path / "b/play.json").read_text())["light"]["maximum"] == 0.25
+    assert json.loads((tmp_path / "b/play_000000-000001.json").read_text())["light"]["maximum"] == 0.25
 
 
 def test_light_options_reach_the_light(files, tmp_path):
@@ -113,7 +162,7 @@ def test_light_options_reach_the_light(files, tmp_path):
         options = {"hdr": tmp_path / "half.exr", "frames": ":1", "background": "0,0,0", name: value}
         assert main(_arguments(files, folder, **options)) == 0
         pictures[folder.name] = read_image(folder / "frames/000000.png").astype(int).sum(axis=2)
-        maxima[folder.name] = json.loads((folder / "play.json").read_text())["light"]["maximum"]
+        maxima[folder.name] = json.loads((folder / "play_000000-000001.json").read_text())["light"]["maximum"]
     assert maxima == {"exposure0": 1, "exposure1": 2, "hdr_yaw180": 1, "hdr_upz": 1}
     assert (pictures["exposure1"] >= pictures["exposure0"]).all()
     columns = {
@@ -200,14 +249,14 @@ def test_avatar_out_of_view_is_an_error_that_says_so(files, tmp_path, capsys):
 def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
     rendered = []
 
-    def render(self, motion, time_s, camera):
-        rendered.append(time_s)
+    def draw(self, encoded, camera, quality):
+        rendered.append(camera)
         if len(rendered) == 3:
             raise KeyboardInterrupt
-        return original(self, motion, time_s, camera)
+        return original(self, encoded, camera, quality)
 
-    original = Player.render
-    monkeypatch.setattr(Player, "render", render)
+    original = Player.draw
+    monkeypatch.setattr(Player, "draw", draw)
     assert main(_arguments(files, tmp_path / "out", format="png,exr,mp4")) == 130
     assert "interrupted" in capsys.readouterr().err
     left = _tree(tmp_path / "out")

@@ -45,6 +45,12 @@ class FakeAvatar:
     trained_light: np.ndarray = field(default_factory=lambda: np.full((32, 64, 3), 0.5, np.float32))
     spacing: float = 0.02
 
+    def encode(self, motion: Motion, time: float) -> tuple[Motion, float]:
+        return motion, time
+
+    def posed(self, encoded: tuple[Motion, float]) -> Gaussians:
+        return self.pose(*encoded)
+
     def pose(self, motion: Motion, time: float) -> Gaussians:
         now = motion.at([time])
         joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]

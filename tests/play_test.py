@@ -33,7 +33,7 @@ class FlatShader:
     def __init__(self, radiance: float) -> None:
         self.radiance = radiance
 
-    def shade(self, gaussians: Gaussians, camera_position: np.ndarray) -> np.ndarray:
+    def shade(self, gaussians: Gaussians, camera_position: np.ndarray, seen=None) -> np.ndarray:
         return np.full((len(gaussians.means), 3), self.radiance, np.float32)
 
 

@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from rnd_trainer.posing import pose_gaussians
+from rnd_trainer.twist import TwistFrames
 
 RELATIVE = 2e-5  # float32 against float64: products of five 3×3 matrices
-WANTED = (0, 2, 3, 5, 6, 7)  # arguments that have a gradient
+WANTED = (0, 1, 2, 3, 5, 6, 7)  # arguments that have a gradient
+LIMBS = slice(8, 11)  # axes, levers and shares
 
 
 def _scene(count: int, joints: int) -> list[torch.Tensor]:
@@ -29,7 +31,14 @@ def _scene(count: int, joints: int) -> list[torch.Tensor]:
         normal(count, 3),
         0.01 * (1 + normal(count, 3).abs()),
         torch.nn.functional.normalize(normal(count, 3), dim=-1),
+        torch.nn.functional.normalize(normal(count, 3), dim=-1),
+        0.1 * normal(count, 3),
+        torch.rand(count, dtype=torch.float64, generator=generator),
     ]
+
+
+def _pose(arguments: list[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    return pose_gaussians(*arguments[: LIMBS.start], TwistFrames(*arguments[LIMBS]))
 
 
 def _relative(ours: torch.Tensor, theirs: torch.Tensor) -> float:
@@ -41,7 +50,7 @@ def test_compiled_posing_equals_the_float64_formulas(count: int, joints: int) ->
     scene = _scene(count, joints)
     slow = [t.clone().requires_grad_(i in WANTED) for i, t in enumerate(scene)]
     fast = [t.float().requires_grad_(i in WANTED) for i, t in enumerate(scene)]
-    expected, ours = pose_gaussians(*slow), pose_gaussians(*fast)
+    expected, ours = _pose(slow), _pose(fast)
     generator = torch.Generator().manual_seed(1)
     incoming = [torch.randn(t.shape, dtype=torch.float64, generator=generator) for t in expected]
     incoming[1] *= 1e4  # covariances are in m², a thousandth of the rest
@@ -60,7 +69,7 @@ def test_a_collapsed_blend_gives_finite_gradients() -> None:
     scene[1] = torch.zeros(2, 3, 4)
     scene[1][0, :, :3], scene[1][1, :, :3] = torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     leaves = [t.requires_grad_(i in WANTED) for i, t in enumerate(scene)]
-    means, covariances, normals = pose_gaussians(*leaves)
+    means, covariances, normals = _pose(leaves)
     (means.sum() + covariances.sum()).backward()
     assert all(t.isfinite().all() for t in (means, covariances, normals))
     assert all(leaves[i].grad.isfinite().all() for i in WANTED if leaves[i].grad is not None)
@@ -69,6 +78,6 @@ def test_a_collapsed_blend_gives_finite_gradients() -> None:
 def test_a_nan_stays_with_its_gaussian() -> None:
     scene = [t.float() for t in _scene(4, 3)]
     scene[2][1, 0] = math.nan
-    means, covariances, _ = pose_gaussians(*scene)
+    means, covariances, _ = _pose(scene)
     assert means[1].isnan().any() and covariances.isfinite().all()
     assert means[[0, 2, 3]].isfinite().all()

@@ -47,6 +47,8 @@ def test_gl_is_refused_where_no_context_can_be_made(monkeypatch):
 def test_gl_is_taken_when_asked_for_and_named(backend):
     with make_rasterizer("gl", gl_backend=backend) as rasterizer:
         assert rasterizer.name.startswith(f"gl ({backend}, ")
+    with make_rasterizer(f"gl-{backend}") as rasterizer:
+        assert rasterizer.name.startswith(f"gl ({backend}, ")
 
 
 def test_all_draw_the_same():
@@ -61,5 +63,5 @@ def test_all_draw_the_same():
 
 
 def test_an_unknown_kind_is_refused():
-    with pytest.raises(InputError, match=r"expected auto \| gl \| cpu, got 'optix'"):
+    with pytest.raises(InputError, match=r"expected auto \| gl \| gl-egl \| gl-osmesa \| cpu, got 'optix'"):
         make_rasterizer("optix")

@@ -1,3 +1,4 @@
+import numba
 import numpy as np
 import pytest
 
@@ -158,3 +159,22 @@ def test_wrong_shapes_are_refused():
         directional_visibility(np.zeros((4, 3)), np.zeros((4, 3)), [0, 1, 0], radii=0.1)
     with pytest.raises(InputError, match="resolution"):
         directional_visibility(np.zeros((4, 3)), np.zeros((4, 3)), [[0, 1, 0]], radii=0.1, resolution=4)
+
+
+def test_others_than_receivers_cast_and_stay_dark():
+    points, normals = capsule_person()
+    every = directional_visibility(points, normals, DIRECTIONS, radii=SPACING)
+    receivers = np.arange(len(points)) % 3 == 0
+    some = directional_visibility(points, normals, DIRECTIONS, radii=SPACING, receivers=receivers)
+    np.testing.assert_array_equal(some, np.where(receivers[:, None], every, 0))
+
+
+def test_threads_change_no_bit():
+    points, normals = capsule_person()
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        alone = directional_visibility(points, normals, DIRECTIONS, radii=SPACING)
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(directional_visibility(points, normals, DIRECTIONS, radii=SPACING), alone)

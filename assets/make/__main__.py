@@ -6,10 +6,11 @@ import sys
 from pathlib import Path
 
 from rnd_runtime.body import Body
+from rnd_runtime.motion import save_motion
+from rnd_trainer.stage.dances import walk
+from rnd_trainer.stage.template import template_body
 
 from . import sky
-from .body import make_body
-from .motion import make_walk
 
 ASSETS = Path(__file__).parents[1]
 STEPS = ("body", "walk", "sky", "capture", "contact")
@@ -22,10 +23,10 @@ def main(steps: list[str]) -> None:
         raise SystemExit(f"assets.make: expected {', '.join(STEPS)}, got {', '.join(sorted(unknown))}")
     steps = steps or list(STEPS)
     if "body" in steps:
-        make_body(ASSETS / "body.npz")
+        template_body().save(ASSETS / "body.npz")
     body = Body.load(ASSETS / "body.npz")
     if "walk" in steps:
-        make_walk(ASSETS / "walk.npz", body.skeleton)
+        save_motion(ASSETS / "walk.npz", walk(body.skeleton))
     if "sky" in steps:
         sky.make_light(ASSETS / "sky.exr", sky.noon())
     if {"capture", "contact"} & set(steps):

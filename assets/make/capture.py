@@ -11,11 +11,11 @@ from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, CaptureLight, Frame, Split, load_capture, save_capture
 from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
+from rnd_trainer.stage.dances import FPS, TRAIN_SECONDS, dance
+from rnd_trainer.stage.remesh import Floats
 
 from . import sky, stage
 from .clothes import Wardrobe, dress
-from .motion import FPS, TRAIN_SECONDS, dance
-from .remesh import Floats
 from .texture import paint
 
 SIZE = 256

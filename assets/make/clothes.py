@@ -10,16 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from rnd_runtime.body import Body
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import matrix_to_axis_angle
 from rnd_runtime.skeleton import SMPL_NAMES, bone_transforms
-
-from .figure import person
-from .remesh import Floats, Ints, adjacency, vertex_normals
-from .sdf import project, smooth_min, surface
+from rnd_trainer.stage.dressing import transferred_weights
+from rnd_trainer.stage.person import person
+from rnd_trainer.stage.remesh import Floats, Ints, vertex_normals
+from rnd_trainer.stage.solids import project, smooth_min, surface
 
 SKIN, SHIRT, TROUSERS, SHOES, HAIR = range(5)
 STEP = 0.005  # m between the dressed mesh's vertices: finer than a pixel of the capture (9 mm)
@@ -93,7 +92,7 @@ def dress(body: Body) -> Dressed:
     vertices, faces = surface(whole, (-0.93, -0.04, -0.18), (0.93, 1.80, 0.25), STEP)
     vertices = project(whole, vertices, 1)
     material = np.argmin(layers(vertices), axis=1)
-    weights = _transfer(body, vertices, faces)
+    weights = transferred_weights(body, vertices, faces)
     x, y = np.abs(vertices[:, 0]), vertices[:, 1]
     hem = ramp(y, 1.10, 0.90) * (x < 0.3)
     looseness = np.where(material == SHIRT, np.maximum(0.15 + 0.85 * hem, 0.6 * ramp(x, 0.30, 0.60)), 0.0)
@@ -194,20 +193,3 @@ def _hair(points: Floats) -> Floats:
     )
     line = line + 0.006 * np.sin(120 * x + 2.0) * (z > 0.03)  # an uneven fringe
     return -smooth_min(-cap, -0.8 * (line - y), 0.010)
-
-
-def _transfer(body: Body, vertices: Floats, faces: Ints) -> Floats:
-    """Skinning weights [V, 24] from the nearest template vertices of the same side, smoothed over the cloth."""
-    weights = np.zeros((len(vertices), len(body.skeleton)))
-    for sign in (-1, 1):
-        here = sign * vertices[:, 0] >= 0
-        source = np.flatnonzero(sign * body.vertices[:, 0] >= -0.004)
-        gap, index = cKDTree(body.vertices[source]).query(vertices[here], k=8)
-        share = 1.0 / (gap + 0.004) ** 2
-        share /= share.sum(axis=1, keepdims=True)
-        weights[here] = np.einsum("vk,vkj->vj", share, body.skinning_weights[source[index]])
-    neighbours = adjacency(faces, len(vertices))
-    degree = neighbours.sum(axis=1)[:, None]
-    for _ in range(12):
-        weights = 0.5 * weights + 0.5 * (neighbours @ weights) / degree
-    return weights / weights.sum(axis=1, keepdims=True)

@@ -8,8 +8,7 @@ import numpy as np
 
 from rnd_runtime.images import write_image
 from rnd_runtime.light import texel_directions
-
-from .remesh import Floats
+from rnd_trainer.stage.remesh import Floats
 
 HEIGHT, WIDTH = 128, 256
 SUBSAMPLES = 8  # per texel and axis, so that the sun's disc has the right area

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rnd_trainer.stage.remesh import Floats
+
 from .clothes import HAIR, SHIRT, SHOES, SKIN, TROUSERS, Dressed, neck_opening, ramp
-from .remesh import Floats
 
 TEAL = np.array([0.035, 0.16, 0.20])
 CREAM = np.array([0.70, 0.64, 0.50])

@@ -1,4 +1,9 @@
-"""Everything of a model that depends on the Gaussians' places alone, computed once."""
+"""Everything of a model that does not depend on the pose, folded as far as it makes the file smaller.
+
+What the networks make of a node's place alone is *not* stored: it follows from the node's coordinates and a few
+small matrices, and onnxruntime computes it once, when the file is loaded (constant folding). Stored, it would be
+more than half of the file.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rnd_trainer.encoders import JointAttention, PoseConditioned
+from rnd_trainer.encoders import JointAttention
 from rnd_trainer.model import AvatarModel
 from rnd_trainer.skinning import small_rotation
 
@@ -19,96 +24,120 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class BakedAttention:
-    """A :class:`JointAttention` whose query [M, width] is a constant, scaled by 1/√(width per head).
+    """A :class:`JointAttention` without its query side.
 
-    ``out`` [O, width] takes the output projection and the layer after it in one.
+    ``query`` [width, width] and ``query_bias`` [width] are scaled by 1/√(width per head); ``out`` [O, width] takes
+    the output projection and the layer after it in one; the rest is the module's.
     """
 
     query: Floats
+    query_bias: Floats
     out: Floats
+    module: dict[str, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class BakedSkinning:
+    """D_W: ``merge`` [width, width] and ``merge_bias`` take f_x to its share of the first layer after attention."""
+
+    temporal: BakedAttention
+    spatial: BakedAttention
+    merge: Floats
+    merge_bias: Floats
     module: dict[str, Floats]
     heads: int
 
 
 @dataclass(frozen=True, eq=False)
-class BakedMlp:
-    """A :class:`PoseConditioned` with the position's part of its first layer as a constant [M, width]."""
-
-    first: Floats
-    module: dict[str, Floats]
-
-
-@dataclass(frozen=True, eq=False)
 class BakedAvatar:
-    """The constants of an avatar: per node [M, …], per Gaussian [N, …]; small weights stay in the modules."""
+    """The constants of an avatar. N Gaussians, M nodes, J joints.
 
-    temporal: BakedAttention
-    spatial: BakedAttention
-    merge_first: Floats
-    skinning: dict[str, Floats]
-    offsets: BakedMlp
-    visibility: BakedMlp
-    node_weights: Floats
-    node_normals: Floats
-    neighbours: NDArray[np.int32]
+    ``codes`` [M, 3] m and ``node_rows`` [M] (the Gaussian that stands at a node) are in the order of the nodes,
+    ``all_codes`` [N, 3] m belong to the Gaussians;
+    ``factors`` [N, 3, 3] m is R S in the rest pose; ``offsets`` and ``visibility`` are a
+    :class:`PoseConditioned` each, ``skinning`` None where the template's weights are used as they are. Skinning is
+    dynamic at the first ``dynamic_nodes`` nodes, the template's at the others.
+    """
+
+    codes: Floats
+    all_codes: Floats
+    frequencies: int
+    node_rows: NDArray[np.int64]
+    dynamic_nodes: int
+    skinning: BakedSkinning | None
+    offsets: dict[str, Floats]
+    visibility: dict[str, Floats]
+    neighbours: NDArray[np.int64]
     neighbour_weights: Floats
-    log_weights: Floats
+    weights: Floats
     points: Floats
-    frames: Floats
-    scales: Floats
+    factors: Floats
     normals: Floats
+    limb_axes: Floats
+    limb_levers: Floats
+    limb_shares: Floats
     opacities: Floats
     albedo: Floats
     roughness: Floats
+    max_offset: float
 
 
 @torch.no_grad()
 def bake(model: AvatarModel) -> BakedAvatar:
     """Evaluate in float64 all that does not depend on the pose."""
     model = copy.deepcopy(model).double()
-    encoded = model.encoded_nodes()
-    static = model.attributes(encoded)
-    nodes = len(encoded)
-    skinning = model.skinning
-    f_x = skinning.position(encoded)
-    width = model.config.width
-    for_t, for_s, for_x = skinning.merge.weight.split([width, width, width], dim=1)
-    merge_first = f_x @ for_x.T + skinning.merge.bias
-    merge_first = merge_first + skinning.temporal.out.bias @ for_t.T + skinning.spatial.out.bias @ for_s.T
+    config = model.config
+    static = model.attributes(model.encoded_nodes())
+    frames = model.tangents @ small_rotation(static.rotation)
     return BakedAvatar(
-        temporal=_attention(skinning.temporal, f_x, for_t),
-        spatial=_attention(skinning.spatial, f_x, for_s),
-        merge_first=_array(merge_first),
-        skinning=_weights(skinning),
-        offsets=_mlp(model.offsets, encoded),
-        visibility=_mlp(model.visibility, encoded),
-        node_weights=_array(model.log_weights[:nodes].softmax(-1)),
-        node_normals=_array(static.normals[:nodes]),
-        neighbours=model.interpolate.neighbours.numpy().astype(np.int32),
+        codes=_array(model.codes[: config.nodes]),
+        all_codes=_array(model.codes),
+        frequencies=config.frequencies,
+        node_rows=np.arange(config.nodes),
+        dynamic_nodes=config.nodes if config.dynamic_skinning else 0,
+        skinning=_skinning(model) if config.dynamic_skinning else None,
+        offsets=_weights(model.offsets),
+        visibility=_weights(model.visibility),
+        neighbours=model.interpolate.neighbours.numpy(),
         neighbour_weights=_array(model.interpolate.weights),
-        log_weights=_array(model.log_weights),
+        weights=_array(model.log_weights.softmax(-1)),
         points=_array(static.points),
-        frames=_array(model.tangents @ small_rotation(static.rotation)),
-        scales=_array(static.scales),
+        factors=_array(frames * static.scales[:, None, :]),
         normals=_array(static.normals),
+        limb_axes=_array(model.limb_axes),
+        limb_levers=_array(model.limb_levers),
+        limb_shares=_array(model.limb_shares),
         opacities=_array(static.opacity),
         albedo=_array(static.albedo),
         roughness=_array(static.roughness),
+        max_offset=config.max_offset,
     )
 
 
-def _attention(module: JointAttention, f_x: Tensor, after: Tensor) -> BakedAttention:
-    scale = (f_x.shape[1] // module.heads) ** -0.5
+def _skinning(model: AvatarModel) -> BakedSkinning:
+    skinning, width = model.skinning, model.config.width
+    assert skinning.temporal is not None, "ablations are refused before"
+    for_t, for_s, for_x = skinning.merge.weight.split([width, width, width], dim=1)
+    bias = skinning.merge.bias
+    bias = bias + skinning.temporal.out.bias @ for_t.T + skinning.spatial.out.bias @ for_s.T
+    return BakedSkinning(
+        temporal=_attention(skinning.temporal, for_t),
+        spatial=_attention(skinning.spatial, for_s),
+        merge=_array(for_x),
+        merge_bias=_array(bias),
+        module=_weights(skinning),
+        heads=skinning.temporal.heads,
+    )
+
+
+def _attention(module: JointAttention, after: Tensor) -> BakedAttention:
+    scale = (module.query.weight.shape[0] // module.heads) ** -0.5
     return BakedAttention(
-        query=_array(module.query(f_x) * scale),
+        query=_array(module.query.weight * scale),
+        query_bias=_array(module.query.bias * scale),
         out=_array(after @ module.out.weight),
         module=_weights(module),
-        heads=module.heads,
     )
-
-
-def _mlp(module: PoseConditioned, encoded: Tensor) -> BakedMlp:
-    return BakedMlp(_array(module.from_position(module.position(encoded))), _weights(module))
 
 
 def _weights(module: torch.nn.Module) -> dict[str, Floats]:

@@ -9,7 +9,9 @@ from typing import Annotated
 
 import tyro
 
+from rnd_runtime.avatar import EncoderKind, Precision
 from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.motion import Motion
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,29 @@ class Options:
     out: Path | None = None
     """where to write; by default avatar.onnx beside the checkpoint"""
     motion: Path | None = None
-    """check against torch on this motion instead of 120 random frames"""
+    """check against torch on this motion instead of random frames"""
+    frames: int = 120
+    """random frames of that check"""
+    encoder: EncoderKind = "full"
+    """networks at every node, at fewer (coarse), or the template's skinning weights (static)"""
+    precision: Precision = "f32"
+    """how constants are stored; f16 must keep 99 % of all places within 1 mm, int8 within 3 mm"""
+    nodes: int | None = None
+    """nodes of --encoder coarse; by default a quarter of the checkpoint's"""
+    window_poses: int | None = None
+    """poses in the motion window; fewer span the same time"""
+    visibility_degree: int = 3
+    """of the visibility's spherical harmonics, 0 to 3"""
+    target_ms: float | None = None
+    """find the file that looks best among those that take this long a frame on this machine"""
+    min_psnr: float | None = None
+    """find the fastest file whose pictures are this near (dB) to the whole avatar's"""
+    max_mb: float | None = None
+    """find the file that looks best among those of this size (1e6 bytes)"""
+    size: int = 512
+    """picture side of that search"""
+    hdr: Path | None = None
+    """light of that search; by default the one that was learned"""
 
 
 def main() -> None:
@@ -32,7 +56,8 @@ def main() -> None:
 
 def _export(options: Options) -> None:
     try:
-        from .export import MAX_POSITION_ERROR_M, MAX_WEIGHT_ERROR, export
+        from .export import export, random_motion
+        from .variant import Variant
     except ModuleNotFoundError as error:
         raise InputError(
             f"{error.name} is not installed",
@@ -42,13 +67,64 @@ def _export(options: Options) -> None:
     from rnd_trainer.checkpoint import load_checkpoint
 
     out = options.out or options.checkpoint.with_suffix(".onnx")
-    motion = None
+    if options.frames < 1:
+        raise InputError("--frames", expected="at least 1", got=options.frames)
+    skeleton = load_checkpoint(options.checkpoint).skeleton
     if options.motion is not None:
-        motion = load_motion(options.motion, load_checkpoint(options.checkpoint).skeleton)
-    drift = export(options.checkpoint, out, motion)
+        motion = load_motion(options.motion, skeleton)
+    else:
+        motion = random_motion(skeleton, frames=options.frames, seed=0)
+    bounds = {"ms": options.target_ms, "psnr": options.min_psnr, "mb": options.max_mb}
+    given = {kind: value for kind, value in bounds.items() if value is not None}
+    if given:
+        _search(options, out, motion, given)
+        return
+    variant = Variant(
+        options.encoder, options.precision, options.nodes, options.window_poses, options.visibility_degree
+    )
+    drift = export(options.checkpoint, out, motion, variant)
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "
-        f"weights {drift.weights:.1e} (at most {MAX_WEIGHT_ERROR:g}), "
-        f"positions {1e3 * drift.position_m:.4f} mm (at most {1e3 * MAX_POSITION_ERROR_M:g}), "
+        f"weights {drift.weights:.1e}, positions {1e3 * drift.position_m:.4f} mm, "
+        f"99 % within {1e3 * drift.position_p99_m:.4f} mm, "
         f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}"
     )
+
+
+def _search(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:
+    """Write the cheapest file that keeps the bound, and say what it gave up."""
+    import onnx
+    from rich.console import Console
+
+    from rnd_runtime.files import atomic_path
+    from rnd_runtime.light import Light, load_light
+    from rnd_trainer.checkpoint import load_checkpoint
+
+    from .budget import Bound, Found, given_up, search
+    from .candidates import Scene, Workbench
+
+    if len(given) > 1:
+        raise InputError("bounds", expected="one of --target-ms, --min-psnr, --max-mb", got=f"{len(given)}")
+    ((kind, value),) = given.items()
+    if not value > 0:
+        raise InputError("bound", expected="more than 0", got=value)
+    probe = load_checkpoint(options.checkpoint).probe.numpy()
+    light = Light(probe) if options.hdr is None else load_light(options.hdr)
+    bench = Workbench(options.checkpoint, Scene(motion, light, options.size))
+    console = Console()
+
+    def show(found: Found) -> None:
+        what = found.measured
+        line = f"{what.ms:7.2f} ms {what.mb:6.2f} MB {what.psnr:6.1f} dB  {', '.join(given_up(bench, found.plan))}"
+        console.print(line, highlight=False, soft_wrap=True)
+
+    found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
+    with atomic_path(out) as temporary:
+        onnx.save_model(found.model, str(temporary))
+    assert found.held_out is not None
+    held = found.held_out
+    console.print(
+        f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen. "
+        f"Given up: {'; '.join(given_up(bench, found.plan))}",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import onnx
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 OPSET = 18
+
+Storage = Literal["f32", "f16", "u16", "u8"]
 
 
 class GraphBuilder:
@@ -36,10 +38,15 @@ class GraphBuilder:
         self._inputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
         return name
 
-    def output(self, name: str, value: str, shape: tuple[int, ...]) -> None:
-        """Name ``value`` as a float32 output of the graph."""
-        self._nodes.append(helper.make_node("Identity", [value], [name], name=f"output/{name}"))
-        self._outputs.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
+    def output(self, name: str, value: str, shape: tuple[int, ...], kind: int = TensorProto.FLOAT) -> None:
+        """Name ``value`` as an output of the graph."""
+        if value in self._constants:
+            self._nodes.append(helper.make_node("Identity", [value], [name], name=f"output/{name}"))
+        else:  # renamed where it is made and read: an Identity would be a copy at every frame
+            for node in self._nodes:
+                for ends in (node.input, node.output):
+                    ends[:] = [name if end == value else end for end in ends]
+        self._outputs.append(helper.make_tensor_value_info(name, kind, shape))
 
     def constant(self, name: str, value: Any) -> str:
         """A constant; float64 becomes float32, everything else keeps its type."""
@@ -47,8 +54,28 @@ class GraphBuilder:
         if array.dtype == np.float64:
             array = array.astype(np.float32)
         full = self._unique(name)
-        self._constants[full] = numpy_helper.from_array(np.ascontiguousarray(array), full)
+        self._constants[full] = numpy_helper.from_array(np.asarray(array, order="C"), full)
         return full
+
+    def stored(self, name: str, value: Any, storage: Storage) -> str:
+        """A float32 constant kept in fewer bits; onnxruntime unpacks it once, when the file is loaded.
+
+        ``u8`` and ``u16`` cut the range of each row along the first axis of ``value`` into 2^bits − 1 steps.
+        """
+        array = np.asarray(value, np.float64)
+        if storage == "f32":
+            return self.constant(name, array)
+        if storage == "f16":
+            packed = self.constant(f"{name}_f16", array.astype(np.float16))
+            return self.op("Cast", packed, name=name, to=TensorProto.FLOAT)
+        steps, kind = (255, np.uint8) if storage == "u8" else (65535, np.uint16)
+        others = tuple(range(1, array.ndim))
+        low = array.min(axis=others, keepdims=True)
+        step = np.maximum((array.max(axis=others, keepdims=True) - low) / steps, 1e-12)
+        packed = self.constant(f"{name}_{storage}", np.round((array - low) / step).astype(kind))
+        counts = self.op("Cast", packed, name=f"{name}_counts", to=TensorProto.FLOAT)
+        spread = self.op("Mul", counts, self.constant(f"{name}_step", step), name=f"{name}_spread")
+        return self.op("Add", spread, self.constant(f"{name}_low", low), name=name)
 
     def op(self, kind: str, *inputs: str, name: str, **attributes: Any) -> str:
         """One node with one output, called ``name``."""
@@ -65,16 +92,26 @@ class GraphBuilder:
         )
         return outputs
 
+    def rows(self, value: str, rows: Any, name: str, axis: int = 0) -> str:
+        """``value`` at ``rows`` of ``axis``."""
+        return self.op(
+            "Gather", value, self.constant(f"{name}_rows", np.asarray(rows, np.int64)), name=name, axis=axis
+        )
+
+    def sum(self, value: str, axis: int, name: str, *, keepdims: bool = False) -> str:
+        """Σ along ``axis``."""
+        axes = self.constant(f"{name}_axis", np.array([axis], np.int64))
+        return self.op("ReduceSum", value, axes, name=name, keepdims=int(keepdims))
+
     def reshape(self, value: str, shape: tuple[int, ...], name: str) -> str:
         """``value`` in another shape."""
         return self.op("Reshape", value, self.constant(f"{name}_shape", np.array(shape, np.int64)), name=name)
 
-    def linear(self, value: str, weight: Any, bias: Any, name: str) -> str:
-        """value [.., I] · weight [O, I]ᵀ + bias [O]."""
-        product = self.op(
-            "MatMul", value, self.constant(f"{name}_weight", np.asarray(weight).T), name=f"{name}_product"
-        )
-        return self.op("Add", product, self.constant(f"{name}_bias", bias), name=name)
+    def filled(self, name: str, shape: tuple[int, ...], value: float) -> str:
+        """A float32 constant that is ``value`` everywhere."""
+        size = self.constant(f"{name}_shape", np.array(shape, np.int64))
+        filler = helper.make_tensor("value", TensorProto.FLOAT, [1], [value])
+        return self.op("ConstantOfShape", size, name=name, value=filler)
 
     def model(self, metadata: dict[str, str], producer: str) -> onnx.ModelProto:
         """The checked model; its bytes depend on nothing but what was put in."""

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from ._raster_lanes import (
+from ._lanes import (
     WIDTH,
     aligned_floats,
     any_lane,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .gaussians import Floats32
@@ -12,6 +12,11 @@ from .gaussians import Floats32
 def floats(array: ArrayLike) -> Floats32:
     """``array`` as the kernels are compiled for: float32, contiguous, aligned, writable; copied only if needed."""
     return np.require(array, np.float32, ["C", "A", "W"])
+
+
+def mask(chosen: ArrayLike | None, count: int) -> NDArray[np.bool_]:
+    """Which of ``count`` Gaussians are ``chosen``, as the kernels are compiled for; all where it is None."""
+    return np.ones(count, np.bool_) if chosen is None else np.require(chosen, np.bool_, ["C", "A", "W"])
 
 
 def checked(

@@ -15,6 +15,12 @@ Outputs are ``means`` [N, 3], ``covariances`` [N, 6], ``normals`` [N, 3], ``visi
 ``skinning_weights`` [N, J], and the constants ``opacities`` [N], ``albedo`` [N, 3] and ``roughness`` [N]; see
 :class:`rnd_runtime.gaussians.Gaussians` for units and frames. Metadata is JSON under ``rnd_avatar`` in the
 model's ``metadata_props``: :class:`AvatarMetadata`.
+
+That is the whole avatar for any ONNX runtime. For ours, which poses faster than a graph does, a file also names what
+stands between its networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
+is dynamic, ``node_logits`` [M, J], and the constants ``neighbours`` [N, K] (int32), ``neighbour_weights`` [N, K],
+``log_template`` [N, J], ``rest_points`` [N, 3], ``rest_factors`` [N, 9], ``rest_normals`` [N, 3], ``rest_limbs`` [N, 7]
+and ``posing_limits`` [3]; see :class:`rnd_runtime.posing.RestPose`. Without these the graph does all of the posing.
 """
 
 from __future__ import annotations
@@ -23,6 +29,8 @@ import base64
 import binascii
 from collections.abc import Sequence
 from pathlib import Path
+from time import perf_counter
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,14 +41,24 @@ from .errors import InputError
 from .files import existing_file
 from .gaussians import Gaussians
 from .motion import Motion
+from .onnx_parts import OnnxFile
+from .posing import RestPose
 from .skeleton import Skeleton, bone_transforms
 from .window import motion_window
 
 SCHEMA = "rnd-avatar/1"
 METADATA_KEY = "rnd_avatar"
 PROBE_SHAPE = (32, 64, 3)
+EncoderKind = Literal["full", "coarse", "static"]
+Precision = Literal["f32", "f16", "int8"]
 POSED_OUTPUTS = ("means", "covariances", "normals", "visibility")
 CONSTANT_OUTPUTS = ("opacities", "albedo", "roughness")
+NODE_OUTPUTS = ("node_offsets", "node_visibility")
+NODE_LOGITS = "node_logits"
+REST_OUTPUTS = (
+    "neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs",
+    "posing_limits",
+)  # fmt: skip
 
 
 class SkeletonMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,6 +67,21 @@ class SkeletonMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: list[str]
     parents: list[int]
     rest_joints: list[tuple[float, float, float]]
+
+
+class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a file has left out for speed or size. The defaults are the whole avatar.
+
+    ``encoder``: networks at every node, at fewer (``coarse``), or the template's skinning (``static``).
+    ``precision``: how constants are stored. ``nodes``: where networks are evaluated, 0 when not stated.
+    ``dynamic_nodes``: those of them with dynamic skinning. ``visibility_degree``: of the harmonics that are kept.
+    """
+
+    encoder: EncoderKind = "full"
+    precision: Precision = "f32"
+    nodes: int = 0
+    dynamic_nodes: int = 0
+    visibility_degree: int = 3
 
 
 class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -68,6 +101,15 @@ class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     checkpoint_sha256: str
     conventions: str
     generator: str
+    variant: VariantMetadata = VariantMetadata()
+
+
+class Encoded(NamedTuple):
+    """What the networks say of one pose; hold it for :meth:`Avatar.posed`, do not look into it."""
+
+    values: list[NDArray[np.float32]]
+    bones: NDArray[np.float32]
+    seconds: dict[str, float]  # that "motion" and "encoders" took
 
 
 class Avatar:
@@ -80,9 +122,14 @@ class Avatar:
     """
 
     def __init__(
-        self, session: ort.InferenceSession, metadata: AvatarMetadata, trained_light: NDArray[np.float32]
+        self,
+        file: OnnxFile,
+        metadata: AvatarMetadata,
+        trained_light: NDArray[np.float32],
+        threads: int | None = None,
     ) -> None:
-        self._session = session
+        self._file, self._threads = file, threads
+        self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
         self.metadata = metadata
         self.trained_light = trained_light
         tree = metadata.skeleton
@@ -91,10 +138,14 @@ class Avatar:
         )
         self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
-        rest = bone_transforms(self.skeleton, np.tile(np.eye(3), (len(tree.names), 1, 1)), np.zeros(3))
-        window = np.tile(_IDENTITY_6D, (self.window_poses, len(tree.names) - 1, 1))
-        still = (window, np.zeros((len(tree.names) - 1, 3)), rest)
-        self._opacities, self._albedo, self._roughness = self.run(still, CONSTANT_OUTPUTS)
+        self._rest: RestPose | None = None
+        self._opacities, self._albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
+        if not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys():
+            self._rest = self._rest_pose()
+            self._node_outputs = (*NODE_OUTPUTS, *({NODE_LOGITS} & file.outputs.keys()))
+            self._session(self._node_outputs)  # now, and not in the first frame
+        else:
+            self._session(POSED_OUTPUTS)
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int | None = None) -> Avatar:
@@ -103,27 +154,38 @@ class Avatar:
         Raises :class:`InputError` for anything that is not a whole avatar of the schema we know.
         """
         path = existing_file(path, what="avatar")
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = threads or 0
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # its complaints about broken files go into our one line instead
         try:
-            session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise InputError("not a readable ONNX model", got=_first_line(error), file=path) from error
-        metadata = _read_metadata(session, path)
-        _check_shapes(session, metadata, path)
-        try:
-            return cls(session, metadata, _decode_light(metadata, path))
+            file = OnnxFile(path.read_bytes())
+            metadata = _read_metadata(file)
+            _check_shapes(file, metadata)
+            return cls(file, metadata, _decode_light(metadata), threads)
         except InputError as error:
-            raise InputError(str(error), file=path) from error
+            raise error.at(file=path) from error
 
     def pose(self, motion: Motion, time: float) -> Gaussians:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton), in the world frame."""
+        return self.posed(self.encode(motion, time))
+
+    def encode(self, motion: Motion, time: float) -> Encoded:
+        """The first half of :meth:`pose`: what the networks say. Runs in onnxruntime, so it may overlap any kernel."""
+        started = perf_counter()
         window, velocity = motion_window(motion, time, poses=self.window_poses, seconds=self.window_seconds)
         now = motion.at(np.array([time]))
         bones = bone_transforms(self.skeleton, now.rotations[0], now.translations[0])
-        means, covariances, normals, visibility = self.run((window, velocity, bones), POSED_OUTPUTS)
+        known = perf_counter()
+        outputs = POSED_OUTPUTS if self._rest is None else self._node_outputs
+        values = self.run((window, velocity, bones), outputs)
+        return Encoded(values, bones, {"motion": known - started, "encoders": perf_counter() - known})
+
+    def posed(self, encoded: Encoded) -> Gaussians:
+        """The second half of :meth:`pose`."""
+        values, bones, _ = encoded
+        if self._rest is None:
+            means, covariances, normals, visibility = values
+        else:
+            offsets, harmonics, *logits = values
+            posed = self._rest.pose(logits[0] if logits else None, offsets, harmonics, bones)
+            means, covariances, normals, visibility = posed
         return Gaussians(
             means, covariances, self._opacities, normals, self._albedo, self._roughness, visibility,
             np.ascontiguousarray(bones[0, :, :3], np.float32),
@@ -132,32 +194,68 @@ class Avatar:
     def run(
         self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike], outputs: Sequence[str]
     ) -> list[NDArray[np.float32]]:
-        """Named outputs of the graph for (pose_window, joint_velocity, bone_transforms)."""
+        """Named outputs of the graph for (pose_window, joint_velocity, bone_transforms); nothing else is computed."""
+        session = self._session(tuple(outputs))
+        values = dict(zip(("pose_window", "joint_velocity", "bone_transforms"), inputs))
         values = {
-            name: np.ascontiguousarray(value, np.float32)
-            for name, value in zip(("pose_window", "joint_velocity", "bone_transforms"), inputs)
+            wanted.name: np.ascontiguousarray(values[wanted.name], np.float32)
+            for wanted in session.get_inputs()
         }
-        results: list[NDArray[np.float32]] = self._session.run(list(outputs), values)
+        results: list[NDArray[np.float32]] = session.run(list(outputs), values)
         return results
 
+    def _rest_pose(self) -> RestPose:
+        neighbours, weights, log_template, *rest, limits = self._constants(REST_OUTPUTS)
+        max_offset, floor, fallback = limits.tolist()
+        points, factors, normals, limbs = rest
+        return RestPose(
+            neighbours.astype(np.int32), weights, log_template, points, factors, normals, limbs,
+            max_offset, floor, fallback,
+        )  # fmt: skip
 
-_IDENTITY_6D = np.array([1, 0, 0, 0, 1, 0], np.float32)
+    def _constants(self, outputs: Sequence[str]) -> list[NDArray[np.float32]]:
+        session = _session(self._file.cut(outputs), 1)
+        if session.get_inputs():
+            names = ", ".join(outputs)
+            raise InputError("graph outputs", expected=f"{names}: constants", got="some that need a pose")
+        results: list[NDArray[np.float32]] = session.run(list(outputs), {})
+        return results
+
+    def _session(self, outputs: tuple[str, ...]) -> ort.InferenceSession:
+        """A session that computes ``outputs`` and no more; kept."""
+        if outputs not in self._sessions:
+            self._sessions[outputs] = _session(self._file.cut(outputs), self._threads or 0)
+        return self._sessions[outputs]
 
 
-def _read_metadata(session: ort.InferenceSession, path: Path) -> AvatarMetadata:
-    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+def _session(model: bytes, threads: int) -> ort.InferenceSession:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Threads that spin between operations take the cores from the kernels that follow, and from everyone on a busy
+    # machine: at load 13 a run of 30 000 Gaussians' networks takes 28 ms without and 157 ms with it (medians).
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # its complaints about broken files go into our one line instead
+    try:
+        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise InputError("not a readable ONNX model", got=_first_line(error)) from error
+
+
+def _read_metadata(file: OnnxFile) -> AvatarMetadata:
+    text = file.metadata.get(METADATA_KEY)
     if text is None:
-        raise InputError("not an RnD avatar", expected=f"metadata {METADATA_KEY!r}", got="none", file=path)
+        raise InputError("not an RnD avatar", expected=f"metadata {METADATA_KEY!r}", got="none")
     try:
         schema = msgspec.json.decode(text.encode(), type=_SchemaOnly).schema
         if schema != SCHEMA:
-            raise InputError("schema", expected=SCHEMA, got=schema, file=path, hint="made by another version")
+            raise InputError("schema", expected=SCHEMA, got=schema, hint="made by another version")
         metadata = msgspec.json.decode(text.encode(), type=AvatarMetadata)
     except msgspec.DecodeError as error:
-        raise InputError("metadata", got=_first_line(error), file=path) from error
+        raise InputError("metadata", got=_first_line(error)) from error
     tree = metadata.skeleton
     if not len(tree.names) == len(tree.parents) == len(tree.rest_joints) >= 2:
-        raise InputError("skeleton", expected="as many names, parents and rest joints", file=path)
+        raise InputError("skeleton", expected="as many names, parents and rest joints")
     return metadata
 
 
@@ -165,7 +263,7 @@ class _SchemaOnly(msgspec.Struct):
     schema: str
 
 
-def _check_shapes(session: ort.InferenceSession, metadata: AvatarMetadata, path: Path) -> None:
+def _check_shapes(file: OnnxFile, metadata: AvatarMetadata) -> None:
     """The graph's inputs and outputs must be what the metadata promises."""
     n, d, joints = metadata.gaussians, metadata.window_poses, len(metadata.skeleton.names)
     inputs = {
@@ -177,23 +275,19 @@ def _check_shapes(session: ort.InferenceSession, metadata: AvatarMetadata, path:
         "means": [n, 3], "covariances": [n, 6], "normals": [n, 3], "visibility": [n, 16],
         "skinning_weights": [n, joints], "opacities": [n], "albedo": [n, 3], "roughness": [n],
     }  # fmt: skip
-    for what, expected, found in (
-        ("inputs", inputs, session.get_inputs()),
-        ("outputs", outputs, session.get_outputs()),
-    ):
-        got = {value.name: value.shape for value in found if value.type == "tensor(float)"}
-        if got != expected:
-            raise InputError(f"graph {what}", expected=expected, got=got, file=path)
+    if file.inputs != inputs:
+        raise InputError("graph inputs", expected=inputs, got=file.inputs)
+    got = {name: shape for name, shape in file.outputs.items() if name in outputs}
+    if got != outputs:
+        raise InputError("graph outputs", expected=outputs, got=got)
 
 
-def _decode_light(metadata: AvatarMetadata, path: Path) -> NDArray[np.float32]:
+def _decode_light(metadata: AvatarMetadata) -> NDArray[np.float32]:
     try:
         values = np.frombuffer(base64.b64decode(metadata.trained_light, validate=True), "<f4")
         return values.reshape(PROBE_SHAPE)
     except (binascii.Error, ValueError) as error:
-        raise InputError(
-            "trained_light", expected=f"float32 of shape {PROBE_SHAPE}", got=error, file=path
-        ) from error
+        raise InputError("trained_light", expected=f"float32 of shape {PROBE_SHAPE}", got=error) from error
 
 
 def encode_light(radiance: NDArray[np.float32]) -> str:

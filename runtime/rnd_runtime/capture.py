@@ -77,16 +77,32 @@ class Capture:
             return None if name is None else read_unit_range(self.folder / name)
 
         try:
-            normal, normal_gt = read(frame.normal), read(frame.normal_gt)
+            mask = read_unit_range(self.folder / frame.mask)[..., 0]
             return FrameImages(
                 image_srgb=read_unit_range(self.folder / frame.image),
-                mask=read_unit_range(self.folder / frame.mask)[..., 0],
-                normal=None if normal is None else decode_normals(normal),
-                normal_gt=None if normal_gt is None else decode_normals(normal_gt),
+                mask=mask,
+                normal=self._read_normals(frame.normal, mask),
+                normal_gt=self._read_normals(frame.normal_gt, mask),
                 albedo_srgb=read(frame.albedo),
             )
         except InputError as error:
             raise error.at(frame=frame.frame) from error
+
+    def _read_normals(self, name: str | None, mask: Floats32) -> Floats32 | None:
+        """Unit normals [H, W, 3], refused when they point away from the camera as a whole."""
+        if name is None:
+            return None
+        normals = decode_normals(read_unit_range(self.folder / name))
+        seen = normals[mask > 0.5][:, 2]
+        if seen.size and seen.mean() > 0:
+            raise InputError(
+                "normals point away from the camera",
+                expected="z < 0 in the camera's OpenCV axes where a surface is seen",
+                got=f"a mean of {seen.mean():.2f}",
+                file=self.folder / name,
+                hint="OpenGL's have y and z the other way round",
+            )
+        return normals
 
     def load_light(self, name: str) -> Light:
         """The light called ``name``, scaled and turned as the capture says."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,11 @@ from .files import atomic_path, existing_file
 
 Floats = NDArray[np.floating[Any]]  # float32 or float64, as given
 Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+# A file that claims more pixels than deflate (1032 : 1) could hide in it is damaged; reading it would fill the memory.
+_MOST_COMPRESSED = 2000
+_SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 
 
 def linear_to_srgb(linear: ArrayLike) -> Floats:
@@ -53,11 +60,8 @@ class ImageHeader:
 
 def read_header(path: str | Path) -> ImageHeader:
     """The size and channel names of an image file, without decoding it."""
-    source = _open(path)
-    try:
+    with _opened(path) as source:
         return _checked_header(source.spec(), path)
-    finally:
-        source.close()
 
 
 def read_image(path: str | Path) -> Image:
@@ -69,16 +73,13 @@ def read_image(path: str | Path) -> Image:
     Raises:
         InputError: not a file, not an image, cut short, turned by EXIF, or a crop of a larger canvas.
     """
-    source = _open(path)
-    try:
+    with _opened(path) as source:
         spec = source.spec()
         _checked_header(spec, path)
         kind = str(spec.format)
         pixels = source.read_image(0, 0, 0, spec.nchannels, kind if kind in ("uint8", "uint16") else "float")
         if pixels is None:
             raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
-    finally:
-        source.close()
     return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
 
 
@@ -121,14 +122,22 @@ def _floats(values: ArrayLike) -> Floats:
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
 
-def _open(path: str | Path) -> Any:
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
     existing_file(path, what="image")
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), settings)
-    if source is None:
-        raise InputError("image cannot be read", got=_reason(oiio.geterror()), file=path)
-    return source
+    source = None
+    try:
+        source = oiio.ImageInput.open(str(path), settings)
+        if source is None:
+            raise InputError("image cannot be read", got=_reason(oiio.geterror()), file=path)
+        yield source
+    except UnicodeDecodeError as error:  # names and complaints of a damaged file need not be text
+        raise InputError("image is damaged", got="names that are not text", file=path) from error
+    finally:
+        if source is not None:
+            source.close()
 
 
 def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
@@ -149,6 +158,13 @@ def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
             expected="one flat picture that fills its canvas",
             got=f"pixels {stored} of canvas {canvas}" + (", deep" if spec.deep else ""),
             file=path,
+        )
+    claimed = spec.width * spec.height * spec.nchannels * spec.format.size()
+    file_bytes = Path(path).stat().st_size
+    if claimed > _MOST_COMPRESSED * file_bytes + _SMALL_IMAGE:
+        expected = f"{claimed} bytes of pixels"
+        raise InputError(
+            "image is cut short or damaged", expected=expected, got=f"{file_bytes} stored", file=path
         )
     return ImageHeader(spec.width, spec.height, tuple(spec.channelnames), str(spec.format))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .joint_names import JointTable, load_joint_map, match_joints
+from .mocap import read_acclaim, read_bvh
 from .motion_files import SMPL_REST_ROOT, read_motion_file
 from .npz import save_npz
+from .retarget import retarget
 from .rotations import matrix_to_axis_angle, slerp_matrices
 from .skeleton import Skeleton
 
@@ -22,6 +25,8 @@ Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 
 # SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
 _STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
+
+_MOCAP_READERS = {".bvh": read_bvh, ".amc": read_acclaim}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,27 +85,63 @@ def load_motion(
     up: Literal["auto", "y", "z"] = "auto",
     fps: float | None = None,
     joint_names: tuple[str, ...] | None = None,
+    joint_map: str | Path | None = None,
 ) -> Motion:
-    """Read a motion file (layouts: :func:`motion_files.read_motion_file`) for ``skeleton``, Y up.
+    """Read a motion file for ``skeleton``, Y up.
 
-    Joints are matched by name; the root is always the root. Joints of ``skeleton`` that the file lacks stay
-    at rest and are noted; joints of the file that ``skeleton`` lacks are left out. Z-up files are of the
-    SMPL family: they place the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever
-    the avatar's own rest position. In Y-up files ``trans`` is an offset from the avatar's rest position.
+    Arrays (.npz, .pkl, .pt, .npy; layouts: :func:`motion_files.read_motion_file`): joints are matched by name; the
+    root is always the root. Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
+    file that ``skeleton`` lacks are left out. Z-up files are of the SMPL family: they place the pelvis at
+    ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In Y-up files
+    ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
+
+    BVH and AMC have a skeleton of their own: :func:`retarget.retarget`.
 
     Args:
         up: the axis that points up in the file; "auto" goes by the layout and the file's ``up_axis``.
         fps: overrides the file's frame rate.
         joint_names: what the columns are, for files that are known to follow a skeleton's order.
+        joint_map: a file that says which of our joints is which of theirs: :func:`joint_names.load_joint_map`.
 
     Raises:
         InputError: with the file, the field and, where there is one, the frame.
     """
-    record = read_motion_file(path, joint_names)
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise InputError("fps", expected="a positive number", got=fps)
+    table = None if joint_map is None else load_joint_map(joint_map)
+    try:
+        if Path(path).suffix.lower() in _MOCAP_READERS:
+            motion = _load_mocap(path, skeleton, up, table)
+        else:
+            motion = _load_arrays(path, skeleton, up, joint_names, table)
+    except InputError as error:
+        raise error.at(file=path) from error
+    if fps is None:
+        return motion
+    notes = tuple(note for note in motion.notes if "frame rate" not in note)
+    return replace(motion, fps=float(fps), notes=notes)
+
+
+def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, table: JointTable | None) -> Motion:
+    tree = _MOCAP_READERS[Path(path).suffix.lower()](path)
+    moved = retarget(tree, skeleton, match_joints(tree.names, skeleton.names, table), up)
+    return Motion(moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes)
+
+
+def _load_arrays(
+    path: str | Path,
+    skeleton: Skeleton,
+    up: str,
+    joint_names: tuple[str, ...] | None,
+    table: JointTable | None,
+) -> Motion:
+    record = read_motion_file(path, joint_names)
+    names = list(record.joint_names)
+    if table is not None:
+        for ours, place in match_joints(names, skeleton.names, table).items():
+            names[place] = ours
     z_up = (record.up if up == "auto" else up) == "z"
-    rotations, notes = _match_joints(record.rotations, record.joint_names, skeleton, path)
+    rotations, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
     translations, rest_root = record.translations, record.rest_root
     if z_up and rest_root is None:
         rest_root = SMPL_REST_ROOT
@@ -110,15 +151,8 @@ def load_motion(
             root_positions = root_positions @ Z_UP_TO_Y_UP.T
             rotations[:, 0] = Z_UP_TO_Y_UP @ rotations[:, 0]
         translations = root_positions - skeleton.rest_joints[0]
-    file_notes = tuple(note for note in record.notes if fps is None or "frame rate" not in note)
-    return Motion(
-        rotations,
-        translations,
-        record.fps if fps is None else float(fps),
-        skeleton.names,
-        str(path),
-        file_notes + notes,
-    )
+    notes = record.notes + notes
+    return Motion(rotations, translations, record.fps, skeleton.names, str(path), notes)
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:

@@ -1,4 +1,4 @@
-"""The .npz layouts motions come in, read into one record in the file's own axes (FORMATS.md section 3.9)."""
+"""The array layouts motions come in, read into one record in the file's own axes (FORMATS.md section 3.9)."""
 
 from __future__ import annotations
 
@@ -9,22 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .npz import Npz
+from .motion_names import NAMES_BY_COUNT
+from .motion_names import SMPL_REST_ROOT as SMPL_REST_ROOT
+from .motion_names import SMPLH_NAMES as SMPLH_NAMES
+from .motion_names import SMPLX_NAMES as SMPLX_NAMES
+from .motion_names import SMPLX_REST_ROOT as SMPLX_REST_ROOT
+from .motion_pickles import PICKLE_SUFFIXES, read_track
+from .npz import Members, Npz
 from .rotations import axis_angle_to_matrix
-from .skeleton import SMPL_NAMES
 
 Floats = NDArray[np.float64]
 
-_FINGERS = tuple(f"{name}{k}" for name in ("index", "middle", "pinky", "ring", "thumb") for k in "123")
-_HANDS = tuple(f"{side}_{finger}" for side in ("left", "right") for finger in _FINGERS)
-SMPLH_NAMES: tuple[str, ...] = SMPL_NAMES[:22] + _HANDS
-SMPLX_NAMES: tuple[str, ...] = (*SMPL_NAMES[:22], "jaw", "left_eye", "right_eye", *_HANDS)
-_NAMES_BY_COUNT = {22: SMPL_NAMES[:22], 24: SMPL_NAMES, 52: SMPLH_NAMES, 55: SMPLX_NAMES}
-
-# Where SMPL's mean body (betas 0) has its pelvis. Files of that family place the origin, not the pelvis.
-SMPL_REST_ROOT: Floats = np.array([-0.0018, -0.2233, 0.0282])
-SMPLX_REST_ROOT: Floats = np.array([0.0031, -0.3514, 0.0120])
-
+# What AMASS' SMPL-X files hold beside the split poses, and nobody else's
+_AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
 _MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and garbage are beyond
 _MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
 _DEFAULT_FPS = 60.0
@@ -54,17 +51,19 @@ class MotionRecord:
 
 
 def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = None) -> MotionRecord:
-    """Read a motion from an .npz of a known layout.
+    """Read a motion from arrays of a known layout: an .npz, or a pickle (:func:`motion_pickles.read_track`).
 
     ======================================================  ==========================================  ====
     members                                                 joints                                      up
     ======================================================  ==========================================  ====
     ``poses`` (F,156) or (F,52,3), ``trans``                AMASS, SMPL-H                               z
     ``poses`` (F,165) or (F,55,3), ``trans``                AMASS, SMPL-X                               z
+    ``root_orient``, ``pose_body`` (F,63), ``trans``,       AMASS, SMPL-X without ``poses``; fingers    z
+    ``mocap_frame_rate``, ``pose_hand`` (F,90)?             where there are any
     ``poses`` (F,72) or (F,24,3), ``trans``                 SMPL                                        y
     ``poses`` (F,66) or (F,22,3), ``trans``                 SMPL's body without hands                   y
-    ``pose_body | body_pose`` (F,63 | 69), ``root_orient |  SMPL without its root                       y
-    global_orient``, ``trans | transl``
+    ``pose_body | body_pose`` (F,63 | 69), ``root_orient |  SMPL without its root; fingers from         y
+    global_orient``, ``trans | transl``                     ``left_hand_pose``, ``right_hand_pose``
     ``poses | poses_all``, ``Rh``, ``Th`` (or ``…_all``)    EasyMocap: turned about the origin          z
     ``poses`` (F,3J) and ``joint_names`` (J)                any; what :func:`motion.save_motion` writes  y
     ======================================================  ==========================================  ====
@@ -78,37 +77,49 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
+    if Path(path).suffix.lower() in PICKLE_SUFFIXES:
+        track = read_track(path)
+        return _read(track.members, joint_names, track.rest_root, list(track.notes))
     with Npz(path, what="motion") as archive:
-        notes: list[str] = []
-        easymocap = archive.first_of("Rh", "Rh_all") is not None
-        axis_angles = _axis_angles(archive, notes, joint_names)
-        names = _names(archive, axis_angles, joint_names)
-        _check_angles(axis_angles, names, path)
-        rotations = axis_angle_to_matrix(axis_angles)
-        named = joint_names is not None or "joint_names" in archive.names
-        amass = len(names) in (52, 55) and not named
-        smpl_root = SMPLX_REST_ROOT if len(names) == 55 else SMPL_REST_ROOT
-        if easymocap:
-            turn = axis_angle_to_matrix(_per_frame(archive, "Rh", "Rh_all", frames=len(rotations)))
-            rotations[:, 0] = turn @ rotations[:, 0]
-            # Rh turns about the origin: transl = Th + R·J0 − J0
-            shift = turn @ smpl_root - smpl_root
-            translations = _per_frame(archive, "Th", "Th_all", frames=len(rotations)) + shift
-        elif archive.first_of("trans", "transl") is not None:
-            translations = _per_frame(archive, "trans", "transl", frames=len(rotations))
-        else:
-            notes.append("no trans in the file: the root stays in place")
-            translations = np.zeros((len(rotations), 3))
-        _check_translations(translations, path)
-        if "betas" in archive.names:
-            notes.append("the file's betas are ignored: the avatar keeps its own shape")
-        fps = _frame_rate(archive, notes)
-        up = _up_axis(archive, default="z" if amass or easymocap else "y")
-        rest_root = smpl_root if amass or easymocap else None
-        return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
+        return _read(archive, joint_names, None, [])
 
 
-def _axis_angles(archive: Npz, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
+def _read(
+    members: Members, joint_names: tuple[str, ...] | None, rest_root: Floats | None, notes: list[str]
+) -> MotionRecord:
+    easymocap = members.first_of("Rh", "Rh_all") is not None
+    axis_angles = _axis_angles(members, notes, joint_names)
+    names = _names(members, axis_angles, joint_names)
+    _check_angles(axis_angles, names, members.path)
+    rotations = axis_angle_to_matrix(axis_angles)
+    named = joint_names is not None or "joint_names" in members.names
+    split = "pose_body" in members.names and "poses" not in members.names
+    whole = len(names) in (52, 55) and "poses" in members.names and not named
+    amass = whole or (split and not named and members.first_of(*_AMASS_MEMBERS) is not None)
+    smpl_x = len(names) == 55 or (split and amass)
+    smpl_root = SMPLX_REST_ROOT if smpl_x else SMPL_REST_ROOT
+    if easymocap:
+        turn = axis_angle_to_matrix(_per_frame(members, "Rh", "Rh_all", frames=len(rotations)))
+        rotations[:, 0] = turn @ rotations[:, 0]
+        # Rh turns about the origin: transl = Th + R·J0 − J0
+        shift = turn @ smpl_root - smpl_root
+        translations = _per_frame(members, "Th", "Th_all", frames=len(rotations)) + shift
+    elif members.first_of("trans", "transl") is not None:
+        translations = _per_frame(members, "trans", "transl", frames=len(rotations))
+    else:
+        notes.append("no trans in the file: the root stays in place")
+        translations = np.zeros((len(rotations), 3))
+    _check_translations(translations, members.path)
+    if "betas" in members.names:
+        notes.append("the file's betas are ignored: the avatar keeps its own shape")
+    fps = _frame_rate(members, notes)
+    up = _up_axis(members, default="z" if amass or easymocap else "y")
+    if rest_root is None and (amass or easymocap):
+        rest_root = smpl_root
+    return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
+
+
+def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
     """[F, J, 3] rad with the root first, from whichever member holds the poses."""
     member = archive.first_of("poses", "poses_all", "pose_body", "body_pose")
     if member is None:
@@ -136,14 +147,26 @@ def _axis_angles(archive: Npz, notes: list[str], joint_names: tuple[str, ...] | 
         root = np.zeros((len(poses), 3))
         if archive.first_of("Rh", "Rh_all") is None:
             notes.append("no root orientation in the file: the root stays upright")
-    return np.concatenate([root[:, None], poses], 1)
+    return np.concatenate([root[:, None], poses, *_fingers(archive, poses, notes)], 1)
 
 
-def _names(archive: Npz, axis_angles: Floats, given: tuple[str, ...] | None) -> tuple[str, ...]:
+def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
+    """Thirty finger joints [F, 30, 3] beside a split body of 21 joints [F, 21, 3], where the file has them."""
+    if body.shape[1] != 21 or ("pose_hand" not in archive.names and "left_hand_pose" not in archive.names):
+        return []
+    sides = ("pose_hand",) if "pose_hand" in archive.names else ("left_hand_pose", "right_hand_pose")
+    poses = [archive.numbers(side) for side in sides]
+    if sum(pose[0].size for pose in poses if len(pose) == len(body)) != 90:
+        notes.append("hands stay at rest: they are not given as 15 joints each")
+        return []
+    return [np.concatenate([pose.reshape(len(body), -1, 3) for pose in poses], 1)]
+
+
+def _names(archive: Members, axis_angles: Floats, given: tuple[str, ...] | None) -> tuple[str, ...]:
     count = axis_angles.shape[1]
     names = archive.strings("joint_names") if "joint_names" in archive.names else given
     if names is None:
-        names = _NAMES_BY_COUNT.get(count)
+        names = NAMES_BY_COUNT.get(count)
         expected = "22, 24, 52 or 55 joints (66, 72, 156 or 165 columns), or joint_names beside them"
     else:
         expected = f"{len(names)} joints ({3 * len(names)} columns)"
@@ -159,7 +182,7 @@ def _names(archive: Npz, axis_angles: Floats, given: tuple[str, ...] | None) -> 
     return names
 
 
-def _per_frame(archive: Npz, *members: str, frames: int) -> Floats:
+def _per_frame(archive: Members, *members: str, frames: int) -> Floats:
     """[F, 3] of the first member present; (F, 1, 3) is how EasyMocap's users store it."""
     member = archive.first_of(*members)
     if member is None:
@@ -203,7 +226,7 @@ def _check_translations(translations: Floats, path: str | Path) -> None:
         )
 
 
-def _frame_rate(archive: Npz, notes: list[str]) -> float:
+def _frame_rate(archive: Members, notes: list[str]) -> float:
     member = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
     if member is None:
         notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
@@ -219,7 +242,7 @@ def _frame_rate(archive: Npz, notes: list[str]) -> float:
     return float(value.item())
 
 
-def _up_axis(archive: Npz, *, default: str) -> str:
+def _up_axis(archive: Members, *, default: str) -> str:
     if "up_axis" not in archive.names:
         return default
     up = "".join(archive.strings("up_axis")).lower()

@@ -1,12 +1,14 @@
-"""Reading .npz archives that somebody else wrote, and writing ours."""
+"""Named arrays that somebody else wrote, in .npz archives or elsewhere, and writing ours."""
 
 from __future__ import annotations
 
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,37 +19,22 @@ from .files import atomic_path, existing_file
 # What numpy and zipfile raise for archives that are cut, scrambled, encrypted or hold Python objects.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError),
-    *(zlib.error, zipfile.BadZipFile),
+    *(zlib.error, zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, TypeError),
 )
 
 
-class Npz:
-    """The members of an .npz, read one at a time when asked for; use it in a ``with`` statement.
+class Members:
+    """Arrays by name, checked when asked for: every failure is an :class:`InputError` naming file and field.
 
-    Members nobody asks for are never touched, so an archive may hold Python objects beside the arrays we
-    need. Nothing is ever unpickled. Every failure is an :class:`InputError` naming file and field.
+    Args:
+        arrays: what numpy takes for arrays, by name.
+        path: the file they are from, for messages.
     """
 
-    def __init__(self, path: str | Path, *, what: str) -> None:
-        self.path = existing_file(path, what=what)
-        self._stream = self.path.open("rb")  # ours to close: numpy leaves its own open when a file is cut
-        try:
-            archive = np.load(self._stream, allow_pickle=False)
-        except _UNREADABLE as error:
-            self._stream.close()
-            raise InputError(f"{what} cannot be read", expected="an .npz archive", file=path) from error
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            self._stream.close()
-            raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
-        self._archive = archive
-        self.names: tuple[str, ...] = tuple(archive.files)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._archive.close()
-        self._stream.close()
+    def __init__(self, arrays: Mapping[str, Any], path: str | Path) -> None:
+        self.path = Path(path)
+        self.names: tuple[str, ...] = tuple(arrays)
+        self._arrays = arrays
 
     def first_of(self, *names: str) -> str | None:
         """The first of ``names`` that the archive holds."""
@@ -80,20 +67,27 @@ class Npz:
             array = np.char.decode(array.astype(np.bytes_), "utf-8", "replace")
         if array.dtype.kind != "U":
             raise InputError(name, expected="strings", got=f"dtype {array.dtype}", file=self.path)
-        return tuple(str(text) for text in array.reshape(-1))
+        try:
+            texts = tuple(str(text) for text in array.reshape(-1))
+            "".join(texts).encode()  # what cannot be written cannot be shown either
+        except (SystemError, ValueError) as error:  # numbers that are no characters
+            raise InputError(name, expected="strings", got="damaged ones", file=self.path) from error
+        return texts
 
     def _member(self, name: str) -> NDArray[np.generic]:
         if name not in self.names:
             raise InputError(
                 f"{name} is missing", got=f"only {', '.join(self.names) or 'nothing'}", file=self.path
             )
+        return self._read(name)
+
+    def _read(self, name: str) -> NDArray[np.generic]:
         try:
-            array: NDArray[np.generic] = self._archive[name]
-        except _UNREADABLE as error:
-            objects = "allow_pickle" in str(error)
-            got = "Python objects" if objects else "data that is cut short or damaged"
-            raise InputError(name, expected="an array", got=got, file=self.path) from error
-        return array
+            return np.asarray(self._arrays[name])
+        except ValueError as error:
+            raise InputError(
+                name, expected="an array", got="rows of unequal lengths", file=self.path
+            ) from error
 
     def _check_shape(
         self, name: str, array: NDArray[np.generic], shape: tuple[int | None, ...] | None
@@ -105,6 +99,46 @@ class Npz:
             wanted = "×".join("n" if want is None else str(want) for want in shape) or "a single number"
             got = "×".join(map(str, array.shape)) or "a single number"
             raise InputError(f"shape of {name}", expected=wanted, got=got, file=self.path)
+
+
+class Npz(Members):
+    """The members of an .npz, read one at a time when asked for; use it in a ``with`` statement.
+
+    Members nobody asks for are never touched, so an archive may hold Python objects beside the arrays we
+    need. Nothing is ever unpickled.
+    """
+
+    def __init__(self, path: str | Path, *, what: str) -> None:
+        path = existing_file(path, what=what)
+        self._stream = path.open("rb")  # ours to close: numpy leaves its own open when a file is cut
+        try:
+            archive = np.load(self._stream, allow_pickle=False)
+        except _UNREADABLE as error:
+            self._stream.close()
+            raise InputError(f"{what} cannot be read", expected="an .npz archive", file=path) from error
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            self._stream.close()
+            raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
+        self._archive = archive
+        super().__init__(archive, path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+        self._stream.close()
+
+    def _read(self, name: str) -> NDArray[np.generic]:
+        try:
+            array: NDArray[np.generic] = self._archive[name]
+            if not isinstance(array, np.ndarray):  # numpy hands over the bytes of what is no array
+                raise ValueError("not an array")
+        except _UNREADABLE as error:
+            objects = "allow_pickle" in str(error)
+            got = "Python objects" if objects else "data that is cut short or damaged"
+            raise InputError(name, expected="an array", got=got, file=self.path) from error
+        return array
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:

@@ -12,7 +12,7 @@ from .gaussians import Floats32, Raster
 from .gl_context import Backend, create_context, is_software, renderer
 from .raster_gl import GlRasterizer
 
-Kind = Literal["auto", "gl", "cpu"]
+Kind = Literal["auto", "gl", "gl-egl", "gl-osmesa", "cpu"]
 
 
 class ChosenRasterizer:
@@ -56,7 +56,7 @@ def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> Cho
     """Make the rasteriser ``kind``.
 
     "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too, which
-    takes three times as long there.
+    takes three times as long there. "gl-egl" and "gl-osmesa" name the backend, "gl" leaves it to ``gl_backend``.
 
     Raises:
         InputError: "gl" and no OpenGL, or no such kind.
@@ -65,10 +65,14 @@ def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> Cho
         raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))
     if kind == "cpu":
         return ChosenRasterizer("cpu")
+    if kind == "gl-egl":
+        gl_backend = "egl"
+    elif kind == "gl-osmesa":
+        gl_backend = "osmesa"
     try:
         context = create_context(gl_backend)
     except InputError:
-        if kind == "gl":
+        if kind != "auto":
             raise
         return ChosenRasterizer("cpu")
     if kind == "auto" and is_software(context):

@@ -14,7 +14,7 @@ from time import perf_counter
 
 import numpy as np
 from numba import get_num_threads
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ._raster_blend import blend, blend_backward
 from ._raster_input import checked, floats
@@ -36,6 +36,41 @@ class State:
     image: Floats32  # [H, W, K] features, then depth
     coverage: Floats32  # [H, W]
     channels: int
+
+
+class Projected:
+    """N Gaussians as a camera sees them, before anyone knows their features: which of them have to be shaded.
+
+    Arguments as of :func:`rasterize`.
+
+    Attributes:
+        drawn: [N] the Gaussians that reach a tile of the picture; the others add nothing to it.
+    """
+
+    def __init__(
+        self, means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, camera: Camera
+    ) -> None:
+        nothing = np.empty((len(np.asarray(means)), 0), np.float32)
+        means, covariances, opacities, nothing = checked(means, covariances, opacities, nothing)
+        self._arrays = means, covariances, opacities, camera
+        self._centers, self._shapes, self._boxes, _, self._depths, self._slot_starts = project(
+            means, covariances, opacities, nothing, view_of(camera), False
+        )
+        self.drawn: NDArray[np.bool_] = np.diff(self._slot_starts) > 0
+
+    def draw(self, features: Floats32) -> Raster:
+        """The picture of ``features`` [N, C], of which only rows of ``drawn`` Gaussians matter; no depth."""
+        features = floats(features)
+        means, covariances, opacities, camera = self._arrays
+        if not np.isfinite(features).all():  # then who is drawn depends on it
+            return rasterize(means, covariances, opacities, features, camera, depth=False)
+        started = perf_counter()
+        pairs = sort_into_tiles(self._boxes, self._depths, self._slot_starts, camera.width, camera.height)
+        splats = Splats(self._centers, self._shapes, features, self._slot_starts, *pairs)
+        sorted_at = perf_counter()
+        image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
+        seconds = {"sort": sorted_at - started, "raster": perf_counter() - sorted_at}
+        return Raster(image, coverage, np.zeros_like(coverage), seconds)
 
 
 def rasterize(

@@ -21,6 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._raster_input import floats, mask
 from .brdf import ggx32, roughness_to_alpha
 from .errors import InputError
 from .gaussians import Gaussians
@@ -84,13 +85,17 @@ class Shader:
         shader.light = replace(self.light, yaw=yaw)
         return shader
 
-    def shade(self, gaussians: Gaussians, camera_position: ArrayLike) -> Floats32:
+    def shade(
+        self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None
+    ) -> Floats32:
         """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m, world.
 
-        Gaussians that face away from the camera are shaded too: at a silhouette they are seen.
+        Gaussians that face away from the camera are shaded too: at a silhouette they are seen. Those that are
+        not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same.
         """
         light_to_world = self.light.rotation
-        radiance = self._sky.shade(gaussians, camera_position, light_to_world)
+        seen = mask(seen, len(gaussians.means))
+        radiance = self._sky.shade(gaussians, camera_position, light_to_world, seen)
         if self.suns and len(radiance):
             directions = np.array([sun.direction for sun in self.suns]) @ light_to_world.T
             visibility = directional_visibility(
@@ -99,16 +104,17 @@ class Shader:
                 directions,
                 radii=_shadow_radii(gaussians),
                 resolution=_SHADOW_RESOLUTION,
+                receivers=seen,
             )
             _add_suns(
-                *(
-                    np.array(a, np.float32, order="C")
-                    for a in (gaussians.means, gaussians.normals, gaussians.albedo)
-                ),
-                np.array(roughness_to_alpha(gaussians.roughness), np.float32),
-                np.array(visibility, order="C"),
+                floats(gaussians.means),
+                floats(gaussians.normals),
+                floats(gaussians.albedo),
+                floats(roughness_to_alpha(gaussians.roughness)),
+                floats(visibility),
                 np.array(camera_position, np.float32),
                 tuple(np.array(a, np.float32, order="C") for a in (directions, *self._sun_arrays())),
+                seen,
                 radiance,
             )
         return radiance
@@ -129,16 +135,26 @@ def _light_count(mode: str) -> int:
 
 def _shadow_radii(gaussians: Gaussians) -> Floats32:
     """Disc radius [N] m of each Gaussian in a depth map; flat ones have σ² twice in the trace."""
-    sigma = np.sqrt(gaussians.covariances[:, [0, 3, 5]].sum(-1) / 2)
-    return np.asarray(np.where(gaussians.opacities > _CASTING_OPACITY, _DISC_SIGMAS * sigma, 0), np.float32)
+    radii = np.empty(len(gaussians.means), np.float32)
+    _radii(floats(gaussians.covariances), floats(gaussians.opacities), radii)
+    return radii
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy")
-def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, radiance):  # type: ignore[no-untyped-def]
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _radii(covariances, opacities, radii):  # type: ignore[no-untyped-def]
+    for i in range(len(radii)):
+        trace = covariances[i, 0] + covariances[i, 3] + covariances[i, 5]
+        radii[i] = _DISC_SIGMAS * np.sqrt(trace / 2) if opacities[i] > _CASTING_OPACITY else 0
+
+
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, radiance):  # type: ignore[no-untyped-def]
     # A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks
     # for α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own.
     directions, irradiance, spread_squared = suns
     for i in numba.prange(len(means)):
+        if not seen[i]:
+            continue
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
         distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)

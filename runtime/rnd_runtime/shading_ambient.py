@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._raster_input import floats, mask
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
 from .sh import sh_basis, sh_columns, sh_rotation
@@ -39,26 +40,32 @@ class AmbientLight:
         flux = light.resized(*texels).radiance * texel_solid_angles(*texels)[..., None]
         return cls(np.einsum("hwj,hwc->jc", sh_basis(texel_directions(*texels)), flux))
 
-    def shade(self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats) -> Floats32:
+    def shade(
+        self,
+        gaussians: Gaussians,
+        camera_position: ArrayLike,
+        light_to_world: Floats,
+        seen: ArrayLike | None = None,
+    ) -> Floats32:
         """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + specular of the bare light) · occlusion.
 
         Occlusion is the visibility's mean over the upper hemisphere, weighted by the cosine. Both it and E(n)
         are exact up to degree 2 and know nothing of each other: light from the open side counts no more than
-        from the blocked one.
+        from the blocked one. 0 where not ``seen``.
         """
         root = np.asarray(gaussians.root_rotation, np.float64)
         in_root = sh_rotation(root.T @ light_to_world) @ self.coefficients
-        radiance = np.empty((len(gaussians.means), 3), np.float32)
+        radiance = np.zeros((len(gaussians.means), 3), np.float32)
         _ambient(
-            *(
-                np.array(a, np.float32, order="C")
-                for a in (gaussians.means, gaussians.normals, gaussians.albedo)
-            ),
-            np.array(gaussians.roughness, np.float32),
-            np.array(gaussians.visibility, np.float32, order="C"),
+            floats(gaussians.means),
+            floats(gaussians.normals),
+            floats(gaussians.albedo),
+            floats(gaussians.roughness),
+            floats(gaussians.visibility),
             np.array(camera_position, np.float32),
             np.array(root, np.float32, order="C"),
             (np.array(in_root, np.float32, order="C"), lobe_table()),
+            mask(seen, len(radiance)),
             radiance,
         )
         return radiance
@@ -67,12 +74,14 @@ class AmbientLight:
 _sh_columns = numba.njit(sh_columns)
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy")
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _ambient(  # type: ignore[no-untyped-def]
-    means, normals, albedo, roughness, visibility, camera, root_rotation, tables, radiance
+    means, normals, albedo, roughness, visibility, camera, root_rotation, tables, seen, radiance
 ):
     light, lobes = tables
     for i in numba.prange(len(means)):
+        if not seen[i]:
+            continue
         nx, ny, nz = transposed(root_rotation, normals[i, 0], normals[i, 1], normals[i, 2])
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
         vx, vy, vz = transposed(root_rotation, vx, vy, vz)

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._raster_input import floats, mask
 from .brdf import ggx32, roughness_to_alpha
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
@@ -75,22 +76,31 @@ class DistantLights:
                 flux.append(texel_flux[top:bottom, left:right].sum((0, 1)))
         return cls(np.reshape(directions, (-1, 3)), np.reshape(flux, (-1, 3)))
 
-    def shade(self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats) -> Floats32:
-        """Linear radiance [N, 3] towards the camera, as ``shade_reference`` defines it over these lights."""
+    def shade(
+        self,
+        gaussians: Gaussians,
+        camera_position: ArrayLike,
+        light_to_world: Floats,
+        seen: ArrayLike | None = None,
+    ) -> Floats32:
+        """Linear radiance [N, 3] towards the camera, as ``shade_reference`` defines it over these lights.
+
+        0 where not ``seen``.
+        """
         directions = self.directions @ light_to_world.T
         basis = sh_basis(
             directions @ np.asarray(gaussians.root_rotation, np.float64)
         )  # rows times R: root's frame
-        radiance = np.empty((len(gaussians.means), 3), np.float32)
+        radiance = np.zeros((len(gaussians.means), 3), np.float32)
         _sum_lights(
-            *(
-                np.array(a, np.float32, order="C")
-                for a in (gaussians.means, gaussians.normals, gaussians.albedo)
-            ),
-            np.array(roughness_to_alpha(gaussians.roughness), np.float32),
-            np.array(gaussians.visibility, np.float32, order="C"),
+            floats(gaussians.means),
+            floats(gaussians.normals),
+            floats(gaussians.albedo),
+            floats(roughness_to_alpha(gaussians.roughness)),
+            floats(gaussians.visibility),
             np.array(camera_position, np.float32),
             *(np.array(a.T, np.float32, order="C") for a in (directions, basis, self.flux)),
+            mask(seen, len(radiance)),
             radiance,
         )
         return radiance
@@ -128,12 +138,14 @@ def _sum(total: Floats, top: int, bottom: int, left: int, right: int) -> float:
     return float(max(total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left], 0))
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True, error_model="numpy")
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _sum_lights(  # type: ignore[no-untyped-def]
-    means, normals, albedo, alpha, visibility, camera, directions, basis, flux, radiance
+    means, normals, albedo, alpha, visibility, camera, directions, basis, flux, seen, radiance
 ):
     """Arrays of lights come transposed, [3, K] and [16, K], so that the inner loop runs in vector registers."""
     for i in numba.prange(len(means)):
+        if not seen[i]:
+            continue
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
         distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _HALF_FLOOR)

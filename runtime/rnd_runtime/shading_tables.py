@@ -19,6 +19,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._lanes import WIDTH, load, total
+from ._raster_input import floats, mask
 from .brdf import ROUGHNESS_RANGE
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
@@ -64,17 +66,22 @@ class SkyTables:
         _prefilter(nodes, np.ascontiguousarray(texel_rows.T), LOBE_WIDTHS.astype(np.float32), specular)
         return cls(diffuse, specular)
 
-    def shade(self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats) -> Floats32:
-        """Linear radiance [N, 3] towards the camera, close to what ``shade_reference`` defines."""
+    def shade(
+        self,
+        gaussians: Gaussians,
+        camera_position: ArrayLike,
+        light_to_world: Floats,
+        seen: ArrayLike | None = None,
+    ) -> Floats32:
+        """Linear radiance [N, 3] towards the camera, close to ``shade_reference``; 0 where not ``seen``."""
         root_to_light = light_to_world.T @ np.asarray(gaussians.root_rotation, np.float64)
-        radiance = np.empty((len(gaussians.means), 3), np.float32)
+        radiance = np.zeros((len(gaussians.means), 3), np.float32)
         _look_up(
-            *(
-                np.array(a, np.float32, order="C")
-                for a in (gaussians.means, gaussians.normals, gaussians.albedo)
-            ),
-            np.array(gaussians.roughness, np.float32),
-            np.array(gaussians.visibility, np.float32, order="C"),
+            floats(gaussians.means),
+            floats(gaussians.normals),
+            floats(gaussians.albedo),
+            floats(gaussians.roughness),
+            floats(gaussians.visibility),
             np.array(camera_position, np.float32),
             tuple(np.array(r, np.float32, order="C") for r in (light_to_world, root_to_light)),
             (
@@ -82,6 +89,7 @@ class SkyTables:
                 self.specular,
                 lobe_table(),
             ),
+            mask(seen, len(radiance)),
             radiance,
         )
         return radiance
@@ -137,13 +145,21 @@ def _prefilter(nodes, texels, widths, specular):  # type: ignore[no-untyped-def]
 _sh_columns = numba.njit(sh_columns)
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
+@numba.njit(
+    parallel=True,
+    nogil=True,
+    cache=True,
+    fastmath={"reassoc", "contract", "arcp", "nsz"},
+    error_model="numpy",
+)
 def _look_up(  # type: ignore[no-untyped-def]
-    means, normals, albedo, roughness, visibility, camera, rotations, tables, radiance
+    means, normals, albedo, roughness, visibility, camera, rotations, tables, seen, radiance
 ):
     light_to_world, root_to_light = rotations
     diffuse, specular, lobes = tables
     for i in numba.prange(len(means)):
+        if not seen[i]:
+            continue
         nx, ny, nz = transposed(light_to_world, normals[i, 0], normals[i, 1], normals[i, 2])
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
         vx, vy, vz = transposed(light_to_world, vx, vy, vz)
@@ -154,30 +170,32 @@ def _look_up(  # type: ignore[no-untyped-def]
             lobes, roughness[i], n_dot_v, nx, ny, nz, vx, vy, vz
         )
         basis = _sh_columns(*transposed(root_to_light, mx, my, mz))
-        seen = visibility[i, 0] * np.float32(basis[0])  # v averaged over the lobe
+        open_share = visibility[i, 0] * np.float32(basis[0])  # v averaged over the lobe
         for j in range(1, 16):
             shrink = shrink1 if j < 4 else (shrink2 if j < 9 else shrink3)
-            seen += shrink * visibility[i, j] * np.float32(basis[j])
+            open_share += shrink * visibility[i, j] * np.float32(basis[j])
 
         low = min(int(place), len(specular) - 2)
         up = place - np.float32(low)
         cell, s, t = octahedral_cell(mx, my, mz, _SPECULAR_SIZE)
         node, ns, nt = octahedral_cell(nx, ny, nz, _DIFFUSE_SIZE)
-        m00, m01 = diffuse[node], diffuse[node + 1]
-        m10, m11 = diffuse[node + _DIFFUSE_SIZE], diffuse[node + _DIFFUSE_SIZE + 1]
         w00, w01, w10, w11 = (_ONE - ns) * (_ONE - nt), ns * (_ONE - nt), (_ONE - ns) * nt, ns * nt
+        coefficients = load(visibility, i * WIDTH)
+        row = 3 * WIDTH  # of one node
+        node *= row
         for channel in range(3):
             lower = _bilinear(specular[low], cell, _SPECULAR_SIZE, s, t, channel)
             upper = _bilinear(specular[low + 1], cell, _SPECULAR_SIZE, s, t, channel)
-            shine = energy * max(seen, _ZERO) * (lower + up * (upper - lower))
-            irradiance = _ZERO
-            for j in range(16):
-                k = channel * 16 + j
-                irradiance += visibility[i, j] * (w00 * m00[k] + w01 * m01[k] + w10 * m10[k] + w11 * m11[k])
+            shine = energy * max(open_share, _ZERO) * (lower + up * (upper - lower))
+            at = node + channel * WIDTH
+            upper_nodes = w00 * load(diffuse, at) + w01 * load(diffuse, at + row)
+            at += _DIFFUSE_SIZE * row
+            lower_nodes = w10 * load(diffuse, at) + w11 * load(diffuse, at + row)
+            irradiance = total(coefficients * (upper_nodes + lower_nodes))
             radiance[i, channel] = max(albedo[i, channel] * _ONE_OVER_PI * irradiance + shine, _ZERO)
 
 
-@numba.njit(parallel=True, cache=True, fastmath=True)
+@numba.njit(parallel=True, nogil=True, cache=True, fastmath=True)
 def _turned(diffuse, turn):  # type: ignore[no-untyped-def]
     """Tables that take coefficients of the root's frame: 3 267 rows to turn instead of one per Gaussian.
 

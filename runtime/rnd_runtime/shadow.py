@@ -6,8 +6,8 @@ in its tangent plane into an orthographic map that keeps what lies nearest to th
 looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its
 own tangent plane, so that a slope casts no shadow on itself.
 
-Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). 30 000 points take
-0.9 ms a direction on two cores, 1.8 ms when there is one direction only.
+Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). Threads share the work of
+each direction; their number changes no bit.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._raster_input import floats, mask
 from .errors import InputError
 
 Floats32 = NDArray[np.float32]
@@ -28,6 +29,7 @@ _CLEARANCE = np.float32(1.0)
 _CLEARANCE_TEXELS = np.float32(0.35)
 _COSINE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
 _EMPTY = np.float32(-np.inf)
+_CHUNK = 1024  # points turned at a time
 
 
 def directional_visibility(
@@ -37,6 +39,7 @@ def directional_visibility(
     *,
     radii: ArrayLike,
     resolution: int = 256,
+    receivers: ArrayLike | None = None,
 ) -> Floats32:
     """How much of a distant light in each direction reaches each point past all other points, in [0, 1].
 
@@ -48,12 +51,13 @@ def directional_visibility(
             where points are scattered at random (1.0 leaves 4 % of the surface open). A point of radius 0
             casts no shadow and still receives them.
         resolution: texels along the longer side of a depth map, which is cut to the points' bounds.
+        receivers: [N] the points whose visibility is wanted; all cast shadows. By default all.
 
     Returns:
-        [N, K]; 0 where the point faces away from the light. Points that are not finite get 0, cast nothing.
+        [N, K]; 0 where the point faces away from the light or is no receiver. Points that are not finite get 0 and
+        cast nothing.
     """
-    # copies: the kernel would be compiled anew for arrays that are read-only
-    points, normals, directions = (np.array(a, np.float32, order="C") for a in (points, normals, directions))
+    points, normals, directions = floats(points), floats(normals), floats(directions)
     if not (points.ndim == 2 and points.shape[1] == 3 and normals.shape == points.shape):
         raise InputError(
             "points and normals of a shadow", expected="[N, 3] both", got=f"{points.shape}, {normals.shape}"
@@ -64,25 +68,62 @@ def directional_visibility(
         raise InputError("resolution of a depth map", expected="8 to 8192 texels", got=resolution)
     disc_radii = np.full(len(points), radii, np.float32)
     visibility = np.zeros((len(directions), len(points)), np.float32)
-    _all_directions(points, normals, directions, disc_radii, resolution, visibility)
+    wanted = mask(receivers, len(points))
+    for direction, row in zip(directions, visibility):
+        arrays = (points, normals, disc_radii, wanted)
+        _one_direction(arrays, _frame(direction), resolution, numba.get_num_threads(), row)
     return visibility.T
 
 
-@numba.njit(parallel=True, cache=True, error_model="numpy")
-def _all_directions(points, normals, directions, radii, resolution, visibility):  # type: ignore[no-untyped-def]
-    for k in numba.prange(len(directions)):
-        _one_direction(points, normals, directions[k], radii, resolution, visibility[k])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _one_direction(points, normals, direction, radii, resolution, visibility):  # type: ignore[no-untyped-def]
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ignore[no-untyped-def]
+    points, _, radii, receivers = arrays
     count = len(points)
-    frame = _frame(direction)
+    chunks = (count + _CHUNK - 1) // _CHUNK
     position = np.empty((count, 3), np.float32)  # x, y in the map's plane, z towards the light
     normal = np.empty((count, 3), np.float32)
-    lower = np.full(2, np.float32(np.inf), np.float32)
-    upper = np.full(2, np.float32(-np.inf), np.float32)
+    bounds = np.empty((chunks, 4), np.float32)
+    for chunk in numba.prange(chunks):
+        first, last = chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)
+        _turn(arrays, frame, first, last, position, normal, bounds[chunk])
+    left, bottom, right, top = (
+        np.float32(np.inf),
+        np.float32(np.inf),
+        -np.float32(np.inf),
+        -np.float32(np.inf),
+    )
+    for chunk in range(chunks):
+        left, bottom = min(left, bounds[chunk, 0]), min(bottom, bounds[chunk, 1])
+        right, top = max(right, bounds[chunk, 2]), max(top, bounds[chunk, 3])
+    extent = max(right - left, top - bottom)
+    if not extent > 0:  # a single point, or none: nothing to cast
+        extent = np.float32(1)
+    # texel centres lie at integers; one empty row all around serves the lookup of the outermost points
+    texel = extent / np.float32(resolution - 3)
+    width = int((right - left) / texel) + 3 if right >= left else 3
+    height = int((top - bottom) / texel) + 3 if right >= left else 3
+    depth = np.full((height, width), _EMPTY, np.float32)
     for i in range(count):
+        if normal[i, 2] > 0:
+            position[i, 0] = (position[i, 0] - left) / texel + 1
+            position[i, 1] = (position[i, 1] - bottom) / texel + 1
+    # each thread draws rows of its own, and about as many discs as the others
+    edges = _bands(position, normal, height, threads)
+    for band in numba.prange(len(edges) - 1):
+        for i in range(count):
+            if normal[i, 2] > 0 and radii[i] > 0:
+                _draw_disc(depth, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
+    for i in numba.prange(count):
+        if normal[i, 2] > 0 and receivers[i]:
+            visibility[i] = _look_up(depth, position, normal, i, radii[i], texel)
+
+
+@numba.njit(error_model="numpy")
+def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
+    """Rows first … last − 1 in the axes of ``frame``, and the least and greatest x and y among them."""
+    points, normals, radii, _ = arrays
+    bounds[:2], bounds[2:] = np.inf, -np.inf
+    for i in range(first, last):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         if not np.isfinite(px + py + pz + nx + ny + nz + radii[i]):
@@ -93,25 +134,24 @@ def _one_direction(points, normals, direction, radii, resolution, visibility):  
             position[i, axis] = fx * px + fy * py + fz * pz
             normal[i, axis] = fx * nx + fy * ny + fz * nz
         for axis in range(2):
-            lower[axis] = min(lower[axis], position[i, axis])
-            upper[axis] = max(upper[axis], position[i, axis])
-    extent = max(upper[0] - lower[0], upper[1] - lower[1])
-    if not extent > 0:  # a single point, or none: nothing to cast
-        extent = np.float32(1)
-    # texel centres lie at integers; one empty row all around serves the lookup of the outermost points
-    texel = extent / np.float32(resolution - 3)
-    width = int((upper[0] - lower[0]) / texel) + 3 if upper[0] >= lower[0] else 3
-    height = int((upper[1] - lower[1]) / texel) + 3 if upper[1] >= lower[1] else 3
-    depth = np.full((height, width), _EMPTY, np.float32)
-    for i in range(count):
+            bounds[axis] = min(bounds[axis], position[i, axis])
+            bounds[2 + axis] = max(bounds[2 + axis], position[i, axis])
+
+
+@numba.njit(error_model="numpy")
+def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
+    """Rows [bands + 1] that cut a map into bands which hold about equally many of the points that face the light."""
+    points = np.zeros(height + 1, np.int64)
+    for i in range(len(position)):
         if normal[i, 2] > 0:
-            position[i, 0] = (position[i, 0] - lower[0]) / texel + 1
-            position[i, 1] = (position[i, 1] - lower[1]) / texel + 1
-            if radii[i] > 0:
-                _draw_disc(depth, position[i], normal[i], radii[i], texel)
-    for i in range(count):
-        if normal[i, 2] > 0:
-            visibility[i] = _look_up(depth, position[i], normal[i], radii[i], texel)
+            points[int(position[i, 1]) + 1] += 1
+    for row in range(height):
+        points[row + 1] += points[row]
+    edges = np.empty(bands + 1, np.int64)
+    for band in range(bands):
+        edges[band] = np.searchsorted(points[: height + 1], points[height] * band // bands)
+    edges[0], edges[bands] = 0, height
+    return edges
 
 
 @numba.njit(cache=True)
@@ -128,34 +168,35 @@ def _frame(direction):  # type: ignore[no-untyped-def]
     return frame
 
 
-@numba.njit(inline="always")
-def _slopes(normal, texel):  # type: ignore[no-untyped-def]
-    """Rise of the tangent plane towards the light, in metres a texel, along x and y."""
-    scale = -texel / max(normal[2], _COSINE_FLOOR)
-    return normal[0] * scale, normal[1] * scale
+@numba.njit(error_model="numpy")
+def _slopes(normal, i, texel):  # type: ignore[no-untyped-def]
+    """Rise of point i's tangent plane towards the light, in metres a texel, along x and y."""
+    scale = -texel / max(normal[i, 2], _COSINE_FLOOR)
+    return normal[i, 0] * scale, normal[i, 1] * scale
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _draw_disc(depth, position, normal, radius, texel):  # type: ignore[no-untyped-def]
-    """Keep the disc's plane where it is nearer to the light than what the map holds."""
-    height, width = depth.shape
-    x, y, z = position
-    slope_x, slope_y = _slopes(normal, texel)
+@numba.njit(error_model="numpy")
+def _draw_disc(depth, position, normal, i, radius, texel, low, high):  # type: ignore[no-untyped-def]
+    """Keep the disc's plane where it is nearer to the light than what rows ``low`` … ``high`` − 1 of the map hold."""
+    width = depth.shape[1]
+    x, y, z = position[i, 0], position[i, 1], position[i, 2]
+    slope_x, slope_y = _slopes(normal, i, texel)
     reach = radius / texel
-    for row in range(max(int(np.ceil(y - reach)), 0), min(int(np.floor(y + reach)) + 1, height)):
+    for row in range(max(int(np.ceil(y - reach)), low), min(int(np.floor(y + reach)) + 1, high)):
         for column in range(max(int(np.ceil(x - reach)), 0), min(int(np.floor(x + reach)) + 1, width)):
             dx, dy = np.float32(column) - x, np.float32(row) - y
             rise = slope_x * dx + slope_y * dy
-            if (dx * dx + dy * dy) * texel * texel + rise * rise <= radius * radius:
-                depth[row, column] = max(depth[row, column], z + rise)
+            # no branch: which texels of a small box lie inside is what no processor can predict
+            inside = (dx * dx + dy * dy) * texel * texel + rise * rise <= radius * radius
+            depth[row, column] = max(depth[row, column], z + rise if inside else _EMPTY)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _look_up(depth, position, normal, radius, texel):  # type: ignore[no-untyped-def]
+@numba.njit(error_model="numpy")
+def _look_up(depth, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
     """Bilinear share of the four texels around a point in which nothing rises above its plane."""
-    x, y, z = position
-    slope_x, slope_y = _slopes(normal, texel)
-    clearance = max(_CLEARANCE * radius, _CLEARANCE_TEXELS * texel) / max(normal[2], _COSINE_FLOOR)
+    x, y, z = position[i, 0], position[i, 1], position[i, 2]
+    slope_x, slope_y = _slopes(normal, i, texel)
+    clearance = max(_CLEARANCE * radius, _CLEARANCE_TEXELS * texel) / max(normal[i, 2], _COSINE_FLOOR)
     column, row = int(x), int(y)  # positive, and one texel short of the far edge
     lit = np.float32(0)
     for corner in range(4):

@@ -21,6 +21,7 @@ from .config import TrainConfig, from_dict, to_dict
 from .light import LightProbe
 from .model import AvatarModel
 from .template import Template
+from .twist import twist_frames
 
 SCHEMA = "rnd-checkpoint/1"
 _KEY = "rnd_checkpoint"
@@ -71,7 +72,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
             tensors["skeleton.rest_joints"].numpy().astype(np.float64),
         )
         state = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
-        model = rebuild_model(config, state)
+        model = rebuild_model(config, state, skeleton)
         probe = tensors["probe"]
     except (KeyError, TypeError, RuntimeError, IndexError, ValueError, AttributeError) as error:
         raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
@@ -80,19 +81,21 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
     return Checkpoint(model, probe, skeleton, config, header.get("info", {}))
 
 
-def rebuild_model(config: TrainConfig, state: dict[str, Tensor]) -> AvatarModel:
+def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:
     """A model of ``config`` with the tensors of ``state``."""
     neighbours = state["interpolate.neighbours"]
     if int(neighbours.min()) < 0 or int(neighbours.max()) >= config.model.nodes:
         raise ValueError("interpolation neighbours out of range")
+    points, weights = state["points"].double().numpy(), state["log_weights"].double().exp().numpy()
     template = Template(
-        points=state["points"].numpy(),
+        points=points,
         normals=state["rest_normals"].numpy(),
         codes=state["codes"].numpy(),
-        weights=state["log_weights"].exp().numpy(),
+        weights=weights,
         spacing=float(state["spacing"]),
         neighbours=neighbours.numpy(),
         neighbour_weights=state["interpolate.weights"].numpy(),
+        limbs=twist_frames(points, weights, skeleton),
         nodes=config.model.nodes,
     )
     model = AvatarModel(config.model, template)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -43,10 +44,24 @@ class TrainOptions:
     """shrink the pictures by this factor"""
     seed: int = 0
     """of every random draw"""
-    light: Literal["learn", "capture"] = "learn"
-    """'capture': train under the capture's own light map (an oracle, for studies)"""
+    perceptual_weights: Path | None = None
+    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses"""
+    refine_poses: bool = False
+    """correct the capture's body poses while training; writes refined_motion.npz"""
+    light: Literal["learn", "capture", "none"] = "learn"
+    """'capture': train under the capture's own light map (an oracle, for studies); 'none': plain colours"""
+    normals: Literal["estimated", "true"] = "estimated"
+    """'true': the capture's exact normals (an oracle, for studies)"""
+    probe_channels: Literal[1, 3] = 3
+    """1: a grey light"""
+    visibility: Literal["pose", "paper", "none"] = "pose"
+    """'paper': visibility towards the camera, as printed; 'none': no shadows (ablations, not exported)"""
     motion: str | None = None
     """another motion file of the capture, such as motion_noisy.npz"""
+    device: str = "cpu"
+    """'cuda' trains on a GPU: the same code, gsplat as its rasteriser (extra [cuda])"""
+    view: bool = False
+    """show the training on a page of this machine: previews, losses, time left"""
 
 
 def main() -> None:
@@ -59,19 +74,21 @@ def _train(options: TrainOptions) -> None:
     need_extra()
     from rnd_runtime.capture import load_capture
 
-    from .config import preset, to_dict
+    from .config import preset, resized, to_dict
+    from .live_view import live_view
+    from .perceptual import load_perceptual
     from .train import Training, run
 
-    config = preset(options.preset)
-    model = config.model
-    if options.gaussians is not None:
-        model = dataclasses.replace(model, gaussians=options.gaussians, nodes=max(16, options.gaussians // 4))
+    config = resized(preset(options.preset), options.gaussians, options.steps)
+    model = dataclasses.replace(config.model, visibility=options.visibility)
     config = dataclasses.replace(
         config,
         model=model,
         seed=options.seed,
         light=options.light,
-        steps=config.steps if options.steps is None else options.steps,
+        normals=options.normals,
+        probe_channels=options.probe_channels,
+        refine_poses=options.refine_poses,
         image_scale=config.image_scale if options.image_scale is None else options.image_scale,
     )
     _check(config.steps >= 1, "--steps", "at least 1", config.steps)
@@ -85,19 +102,47 @@ def _train(options: TrainOptions) -> None:
         raise InputError(
             "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
         )
-    training = Training(capture, config)
+    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    if perceptual is None:
+        print(  # noqa: T201
+            "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
+            file=sys.stderr,
+        )
+    elif not perceptual.heads:
+        raise InputError(
+            "--perceptual-weights", expected="a network with LPIPS heads", got=perceptual.backbone,
+            file=options.perceptual_weights,
+        )  # fmt: skip
+    training = Training(capture, config, perceptual, _device(options.device))
     if options.resume:
         training.resume(state)
     with atomic_path(folder / "config.json") as temporary:
         temporary.write_text(json.dumps(to_dict(config), indent=1) + "\n", encoding="utf-8")
     for frame in training.bad_masks:
         print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
-    interrupted = _run_with_progress(training, folder, run)
+    with live_view(folder, config.steps) if options.view else nullcontext() as page:
+        if page:
+            print(f"rnd-train: {page}", file=sys.stderr)  # noqa: T201
+        interrupted = _run_with_progress(training, folder, run)
     print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
     if interrupted:
         print(f"rnd-train: stopped; continue with --resume --out {folder}", file=sys.stderr)  # noqa: T201
         raise KeyboardInterrupt
     _score_after_training(training, folder, options)
+
+
+def _device(name: str) -> str:
+    """``name`` if torch can compute there; the CUDA path is refused where its parts are missing."""
+    import torch
+
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError(
+            "--device", expected="a GPU that this torch can use", got="none", hint="--device cpu"
+        )
+    try:
+        return str(torch.device(name))
+    except RuntimeError as error:
+        raise InputError("--device", expected="cpu or cuda", got=name) from error
 
 
 def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:

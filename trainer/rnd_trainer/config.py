@@ -35,6 +35,12 @@ class ModelConfig:
     """bound of a Gaussian's offset from the unclothed template (hair, loose cloth), metres"""
     dynamic_skinning: bool = True
     """False: the template's weights, the paper's static baseline"""
+    motion_encoder: Literal["full", "spatial"] = "full"
+    """'spatial': no temporal attention, the paper's ablation"""
+    visibility: Literal["pose", "paper", "none"] = "pose"
+    """'paper': of x_c and the normal, at the direction to the camera; 'none': no shadows. Ablations, not exported"""
+    learned_normals: bool = True
+    """False: the template's normals (mesh-normal shading, an ablation)"""
 
 
 @dataclass(frozen=True)
@@ -50,18 +56,36 @@ class TrainConfig:
     """training pictures are shrunk by this factor"""
     seed: int = 0
     """of every random draw"""
-    light: Literal["learn", "capture"] = "learn"
-    """'capture' trains under the capture's own light map: an oracle that tells what the learned light costs"""
+    light: Literal["learn", "capture", "none"] = "learn"
+    """'capture': the capture's own light map, an oracle that tells what the learned light costs; 'none': plain
+    colours to the end, as avatars that cannot be relit are trained"""
+    normals: Literal["estimated", "true"] = "estimated"
+    """'true': the capture's exact normals, an oracle"""
+    probe_channels: Literal[1, 3] = 3
+    """1: a grey light, as printed in the paper"""
+
+    light_search: bool = True
+    """start the second stage from a sky and suns found by least squares, instead of from a white probe"""
 
     rate_networks: float = 2e-3
     """Adam's step for the networks; decays to a tenth"""
     rate_residuals: float = 1.5e-2
     """Adam's step for the per-Gaussian residuals; decays to a tenth"""
-    rate_light: float = 3e-2
-    """Adam's step for the probe's texels (before softplus)"""
+    rate_light: float = 1e-2
+    """Adam's step for the logarithms of the probe's texels"""
 
     weight_dssim: float = 0.2
     """of 1 − SSIM beside L1, in image terms"""
+    dssim_scales: int = 3
+    """halvings over which 1 − SSIM is averaged where there is no perceptual network"""
+    weight_lpips: float = 0.05
+    """of LPIPS, with --perceptual-weights"""
+    lpips_every: int = 2
+    """steps between evaluations of LPIPS: it costs as much as everything else in a step"""
+    weight_consistency: float = 0.002
+    """of L_gc, with --perceptual-weights"""
+    consistency_every: int = 8
+    """steps between evaluations of L_gc: a second picture and two feature stacks"""
     weight_mask: float = 0.5
     """of L1 between alpha and the mask"""
     weight_normal: float = 0.1
@@ -74,8 +98,11 @@ class TrainConfig:
     """of the mean square of the geometric residuals: an unseen Gaussian follows its neighbours"""
     weight_visibility: float = 0.2
     """of the traced visibility's square error"""
-    weight_light_grey: float = 0.01
-    """of the probe's chroma: a white light unless the pictures say otherwise"""
+    weight_light_grey: float = 0.02
+    """of the chroma of the probe as a whole: white light on average"""
+
+    weight_light_sky: float = 0.03
+    """of the distance from a natural sky, sun apart: what lights the side that is never seen is like the rest"""
 
     light_texels: int = 128
     """texels of the probe drawn for a step, by luminance × solid angle"""
@@ -87,6 +114,15 @@ class TrainConfig:
     """directions a step in which visibility is traced to supervise its network"""
     pose_noise: float = 0.05
     """radians of noise on the encoders' input poses: they must not memorise the frames"""
+
+    refine_poses: bool = False
+    """correct the capture's body poses while training"""
+    refine_after: float = 0.08
+    """share of the steps before poses may move: the first shape is too rough to correct anything by"""
+    rate_poses: float = 1.5e-3
+    """Adam's step for pose corrections, radians and metres, at each look at a frame"""
+    weight_poses: float = 1e-3
+    """of the mean square correction in units of its bounds"""
 
     preview_every: int = 500
     """steps between preview pictures"""
@@ -103,8 +139,16 @@ def preset(name: str) -> TrainConfig:
         return dataclasses.replace(standard, steps=5 * standard.steps)
     if name == "quick":
         small = dataclasses.replace(standard.model, gaussians=12_000, nodes=3_000)
-        return dataclasses.replace(standard, model=small, steps=2_500, preview_every=250, save_every=250)
+        return dataclasses.replace(standard, model=small, steps=2_000, preview_every=250, save_every=250)
     raise InputError("preset", expected="quick, standard or full", got=name)
+
+
+def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> TrainConfig:
+    """``config`` with another number of Gaussians (a quarter of them nodes) and of steps, where given."""
+    model = config.model
+    if gaussians is not None:
+        model = dataclasses.replace(model, gaussians=gaussians, nodes=max(16, gaussians // 4))
+    return dataclasses.replace(config, model=model, steps=config.steps if steps is None else steps)
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:
@@ -113,15 +157,15 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
-    """Rebuild a configuration; an unknown or missing field is an error, never a default."""
+    """Rebuild a configuration; an unknown field is an error.
+
+    A missing one has the value it has today: a checkpoint from before a switch existed was trained without it.
+    """
     return _build(TrainConfig, {**values, "model": _build(ModelConfig, values.get("model", {}))})
 
 
 def _build(kind: Any, values: dict[str, Any]) -> Any:
-    known = {field.name for field in dataclasses.fields(kind)}
-    if set(values) != known:
-        wrong = sorted(set(values) ^ known)
-        raise InputError(
-            "configuration", expected=f"the fields of {kind.__name__}", got=f"{wrong} unknown or missing"
-        )
+    unknown = sorted(set(values) - {field.name for field in dataclasses.fields(kind)})
+    if unknown:
+        raise InputError("configuration", expected=f"the fields of {kind.__name__}", got=f"{unknown} too")
     return kind(**values)

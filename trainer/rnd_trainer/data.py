@@ -57,8 +57,12 @@ class View:
         return (torch.from_numpy(self.normal).float() / 127.5 - 1) * covered
 
 
-def load_views(capture: Capture, split: str, scale: float = 1.0) -> tuple[list[View], list[int]]:
+def load_views(
+    capture: Capture, split: str, scale: float = 1.0, true_normals: bool = False
+) -> tuple[list[View], list[int]]:
     """The usable views of a split, and the motion frames whose masks were empty or full.
+
+    ``true_normals`` takes the capture's exact normals instead of the estimated ones (an oracle, for studies).
 
     Raises :class:`InputError` when the split is empty or more than a fifth of its masks are unusable.
     """
@@ -72,9 +76,9 @@ def load_views(capture: Capture, split: str, scale: float = 1.0) -> tuple[list[V
         if not low < float(data.mask.mean()) < high:
             bad.append(frame.frame)
             continue
-        views.append(
-            _crop(frame, capture.cameras[frame.camera], data.image_srgb, data.mask, data.normal, scale)
-        )
+        normal = data.normal_gt if true_normals else data.normal
+        camera = capture.cameras[frame.camera]
+        views.append(_crop(frame, camera, data.image_srgb, data.mask, normal, scale))
     if len(bad) > MAX_BAD_MASKS * len(frames):
         raise InputError(
             "masks", expected=f"at most {MAX_BAD_MASKS:.0%} empty or full", got=f"{len(bad)} of {len(frames)}",

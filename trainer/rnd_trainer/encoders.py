@@ -92,14 +92,17 @@ class DynamicSkinning(nn.Module):
 
     ``forward(encoded [M, E], window [d, J−1, 6], velocity [J−1, 3] rad/s) → [M, J]``. The temporal branch
     reads each joint's d poses as one token, the spatial branch the joints' velocities (paper, section 3.2).
+    Without ``temporal`` only the second is there, the paper's ablation.
     """
 
-    def __init__(self, inputs: int, joints: int, poses: int, width: int, heads: int) -> None:
+    def __init__(
+        self, inputs: int, joints: int, poses: int, width: int, heads: int, temporal: bool = True
+    ) -> None:
         super().__init__()
         self.position = PositionEncoder(inputs, width)
-        self.temporal = JointAttention(6 * poses, joints - 1, width, heads)
+        self.temporal = JointAttention(6 * poses, joints - 1, width, heads) if temporal else None
         self.spatial = JointAttention(3, joints - 1, width, heads)
-        self.merge = nn.Linear(3 * width, width)
+        self.merge = nn.Linear((3 if temporal else 2) * width, width)
         self.hidden = nn.Linear(width, width)
         self.logits = nn.Linear(width, joints)
         nn.init.zeros_(self.logits.weight)
@@ -107,9 +110,10 @@ class DynamicSkinning(nn.Module):
 
     def forward(self, encoded: Tensor, window: Tensor, velocity: Tensor) -> Tensor:
         f_x = self.position(encoded)
-        f_t = self.temporal(window.transpose(0, 1).flatten(1), f_x)
-        f_s = self.spatial(torch.tanh(VELOCITY_SCALE * velocity), f_x)
-        merged = torch.relu(self.merge(torch.cat([f_t, f_s, f_x], dim=-1)))
+        branches = [self.spatial(torch.tanh(VELOCITY_SCALE * velocity), f_x), f_x]
+        if self.temporal is not None:
+            branches.insert(0, self.temporal(window.transpose(0, 1).flatten(1), f_x))
+        merged = torch.relu(self.merge(torch.cat(branches, dim=-1)))
         return self.logits(torch.relu(self.hidden(merged)))
 
 

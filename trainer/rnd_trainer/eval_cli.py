@@ -8,7 +8,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -16,9 +16,21 @@ from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    from .perceptual import Perceptual
 
-    from rnd_runtime.capture_format import Split
+COLUMNS = {
+    "psnr": ("PSNR", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_box": ("PSNR box", "{:.2f}"),
+    "ssim_box": ("SSIM box", "{:.4f}"),
+    "lpips_box": ("LPIPS box", "{:.4f}"),
+    "psnr_n": ("PSNR_n", "{:.2f}"),
+    "ssim_n": ("SSIM_n", "{:.4f}"),
+    "normal_deg": ("normals °", "{:.1f}"),
+    "psnr_albedo": ("albedo", "{:.2f}"),
+}
+"""what the terminal's table shows of a row: heading and format"""
 
 
 @dataclass(frozen=True)
@@ -37,12 +49,32 @@ class EvalOptions:
     """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds the LPIPS column"""
     shade: str = "table+sun"
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
+    motion: str | None = None
+    """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones"""
+    method: str | None = None
+    """name of the rows in the JSON; the run folder's unless given"""
+    ablate: bool = False
+    """train and score a study's variants in the folder RUN instead; done runs are not done again"""
+    study: Literal["ablations", "causes"] = "ablations"
+    """the paper's ablations, or what holds the figures back: light, normals, poses, number of Gaussians"""
+    preset: Literal["quick", "standard", "full"] = "quick"
+    """of the ablations' trainings"""
+    steps: int | None = None
+    """of the ablations' trainings, instead of the preset's"""
+    gaussians: int | None = None
+    """of the ablations' trainings, instead of the preset's"""
+    image_scale: float = 1.0
+    """of the ablations' training pictures"""
+    seeds: int = 3
+    """of the ablations' trainings: 0 to SEEDS − 1"""
 
 
 def main() -> None:
     """Entry point of ``rnd-eval``."""
     options = tyro.cli(EvalOptions, prog="rnd-eval")
-    sys.exit(run_command("rnd-eval", lambda: evaluate_run(options)))
+    sys.exit(
+        run_command("rnd-eval", lambda: ablate_run(options) if options.ablate else evaluate_run(options))
+    )
 
 
 def need_extra() -> None:
@@ -62,71 +94,110 @@ def evaluate_run(options: EvalOptions) -> None:
     from rich.table import Table
 
     from rnd_runtime.capture import load_capture
-    from rnd_runtime.images import write_image
 
     from .checkpoint import load_checkpoint
-    from .evaluate import HELD_OUT, albedo_scale, evaluate
-    from .perceptual import load_perceptual
-    from .preview import strip
+    from .held_out import score
 
     path = options.run / "avatar.ckpt" if options.run.is_dir() else options.run
     checkpoint = load_checkpoint(path)
-    capture = load_capture(options.capture)
-    scale = albedo_scale(checkpoint, capture)
-    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
-    if scale is not None and capture.split("relight"):
-        jobs.append(("relight", scale))
-    if not jobs:
-        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=options.capture)
-
-    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
-    if perceptual is not None and not perceptual.is_lpips:
-        raise InputError(
-            "--perceptual-weights", expected="a whole network with LPIPS heads", got=perceptual.backbone,
-            file=options.perceptual_weights,
-        )  # fmt: skip
-    columns = ["split", "frames", "PSNR", "SSIM", "PSNR box", "SSIM box", "normals °"]
-    columns += [] if perceptual is None else [f"LPIPS ({perceptual.backbone})"]
-    table = Table(*columns, title=str(path))
-    rows = []
-    for split, factor in jobs:
-        name = split if factor is None else f"{split}, albedo scaled"
-
-        def keep(
-            frame: Any, rendered: Any, target: Any, folder: str = name.replace(", ", "_").replace(" ", "_")
-        ) -> None:
-            if options.pictures is not None:
-                file = options.pictures / folder / Path(frame.image).name
-                write_image(file, strip(rendered, target.numpy()))
-
-        score = evaluate(
-            checkpoint,
-            capture,
-            split,
-            mode=options.shade,
-            albedo_scale=factor,
-            perceptual=perceptual,
-            on_frame=keep,
-        )
-        row = {**dataclasses.asdict(score), "split": name, "shade": options.shade}
-        row |= _provenance(checkpoint)
-        row["lpips_weights_sha256"] = None if perceptual is None else perceptual.sha256
-        rows.append(row)
-        cells = [f"{score.psnr:.2f}", f"{score.ssim:.4f}", f"{score.psnr_box:.2f}", f"{score.ssim_box:.4f}"]
-        cells += [f"{score.normal_deg:.1f}"] + ([] if score.lpips is None else [f"{score.lpips:.4f}"])
-        table.add_row(name, str(score.frames), *cells)
-    Console().print(table)
+    capture = load_capture(options.capture, motion_file=options.motion)
+    exported = path.with_suffix(".onnx")
+    rows = score(
+        checkpoint,
+        capture,
+        method=options.method or path.resolve().parent.name,
+        mode=options.shade,
+        pictures=options.pictures,
+        perceptual=_perceptual(options.perceptual_weights),
+        avatar=exported if exported.is_file() else None,
+    )
+    names = [name for name in COLUMNS if any(name in row for row in rows)]
+    table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=str(path))
+    for row in rows:
+        cells = [COLUMNS[name][1].format(row[name]) if name in row else "" for name in names]
+        table.add_row(row["split"], str(row["frames"]), *cells)
+    console = Console()
+    console.print(table)
+    if rows[0].get("flicker") is not None:
+        console.print(f"flicker on the held-out motion: {rows[0]['flicker']:.2f} of 255 levels")
+    if "fps" in rows[0]:
+        console.print(f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second")
     if options.json is not None:
         with atomic_path(options.json) as temporary:
             temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
-def _provenance(checkpoint: Any) -> dict[str, Any]:
-    from rnd_runtime.doctor import machine
+def _perceptual(path: Path | None) -> Perceptual | None:
+    from .perceptual import load_perceptual
 
-    info, config = checkpoint.info, checkpoint.config
-    return {
-        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps, "seed": config.seed,
-        "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
-        "machine": machine(),
-    }  # fmt: skip
+    if path is None:
+        return None
+    perceptual = load_perceptual(path)
+    if not perceptual.is_lpips:
+        raise InputError(
+            "--perceptual-weights",
+            expected="a whole network with LPIPS heads",
+            got=perceptual.backbone,
+            file=path,
+        )
+    return perceptual
+
+
+def ablate_run(options: EvalOptions) -> None:
+    """Train the ablations into the folder ``options.run``; print their table and write rows and summary as JSON."""
+    need_extra()
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from rnd_runtime.capture import load_capture
+
+    from .ablate import STUDIES, ablate, summarise
+    from .config import preset, resized
+
+    variants = STUDIES[options.study]
+    config = resized(preset(options.preset), options.gaussians, options.steps)
+    config = dataclasses.replace(config, image_scale=options.image_scale)
+    capture = load_capture(options.capture, motion_file=options.motion)
+    perceptual = _perceptual(options.perceptual_weights)
+    console = Console(stderr=True)
+    if perceptual is None:
+        console.print("rnd-eval: no --perceptual-weights: no LPIPS, and L_gc is off in every row")
+    with Progress(console=console) as progress:
+        task = progress.add_task("", total=None)
+
+        def on_run(name: str, seed: int, done: int, total: int) -> None:
+            progress.update(task, description=f"{name}, seed {seed}", completed=done, total=total)
+
+        seeds = range(options.seeds)
+        rows = ablate(
+            capture,
+            config,
+            options.run,
+            variants,
+            seeds=seeds,
+            perceptual=perceptual,
+            mode=options.shade,
+            on_run=on_run,
+        )
+    summary = summarise(rows, variants)
+    splits = [key for key, cell in summary[0].items() if isinstance(cell, dict)]
+    table = Table("method", *splits, "read beside", "GFLOP", "ms", title=f"{options.study}, PSNR")
+    for line in summary:
+        cells = [_with_gain(line[split]) if split in line else "" for split in splits]
+        cost = (f"{line['encoder_gflop']:.3f}", f"{line['encoder_ms']:.1f}")
+        table.add_row(line["method"], *cells, line["beside"] or "", *cost)
+    Console().print(table)
+    if options.json is not None:
+        with atomic_path(options.json) as temporary:
+            text = json.dumps({"summary": summary, "rows": rows}, indent=1)
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _with_gain(cell: dict[str, Any]) -> str:
+    """Mean ± spread, and the difference to the row it is read beside; in brackets where the seeds differ by more."""
+    text = f"{cell['mean']:.2f} ± {cell['spread']:.2f}"
+    if "gain" not in cell:
+        return text
+    gain = f"{cell['gain']:+.2f}"
+    return f"{text}  {gain if cell['shows'] else f'({gain})'}"

@@ -11,115 +11,130 @@ from torch import Tensor
 
 from rnd_runtime.capture import Capture, Frame
 from rnd_runtime.capture_format import Split
-from rnd_runtime.images import linear_to_srgb, srgb_to_linear
+from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
+from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 
 from .checkpoint import Checkpoint
 from .data import pose_input
 from .judge import Rendered, render_runtime
-from .metrics import mask_box, normal_degrees, psnr, ssim
 from .perceptual import Perceptual
+from .scores import frame_scores, to_srgb8
 
 HELD_OUT: tuple[Split, ...] = ("novel_view", "novel_pose", "relight")
-BOX_MARGIN = 8
-"""pixels around the mask's box in which the second figure of each pair is computed"""
+FLICKER_FRAMES = 24
+"""consecutive frames of the held-out motion that the flicker figure looks at"""
 
 
 @dataclass
 class SplitScore:
-    """Means over the frames of one split; ``*_box`` inside the mask's bounding box only.
-
-    The full frame is nine tenths black background, so its figures flatter everybody. ``lpips`` is of the full
-    frame, None where no weights were given.
-    """
+    """Means over the frames of one split of what :func:`rnd_trainer.scores.frame_scores` names."""
 
     split: str
     frames: int
-    psnr: float
-    ssim: float
-    psnr_box: float
-    ssim_box: float
-    normal_deg: float
-    lpips: float | None
+    scores: dict[str, float]
+
+
+class Judge:
+    """Renders a trained avatar for the frames of a capture, each under its light.
+
+    Unknown lights come from the capture, the training light from the learned probe: both are what a player has.
+
+    Args:
+        mode: shading of the runtime.
+        motion: poses to render, the capture's own unless given (exact ones for an avatar trained on noisy poses).
+    """
+
+    def __init__(
+        self, checkpoint: Checkpoint, capture: Capture, mode: str = "table+sun", motion: Motion | None = None
+    ) -> None:
+        self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
+        self.motion = capture.motion if motion is None else motion
+        self._trained = {frame.light for frame in capture.split("train")}
+        self._shaders: dict[str | None, Shader | None] = {}
+
+    def render(self, frame: Frame, albedo_scale: Tensor | None = None, index: int | None = None) -> Rendered:
+        """``frame``'s camera and light; ``index`` shows another motion frame instead of its own."""
+        index = frame.frame if index is None else index
+        model = self.checkpoint.config.model
+        pose = pose_input(self.motion, self.checkpoint.skeleton, index / self.motion.fps, model)
+        camera = self.capture.cameras[frame.camera]
+        return render_runtime(self.checkpoint.model, pose, camera, self._shader(frame.light), albedo_scale)
+
+    def _shader(self, name: str | None) -> Shader | None:
+        if name not in self._shaders:
+            known = name is not None and name not in self._trained
+            light = self.capture.load_light(name) if name and known else Light(self.checkpoint.probe.numpy())
+            plain = self.checkpoint.config.light == "none"  # colours that no light changes
+            self._shaders[name] = None if plain else Shader(light, self.mode)
+        return self._shaders[name]
 
 
 def evaluate(
-    checkpoint: Checkpoint,
-    capture: Capture,
+    judge: Judge,
     split: Split,
     *,
-    mode: str = "table+sun",
     albedo_scale: Tensor | None = None,
+    shown_scale: Tensor | None = None,
     perceptual: Perceptual | None = None,
     on_frame: Callable[[Frame, Rendered, Tensor], None] | None = None,
 ) -> SplitScore:
-    """Score one split. Unknown lights come from the capture, the training light from the learned probe.
+    """Score one split.
 
     Args:
         albedo_scale: [3] factor on the albedo, for relighting with the albedo–light ambiguity taken out.
+        shown_scale: [3] factor on the albedo picture alone, where that is compared with the truth.
         perceptual: LPIPS of these weights is reported too.
         on_frame: called with each frame, its rendering and the true image [H, W, 3] (sRGB).
     """
-    shaders: dict[str | None, Shader] = {}
-    rows: list[tuple[float, ...]] = []
-    trained = {frame.light for frame in capture.split("train")}
-    for frame in capture.split(split):
-        if frame.light not in shaders:
-            if frame.light is None or frame.light in trained:
-                light = Light(checkpoint.probe.numpy())
-            else:
-                light = capture.load_light(frame.light)
-            shaders[frame.light] = Shader(light, mode)
-        pose = pose_input(
-            capture.motion, checkpoint.skeleton, frame.frame / capture.motion.fps, checkpoint.config.model
+    rows: list[dict[str, float]] = []
+    frames = judge.capture.split(split)
+    for frame in frames:
+        rendered = judge.render(frame, albedo_scale)
+        truth = judge.capture.load_frame(frame)
+        rows.append(
+            frame_scores(rendered, truth, perceptual, None if albedo_scale is not None else shown_scale)
         )
-        rendered = render_runtime(
-            checkpoint.model, pose, capture.cameras[frame.camera], shaders[frame.light], albedo_scale
-        )
-        truth = capture.load_frame(frame)
-        target, mask = torch.from_numpy(truth.image_srgb), torch.from_numpy(truth.mask)
-        image = to_srgb8(rendered.image)
-        box = mask_box(mask > 0, BOX_MARGIN)
-        normal = truth.normal_gt if truth.normal_gt is not None else truth.normal
-        inside = (mask > 0.5) & (rendered.alpha > 0.5)
-        angle = (
-            float("nan")
-            if normal is None
-            else normal_degrees(rendered.normals, torch.from_numpy(normal), inside)
-        )
-        row = [
-            psnr(image, target),
-            ssim(image, target),
-            psnr(image[box], target[box]),
-            ssim(image[box], target[box]),
-        ]
-        distance = None if perceptual is None else float(perceptual(image, target))
-        rows.append((*row, angle, *([] if distance is None else [distance])))
         if on_frame is not None:
-            on_frame(frame, rendered, target)
-    means = [float(x) for x in np.mean(rows, axis=0)]
-    lpips = means.pop() if perceptual is not None else None
-    image_psnr, image_ssim, box_psnr, box_ssim, angle = means
-    return SplitScore(split, len(rows), image_psnr, image_ssim, box_psnr, box_ssim, angle, lpips)
+            on_frame(frame, rendered, torch.from_numpy(truth.image_srgb))
+    names = [name for name in rows[0] if all(name in row for row in rows)]
+    return SplitScore(split, len(rows), {name: float(np.mean([row[name] for row in rows])) for name in names})
 
 
-def albedo_scale(checkpoint: Checkpoint, capture: Capture) -> Tensor | None:
+def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
+    """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive held-out frames.
+
+    Motion at constant speed cancels in the second difference to first order; what jumps does not. None where
+    the motion has fewer than three frames after the split's first.
+    """
+    frames = sorted(judge.capture.split(split), key=lambda frame: (frame.camera, frame.frame))
+    if not frames:
+        return None
+    first = frames[0]
+    last = min(first.frame + FLICKER_FRAMES, judge.motion.frame_count)
+    if last - first.frame < 3:
+        return None
+    shown = [judge.render(first, index=k) for k in range(first.frame, last)]
+    images = torch.stack([to_srgb8(r.image) for r in shown])
+    covered = torch.stack([r.alpha for r in shown])[1:-1] > 0.5
+    second = (images[:-2] - 2 * images[1:-1] + images[2:]).abs().mean(-1) / 2
+    return float(255 * second[covered].mean())
+
+
+def albedo_scale(judge: Judge) -> Tensor | None:
     """Per-channel least-squares factor [3] from the learned to the true albedo, over training frames that have it.
 
     Albedo and light are known up to this factor; IntrinsicAvatar's protocol fits it before relighting.
     None where the capture has no albedo.
     """
     ours, theirs = [], []
-    shader = Shader(Light(checkpoint.probe.numpy()), "ao")
-    for frame in capture.split("train"):
-        truth = capture.load_frame(frame)
-        if truth.albedo_srgb is None:
+    for frame in judge.capture.split("train"):
+        if frame.albedo is None:
             continue
-        pose = pose_input(
-            capture.motion, checkpoint.skeleton, frame.frame / capture.motion.fps, checkpoint.config.model
-        )
-        rendered = render_runtime(checkpoint.model, pose, capture.cameras[frame.camera], shader)
+        truth = judge.capture.load_frame(frame)
+        assert truth.albedo_srgb is not None
+        rendered = judge.render(frame)
         inside = (torch.from_numpy(truth.mask) > 0.99) & (rendered.alpha > 0.99)
         ours.append(rendered.albedo[inside])
         theirs.append(torch.from_numpy(srgb_to_linear(truth.albedo_srgb)).float()[inside])
@@ -127,8 +142,3 @@ def albedo_scale(checkpoint: Checkpoint, capture: Capture) -> Tensor | None:
         return None
     x, y = torch.cat(ours), torch.cat(theirs)
     return (x * y).sum(0) / (x * x).sum(0)
-
-
-def to_srgb8(image: Tensor) -> Tensor:
-    """Linear premultiplied [H, W, 3] on black → sRGB as a PNG holds it."""
-    return torch.from_numpy(np.round(np.clip(linear_to_srgb(image.numpy()), 0, 1) * 255) / 255).float()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rnd_runtime.camera import Camera
@@ -13,7 +14,9 @@ from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 
+from .encoders import SH_DC_OF_ONE
 from .model import AvatarModel, Posed, PoseInput
+from .shading import view_visibility
 
 
 @torch.no_grad()
@@ -50,9 +53,28 @@ def render_runtime(
     gaussians = to_gaussians(posed, pose)
     if albedo_scale is not None:
         gaussians = replace(gaussians, albedo=gaussians.albedo * albedo_scale.numpy())
-    radiance = posed.attributes.colour.numpy() if shader is None else shader.shade(gaussians, camera.position)
+    radiance = posed.attributes.colour.cpu().numpy()
+    if shader is not None:
+        radiance = _shade(model, gaussians, posed, pose, camera, shader)
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
     raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
     image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
+
+
+def _shade(
+    model: AvatarModel, gaussians: Gaussians, posed: Posed, pose: PoseInput, camera: Camera, shader: Shader
+) -> NDArray[np.float32]:
+    """Radiance [N, 3]; the ablated kinds of visibility see no shadows, and the paper's dims by direction."""
+    kind = model.config.visibility
+    if kind == "pose":
+        return shader.shade(gaussians, camera.position)
+    everywhere = np.zeros_like(gaussians.visibility)
+    everywhere[:, 0] = SH_DC_OF_ONE
+    radiance = shader.shade(replace(gaussians, visibility=everywhere), camera.position)
+    if kind == "paper":
+        eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
+        view = torch.nn.functional.normalize(eye - posed.means, dim=-1)
+        radiance = radiance * view_visibility(posed.visibility, view, pose.bones[0, :, :3]).cpu().numpy()
+    return radiance

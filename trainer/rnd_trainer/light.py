@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rnd_runtime.light import texel_directions, texel_solid_angles
@@ -26,17 +28,19 @@ class Texels:
 
 
 class LightProbe(nn.Module):
-    """L(ω): 32×64 texels of linear RGB through softplus, mean luminance over the sphere fixed at 1.
+    """L(ω): 32×64 texels of linear RGB, kept as logarithms, mean luminance over the sphere fixed at 1.
 
-    Albedo and light are known up to a common factor only; the fixed mean chooses it.
+    A logarithm lets a sun grow (its texel is a thousand times the sky's), which softplus does not in any
+    number of steps that we would wait for. Albedo and light are known up to a common factor only; the fixed
+    mean chooses it.
     """
 
     directions: Tensor
     solid_angles: Tensor
 
-    def __init__(self) -> None:
+    def __init__(self, channels: int = 3) -> None:
         super().__init__()
-        self.raw = nn.Parameter(torch.full((*PROBE_SHAPE, 3), math.log(math.e - 1)))  # softplus gives 1
+        self.raw = nn.Parameter(torch.zeros(*PROBE_SHAPE, channels))
         self.register_buffer(
             "directions", torch.as_tensor(texel_directions(*PROBE_SHAPE), dtype=torch.float32)
         )
@@ -46,8 +50,22 @@ class LightProbe(nn.Module):
 
     def radiance(self) -> Tensor:
         """[32, 64, 3] linear."""
-        light = nn.functional.softplus(self.raw)
+        light = torch.exp(self.raw).expand(*PROBE_SHAPE, 3)
         return light / (luminance(light) * self.solid_angles).sum() * (4 * math.pi)
+
+    @torch.no_grad()
+    def start_from(self, radiance: Tensor) -> None:
+        """Take ``radiance`` [32, 64, 3] > 0, up to scale, as the map to go on from."""
+        grey = self.raw.shape[-1] == 1
+        self.raw.copy_(torch.log(luminance(radiance)[..., None] if grey else radiance))
+
+
+def natural_sky(height: Tensor | NDArray[np.float64]) -> Any:
+    """Relative radiance to expect from a direction of which pictures tell nothing, by its ``height`` y in −1…1.
+
+    Light comes from above more than from below, five to three on average (after Dror et al. 2004).
+    """
+    return 1 + 0.5 * height
 
 
 def luminance(rgb: Tensor) -> Tensor:

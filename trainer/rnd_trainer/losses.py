@@ -5,16 +5,33 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .metrics import ssim_map
+from .light import luminance, natural_sky
+from .metrics import SSIM_WINDOW, ssim_map
 from .model import Posed
 
 
-def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float) -> Tensor:
-    """L1 plus weighted 1 − SSIM of two sRGB images [H, W, 3]."""
+def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, scales: int = 1) -> Tensor:
+    """L1 plus weighted 1 − SSIM of two sRGB images [H, W, 3], averaged over ``scales`` halvings of both."""
     l1 = (image_srgb - target_srgb).abs().mean()
     if weight_dssim == 0:
         return l1
-    return l1 + weight_dssim * (1 - ssim_map(image_srgb, target_srgb).mean())
+    return l1 + weight_dssim * multiscale_dssim(image_srgb, target_srgb, scales)
+
+
+def multiscale_dssim(image_srgb: Tensor, target_srgb: Tensor, scales: int) -> Tensor:
+    """Mean of 1 − SSIM at full size, half, quarter …, as long as the 11-pixel window fits."""
+    terms = []
+    for scale in range(scales):
+        if scale:
+            image_srgb, target_srgb = _halved(image_srgb), _halved(target_srgb)
+            if min(image_srgb.shape[:2]) < SSIM_WINDOW:
+                break
+        terms.append(1 - ssim_map(image_srgb, target_srgb).mean())
+    return torch.stack(terms).mean()
+
+
+def _halved(image: Tensor) -> Tensor:
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
 
 
 def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:
@@ -29,10 +46,24 @@ def geometry_prior(posed: Posed, weight_offset: float, weight_residual: float) -
 
 
 def grey_prior(radiance: Tensor, solid_angles: Tensor) -> Tensor:
-    """Mean absolute chroma of a probe [32, 64, 3] relative to its mean level."""
-    grey = radiance.mean(dim=-1, keepdim=True)
-    share = solid_angles / solid_angles.sum()
-    return ((radiance - grey).abs().mean(-1) * share).sum() / (grey[..., 0] * share).sum()
+    """Mean absolute chroma of the light of a probe [32, 64, 3] as a whole, relative to its level.
+
+    Colour of light and albedo are known up to a factor per channel, which "white on average" chooses. Single
+    directions stay free: under a low sun the shadows are blue.
+    """
+    mean = (radiance * (solid_angles / solid_angles.sum())[..., None]).sum((0, 1))
+    return ((mean - mean.mean()).abs() / mean.mean()).mean()
+
+
+def sky_prior(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Tensor:
+    """Mean of d² / (1 + d²), d the logarithm of a probe [32, 64, 3] beside a natural sky of the same level.
+
+    Geman and McClure's function: a sun, which is far from any sky, is left alone, and near the level nothing holds
+    the sky back when all of it darkens beside the sun (an absolute value would).
+    """
+    off = torch.log(luminance(radiance)) - torch.log(natural_sky(directions[..., 1]))
+    square = (off - off.detach().median()).square()
+    return (square / (1 + square) * solid_angles).sum() / solid_angles.sum()
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:

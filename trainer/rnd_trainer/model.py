@@ -20,6 +20,7 @@ from .interpolate import NodeInterpolation
 from .posing import pose_gaussians
 from .skinning import blend_transforms, tangent_frames, transform_normals
 from .template import WEIGHT_FLOOR, Template
+from .twist import TwistFrames
 
 ALBEDO_RANGE = (0.03, 0.80)
 """of natural diffuse materials; holds the albedo–light scale in a plausible place"""
@@ -33,6 +34,7 @@ START_OPACITY = 2.2
 """raw opacity at the start; sigmoid gives 0.90"""
 
 GEOMETRY_COLUMNS = {"opacity": 1, "rotation": 3, "scale": 3, "normal": 3, "offset": 3}
+LIMB_BUFFERS = ("limb_axes", "limb_levers", "limb_shares")
 APPEARANCE_COLUMNS = {"colour": 3, "albedo": 3, "roughness": 1}
 
 
@@ -43,6 +45,10 @@ class PoseInput:
     window: Tensor
     velocity: Tensor
     bones: Tensor
+
+    def to(self, device: torch.device) -> PoseInput:
+        """The same on ``device``."""
+        return PoseInput(self.window.to(device), self.velocity.to(device), self.bones.to(device))
 
 
 @dataclass
@@ -91,6 +97,9 @@ class AvatarModel(nn.Module):
     log_weights: Tensor
     spacing: Tensor
     tangents: Tensor
+    limb_axes: Tensor
+    limb_levers: Tensor
+    limb_shares: Tensor
 
     def __init__(self, config: ModelConfig, template: Template) -> None:
         super().__init__()
@@ -106,6 +115,8 @@ class AvatarModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32))
+        for name, value in zip(LIMB_BUFFERS, template.limbs):  # follow from what is saved
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
         self.interpolate = NodeInterpolation(
             torch.as_tensor(template.neighbours),
             torch.as_tensor(template.neighbour_weights, dtype=torch.float32),
@@ -118,7 +129,10 @@ class AvatarModel(nn.Module):
         self.appearance = AttributeEncoder(inputs, config.attribute_width, appearance)
         self.geometry_residual = nn.Parameter(torch.zeros(len(template.points), geometry))
         self.appearance_residual = nn.Parameter(torch.zeros(len(template.points), appearance))
-        self.skinning = DynamicSkinning(inputs, joints, config.window_poses, config.width, config.heads)
+        temporal = config.motion_encoder == "full"
+        self.skinning = DynamicSkinning(
+            inputs, joints, config.window_poses, config.width, config.heads, temporal
+        )
         self.offsets = PoseConditioned(inputs, joints, config.width, outputs=6)
         self.visibility = Visibility(inputs, joints, config.width)
 
@@ -137,7 +151,8 @@ class AvatarModel(nn.Module):
         residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
         part = _by_name(smooth + residual, columns)
         place, stray = _by_name(smooth, columns)["offset"], _by_name(residual, columns)["offset"]
-        normals = nn.functional.normalize(self.rest_normals + 0.8 * torch.tanh(part["normal"]), dim=-1)
+        tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0
+        normals = nn.functional.normalize(self.rest_normals + tilt, dim=-1)
         tangents, across = part["scale"].split([2, 1], dim=-1)
         scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
         offset = self.config.max_static_offset * torch.tanh(place) + self.spacing * torch.tanh(stray)
@@ -166,9 +181,10 @@ class AvatarModel(nn.Module):
             if self.config.dynamic_skinning
             else torch.zeros_like(self.log_weights[:nodes])
         )
-        node_normals = self._node_normals(static.normals[:nodes].detach(), pose.bones)
+        node_normals = self._node_normals(static.normals[:nodes].detach(), pose.bones.detach())
+        seen = flat if self.config.visibility == "pose" else torch.zeros_like(flat)
         fields = torch.cat(
-            [logits, self.offsets(encoded, flat), self.visibility(encoded, flat, node_normals)], dim=-1
+            [logits, self.offsets(encoded, flat), self.visibility(encoded, seen, node_normals)], dim=-1
         )
         logits, offset, turn, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
 
@@ -183,6 +199,7 @@ class AvatarModel(nn.Module):
             static.rotation,
             static.scales,
             static.normals,
+            TwistFrames(self.limb_axes, self.limb_levers, self.limb_shares),
         )
         return Posed(
             means=means,

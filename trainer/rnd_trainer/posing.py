@@ -6,7 +6,15 @@ import torch
 from torch import Tensor
 
 from .posing_kernel import PoseGaussians
-from .skinning import blend_transforms, covariances, small_rotation, transform_normals, transform_points
+from .skinning import (
+    blend_transforms,
+    cofactor,
+    covariances,
+    small_rotation,
+    transform_normals,
+    transform_points,
+)
+from .twist import TwistFrames, excess
 
 
 def pose_gaussians(
@@ -18,15 +26,22 @@ def pose_gaussians(
     rotation: Tensor,  # [N, 3] r_c in the tangent frame, a rotation vector
     scales: Tensor,  # [N, 3] m
     normals: Tensor,  # [N, 3] unit, rest pose
+    limbs: TwistFrames,  # what keeps them round under twists
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Means [N, 3] m, covariances [N, 6] m² and unit normals [N, 3] in the world frame.
 
-    Σ' = F Fᵀ with F = A_R · R(Δr) · R_c · S. Float32 on the CPU takes the compiled kernel, which has no gradient
-    by bones and tangents.
+    Σ' = F Fᵀ with F = A_R · C · R(Δr) · R_c · S and C the widening of :mod:`rnd_trainer.twist`. Float32 on the CPU
+    takes the compiled kernel, which has no gradient by tangents.
     """
     if not weights.is_cuda and weights.dtype == torch.float32:
-        return PoseGaussians.apply(weights, bones, points, turn, tangents, rotation, scales, normals)
+        twist = (limbs.axes, limbs.levers, limbs.shares)
+        return PoseGaussians.apply(weights, bones, points, turn, tangents, rotation, scales, normals, *twist)
     blend = blend_transforms(weights, bones)
-    frames = small_rotation(turn) @ tangents @ small_rotation(rotation)
-    factors = blend[:, :, :3] @ (frames * scales[:, None, :])
-    return transform_points(blend, points), covariances(factors), transform_normals(blend, normals)
+    linear, axes = blend[:, :, :3], limbs.axes
+    kappa = excess(linear, cofactor(linear), limbs)[:, None]
+    points = points + kappa * limbs.levers
+    normals = normals + kappa * axes * (axes * normals).sum(-1, keepdim=True)
+    factors = (small_rotation(turn) @ tangents @ small_rotation(rotation)) * scales[:, None, :]
+    along = axes[:, :, None] * (axes[:, :, None] * factors).sum(1, keepdim=True)
+    factors = factors + kappa[..., None] * (factors - along)
+    return transform_points(blend, points), covariances(linear @ factors), transform_normals(blend, normals)

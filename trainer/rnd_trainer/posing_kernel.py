@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from .skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
+from .twist import SMALLEST_SQUARE, STEPS
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
 _inline = numba.njit(
@@ -24,9 +25,10 @@ _inline = numba.njit(
 class PoseGaussians(torch.autograd.Function):
     """Means [N, 3], covariances [N, 6] and unit normals [N, 3] of posed Gaussians.
 
-    Arguments: weights [N, J], bones [J, 3, 4] (no gradient), points [N, 3] with all offsets, turn [N, 3] (Δr as
+    Arguments: weights [N, J], bones [J, 3, 4], points [N, 3] with all offsets, turn [N, 3] (Δr as
     a rotation vector), tangents [N, 3, 3] (no gradient), rotation [N, 3] (r_c in the tangent frame, a rotation
-    vector), scales [N, 3], normals [N, 3].
+    vector), scales [N, 3], normals [N, 3]; then axes [N, 3], levers [N, 3] and shares [N] of
+    :class:`rnd_trainer.twist.TwistFrames` (no gradient).
     """
 
     @staticmethod
@@ -38,8 +40,11 @@ class PoseGaussians(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, ...]:
         grads = _pose_backward(*ctx.arrays, *(np.ascontiguousarray(g.numpy()) for g in incoming))
-        weights, points, turn, rotation, scales, normals = (torch.from_numpy(g) for g in grads)
-        return weights, None, points, turn, None, rotation, scales, normals
+        weights, blend, points, turn, rotation, scales, normals = (torch.from_numpy(g) for g in grads)
+        bones = None
+        if ctx.needs_input_grad[1]:
+            bones = (torch.from_numpy(ctx.arrays[0]).T @ blend).view(ctx.arrays[1].shape)
+        return weights, bones, points, turn, None, rotation, scales, normals, None, None, None
 
 
 @_inline
@@ -152,6 +157,45 @@ def _blend(weights, bones, n):
 
 
 @_inline
+def _excess(linear, axes, shares, n):
+    """:func:`rnd_trainer.twist.excess`."""
+    x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
+    a, b, c = _apply(linear, x, y, z)
+    length_squared = max(a * a + b * b + c * c, np.float32(SMALLEST_SQUARE))
+    first, second, third = (linear[0], linear[1], linear[2]), (linear[3], linear[4], linear[5]), linear[6:]
+    p, q, r = _cross(second, third), _cross(third, first), _cross(first, second)
+    a, b, c = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
+    kept = min(np.sqrt(a * a + b * b + c * c) / length_squared, np.float32(1))
+    factor = np.float32(1)
+    for _ in range(STEPS):
+        step = np.float32(0.5) * (np.float32(3) - kept)
+        factor, kept = factor * step, kept * step * step
+    return shares[n] * (factor - np.float32(1))
+
+
+@_inline
+def _widened(m, axes, kappa, n):
+    """C M with C = (1 + κ) I − κ u uᵀ."""
+    x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
+    k = np.float32(1) + kappa
+    a = kappa * (x * m[0] + y * m[3] + z * m[6])
+    b = kappa * (x * m[1] + y * m[4] + z * m[7])
+    c = kappa * (x * m[2] + y * m[5] + z * m[8])
+    return (
+        k * m[0] - x * a, k * m[1] - x * b, k * m[2] - x * c,
+        k * m[3] - y * a, k * m[4] - y * b, k * m[5] - y * c,
+        k * m[6] - z * a, k * m[7] - z * b, k * m[8] - z * c,
+    )  # fmt: skip
+
+
+@_inline
+def _steepened(x, y, z, axes, kappa, n):
+    """n + κ u (u·n)."""
+    along = kappa * (axes[n, 0] * x + axes[n, 1] * y + axes[n, 2] * z)
+    return (x + axes[n, 0] * along, y + axes[n, 1] * along, z + axes[n, 2] * along)
+
+
+@_inline
 def _load(matrices, n):
     m = matrices[n]
     return (m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2])
@@ -165,7 +209,7 @@ def _scaled(m, scales, n):
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _pose(weights, bones, points, turn, tangents, rotation, scales, normals):
+def _pose(weights, bones, points, turn, tangents, rotation, scales, normals, axes, levers, shares):
     count = len(points)
     means = np.empty((count, 3), np.float32)
     covariances = np.empty((count, 6), np.float32)
@@ -173,13 +217,19 @@ def _pose(weights, bones, points, turn, tangents, rotation, scales, normals):
     floor = np.float32(THICKNESS_FLOOR**2)
     for n in numba.prange(count):
         linear, shift = _blend(weights, bones, n)
-        x, y, z = _apply(linear, points[n, 0], points[n, 1], points[n, 2])
+        kappa = _excess(linear, axes, shares, n)
+        x, y, z = _apply(
+            linear,
+            points[n, 0] + kappa * levers[n, 0],
+            points[n, 1] + kappa * levers[n, 1],
+            points[n, 2] + kappa * levers[n, 2],
+        )
         means[n, 0], means[n, 1], means[n, 2] = x + shift[0], y + shift[1], z + shift[2]
 
         own, _ = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
         added, _ = _quaternion(turn[n, 0], turn[n, 1], turn[n, 2])
         frame = _scaled(_multiply(_load(tangents, n), _rotation(own)), scales, n)
-        g = _multiply(linear, _multiply(_rotation(added), frame))
+        g = _multiply(linear, _widened(_multiply(_rotation(added), frame), axes, kappa, n))
         covariances[n, 0] = g[0] * g[0] + g[1] * g[1] + g[2] * g[2] + floor
         covariances[n, 1] = g[0] * g[3] + g[1] * g[4] + g[2] * g[5]
         covariances[n, 2] = g[0] * g[6] + g[1] * g[7] + g[2] * g[8]
@@ -187,7 +237,8 @@ def _pose(weights, bones, points, turn, tangents, rotation, scales, normals):
         covariances[n, 4] = g[3] * g[6] + g[4] * g[7] + g[5] * g[8]
         covariances[n, 5] = g[6] * g[6] + g[7] * g[7] + g[8] * g[8] + floor
 
-        x, y, z = _apply(_normal_matrix(linear), normals[n, 0], normals[n, 1], normals[n, 2])
+        x, y, z = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
+        x, y, z = _apply(_normal_matrix(linear), x, y, z)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         posed_normals[n, 0], posed_normals[n, 1], posed_normals[n, 2] = x / length, y / length, z / length
     return means, covariances, posed_normals
@@ -195,10 +246,11 @@ def _pose(weights, bones, points, turn, tangents, rotation, scales, normals):
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def _pose_backward(
-    weights, bones, points, turn, tangents, rotation, scales, normals, by_mean, by_covariance, by_normal
-):
+    weights, bones, points, turn, tangents, rotation, scales, normals, axes, levers, shares,
+    by_mean, by_covariance, by_normal,
+):  # fmt: skip
     count, joints = weights.shape
-    by_weights = np.empty((count, joints), np.float32)
+    by_weights, by_blend = np.empty((count, joints), np.float32), np.empty((count, 12), np.float32)
     by_points, by_turn = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     by_rotation, by_scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     by_rest_normals = np.empty((count, 3), np.float32)
@@ -207,7 +259,12 @@ def _pose_backward(
         linear, _ = _blend(weights, bones, n)
         upright = _transpose(linear)
         mx, my, mz = by_mean[n, 0], by_mean[n, 1], by_mean[n, 2]
-        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        kappa = _excess(linear, axes, shares, n)
+        px, py, pz = (
+            points[n, 0] + kappa * levers[n, 0],
+            points[n, 1] + kappa * levers[n, 1],
+            points[n, 2] + kappa * levers[n, 2],
+        )
         by_points[n, 0], by_points[n, 1], by_points[n, 2] = _apply(upright, mx, my, mz)
 
         own, own_length = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
@@ -215,7 +272,7 @@ def _pose_backward(
         added_matrix = _rotation(added)
         frame = _multiply(_load(tangents, n), _rotation(own))
         scaled = _scaled(frame, scales, n)
-        turned = _multiply(added_matrix, scaled)
+        turned = _widened(_multiply(added_matrix, scaled), axes, kappa, n)
         g = _multiply(linear, turned)
         c = by_covariance[n]
         symmetric = (
@@ -225,7 +282,7 @@ def _pose_backward(
         )  # fmt: skip  # twice the gradient by the full matrix, whose off-diagonal entries share one number
         by_g = _multiply(symmetric, g)
         by_linear = _multiply(by_g, _transpose(turned))
-        by_turned = _multiply(upright, by_g)
+        by_turned = _widened(_multiply(upright, by_g), axes, kappa, n)
         by_added = _multiply(by_turned, _transpose(scaled))
         u = _rotation_backward(added, added_length, by_added)
         by_turn[n, 0], by_turn[n, 1], by_turn[n, 2] = u
@@ -239,16 +296,16 @@ def _pose_backward(
         by_rotation[n, 0], by_rotation[n, 1], by_rotation[n, 2] = r
 
         matrix = _normal_matrix(linear)
-        nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
+        nx, ny, nz = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
         x, y, z = _apply(matrix, nx, ny, nz)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         x, y, z = x / length, y / length, z / length
         gx, gy, gz = by_normal[n, 0], by_normal[n, 1], by_normal[n, 2]
         along = x * gx + y * gy + z * gz
         gx, gy, gz = (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
-        by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = _apply(
-            _transpose(matrix), gx, gy, gz
-        )
+        x, y, z = _apply(_transpose(matrix), gx, gy, gz)
+        x, y, z = _steepened(x, y, z, axes, kappa, n)
+        by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = x, y, z
         outer = (gx * nx, gx * ny, gx * nz, gy * nx, gy * ny, gy * nz, gz * nx, gz * ny, gz * nz)
         k = _normal_matrix_backward(linear, outer)
 
@@ -257,6 +314,10 @@ def _pose_backward(
             by_linear[3] + k[3] + my * px, by_linear[4] + k[4] + my * py, by_linear[5] + k[5] + my * pz,
             by_linear[6] + k[6] + mz * px, by_linear[7] + k[7] + mz * py, by_linear[8] + k[8] + mz * pz,
         )  # fmt: skip
+        for row in range(3):
+            for column in range(3):
+                by_blend[n, 4 * row + column] = a[3 * row + column]
+        by_blend[n, 3], by_blend[n, 7], by_blend[n, 11] = mx, my, mz
         for j in range(joints):
             b = bones[j]
             by_weights[n, j] = (
@@ -264,4 +325,4 @@ def _pose_backward(
                 + a[3] * b[1, 0] + a[4] * b[1, 1] + a[5] * b[1, 2] + my * b[1, 3]
                 + a[6] * b[2, 0] + a[7] * b[2, 1] + a[8] * b[2, 2] + mz * b[2, 3]
             )  # fmt: skip
-    return by_weights, by_points, by_turn, by_rotation, by_scales, by_rest_normals
+    return by_weights, by_blend, by_points, by_turn, by_rotation, by_scales, by_rest_normals

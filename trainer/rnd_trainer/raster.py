@@ -11,7 +11,7 @@ from rnd_runtime import raster_cpu
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 
-NEAR = 0.01  # m
+NEAR = 0.1  # m, see rnd_runtime.raster_oracle
 
 
 def rasterize(

@@ -46,6 +46,11 @@ def light_visibility(
     return visibility
 
 
+def view_visibility(coefficients: Tensor, view: Tensor, root_rotation: Tensor) -> Tensor:
+    """The paper's visibility [n, 1]: root-frame harmonics [n, 16] at the direction [n, 3] to the camera, ≥ 0."""
+    return (coefficients * sh_basis(view @ root_rotation)).sum(-1, keepdim=True).clamp(min=0)
+
+
 def shade(
     normals: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor, visibility: Tensor, texels: Texels
 ) -> Tensor:

@@ -14,6 +14,8 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import bone_transforms
 
+from .twist import twist_frames
+
 Floats = NDArray[np.float64]
 
 NEIGHBOURS = 4
@@ -43,6 +45,7 @@ class Template:
         weights: [N, J] the template's skinning weights.
         spacing: mean distance between neighbouring Gaussians, m.
         neighbours, neighbour_weights: [N, 4] nodes that a Gaussian interpolates between, rows sum to 1.
+        limbs: axes [N, 3], levers [N, 3] and shares [N] of :class:`rnd_trainer.twist.TwistFrames`.
         nodes: M.
     """
 
@@ -53,6 +56,7 @@ class Template:
     spacing: float
     neighbours: NDArray[np.int64]
     neighbour_weights: Floats
+    limbs: tuple[Floats, Floats, Floats]
     nodes: int
 
 
@@ -91,19 +95,29 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
     normals = interpolate(_vertex_normals(vertices, body.faces, crosses))[chosen]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
-    distances, neighbours = cKDTree(codes[:nodes]).query(codes, k=min(NEIGHBOURS, nodes))
-    node_spacing = float(np.sqrt(areas.sum() / nodes))
-    kernel = 1.0 / (distances**2 + (0.3 * node_spacing) ** 2)
+    neighbours, neighbour_weights = node_interpolation(codes, nodes, float(areas.sum()))
+    weights = weights / weights.sum(axis=1, keepdims=True)
     return Template(
         points=points,
         normals=normals,
         codes=codes,
-        weights=weights / weights.sum(axis=1, keepdims=True),
+        weights=weights,
         spacing=float(np.sqrt(areas.sum() / count)),
-        neighbours=neighbours.astype(np.int64),
-        neighbour_weights=kernel / kernel.sum(axis=1, keepdims=True),
+        neighbours=neighbours,
+        neighbour_weights=neighbour_weights,
+        limbs=twist_frames(points, weights, body.skeleton),
         nodes=nodes,
     )
+
+
+def node_interpolation(codes: Floats, nodes: int, area: float) -> tuple[NDArray[np.int64], Floats]:
+    """The nearest of the first ``nodes`` of ``codes`` [N, 3] m, and their weights: both [N, 4], rows sum to 1.
+
+    ``area`` [m²] of the surface gives the nodes' spacing, at which the kernel softens.
+    """
+    distances, neighbours = cKDTree(codes[:nodes]).query(codes, k=min(NEIGHBOURS, nodes))
+    kernel = 1.0 / (distances**2 + (0.3 * float(np.sqrt(area / nodes))) ** 2)
+    return neighbours.astype(np.int64), kernel / kernel.sum(axis=1, keepdims=True)
 
 
 def skin(points: Floats, weights: Floats, bones: Floats) -> Floats:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import math
 import signal
 import threading
 import time
@@ -21,15 +21,17 @@ from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
 from rnd_runtime.light import texel_directions
+from rnd_runtime.motion import Motion, save_motion
 
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
 from .data import View, load_views, pose_input
-from .light import PROBE_SHAPE, LightProbe, all_texels, as_probe, draw_texels
-from .losses import geometry_prior, grey_prior, image_loss, linear_to_srgb, skinning_divergence
-from .model import APPEARANCE_COLUMNS, AvatarModel, Posed, PoseInput
-from .render import shade_visible, splat
-from .shading import sh_basis, traced_visibility
+from .light import PROBE_SHAPE, LightProbe, as_probe
+from .light_start import start_light
+from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
+from .objective import Objective, noisy
+from .perceptual import Perceptual
+from .pose_refinement import PoseRefinement
 from .template import sample_template
 
 STATE_SCHEMA = "rnd-training/1"
@@ -53,18 +55,31 @@ class Training:
     Args:
         capture: the pictures, poses and body to learn from.
         config: schedule and weights.
+        perceptual: feature network of the LPIPS and consistency losses; None leaves both out.
+        device: where the tensors live; random draws are made on the CPU, so that they do not depend on it.
     """
 
-    def __init__(self, capture: Capture, config: TrainConfig) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        config: TrainConfig,
+        perceptual: Perceptual | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.capture, self.config = capture, config
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.views, self.bad_masks = load_views(capture, "train", config.image_scale)
+        self.device = torch.device(device)
+        self.perceptual = None if perceptual is None else perceptual.to(device=self.device)
+        true_normals = config.normals == "true"
+        self.views, self.bad_masks = load_views(capture, "train", config.image_scale, true_normals)
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
-        self.model = AvatarModel(config.model, template)
-        self.probe = LightProbe()
-        self.fixed_light = self._capture_light() if config.light == "capture" else None
+        self.model = AvatarModel(config.model, template).to(self.device)
+        self.probe = LightProbe(config.probe_channels).to(self.device)
+        fixed_light = self._capture_light() if config.light == "capture" else None
+        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.generator)
         self.poses = [self._pose(view) for view in self.views]
+        self.refinement = self._refinement() if config.refine_poses else None
         self.optimizer = self._optimizer()
         self.step_index = 0
         self.bad_steps = 0
@@ -78,9 +93,17 @@ class Training:
         stage = self.stage
         if self.step_index == self.stage1_steps:
             self._start_albedo_from_colour()
+            self._start_light()
         self._set_rates()
         view_index = self._next_view()
-        terms = self._losses(self.views[view_index], self._noisy(self.poses[view_index]), stage)
+        view, pose = self.views[view_index], self.poses[view_index]
+        pose = noisy(pose, self.config.pose_noise, self.generator)
+        refinement = self.refinement if self.step_index >= self._refine_from else None
+        if refinement is not None:
+            pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
+        terms = self.objective(self.model, view, pose, self.step_index, stage)
+        if refinement is not None:
+            terms["poses"] = self.config.weight_poses * refinement.prior(view.frame.frame)
         total = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(total))
@@ -93,7 +116,7 @@ class Training:
         if self.bad_steps >= MAX_BAD_STEPS:
             raise InputError(
                 f"training: {MAX_BAD_STEPS} steps in a row were not finite",
-                frame=self.views[view_index].frame.frame,
+                frame=view.frame.frame,
             )
         done = Step(
             self.step_index, stage, {name: float(value.detach()) for name, value in terms.items()}, not finite
@@ -102,58 +125,18 @@ class Training:
         self.seconds += time.perf_counter() - started
         return done
 
-    def _losses(self, view: View, pose: PoseInput, stage: int) -> dict[str, Tensor]:
-        """Weighted loss terms of one picture."""
-        config, model = self.config, self.model
-        posed = model(pose)
-        terms = {
-            "visibility": config.weight_visibility * self._visibility_loss(posed, pose),
-            "skinning": config.weight_skinning
-            * self._decay()
-            * skinning_divergence(posed.weights, model.log_weights),
-            "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
-        }
-        if stage == 1:
-            radiance = posed.attributes.colour
-        else:
-            light = self.light()
-            maps = (light, self.probe.directions, self.probe.solid_angles)
-            full = self.step_index >= config.steps * (1 - config.full_light_fraction)
-            texels = all_texels(*maps) if full else draw_texels(*maps, config.light_texels, self.generator)
-            radiance = shade_visible(
-                posed, pose, texels, view.camera, float(model.spacing), config.traced_texels
-            )
-            if self.fixed_light is None:
-                terms["grey"] = config.weight_light_grey * grey_prior(light, self.probe.solid_angles)
-        picture = splat(posed, radiance, view.camera)
-        background = torch.rand(3, generator=self.generator)
-        target, mask = view.target(background)
-        image = picture.image + (1 - picture.alpha[..., None]) * background
-        terms["image"] = image_loss(linear_to_srgb(image), linear_to_srgb(target), config.weight_dssim)
-        terms["mask"] = config.weight_mask * (picture.alpha - mask).abs().mean()
-        normals = view.normals()
-        if normals is not None:
-            terms["normal"] = config.weight_normal * (picture.normals - normals).abs().mean()
-        return terms
-
-    def _visibility_loss(self, posed: Posed, pose: PoseInput) -> Tensor:
-        """Square error of the harmonics against shadow-mapped visibility at the nodes, in random directions."""
-        nodes = self.config.model.nodes
-        directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
-        directions = torch.nn.functional.normalize(directions, dim=-1)
-        spacing = float(self.model.spacing) * math.sqrt(self.config.model.gaussians / nodes)
-        means, normals = posed.means[:nodes], posed.normals[:nodes]
-        truth = traced_visibility(means, normals, directions, spacing)
-        above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
-        predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3]).T
-        return (above * (predicted - truth).square()).mean()
-
     # -- schedule ------------------------------------------------------------------------------------------
 
     @property
     def stage1_steps(self) -> int:
         """Steps of the first stage."""
+        if self.config.light == "none":
+            return self.config.steps
         return round(self.config.stage1_fraction * self.config.steps)
+
+    @property
+    def _refine_from(self) -> float:
+        return self.config.refine_after * self.config.steps
 
     @property
     def stage(self) -> int:
@@ -162,7 +145,13 @@ class Training:
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the capture's own."""
-        return self.probe.radiance() if self.fixed_light is None else self.fixed_light
+        return self.objective.light()
+
+    def motion(self) -> Motion:
+        """The capture's motion, its training frames corrected where poses are refined."""
+        return (
+            self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
+        )
 
     def _decay(self) -> float:
         """1 at the start, 0.1 at the end, exponential."""
@@ -178,13 +167,6 @@ class Training:
         order = np.random.default_rng((self.config.seed, epoch)).permutation(len(self.views))
         return int(order[position])
 
-    def _noisy(self, pose: PoseInput) -> PoseInput:
-        """The encoders' input with noise; the bones, which place the picture, stay exact."""
-        sigma = self.config.pose_noise
-        noise = sigma * torch.randn(pose.window.shape[1:], generator=self.generator)
-        velocity = pose.velocity + 10 * sigma * torch.randn(pose.velocity.shape, generator=self.generator)
-        return PoseInput(pose.window + noise, velocity, pose.bones)
-
     def _start_albedo_from_colour(self) -> None:
         """The first stage's colour is the best first albedo there is: copy it, network and residual alike."""
         columns = list(APPEARANCE_COLUMNS)
@@ -197,22 +179,39 @@ class Training:
             last.bias[albedo] = last.bias[colour] + 1.0  # undoes the −1 of the albedo's activation
             self.model.appearance_residual[:, albedo] = self.model.appearance_residual[:, colour]
 
+    def _start_light(self) -> None:
+        """Search the pictures for a sky and suns, now that there is a shape that can cast shadows."""
+        if self.objective.fixed_light is None and self.config.light_search:
+            motion = self.motion()
+            found = start_light(self.model, self.views, [self._pose(view, motion) for view in self.views])
+            if found is not None:
+                self.probe.start_from(torch.from_numpy(found))
+
     def _parameters(self) -> list[Tensor]:
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
     def _optimizer(self) -> torch.optim.Adam:
         residuals = [self.model.geometry_residual, self.model.appearance_residual]
         networks = [p for p in self.model.parameters() if all(p is not r for r in residuals)]
-        rates = self.config.rate_networks, self.config.rate_residuals, self.config.rate_light
-        groups = [
-            {"params": params, "lr": rate, "start_rate": rate}
-            for params, rate in zip((networks, residuals, [self.probe.raw]), rates)
+        config = self.config
+        parts = [
+            (networks, config.rate_networks),
+            (residuals, config.rate_residuals),
+            ([self.probe.raw], config.rate_light),
         ]
+        if self.refinement is not None:
+            parts.append((list(self.refinement.raw), config.rate_poses))
+        groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in parts]
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
-    def _pose(self, view: View) -> PoseInput:
-        time_s = view.frame.frame / self.capture.motion.fps
-        return pose_input(self.capture.motion, self.capture.body.skeleton, time_s, self.config.model)
+    def _pose(self, view: View, motion: Motion | None = None) -> PoseInput:
+        motion = self.capture.motion if motion is None else motion
+        time_s = view.frame.frame / motion.fps
+        return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
+
+    def _refinement(self) -> PoseRefinement:
+        frames = [view.frame.frame for view in self.views]
+        return PoseRefinement(self.capture.motion, self.capture.body.skeleton, frames).to(self.device)
 
     def _capture_light(self) -> Tensor:
         names = {view.frame.light or "unknown" for view in self.views}
@@ -221,16 +220,19 @@ class Training:
         light = self.capture.load_light(names.pop()).resized(
             *PROBE_SHAPE
         )  # before turning: a sun stays whole
-        return as_probe(light.sample(texel_directions(*PROBE_SHAPE)))
+        return as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
 
     # -- saving and resuming -------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
         """Write the resumable state, then the avatar."""
-        tensors = {f"model.{k}": v.contiguous() for k, v in self.model.state_dict().items()}
-        tensors |= {f"probe.{k}": v.contiguous() for k, v in self.probe.state_dict().items()}
+        tensors = {f"model.{k}": v.cpu().contiguous() for k, v in self.model.state_dict().items()}
+        tensors |= {f"probe.{k}": v.cpu().contiguous() for k, v in self.probe.state_dict().items()}
+        if self.refinement is not None:
+            tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
+            save_motion(folder / "refined_motion.npz", self.motion())
         for index, values in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{index}.{k}": torch.as_tensor(v).contiguous() for k, v in values.items()}
+            tensors |= {f"adam.{index}.{k}": torch.as_tensor(v).cpu().contiguous() for k, v in values.items()}
         tensors["generator"] = self.generator.get_state()
         header = {
             "schema": STATE_SCHEMA,
@@ -238,6 +240,7 @@ class Training:
             "step": self.step_index,
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
+            "perceptual_sha256": self._perceptual_sha256(),
         }
         write_tensors(folder / "training.state", tensors, header)
         save_checkpoint(
@@ -257,9 +260,16 @@ class Training:
             raise InputError(
                 "--resume", expected="the configuration it was started with", got=f"other {wrong}", file=path
             )
+        if header.get("perceptual_sha256") != self._perceptual_sha256():
+            raise InputError(
+                "--resume", expected=f"the perceptual weights {header.get('perceptual_sha256')}",
+                got=self._perceptual_sha256(), file=path,
+            )  # fmt: skip
         try:
             self.model.load_state_dict(_strip(tensors, "model."))
             self.probe.load_state_dict(_strip(tensors, "probe."))
+            if self.refinement is not None:
+                self.refinement.load_state_dict(_strip(tensors, "poses."))
             moments: dict[int, dict[str, Tensor]] = {}
             for name, value in _strip(tensors, "adam.").items():
                 index, key = name.split(".")
@@ -271,6 +281,9 @@ class Training:
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
+    def _perceptual_sha256(self) -> str | None:
+        return None if self.perceptual is None else self.perceptual.sha256
+
     def info(self) -> dict[str, Any]:
         """Provenance for the checkpoint."""
         return {
@@ -280,6 +293,8 @@ class Training:
             "minutes": round(self.seconds / 60, 3),
             "pictures": len(self.views),
             "spacing_m": float(self.model.spacing),
+            "perceptual": None if self.perceptual is None else self.perceptual.backbone,
+            "perceptual_sha256": self._perceptual_sha256(),
         }
 
 
@@ -318,14 +333,13 @@ def _keep_until(path: Path, step: int) -> TextIO:
     """The metrics log, without rows at or after ``step``: those steps will be done again."""
     kept = []
     if path.exists():
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         kept = [
-            line
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if line and json.loads(line)["step"] < step
-        ]
+            line for line in lines if line.endswith("}") and json.loads(line)["step"] < step
+        ]  # one may be cut
     with atomic_path(path) as temporary:
         temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-    return path.open("a", encoding="utf-8")
+    return path.open("a", encoding="utf-8", buffering=1)  # line by line: --view reads along
 
 
 @contextmanager

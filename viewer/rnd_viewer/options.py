@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError
+from rnd_runtime.motion_edit import MotionEdits
 
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
@@ -30,7 +31,8 @@ class PlayOptions:
     avatar: Annotated[tyro.conf.Positional[Path | None], _option("AVATAR.onnx")] = None
     """The avatar, a file that rnd-export wrote."""
     motion: Annotated[Path | None, _option("FILE")] = None
-    """Body poses over time: an .npz of AMASS, SMPL or EasyMocap."""
+    """Body poses over time: .npz of AMASS, SMPL or EasyMocap, .pkl of AIST++ or WHAM, .pt of GVHMR, .npy of MDM,
+    .bvh, or .amc with its .asf beside it."""
     hdr: Annotated[Path | None, _option("FILE")] = None
     """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
     out: Annotated[Path | None, _option("FOLDER")] = None
@@ -41,7 +43,8 @@ class PlayOptions:
     fps: Annotated[float | None, _option("FLOAT")] = None
     """Frames per second. Default: the motion's."""
     frames: Annotated[str | None, _option("START:END")] = None
-    """Frames to render, END excluded, either may be missing; same pixels as in the whole run. Default: all."""
+    """Frames to render, END excluded, either may be missing; same pixels as in the whole run, and processes with
+    different parts may share a folder. Default: all."""
     format: Annotated[str | None, _option("LIST")] = None
     """Some of png,exr,mp4. Default: png, and mp4 where PyAV is installed."""
 
@@ -76,21 +79,45 @@ class PlayOptions:
     """Which axis points up in the motion's file."""
     motion_fps: Annotated[float | None, _option("FLOAT")] = None
     """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
+    joint_map: Annotated[Path | None, _option("FILE")] = None
+    """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
+    smooth: Annotated[float | None, _option("HZ")] = None
+    """Take jitter out of the motion: a One-Euro filter of this cutoff, 1 to 5; lower is smoother."""
+    speed: float = 1.0
+    """How many times as fast the motion is played."""
+    in_place: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Hold the motion's root over the place where it begins."""
+    loop: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Blend the motion's end into its beginning, so that the clip can be repeated."""
+
     threads: Annotated[int | None, _option("INT")] = None
     """CPU threads. Default: all."""
+    fps_floor: Annotated[float | None, _option("FLOAT")] = None
+    """Frames per second to hold by shading less often, then at a lower resolution, rather than by dropping frames:
+    what is given up depends on the machine, so two runs may differ."""
+    pipeline: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
+    """Encode the next frame and write the last while one is drawn; --no-pipeline does one after the other."""
     doctor: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")] = False
     """Print renderer, providers, threads, versions and what to install for what is missing."""
+
+    @property
+    def edits(self) -> MotionEdits:
+        """What is done to the motion before it is played."""
+        return MotionEdits(self.smooth, self.speed, self.in_place, self.loop)
 
     def __post_init__(self) -> None:
         """Refuse numbers that no later step could explain."""
         limits = {
             "fps": (1e-3, 1000),
+            "fps_floor": (1e-3, 1000),
             "orbit_seconds": (-1e6, 1e6),
             "distance": (1e-3, 1e4),
             "elevation": (-89, 89),
             "fov": (1, 170),
             "hdr_yaw": (-1e6, 1e6),
             "exposure": (-30, 30),
+            "smooth": (1e-2, 1e3),
+            "speed": (1e-2, 100),
         }
         for name, (low, high) in limits.items():
             value = getattr(self, name)

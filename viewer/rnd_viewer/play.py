@@ -5,30 +5,41 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, replace
 from pathlib import Path
+from time import perf_counter
 
 import numba
 import numpy as np
 
 from rnd_runtime import __version__
-from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import output_folder
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import load_motion
+from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 
 from .aov import parse_aovs
 from .background import Background
 from .cameras import CameraPath, Framing, View, file_path, frame_motion, front_path, orbit_path
+from .governor import FULL, Governor, Quality
 from .options import PlayOptions, frame_count, parse_frames, parse_size
-from .player import Player
-from .report import FRAME, print_summary, warn, with_progress
+from .pipeline import run
+from .player import Frame, Player
+from .report import FRAME, LATENCY, print_summary, warn, with_progress
+from .run_folder import claim, part_name
 from .timing import StageTimes
-from .writers import frame_writer, parse_formats, write_report
+from .writers import frame_writer, parse_formats, tone_map_for, write_report
 
 DEFAULT_SIZE = 512
+OWN_TO_A_PROCESS = (
+    "frames",
+    "threads",
+    "format",
+    "pipeline",
+)  # options that do not tell one run from another
 DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 
@@ -46,7 +57,16 @@ def play(options: PlayOptions) -> int:
     times = StageTimes()
     with times.stage("load"):
         avatar = Avatar.load(avatar_file, threads=options.threads)
-        motion = load_motion(motion_file, avatar.skeleton, up=options.motion_up, fps=options.motion_fps)
+        motion = edit_motion(
+            load_motion(
+                motion_file,
+                avatar.skeleton,
+                up=options.motion_up,
+                fps=options.motion_fps,
+                joint_map=options.joint_map,
+            ),
+            options.edits,
+        )
         light = _light(options, avatar)
         shader = Shader(light, mode=options.shade)
         rasterizer = make_rasterizer(options.raster)
@@ -60,16 +80,52 @@ def play(options: PlayOptions) -> int:
     for note in notes:
         warn(note)
 
-    with rasterizer, frame_writer(out, formats, fps=fps, times=times) as write:
-        for number in with_progress(frames):
-            with times.stage(FRAME):
-                time_s = number / fps
-                camera = camera_at(number, time_s)
-                frame = player.render(motion, time_s, camera)
-                if number == frames.start and not frame.alpha.any():
-                    raise _out_of_view(framing, camera, number)
-                write(number, frame, _reach(framing, camera))
+    governor = Governor(options.fps_floor) if options.fps_floor else None
+    qualities: list[Quality] = []
 
+    def encode(number: int) -> tuple[float, float, Encoded]:
+        started = perf_counter()
+        encoded = player.encode(motion, number / fps)
+        return started, perf_counter() - started, encoded
+
+    def draw(number: int, turn: tuple[float, float, Encoded]) -> tuple[Frame, Camera]:
+        asked, encoding, encoded = turn
+        started = perf_counter()
+        camera = camera_at(number, number / fps)
+        qualities.append(governor.quality if governor else FULL)
+        frame = player.draw(encoded, camera, qualities[-1])
+        if number == frames.start and not frame.alpha.any():
+            raise _out_of_view(framing, camera, number)
+        with times.stage("tonemap"):
+            tone_map_for(formats, frame)
+        now = perf_counter()
+        times.add(LATENCY, now - asked)
+        if governor:
+            governor.observe(encoding + now - started)
+        return frame, camera
+
+    count = frame_count(motion.duration, fps)
+    name = part_name("play", frames, count)
+    common = {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
+    claim(out, common, (avatar_file, motion_file, options.hdr))
+    with rasterizer, frame_writer(out, formats, name=name, fps=fps, times=times) as write:
+        started = before = perf_counter()
+
+        def put(number: int, drawn: tuple[Frame, Camera]) -> None:
+            write(number, drawn[0], _reach(framing, drawn[1]))
+
+        for _ in with_progress(frames, run(frames, encode, draw, put, overlap=options.pipeline)):
+            now = perf_counter()
+            times.add(FRAME, now - before)
+            before = now
+    seconds = perf_counter() - started
+
+    if lowered := sum(quality != FULL for quality in qualities):
+        notes.append(
+            f"{lowered} of {len(frames)} frames at less than full quality, for {options.fps_floor:g} frames/s"
+        )
+        warn(notes[-1])
+    camera = camera_at(frames.stop - 1, (frames.stop - 1) / fps)
     summary = times.summary()
     report = {
         "version": __version__,
@@ -82,8 +138,8 @@ def play(options: PlayOptions) -> int:
         "notes": notes,
         "times": summary,
     }
-    write_report(out, report)
-    rate = 1e3 / summary[FRAME]["median_ms"]
+    write_report(out / f"{name}.json", report)
+    rate = len(frames) / seconds
     headline = f"{len(frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
     print_summary(summary, headline=f"{headline} ({rasterizer.name}, {options.shade}) in {out}")
     return 0

@@ -9,16 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
-from rnd_runtime.gaussians import Rasterizer
+from rnd_runtime.frame import KeptRadiance, draw
+from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
+from rnd_runtime.tone import tone_map, tone_map_straight
 
 from .aov import CHANNELS, aov_values, splat_features
 from .background import Background
+from .governor import FULL, Quality, enlarged
 from .timing import StageTimes
 
 Floats32 = NDArray[np.float32]
@@ -53,13 +56,12 @@ class Frame:
 
         Splats are blended in linear light and coded at the end, as in training.
         """
-        return coded(self._over(np.zeros(3, np.float32) if self.behind is None else self.behind))
+        return tone_map(self.radiance, self.alpha, self.behind)
 
     @cached_property
     def srgb_alpha(self) -> NDArray[np.uint8]:
         """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied, as PNG has it."""
-        opaque = np.where(self.alpha > 0, self.alpha, np.float32(1))[..., None]
-        return np.dstack([coded(self.radiance / opaque), to_bytes(self.alpha)])
+        return tone_map_straight(self.radiance, self.alpha)
 
     def _over(self, behind: Floats32) -> Floats32:
         return self.radiance + (1 - self.alpha)[..., None] * behind
@@ -88,22 +90,25 @@ class Player:
     aovs: tuple[str, ...] = ()
     times: StageTimes = field(default_factory=StageTimes)
     _behind: tuple[Camera, Floats32] | None = field(default=None, init=False, repr=False)
+    _kept: tuple[KeptRadiance, int] | None = field(default=None, init=False, repr=False)  # and its frames
 
     def render(self, motion: Motion, time_s: float, camera: Camera) -> Frame:
         """The avatar at ``time_s`` seconds of ``motion``, seen by ``camera``."""
+        return self.draw(self.encode(motion, time_s), camera)
+
+    def encode(self, motion: Motion, time_s: float) -> Encoded:
+        """The first half of :meth:`render`; may run in another thread than the second."""
         with self.times.stage("encoders"):
-            gaussians = self.avatar.pose(motion, time_s)
-        with self.times.stage("shading"):
-            radiance = self.shader.shade(gaussians, camera.position)
-            features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
-        raster = self.rasterizer(
-            gaussians.means,
-            gaussians.covariances,
-            gaussians.opacities,
-            features.astype(np.float32),
-            camera,
-            depth="depth" in self.aovs,
-        )
+            return self.avatar.encode(motion, time_s)
+
+    def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
+        """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
+        with self.times.stage("posing"):
+            gaussians = self.avatar.posed(encoded)
+        if quality == FULL or self.aovs:
+            raster = self._raster(gaussians, camera)
+        else:
+            raster = self._cheaper_raster(gaussians, camera, quality)
         for stage, seconds in raster.seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):
@@ -117,6 +122,38 @@ class Player:
                 start += len(CHANNELS[name])
             aovs[name] = aov_values(name, splatted, raster.alpha)
         return Frame(raster.image[..., :3], raster.alpha, behind, aovs)
+
+    def _cheaper_raster(self, gaussians: Gaussians, camera: Camera, quality: Quality) -> Raster:
+        count = len(gaussians.means)
+        if self._kept is None or self._kept[1] >= quality.shade_every or len(self._kept[0].known) != count:
+            self._kept = KeptRadiance(count), 0
+        kept, age = self._kept
+        self._kept = kept, age + 1
+        sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
+        raster = draw(gaussians, self.shader, camera.resized(*sides), self.rasterizer, kept=kept)
+        if quality.scale == 1:
+            return raster
+        with self.times.stage("enlarging"):
+            picture = np.dstack([raster.image, raster.alpha])
+            picture = enlarged(picture, camera.height, camera.width)
+        depth = np.zeros((camera.height, camera.width), np.float32)
+        return Raster(picture[..., :3], picture[..., 3], depth, raster.seconds)
+
+    def _raster(self, gaussians: Gaussians, camera: Camera) -> Raster:
+        """Radiance, then the AOVs' features, splatted."""
+        if not self.aovs:
+            return draw(gaussians, self.shader, camera, self.rasterizer)
+        with self.times.stage("shading"):
+            radiance = self.shader.shade(gaussians, camera.position)
+            features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
+        return self.rasterizer(
+            gaussians.means,
+            gaussians.covariances,
+            gaussians.opacities,
+            features.astype(np.float32),
+            camera,
+            depth="depth" in self.aovs,
+        )
 
     def _radiance_behind(self, camera: Camera) -> Floats32 | None:
         """The background, kept for as long as the camera stands still."""

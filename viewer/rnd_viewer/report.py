@@ -10,8 +10,14 @@ from rich.table import Table
 
 from rnd_runtime.doctor import Finding
 
-FRAME = "whole frame"
+FRAME = "frame to frame"
+LATENCY = "pose to pixels"
 _stderr = Console(stderr=True)
+
+
+def say(line: str) -> None:
+    """One plain line on stdout."""
+    Console().print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def warn(message: str) -> None:
@@ -19,8 +25,8 @@ def warn(message: str) -> None:
     _stderr.print(f"rnd-play: warning: {message}", markup=False, highlight=False, soft_wrap=True)
 
 
-def with_progress(frames: range) -> Iterable[int]:
-    """``frames``, with a bar and the time left on stderr where that is a terminal."""
+def with_progress(frames: range, done: Iterable[int]) -> Iterable[int]:
+    """``done``, numbers out of ``frames``, with a bar and the time left on stderr where that is a terminal."""
     with Progress(
         TextColumn("rendering"),
         BarColumn(),
@@ -29,7 +35,7 @@ def with_progress(frames: range) -> Iterable[int]:
         console=_stderr,
         disable=not _stderr.is_terminal,
     ) as progress:
-        yield from progress.track(frames)
+        yield from progress.track(done, total=len(frames))
 
 
 def print_summary(summary: dict[str, dict[str, float]], *, headline: str) -> None:

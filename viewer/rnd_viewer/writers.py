@@ -7,6 +7,7 @@
     out/aov/normal/000010.png    AOVs to look at
     out/play.mp4
     out/play.json                settings, what was found in the inputs, stage times
+    out/play_000010-000050.*     the same of a part of a run, see :mod:`rnd_viewer.run_folder`
 """
 
 from __future__ import annotations
@@ -46,37 +47,43 @@ def parse_formats(text: str | None) -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in names)
 
 
+def tone_map_for(formats: tuple[str, ...], frame: Frame) -> None:
+    """Let ``frame`` make the pixels that ``formats`` need, which it keeps: before it goes to a writer's thread."""
+    if "png" in formats and frame.behind is None:
+        frame.srgb_alpha  # noqa: B018
+    if "mp4" in formats or ("png" in formats and frame.behind is not None):
+        frame.srgb  # noqa: B018
+
+
 @contextmanager
 def frame_writer(
-    folder: Path, formats: tuple[str, ...], *, fps: float, times: StageTimes
+    folder: Path, formats: tuple[str, ...], *, name: str = "play", fps: float, times: StageTimes
 ) -> Iterator[FrameWriter]:
     """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
 
     ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
-    one, and into pictures of their own if PNG is asked for or there is no EXR. The mp4 appears at the end.
+    one, and into pictures of their own if PNG is asked for or there is no EXR. The mp4, called ``name``, appears
+    at the end.
     """
     output_folder(folder)
-    video = mp4_writer(folder / "play.mp4", fps=fps) if "mp4" in formats else nullcontext(None)
+    video = mp4_writer(folder / f"{name}.mp4", fps=fps) if "mp4" in formats else nullcontext(None)
     with video as append:
 
         def write(number: int, frame: Frame, reach: tuple[float, float]) -> None:
             files: dict[Path, NDArray[np.uint8]] = {}
-            name = f"{number:06d}"
-            with times.stage("tonemap"):
+            number_name = f"{number:06d}"
+            with times.stage("write"):
                 if "png" in formats:
-                    files[folder / f"frames/{name}.png"] = (
-                        frame.srgb_alpha if frame.behind is None else frame.srgb
-                    )
+                    pixels = frame.srgb_alpha if frame.behind is None else frame.srgb
+                    files[folder / f"frames/{number_name}.png"] = pixels
                 if "png" in formats or "exr" not in formats:
                     for aov, values in frame.aovs.items():
-                        files[folder / f"aov/{aov}/{name}.png"] = aov_picture(aov, values, frame.alpha, reach)
-                if append:
-                    frame.srgb  # noqa: B018  (kept by the frame: its time belongs here)
-            with times.stage("write"):
+                        picture = aov_picture(aov, values, frame.alpha, reach)
+                        files[folder / f"aov/{aov}/{number_name}.png"] = picture
                 for path, pixels in files.items():
                     write_image(path, pixels)
                 if "exr" in formats:
-                    _write_exr(folder / f"frames_exr/{name}.exr", frame)
+                    _write_exr(folder / f"frames_exr/{number_name}.exr", frame)
                 if append:
                     append(frame.srgb)
 
@@ -89,7 +96,7 @@ def _write_exr(path: Path, frame: Frame) -> None:
     write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)
 
 
-def write_report(folder: Path, report: dict[str, Any]) -> None:
-    """Write ``play.json``."""
-    with atomic_path(folder / "play.json") as temporary:
+def write_report(file: Path, report: dict[str, Any]) -> None:
+    """Write ``play.json``, under the name of its part of a run."""
+    with atomic_path(file) as temporary:
         temporary.write_text(json.dumps(report, indent=1) + "\n")

@@ -1,0 +1,186 @@
+"""No more than a scene needs: the cheapest file of an avatar that keeps a bound, found on this machine.
+
+The search starts from the whole avatar and takes, one after another, the step that saves most for what it costs in the
+picture. Pictures are compared with those of the whole avatar under the same player, light and poses, the worst one
+counts. What is found must keep the bound in shots that the search has not seen; a file that does not is given up for
+the one before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import onnx
+
+from rnd_runtime.errors import InputError
+from rnd_trainer.config import ModelConfig
+
+from .candidates import Measured, Recipe, Workbench
+from .variant import Variant
+
+PRECISIONS: tuple[Literal["f32", "f16", "int8"], ...] = ("f32", "f16", "int8")
+LADDERS: dict[str, tuple[float, ...]] = {
+    "precision": (1, 2),
+    "dynamic_mm": (0.05, 0.2, 0.5, 1.0, 2.0, np.inf),
+    "nodes": (0.5, 0.25, 0.125),
+    "gaussians": (0.85, 0.7, 0.55, 0.4, 0.3, 0.2),
+    "visibility_degree": (2, 1, 0),
+    "window": (0.5, 0.3, 0.2),
+}
+"""steps of each choice away from the whole; nodes, Gaussians and window poses as shares of the checkpoint's"""
+MARGIN_DB = 0.3
+"""that the search keeps from a least PSNR: shots it has not seen are a little worse"""
+LEAST_GAIN = 0.01
+"""of the cost: steps that save less are not taken while others are left"""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """``ms`` a frame at most, ``psnr`` (dB) at least, or ``mb`` (1e6 bytes) at most."""
+
+    kind: Literal["ms", "psnr", "mb"]
+    value: float
+
+    def held(self, found: Measured) -> bool:
+        """Does a file of which ``found`` was measured keep it?"""
+        value: float = getattr(found, self.kind)
+        return value >= self.value if self.kind == "psnr" else value <= self.value
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many rungs down each of ``LADDERS`` a file is."""
+
+    precision: int = 0
+    dynamic_mm: int = 0
+    nodes: int = 0
+    gaussians: int = 0
+    visibility_degree: int = 0
+    window: int = 0
+
+    def recipe(self, config: ModelConfig) -> Recipe:
+        """For a checkpoint of ``config``."""
+
+        def rung(name: str) -> float | None:
+            at = getattr(self, name)
+            return LADDERS[name][at - 1] if at else None
+
+        nodes, gaussians, window, degree = (
+            rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree")
+        )
+        static = rung("dynamic_mm") == np.inf
+        variant = Variant(
+            encoder="coarse" if nodes else "full",
+            precision=PRECISIONS[self.precision],
+            nodes=max(16, int(nodes * config.nodes)) if nodes else None,
+            window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
+            visibility_degree=3 if degree is None else int(degree),
+        )
+        count = int(gaussians * config.gaussians) if gaussians else None
+        return Recipe(variant, count, rung("dynamic_mm") or 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A plan, its file, and what was measured on the shots of the search and, at the end, on the others."""
+
+    plan: Plan
+    model: onnx.ModelProto
+    measured: Measured
+    held_out: Measured | None = None
+
+
+def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> Found:
+    """The cheapest file that keeps ``bound``, on held-out shots too; ``on_step`` sees every step taken.
+
+    Raises :class:`InputError` where no file of the ladders does.
+    """
+    now = _made(bench, Plan())
+    path, worths = [now], dict.fromkeys(LADDERS, np.inf)
+    on_step(now)
+    while bound.kind == "psnr" or not _kept(bench, bound, now):
+        step = _best_step(bench, bound, now, worths)
+        if step is None:
+            break
+        now = step
+        path.append(now)
+        on_step(now)
+    for found in reversed(path):
+        held_out = bench.measure(found.model, bench.held_out)
+        if bound.held(held_out):
+            return replace(found, held_out=held_out)
+    raise InputError(
+        f"no file keeps the bound of {bound.kind}",
+        expected=f"{bound.value:g}",
+        got=f"{getattr(path[-1].measured, bound.kind):.3g} at the end of all steps",
+    )
+
+
+def _kept(bench: Workbench, bound: Bound, found: Found) -> bool:
+    return bound.held(found.measured) and bound.held(bench.measure(found.model, bench.held_out))
+
+
+def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, float]) -> Found | None:
+    """Of the steps further down, the one that saves most for what it costs in the picture.
+
+    ``worths`` of each ladder are remembered from earlier rounds, and looked at again only where they promise most:
+    what saves little once seldom saves more later.
+    """
+    cost = "mb" if bound.kind == "mb" else "ms"
+    made: dict[str, Found] = {}
+    while True:
+        name = max(worths, key=lambda name: worths[name])
+        if worths[name] <= 0:
+            return None
+        if name in made:
+            return made[name]
+        if getattr(now.plan, name) == len(LADDERS[name]):
+            worths[name] = 0
+            continue
+        found = _made(bench, replace(now.plan, **{name: getattr(now.plan, name) + 1}))
+        saved = 1 - getattr(found.measured, cost) / getattr(now.measured, cost)
+        allowed = bound.kind != "psnr" or found.measured.psnr >= bound.value + MARGIN_DB
+        worths[name] = (
+            saved / max(_square(found) - _square(now), 1e-9) if allowed and saved > LEAST_GAIN else 0
+        )
+        made[name] = found
+
+
+def _made(bench: Workbench, plan: Plan) -> Found:
+    model = bench.model(plan.recipe(bench.config))
+    return Found(plan, model, bench.measure(model, bench.seen))
+
+
+def _square(found: Found) -> float:
+    return float(10 ** (-found.measured.psnr / 10))
+
+
+def given_up(bench: Workbench, plan: Plan) -> list[str]:
+    """What a file of ``plan`` leaves out, a line each."""
+    recipe, config = plan.recipe(bench.config), bench.config
+    lines = []
+    if recipe.gaussians is not None:
+        lines.append(
+            f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again"
+        )
+    if recipe.variant.nodes is not None:
+        lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
+    if recipe.dynamic_mm == np.inf:
+        lines.append("dynamic skinning nowhere")
+    elif recipe.dynamic_mm:
+        share = bench.still_share(recipe.dynamic_mm)
+        lines.append(
+            f"dynamic skinning where it moves less than {recipe.dynamic_mm:g} mm ({share:.0%} of the nodes)"
+        )
+    if recipe.variant.visibility_degree < 3:
+        lines.append(f"visibility above degree {recipe.variant.visibility_degree}")
+    if recipe.variant.window_poses is not None:
+        lines.append(
+            f"{config.window_poses - recipe.variant.window_poses} of {config.window_poses} window poses"
+        )
+    if recipe.variant.precision != "f32":
+        lines.append(f"constants of 32 bits: {recipe.variant.precision}")
+    return lines or ["nothing"]

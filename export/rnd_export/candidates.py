@@ -1,0 +1,183 @@
+"""Making and measuring smaller files of one checkpoint, in one scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.frame import FrameRenderer
+from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.images import linear_to_srgb
+from rnd_runtime.light import Light
+from rnd_runtime.motion import Motion
+from rnd_runtime.raster_cpu import rasterize
+from rnd_trainer.checkpoint import load_checkpoint
+
+from .bake import BakedAvatar, bake
+from .export import refuse_ablations, surface_area, written
+from .merge import contributions, fitted_albedo, merged
+from .variant import Variant, reduced, static_where
+
+Floats = NDArray[np.float64]
+
+POSES = 6
+"""to search on; as many others, between them, are held out"""
+FIT_SIDE = 256
+"""of the pictures that colours are fitted to"""
+FIELD_OF_VIEW = 0.6
+TIMED = 12
+"""frames of which the faster half is averaged: what else the machine does is not the avatar's"""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What an avatar is judged in."""
+
+    motion: Motion
+    light: Light
+    size: int = 512
+    shade: str = "table+sun"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a file leaves out, beyond its :class:`Variant`.
+
+    ``gaussians``: N, or None for all. ``dynamic_mm``: nodes whose dynamic skinning moves nothing by more than this
+    are given the template's.
+    """
+
+    variant: Variant = field(default_factory=Variant)
+    gaussians: int | None = None
+    dynamic_mm: float = 0.0
+
+
+class Shot(NamedTuple):
+    """A moment of the motion and where it is seen from."""
+
+    time: float
+    camera: Camera
+
+
+class Measured(NamedTuple):
+    """``psnr``: of the worst picture against the whole avatar's, dB; ``ms`` a frame; ``mb`` (1e6 bytes)."""
+
+    psnr: float
+    ms: float
+    mb: float
+
+
+class Workbench:
+    """``seen`` are the shots to search on, ``held_out`` others; ``clock`` gives an avatar's ms per frame."""
+
+    def __init__(self, path: Path, scene: Scene, clock: Callable[[Avatar], float] | None = None) -> None:
+        self.checkpoint, self._path, self._scene = load_checkpoint(path), path, scene
+        refuse_ablations(self.checkpoint, path)
+        self.config = self.checkpoint.config.model
+        self._clock = clock or self._fastest
+        self._baked = bake(self.checkpoint.model)
+        self._whole = _loaded(self.model(Recipe()))
+        times = (np.arange(2 * POSES) + 0.5) / (2 * POSES) * scene.motion.duration
+        shots = [Shot(float(t), self._view(float(t), k)) for k, t in enumerate(times)]
+        self.seen, self.held_out = shots[::2], shots[1::2]
+        renderer = self._renderer(self._whole)
+        self._truth = {shot.time: self._picture(renderer, shot) for shot in shots}
+        self._fit = [Shot(shot.time, shot.camera.resized(FIT_SIDE, FIT_SIDE)) for shot in self.seen]
+        self._shares = contributions(self._posed(self._whole))
+        self._moves = self._node_moves()
+
+    def model(self, recipe: Recipe) -> onnx.ModelProto:
+        """The file of ``recipe``."""
+        baked = reduced(self._baked, self.config, recipe.variant, surface_area(self.checkpoint))
+        if recipe.dynamic_mm and baked.skinning is not None:
+            baked = static_where(baked, self._moves[: len(baked.codes)] < recipe.dynamic_mm)
+        if recipe.gaussians is not None:
+            baked = merged(baked, recipe.gaussians, self._shares)
+            fewer = _loaded(self._written(baked, recipe.variant))
+            wanted = [_albedo_picture(*view) for view in self._posed(self._whole)]
+            baked = dataclasses.replace(baked, albedo=fitted_albedo(baked.albedo, self._posed(fewer), wanted))
+        return self._written(baked, recipe.variant)
+
+    def measure(self, model: onnx.ModelProto, shots: Sequence[Shot]) -> Measured:
+        """``model`` in ``shots``."""
+        avatar = _loaded(model)
+        renderer = self._renderer(avatar)
+        squares = [np.mean((self._picture(renderer, shot) - self._truth[shot.time]) ** 2) for shot in shots]
+        psnr = -10 * np.log10(max(float(max(squares)), 1e-12))
+        return Measured(float(psnr), self._clock(avatar), model.ByteSize() / 1e6)
+
+    def still_share(self, limit_mm: float) -> float:
+        """Share of the nodes at which dynamic skinning moves nothing by more than ``limit_mm``."""
+        return float((self._moves < limit_mm).mean())
+
+    def _written(self, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
+        return written(self.checkpoint, self._path, baked, variant)
+
+    def _renderer(self, avatar: Avatar) -> FrameRenderer:
+        return FrameRenderer(avatar, self._scene.light, self.seen[0].camera, shade=self._scene.shade)
+
+    def _picture(self, renderer: FrameRenderer, shot: Shot) -> Floats:
+        """sRGB [H, W, 3], not rounded."""
+        renderer.camera = shot.camera
+        radiance = renderer.render(self._scene.motion, shot.time).radiance
+        return np.asarray(linear_to_srgb(np.clip(radiance, 0, 1)), np.float64)
+
+    def _fastest(self, avatar: Avatar) -> float:
+        taken, renderer = [], self._renderer(avatar)
+        for k in range(TIMED + 2):
+            shot = self.held_out[k % len(self.held_out)]
+            renderer.camera = shot.camera
+            start = perf_counter()
+            renderer.render(self._scene.motion, shot.time)
+            taken.append(1e3 * (perf_counter() - start))
+        return float(np.mean(sorted(taken[2:])[: TIMED // 2]))
+
+    def _view(self, time: float, number: int) -> Camera:
+        """A picture that the avatar just fills, from another side for each shot."""
+        means = self._whole.pose(self._scene.motion, time).means
+        low, high = means.min(0), means.max(0)
+        centre = (low + high) / 2
+        distance = 0.6 * float(np.linalg.norm(high - low)) / np.tan(FIELD_OF_VIEW / 2)
+        angle = 2 * np.pi * 0.381966 * number  # the golden angle: no two from one side
+        eye = centre + distance * np.array([np.sin(angle), 0.1, np.cos(angle)])
+        size = self._scene.size
+        return Camera.look_at(eye, centre, width=size, height=size, fov_y=FIELD_OF_VIEW)
+
+    def _posed(self, avatar: Avatar) -> list[tuple[Gaussians, Camera]]:
+        return [(avatar.pose(self._scene.motion, shot.time), shot.camera) for shot in self._fit]
+
+    def _node_moves(self) -> Floats:
+        """By how many mm dynamic skinning moves what reads each node [M], at most over the poses of the search."""
+        moves: Floats = np.zeros(len(self._baked.codes))
+        if self._baked.skinning is None:
+            return moves
+        static, motion = _loaded(self.model(Recipe(Variant("static")))), self._scene.motion
+        most = np.zeros(len(self._baked.points))
+        for shot in self.seen:
+            apart = self._whole.pose(motion, shot.time).means - static.pose(motion, shot.time).means
+            most = np.maximum(most, 1e3 * np.linalg.norm(apart, axis=1))
+        np.maximum.at(moves, self._baked.neighbours, most[:, None])
+        return moves
+
+
+def _albedo_picture(gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
+    arrays = (gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.albedo)
+    return rasterize(*arrays, camera, depth=False).image
+
+
+def _loaded(model: onnx.ModelProto) -> Avatar:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "avatar.onnx"
+        onnx.save_model(model, str(file))
+        return Avatar.load(file)

@@ -1,0 +1,119 @@
+"""What an exported file may leave out for speed or size."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar import EncoderKind, Precision
+from rnd_runtime.errors import InputError
+from rnd_runtime.sh import SH_DEGREE
+from rnd_trainer.config import ModelConfig
+from rnd_trainer.template import NEIGHBOURS, node_interpolation
+
+from .bake import BakedAvatar, BakedSkinning
+
+COARSE_SHARE = 4
+"""``coarse`` evaluates the networks at one of this many nodes: 16 mm apart become 32 mm on a person"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way of writing an avatar; the defaults leave nothing out.
+
+    Attributes:
+        encoder: ``full``; ``coarse``: the networks at ``nodes`` points, by default a quarter of the checkpoint's;
+            ``static``: the template's skinning weights, no attention.
+        precision: how constants are stored; arithmetic is float32 always.
+        nodes: M, a prefix of the farthest-point order; for ``coarse``.
+        window_poses: d; fewer poses span the same seconds, those between are interpolated.
+        visibility_degree: 0 to 3; higher coefficients are left out.
+    """
+
+    encoder: EncoderKind = "full"
+    precision: Precision = "f32"
+    nodes: int | None = None
+    window_poses: int | None = None
+    visibility_degree: int = SH_DEGREE
+
+    def node_count(self, config: ModelConfig) -> int:
+        """M of the file."""
+        if self.encoder != "coarse":
+            return config.nodes
+        return self.nodes or max(NEIGHBOURS, config.nodes // COARSE_SHARE)
+
+    def check(self, config: ModelConfig) -> None:
+        """Raise :class:`InputError` for what no file of this checkpoint can be."""
+        least = {
+            "nodes": NEIGHBOURS,
+            "window_poses": 2 if config.window_poses > 1 else 1,
+            "visibility_degree": 0,
+        }
+        most = {"nodes": config.nodes, "window_poses": config.window_poses, "visibility_degree": SH_DEGREE}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= most[name]:
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(option, expected=f"{low} to {most[name]}", got=value)
+        if self.nodes is not None and self.encoder != "coarse":
+            raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
+
+
+def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant, area: float) -> BakedAvatar:
+    """``baked`` without what ``variant`` leaves out; ``area`` [m²] is that of the template's surface."""
+    changes: dict[str, Any] = {}
+    nodes, skinning = variant.node_count(config), baked.skinning
+    if nodes < len(baked.codes):
+        neighbours, weights = node_interpolation(baked.all_codes, nodes, area)
+        changes |= {
+            "codes": baked.codes[:nodes], "node_rows": baked.node_rows[:nodes],
+            "neighbours": neighbours, "neighbour_weights": weights,
+            "dynamic_nodes": nodes if skinning else 0,
+        }  # fmt: skip
+    if variant.encoder == "static":
+        changes |= {"skinning": None, "dynamic_nodes": 0}
+    elif skinning is not None and variant.window_poses not in (None, config.window_poses):
+        changes["skinning"] = _shorter(skinning, config.window_poses, int(variant.window_poses or 0))
+    if variant.visibility_degree < SH_DEGREE:
+        kept = (variant.visibility_degree + 1) ** 2
+        out = {name: baked.visibility[name][:kept] for name in ("out.weight", "out.bias")}
+        changes["visibility"] = {**baked.visibility, **out}
+    return dataclasses.replace(baked, **changes)
+
+
+def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
+    """The template's skinning at the nodes ``still`` [M]; the others come first in the file's order."""
+    order = np.argsort(still, kind="stable")
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    moving = int((~still).sum())
+    return dataclasses.replace(
+        baked,
+        codes=baked.codes[order],
+        node_rows=baked.node_rows[order],
+        neighbours=place[baked.neighbours],
+        dynamic_nodes=moving,
+        skinning=baked.skinning if moving else None,
+    )
+
+
+def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:
+    """Tokens of ``fewer`` poses: the first layer reads the missing ones off the line between their neighbours."""
+    module = dict(skinning.temporal.module)
+    weight = module["embed.weight"]  # [width, poses · 6]
+    spread = line_through(poses, fewer)
+    module["embed.weight"] = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), spread).reshape(
+        len(weight), fewer * 6
+    )
+    return dataclasses.replace(skinning, temporal=dataclasses.replace(skinning.temporal, module=module))
+
+
+def line_through(poses: int, fewer: int) -> NDArray[np.float64]:
+    """[poses, fewer]: piecewise linear interpolation of evenly spaced values, ends kept."""
+    places = np.linspace(0, fewer - 1, poses)
+    weights: NDArray[np.float64] = np.maximum(0, 1 - np.abs(places[:, None] - np.arange(fewer)))
+    return weights

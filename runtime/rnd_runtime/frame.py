@@ -1,0 +1,175 @@
+"""One picture of an avatar from a motion, a light and a camera: all of playback behind one call.
+
+::
+
+    renderer = FrameRenderer(Avatar.load("avatar.onnx"), load_light("sky.exr"), camera)
+    frame = renderer.render(motion, 0.5)   # frame.image: 8-bit sRGB; frame.stage_seconds: where the time went
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from . import raster_cpu
+from ._raster_input import floats
+from .avatar import Avatar
+from .camera import Camera
+from .gaussians import Floats32, Gaussians, Raster, Rasterizer
+from .light import Light
+from .motion import Motion
+from .raster import make_rasterizer
+from .shading import Shader
+from .tone import tone_map
+
+_LEAST_OPACITY = np.float32(1 / 255)  # below it nothing is drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One rendered picture.
+
+    Attributes:
+        image: [H, W, 3] 8-bit sRGB, over black.
+        radiance: [H, W, 3] linear Rec.709, premultiplied by alpha.
+        alpha: [H, W].
+        stage_seconds: how long each stage took, in the order in which they ran; they add up to the frame.
+    """
+
+    image: NDArray[np.uint8]
+    radiance: Floats32
+    alpha: Floats32
+    stage_seconds: Mapping[str, float]
+
+
+class FrameRenderer:
+    """Renders one avatar; frames depend on the arguments and on ``camera`` and the light alone.
+
+    Only Gaussians that reach the picture are shaded.
+
+    Args:
+        avatar: as :meth:`rnd_runtime.avatar.Avatar.load` gives it, with the threads chosen there.
+        light: the probe; :meth:`turn` and :meth:`relight` change it between frames.
+        camera: the view; assign ``renderer.camera`` to move it between frames.
+        shade: one of :data:`rnd_runtime.shading.SHADE_MODES`.
+        raster: "cpu", "gl" or "auto", see :func:`rnd_runtime.raster.make_rasterizer`.
+        cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5. What that costs
+            stands in :func:`facing`; by default all are drawn.
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        light: Light,
+        camera: Camera,
+        *,
+        shade: str = "table+sun",
+        raster: Literal["auto", "gl", "cpu"] = "cpu",
+        cull: float | None = None,
+    ) -> None:
+        self.avatar, self.camera, self.cull = avatar, camera, cull
+        self._shader = Shader(light, shade)
+        self._rasterizer = make_rasterizer(raster)
+
+    def turn(self, yaw: float) -> None:
+        """Turn the light to ``yaw`` radians (as :class:`rnd_runtime.light.Light`); costs nothing."""
+        self._shader = self._shader.turned(yaw)
+
+    def relight(self, light: Light) -> None:
+        """Another light from now on; its tables are built here."""
+        self._shader = Shader(light, self._shader.mode)
+
+    def render(self, motion: Motion, time: float) -> Frame:
+        """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton)."""
+        encoded = self.avatar.encode(motion, time)
+        started = perf_counter()
+        gaussians = self.avatar.posed(encoded)
+        seconds = {**encoded.seconds, "posing": perf_counter() - started}
+        raster = draw(gaussians, self._shader, self.camera, self._rasterizer, cull=self.cull)
+        started = perf_counter()
+        image = tone_map(raster.image, raster.alpha)
+        seconds |= {**raster.seconds, "tone map": perf_counter() - started}
+        return Frame(image, raster.image, raster.alpha, seconds)
+
+    def close(self) -> None:
+        """Release the rasteriser."""
+        self._rasterizer.close()
+
+
+def draw(
+    gaussians: Gaussians,
+    shader: Shader,
+    camera: Camera,
+    rasterizer: Rasterizer,
+    *,
+    cull: float | None = None,
+    kept: KeptRadiance | None = None,
+) -> Raster:
+    """Shade what can be seen and splat it: the raster's picture is linear radiance [H, W, 3], without depth.
+
+    ``cull`` as of :class:`FrameRenderer`. With ``kept``, only Gaussians are shaded that were not seen since it was
+    made. The raster's ``seconds`` have "shading" beside its own stages.
+    """
+    started = perf_counter()
+    opacities = gaussians.opacities
+    if cull is not None:
+        opacities = facing(gaussians, camera.position, cull)
+    if getattr(rasterizer, "name", "") != "cpu":
+        radiance = _shade(gaussians, shader, camera, opacities >= _LEAST_OPACITY, kept)
+        shaded = perf_counter()
+        raster = rasterizer(gaussians.means, gaussians.covariances, opacities, radiance, camera, depth=False)
+        return replace(raster, seconds={"shading": shaded - started, **raster.seconds})
+    projected = raster_cpu.Projected(gaussians.means, gaussians.covariances, opacities, camera)
+    seen = perf_counter()
+    radiance = _shade(gaussians, shader, camera, projected.drawn, kept)
+    seconds = {"projection": seen - started, "shading": perf_counter() - seen}
+    raster = projected.draw(radiance)
+    return replace(raster, seconds={**seconds, **raster.seconds})
+
+
+class KeptRadiance:
+    """Radiance of some frames ago, of the Gaussians that were seen since."""
+
+    def __init__(self, count: int) -> None:
+        self.radiance = np.zeros((count, 3), np.float32)
+        self.known = np.zeros(count, np.bool_)
+
+
+def _shade(
+    gaussians: Gaussians, shader: Shader, camera: Camera, seen: NDArray[np.bool_], kept: KeptRadiance | None
+) -> Floats32:
+    if kept is None:
+        return shader.shade(gaussians, camera.position, seen)
+    fresh = seen & ~kept.known
+    if fresh.any():
+        kept.radiance[fresh] = shader.shade(gaussians, camera.position, fresh)[fresh]
+        kept.known |= fresh
+    return kept.radiance
+
+
+def facing(gaussians: Gaussians, eye: ArrayLike, least: float) -> Floats32:
+    """Opacities [N], 0 where the angle between normal and view is so large that n·v < ``least``.
+
+    What faces away from the camera at ``eye`` [3] m lies behind what faces it, if the body is closed and opaque. A
+    little below 0 the silhouette's own Gaussians are kept, which are seen from their edge. No trained avatar is quite
+    that: one of 30 000 at 512² keeps (mean and worst of six views, against the whole picture) 41.0 and 38.1 dB at −0.2,
+    44.3 and 41.0 at −0.5.
+    """
+    opacities = np.empty(len(gaussians.means), np.float32)
+    arrays = (floats(gaussians.means), floats(gaussians.normals), floats(gaussians.opacities))
+    _facing(*arrays, floats(eye), np.float32(least), opacities)
+    return opacities
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _facing(means, normals, opacities, eye, least, kept):  # type: ignore[no-untyped-def]
+    for i in range(len(means)):
+        x, y, z = eye[0] - means[i, 0], eye[1] - means[i, 1], eye[2] - means[i, 2]
+        along = x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]
+        kept[i] = opacities[i] if along >= least * np.sqrt(x * x + y * y + z * z) else 0

@@ -1,0 +1,131 @@
+"""Motions that come as pickles: AIST++, WHAM, GVHMR, MDM, or the members of an .npz in a dict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .motion_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
+from .npz import Members
+from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
+from .unpickle import read_pickle
+
+Floats = NDArray[np.float64]
+
+PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
+
+_AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
+_VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One person's motion as the members of an .npz (:func:`motion_files.read_motion_file`).
+
+    Attributes:
+        members: ``poses`` and the like.
+        rest_root: [3] m, the pelvis' rest position that translations are relative to; None for the avatar's own.
+        notes: what was assumed or left out.
+    """
+
+    members: Members
+    rest_root: Floats | None
+    notes: tuple[str, ...] = ()
+
+
+def read_track(path: str | Path) -> Track:
+    """Read the motion in a .pkl, .joblib, .pt or .npy. All of them are Y up, in a world of their own.
+
+    ===========  ============================================================================================
+    AIST++       ``smpl_poses`` (F,72), ``smpl_trans`` (F,3), ``smpl_scaling``: metres are trans / scaling;
+                 60 frames per second
+    GVHMR        ``smpl_params_global`` {``body_pose`` (F,63), ``global_orient``, ``transl``}, SMPL-X
+    WHAM         {person: {``pose_world`` (F,72), ``trans_world`` (F,3), ``frame_ids``}}: the person seen
+                 longest; frames between the parts of a track are filled in
+    MDM          ``thetas`` (24,6,F) the first two rows of each rotation, or ``thetas_ori`` (24,3,F)
+                 axis-angle, and ``root_translation`` (3,F), the pelvis' place; 20 frames per second
+    others       a dict with the members of an .npz, or an object array of it
+    ===========  ============================================================================================
+
+    Raises:
+        InputError: when it is none of them.
+    """
+    content = read_pickle(path, what="motion")
+    if not isinstance(content, Mapping) or not content:
+        kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
+        raise InputError("motion", expected="a dict of arrays", got=kind, file=path)
+    try:
+        return _track(content, path)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        got = f"arrays that do not fit together ({error})"
+        raise InputError("motion", expected="poses over time", got=got, file=path) from error
+
+
+def _track(content: Mapping[Any, Any], path: str | Path) -> Track:
+    if "smpl_poses" in content:
+        arrays: dict[str, Any] = {
+            "poses": content["smpl_poses"],
+            "trans": np.asarray(content["smpl_trans"])
+            / np.asarray(content.get("smpl_scaling", 1.0)).reshape(-1)[0],
+            "fps": _AIST_FPS,
+        }
+        return Track(Members(arrays, path), SMPL_REST_ROOT)
+    if "smpl_params_global" in content:
+        return Track(Members(_with_fps(content["smpl_params_global"]), path), SMPLX_REST_ROOT, (_VIDEO_NOTE,))
+    if "root_translation" in content and ("thetas" in content or "thetas_ori" in content):
+        return _mdm(content, path)
+    people = {who: track for who, track in content.items() if isinstance(track, Mapping) and "pose" in track}
+    if people:
+        return _wham(people, path)
+    return Track(Members({str(name): value for name, value in content.items()}, path), None)
+
+
+def _with_fps(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    return {"fps": _VIDEO_FPS, **arrays}
+
+
+def _mdm(content: Mapping[Any, Any], path: str | Path) -> Track:
+    if "thetas_ori" in content:
+        poses = np.asarray(content["thetas_ori"], np.float64).transpose(2, 0, 1)
+    else:
+        rows = np.asarray(content["thetas"], np.float64).transpose(2, 0, 1)
+        x = rows[..., :3] / np.linalg.norm(rows[..., :3], axis=-1, keepdims=True)
+        y = rows[..., 3:] - (x * rows[..., 3:]).sum(-1, keepdims=True) * x
+        y /= np.linalg.norm(y, axis=-1, keepdims=True)
+        poses = matrix_to_axis_angle(np.stack([x, y, np.cross(x, y)], -2))
+    trans = np.asarray(content["root_translation"], np.float64).T
+    return Track(Members({"poses": poses, "trans": trans, "fps": _MDM_FPS}, path), np.zeros(3))
+
+
+def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
+    notes = [_VIDEO_NOTE]
+    longest = max(people, key=lambda who: len(people[who]["pose"]))
+    if len(people) > 1:
+        others = ", ".join(str(who) for who in people if who != longest)
+        notes.append(f"person {longest} is taken, who is seen longest; left out: {others}")
+    person = people[longest]
+    world = "pose_world" in person and "trans_world" in person
+    if not world:
+        notes.append("no world coordinates in the file: the camera's are used, whose Y points down")
+    poses = np.asarray(person["pose_world" if world else "pose"], np.float64)
+    trans = np.asarray(person["trans_world" if world else "trans"], np.float64)
+    frames = np.asarray(person.get("frame_ids", np.arange(len(poses)))).reshape(-1)
+    if len(frames) != len(poses) or (np.diff(frames) <= 0).any():
+        raise InputError("frame_ids", expected=f"{len(poses)} that ascend", got=f"{len(frames)}", file=path)
+    missing = int(frames[-1] - frames[0] + 1 - len(frames))
+    if missing:
+        notes.append(f"{missing} frames without the person are filled in between their neighbours")
+        wanted = np.arange(frames[0], frames[-1] + 1)
+        after = np.clip(np.searchsorted(frames, wanted), 1, len(frames) - 1)
+        t = (wanted - frames[after - 1]) / (frames[after] - frames[after - 1])
+        turns = axis_angle_to_matrix(poses.reshape(len(poses), -1, 3))
+        filled = slerp_matrices(turns[after - 1], turns[after], t[:, None])
+        poses = matrix_to_axis_angle(filled)
+        trans = (1 - t[:, None]) * trans[after - 1] + t[:, None] * trans[after]
+    return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, tuple(notes))

@@ -1,0 +1,343 @@
+"""From what the networks say at the nodes to posed Gaussians, in one compiled pass.
+
+An avatar's graph evaluates its networks at M nodes and does the rest for N Gaussians, operation by operation: two
+thirds of its time. Here each Gaussian goes through all of it at once:
+
+    fields = Σ_k weight_k · node fields[neighbour_k]          Δ logits, Δx and Δr before tanh, visibility
+    W      = softmax(log W_template + Δ logits)
+    A      = Σ_j W_j B_j = [A_R | A_T]
+    t      = min(1, |cofactor(A_R) u| / |A_R u|²)             u: the limb's axis; 1 but where it is twisted
+    κ      = share · (Newton–Schulz factor of t − 1)          widens what a twist has pinched
+    mean   = A_R (x_c + max_offset · tanh Δx + κ lever) + A_T
+    Σ      = F Fᵀ + floor² I,  F = A_R · C · R(tanh Δr) · (R S)   R(v): the quaternion normalize(1, v/2)
+    normal = normalize((cofactor(A_R) + fallback · A_R) (n_c + κ u (u·n_c)))      C = (1 + κ) I − κ u uᵀ
+
+``posing_reference`` says the same in plain float64.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from ._lanes import WIDTH, aligned_floats, exp2, lanes, largest, load, root, select, store, total
+
+Floats32 = NDArray[np.float32]
+
+_HARMONICS = 16
+_CHUNK = 256  # Gaussians handed to a thread at a time
+_NEVER = -1e30  # log weight of the joints that fill up the last register
+_LOG2_E = np.float32(np.log2(np.e))
+_SMALLEST_POWER = np.float32(-126)  # of two in float32
+_LARGEST_TANH = np.float32(9)  # beyond it tanh is 1 in float32
+_ZERO, _HALF, _ONE, _TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
+_SHORTEST = np.float32(1e-9)  # of a normal before it is normalised
+TWIST_STEPS = 3  # of Newton–Schulz, s → s (3 − s²)/2 on s = √t: two leave 0.54 of a limb at 150°, three 0.73
+SMALLEST_SQUARE = np.float32(1e-6)  # of |A_R u|: a blend without length has no axis to be widened about
+_THREE = np.float32(3)
+_POINTS, _FACTORS, _NORMALS, _LIMBS, _OWN = (
+    0,
+    3,
+    12,
+    15,
+    22,
+)  # where each begins among the rest pose's components
+
+
+class Posed(NamedTuple):
+    """Posed Gaussians in the world frame; see :class:`rnd_runtime.gaussians.Gaussians`."""
+
+    means: Floats32  # [N, 3] m
+    covariances: Floats32  # [N, 6] m²
+    normals: Floats32  # [N, 3] unit
+    visibility: Floats32  # [N, 16]
+
+
+@dataclass(frozen=True, eq=False)
+class RestPose:
+    """What of an avatar does not depend on the pose.
+
+    Attributes:
+        neighbours: [N, K] nodes between which a Gaussian is interpolated.
+        neighbour_weights: [N, K].
+        log_template: [N, J] log of the template's skinning weights, up to a constant for each Gaussian.
+        points: [N, 3] m, x_c.
+        factors: [N, 9] m, R S row by row.
+        normals: [N, 3] unit.
+        limbs: [N, 7] the limb's axis (unit), the lever from it to the point (m), and the share of a limb (0…1).
+        max_offset: m. floor: m², added to variances. fallback: share of A_R in a normal.
+    """
+
+    neighbours: NDArray[np.int32]
+    neighbour_weights: Floats32
+    log_template: Floats32
+    points: Floats32
+    factors: Floats32
+    normals: Floats32
+    limbs: Floats32
+    max_offset: float
+    floor: float
+    fallback: float
+
+    def pose(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
+    ) -> Posed:
+        """Pose all Gaussians.
+
+        Args:
+            logits: [M, J] Δ logits at the nodes; None where skinning is the template's.
+            offsets: [M, 6] Δx and Δr before tanh.
+            visibility: [M, S] harmonics, S ≤ 16; what is missing is 0.
+            bones: [J, 3, 4] rest pose → posed world.
+        """
+        rest = self._arrays
+        rows = np.zeros((self.log_template.shape[1], WIDTH), np.float32)
+        rows[:, :12] = np.asarray(bones, np.float32).reshape(len(rows), 12)
+        logits = np.zeros((len(np.asarray(offsets)), 0)) if logits is None else logits
+        nodes = (np.require(values, np.float32, ["C", "W"]) for values in (logits, offsets, visibility))
+        fields = _pack(*nodes, rest.log_template.shape[1])
+        count = len(self.points)
+        posed = Posed(
+            np.empty((count, 3), np.float32),
+            np.empty((count, 6), np.float32),
+            np.empty((count, 3), np.float32),
+            np.empty((count, _HARMONICS), np.float32),
+        )
+        limits = tuple(np.float32(x) for x in (self.max_offset, self.floor, self.fallback))
+        _pose(fields, rest, rows, limits, posed)
+        return posed
+
+    @cached_property
+    def _arrays(self) -> _RestArrays:
+        """As the kernel wants them."""
+        count, joints = self.log_template.shape
+        log_template = np.full((count, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
+        log_template[:, :joints] = self.log_template
+        own = np.zeros((_OWN, -(-count // WIDTH) * WIDTH), np.float32)
+        for first, values in (
+            (_POINTS, self.points),
+            (_FACTORS, self.factors),
+            (_NORMALS, self.normals),
+            (_LIMBS, self.limbs),
+        ):
+            own[first : first + values.shape[1], :count] = values.T
+        weights = np.array(self.neighbour_weights, np.float32, order="C")
+        return _RestArrays(np.array(self.neighbours, np.int32), weights, log_template, own)
+
+
+class _RestArrays(NamedTuple):
+    neighbours: NDArray[np.int32]  # [N, K]
+    weights: Floats32  # [N, K]
+    log_template: Floats32  # [N, J up to whole registers]
+    own: Floats32  # [22, N up to whole registers] points, factors, normals and limbs by component
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def _pack(logits, offsets, visibility, columns):  # type: ignore[no-untyped-def]
+    """[M, columns + 16 + 16] with zeros between: every part starts a register and none reaches past the end."""
+    fields = np.zeros((len(offsets), columns + 2 * WIDTH), np.float32)
+    for m in prange(len(offsets)):
+        fields[m, : logits.shape[1]] = logits[m]
+        fields[m, columns : columns + offsets.shape[1]] = offsets[m]
+        fields[m, columns + WIDTH : columns + WIDTH + visibility.shape[1]] = visibility[m]
+    return fields
+
+
+@njit(inline="always")
+def _interpolated(fields, rest, i, column):  # type: ignore[no-untyped-def]
+    """Sixteen fields of Gaussian i, from ``column`` on."""
+    width = fields.shape[1]
+    value = rest.weights[i, 0] * load(fields, rest.neighbours[i, 0] * width + column)
+    for k in range(1, rest.neighbours.shape[1]):
+        value += rest.weights[i, k] * load(fields, rest.neighbours[i, k] * width + column)
+    return value
+
+
+@njit(inline="always")
+def _exp(x):  # type: ignore[no-untyped-def]
+    power = x * _LOG2_E
+    return exp2(select(power > _SMALLEST_POWER, power, _SMALLEST_POWER))
+
+
+@njit(inline="always")
+def _tanh(x):  # type: ignore[no-untyped-def]
+    """To 1e-7, absolute."""
+    x = select(x < _LARGEST_TANH, x, _LARGEST_TANH)
+    x = select(x > -_LARGEST_TANH, x, -_LARGEST_TANH)
+    return lanes(_ONE) - lanes(_TWO) / (_exp(x * _TWO) + _ONE)
+
+
+@njit(error_model="numpy")
+def _blend(i, fields, rest, bones, weights, blend):  # type: ignore[no-untyped-def]
+    """A [3, 4] of Gaussian i into ``blend``; ``weights`` is room for its weights."""
+    columns = rest.log_template.shape[1]
+    greatest = lanes(np.float32(_NEVER))
+    for column in range(0, columns, WIDTH):
+        logits = load(rest.log_template, i * columns + column) + _interpolated(fields, rest, i, column)
+        greatest = select(logits > greatest, logits, greatest)
+        store(weights, column, logits)
+    top = largest(greatest)
+    sums = lanes(_ZERO)
+    for column in range(0, columns, WIDTH):
+        share = _exp(load(weights, column) - top)
+        sums += share
+        store(weights, column, share)
+    # two sums: each product would have to wait for the one before
+    even, odd = lanes(_ZERO), lanes(_ZERO)
+    joints = len(bones)
+    for j in range(0, joints - 1, 2):
+        even += weights[j] * load(bones, j * WIDTH)
+        odd += weights[j + 1] * load(bones, (j + 1) * WIDTH)
+    if joints % 2:
+        even += weights[joints - 1] * load(bones, (joints - 1) * WIDTH)
+    store(blend, 0, (even + odd) * (_ONE / total(sums)))
+
+
+@njit
+def _row(x, y, z, b):  # type: ignore[no-untyped-def]
+    """(x, y, z) B."""
+    return x * b[0] + y * b[3] + z * b[6], x * b[1] + y * b[4] + z * b[7], x * b[2] + y * b[5] + z * b[8]
+
+
+@njit
+def _apply(a, x, y, z):  # type: ignore[no-untyped-def]
+    """A (x, y, z)."""
+    return a[0] * x + a[1] * y + a[2] * z, a[3] * x + a[4] * y + a[5] * z, a[6] * x + a[7] * y + a[8] * z
+
+
+@njit
+def _cofactors(a):  # type: ignore[no-untyped-def]
+    """det(A) A⁻ᵀ, finite whatever A is."""
+    return (
+        a[4] * a[8] - a[5] * a[7], a[5] * a[6] - a[3] * a[8], a[3] * a[7] - a[4] * a[6],
+        a[7] * a[2] - a[8] * a[1], a[8] * a[0] - a[6] * a[2], a[6] * a[1] - a[7] * a[0],
+        a[1] * a[5] - a[2] * a[4], a[2] * a[3] - a[0] * a[5], a[0] * a[4] - a[1] * a[3],
+    )  # fmt: skip
+
+
+@njit
+def _turned(x, y, z, f):  # type: ignore[no-untyped-def]
+    """R(x, y, z) F with F row by row; R of the quaternion normalize(1, v/2)."""
+    x, y, z = _HALF * x, _HALF * y, _HALF * z
+    scale = _TWO / (_ONE + x * x + y * y + z * z)
+    first = _row(_ONE - scale * (y * y + z * z), scale * (x * y - z), scale * (x * z + y), f)
+    second = _row(scale * (x * y + z), _ONE - scale * (x * x + z * z), scale * (y * z - x), f)
+    third = _row(scale * (x * z - y), scale * (y * z + x), _ONE - scale * (x * x + y * y), f)
+    return first + second + third
+
+
+@njit
+def _widening(a, cofactors, axis, share):  # type: ignore[no-untyped-def]
+    """κ of a blend A about a limb's axis."""
+    x, y, z = _apply(a, axis[0], axis[1], axis[2])
+    length_squared = x * x + y * y + z * z
+    length_squared = select(length_squared > SMALLEST_SQUARE, length_squared, SMALLEST_SQUARE)
+    x, y, z = _apply(cofactors, axis[0], axis[1], axis[2])
+    kept = root(x * x + y * y + z * z) / length_squared
+    kept = select(kept > _ONE, _ONE, kept)
+    factor = lanes(_ONE)
+    for _ in range(TWIST_STEPS):
+        step = _HALF * (_THREE - kept)
+        factor, kept = factor * step, kept * step * step
+    return share * (factor - _ONE)
+
+
+@njit
+def _three(array, first, i, stride):  # type: ignore[no-untyped-def]
+    """Components ``first`` … ``first + 2`` of the sixteen Gaussians from i on; arrays are laid out by component."""
+    at = first * stride + i
+    return load(array, at), load(array, at + stride), load(array, at + 2 * stride)
+
+
+@njit
+def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyped-def]
+    """Means, covariances and normals of Gaussians i … i + 15, twelve rows of sixteen in ``out``.
+
+    ``blend`` has their A and ``offset`` their bounded offsets and turns, both by component.
+    """
+    max_offset, floor, fallback = limits
+    stride = rest.own.shape[1]
+    first, second, third = (
+        _three(blend, 0, 0, WIDTH), _three(blend, 4, 0, WIDTH), _three(blend, 8, 0, WIDTH),
+    )  # fmt: skip
+    a = first + second + third
+    cofactors = _cofactors(a)
+    axis, lever = _three(rest.own, _LIMBS, i, stride), _three(rest.own, _LIMBS + 3, i, stride)
+    kappa = _widening(a, cofactors, axis, load(rest.own, (_LIMBS + 6) * stride + i))
+
+    point, moved = _three(rest.own, _POINTS, i, stride), _three(offset, 0, 0, WIDTH)
+    x = point[0] + max_offset * moved[0] + kappa * lever[0]
+    y = point[1] + max_offset * moved[1] + kappa * lever[1]
+    z = point[2] + max_offset * moved[2] + kappa * lever[2]
+    x, y, z = _apply(a, x, y, z)
+    store(out, 0, x + load(blend, 3 * WIDTH))
+    store(out, WIDTH, y + load(blend, 7 * WIDTH))
+    store(out, 2 * WIDTH, z + load(blend, 11 * WIDTH))
+
+    f = (
+        _three(rest.own, _FACTORS, i, stride)
+        + _three(rest.own, _FACTORS + 3, i, stride)
+        + _three(rest.own, _FACTORS + 6, i, stride)
+    )
+    turn = _three(offset, 3, 0, WIDTH)
+    f = _turned(turn[0], turn[1], turn[2], f)
+    wide = _ONE + kappa
+    x, y, z = _row(kappa * axis[0], kappa * axis[1], kappa * axis[2], f)
+    f = (
+        wide * f[0] - axis[0] * x, wide * f[1] - axis[0] * y, wide * f[2] - axis[0] * z,
+        wide * f[3] - axis[1] * x, wide * f[4] - axis[1] * y, wide * f[5] - axis[1] * z,
+        wide * f[6] - axis[2] * x, wide * f[7] - axis[2] * y, wide * f[8] - axis[2] * z,
+    )  # fmt: skip
+    f0, f1, f2 = _row(a[0], a[1], a[2], f)
+    f3, f4, f5 = _row(a[3], a[4], a[5], f)
+    f6, f7, f8 = _row(a[6], a[7], a[8], f)
+    store(out, 3 * WIDTH, f0 * f0 + f1 * f1 + f2 * f2 + floor)
+    store(out, 4 * WIDTH, f0 * f3 + f1 * f4 + f2 * f5)
+    store(out, 5 * WIDTH, f0 * f6 + f1 * f7 + f2 * f8)
+    store(out, 6 * WIDTH, f3 * f3 + f4 * f4 + f5 * f5 + floor)
+    store(out, 7 * WIDTH, f3 * f6 + f4 * f7 + f5 * f8)
+    store(out, 8 * WIDTH, f6 * f6 + f7 * f7 + f8 * f8 + floor)
+
+    normal = _three(rest.own, _NORMALS, i, stride)
+    along = kappa * (axis[0] * normal[0] + axis[1] * normal[1] + axis[2] * normal[2])
+    nx, ny, nz = normal[0] + axis[0] * along, normal[1] + axis[1] * along, normal[2] + axis[2] * along
+    x, y, z = _apply(cofactors, nx, ny, nz)
+    u, v, w = _apply(a, nx, ny, nz)
+    x, y, z = x + fallback * u, y + fallback * v, z + fallback * w
+    length = root(x * x + y * y + z * z)
+    scale = _ONE / select(length > _SHORTEST, length, _SHORTEST)
+    store(out, 9 * WIDTH, x * scale)
+    store(out, 10 * WIDTH, y * scale)
+    store(out, 11 * WIDTH, z * scale)
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
+    count, columns = len(rest.log_template), rest.log_template.shape[1]
+    means, covariances, normals = posed.means, posed.covariances, posed.normals
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        weights, row, out = aligned_floats(columns), aligned_floats(WIDTH), aligned_floats(12 * WIDTH)
+        blend, offset = aligned_floats(12 * WIDTH), aligned_floats(6 * WIDTH)
+        blend[:], offset[:] = _ZERO, _ZERO
+        for first in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), WIDTH):
+            last = min(first + WIDTH, count)
+            for i in range(first, last):
+                _blend(i, fields, rest, bones, weights, row)
+                for c in range(12):
+                    blend[c * WIDTH + i - first] = row[c]
+                store(row, 0, _tanh(_interpolated(fields, rest, i, columns)))
+                for c in range(6):
+                    offset[c * WIDTH + i - first] = row[c]
+                store(posed.visibility, i * WIDTH, _interpolated(fields, rest, i, columns + WIDTH))
+            _pose_sixteen(first, blend, offset, rest, limits, out)
+            for i in range(first, last):
+                at = i - first
+                for c in range(3):
+                    means[i, c], normals[i, c] = out[c * WIDTH + at], out[(9 + c) * WIDTH + at]
+                for c in range(6):
+                    covariances[i, c] = out[(3 + c) * WIDTH + at]

@@ -1,0 +1,92 @@
+"""Renders the pictures of docs/method.md from the embedded avatar: python scripts/doc_pictures.py"""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.images import write_image
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.shading import Shader
+from rnd_viewer.aov import aov_picture
+from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.player import Player
+
+ROOT = Path(__file__).parent.parent
+SIDE, TIME_S = 400, 0.55
+AOVS = ("albedo", "normal", "roughness", "visibility")
+
+
+def main() -> None:
+    """Write docs/pictures/*.png."""
+    avatar = Avatar.load(ROOT / "assets/avatar.onnx")
+    walk = load_motion(ROOT / "assets/walk.npz", avatar.skeleton)
+    moment = walk.at([TIME_S])
+    camera = front_path(
+        frame_motion(avatar.skeleton, moment), View(SIDE, SIDE, math.radians(35), math.radians(5))
+    )(0, 0.0)
+    sky = load_light(ROOT / "assets/sky.exr")
+
+    frame = Player(avatar, sky, Shader(sky), rasterize, aovs=AOVS).render(walk, TIME_S, camera)
+    tiles = [frame.srgb]
+    for name in AOVS:
+        tile = aov_picture(name, frame.aovs[name], frame.alpha, (0, 1))
+        tiles.append(np.broadcast_to(tile, (SIDE, SIDE, 3)))
+    _write("materials.png", tiles)
+
+    learned = Light(avatar.trained_light)
+    lights = [learned, *(replace(sky, yaw=math.radians(yaw)) for yaw in (0, 120, 240))]
+    _write(
+        "relight.png",
+        [Player(avatar, x, Shader(x), rasterize).render(walk, TIME_S, camera).srgb for x in lights],
+    )
+
+    rest = Motion(
+        np.tile(np.eye(3), (1, len(avatar.skeleton), 1, 1)), np.zeros((1, 3)), 30, avatar.skeleton.names
+    )
+    tiles = []
+    for motion, time_s in ((rest, 0.0), (walk, TIME_S)):
+        view = front_path(
+            frame_motion(avatar.skeleton, motion.at([time_s])),
+            View(SIDE, SIDE, math.radians(35), math.radians(5)),
+        )
+        tiles.append(_weights(avatar, motion, time_s, view(0, 0.0)))
+    _write("weights.png", tiles)
+
+
+def _weights(avatar: Avatar, motion: Motion, time_s: float, camera) -> np.ndarray:
+    """Skinning weights as colours: each joint has its own, a Gaussian the mixture of its joints'."""
+    from rnd_runtime.skeleton import bone_transforms
+    from rnd_runtime.window import motion_window
+
+    gaussians = avatar.pose(motion, time_s)
+    now = motion.at([time_s])
+    bones = bone_transforms(avatar.skeleton, now.rotations[0], now.translations[0])
+    window = motion_window(motion, time_s, poses=avatar.window_poses, seconds=avatar.window_seconds)
+    (weights,) = avatar.run((*window, bones), ["skinning_weights"])
+    joints = weights.shape[1]
+    palette = np.array([colorsys.hsv_to_rgb(0.381966 * k % 1, 0.75, 0.95) for k in range(joints)])
+    light = 0.35 + 0.65 * np.maximum(gaussians.normals @ np.array([0.3, 0.5, 0.81], np.float32), 0)
+    colours = np.ascontiguousarray(weights @ palette * light[:, None], np.float32)
+    raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, colours, camera)
+    return (255 * raster.image.clip(0, 1)).astype(np.uint8)
+
+
+def _write(name: str, tiles: list[np.ndarray]) -> None:
+    """The tiles side by side, cropped to what is not black in any of them."""
+    stack = np.stack(tiles)
+    columns = np.flatnonzero(stack.max(axis=(0, 1, 3)) > 8)
+    rows = np.flatnonzero(stack.max(axis=(0, 2, 3)) > 8)
+    cut = stack[:, rows[0] : rows[-1] + 1, max(columns[0] - 12, 0) : columns[-1] + 13]
+    write_image(ROOT / "docs/pictures" / name, np.ascontiguousarray(np.concatenate(list(cut), axis=1)))
+
+
+if __name__ == "__main__":
+    main()

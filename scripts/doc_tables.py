@@ -1,0 +1,58 @@
+"""Fills the tables of README.md and docs/performance.md from assets/bench/*.json: python scripts/doc_tables.py
+
+A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
+the file's rows, with the format of its numbers. ``<!-- chart: FILE.svg -->`` … ``<!-- end -->`` holds a picture. What
+was not measured yet leaves its place empty.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+CHART = re.compile(r"(<!-- chart: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- table: (\S+) \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+PAGES = {ROOT / "README.md": "assets/bench", ROOT / "docs" / "performance.md": "../assets/bench"}
+"""the pages with tables, and where their pictures lie as seen from them"""
+
+
+def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
+    """``text`` with every table and chart as the files in ``bench`` have it; ``pictures`` is the folder in links."""
+
+    def chart(found: re.Match[str]) -> str:
+        picture = f"![{Path(found[2]).stem}]({pictures}/{found[2]})\n"
+        return found[1] + (picture if (bench / found[2]).is_file() else "") + found[3]
+
+    def table(found: re.Match[str]) -> str:
+        if not (bench / found[2]).is_file():
+            return found[1] + found[4]
+        rows = json.loads((bench / found[2]).read_text(encoding="utf-8"))
+        rows = rows["summary"] if isinstance(rows, dict) and "summary" in rows else rows
+        columns = [column.strip().partition(" ")[::2] for column in found[3].split(",")]
+        lines = [[name for name, _ in columns], ["---"] * len(columns)]
+        lines += [[_cell(_value(row, name), form) for name, form in columns] for row in rows]
+        return found[1] + "".join(f"| {' | '.join(line)} |\n" for line in lines) + found[4]
+
+    return CHART.sub(chart, TABLE.sub(table, text))
+
+
+def _value(row: dict[str, Any], name: str) -> object:
+    """``name`` of a row; ``split/figure`` looks into a cell."""
+    for part in name.split("/"):
+        row = row.get(part) if isinstance(row, dict) else None  # type: ignore[assignment]
+    return row
+
+
+def _cell(value: object, form: str) -> str:
+    return "" if value is None else format(value, form)
+
+
+if __name__ == "__main__":
+    for page, pictures in PAGES.items():
+        text = filled(page.read_text(encoding="utf-8"), ROOT / "assets" / "bench", pictures)
+        page.write_text(text, encoding="utf-8")

@@ -1,0 +1,191 @@
+"""rnd-bench: what it measures is what it says, and it does not measure twice."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.errors import InputError
+from rnd_runtime.frame import FrameRenderer
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion
+from rnd_trainer import bench_frame, bench_grid, bench_peers
+from rnd_trainer.bench_avatars import Encoders, seeded_checkpoint
+from rnd_trainer.bench_chart import draw_chart
+from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
+from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, read_rows, settings
+from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
+from rnd_trainer.checkpoint import load_checkpoint
+from tiny import ASSETS
+
+WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
+BRUTE_DB = 65.0
+"""the fastest exact path against the reference: float32 against float64, numba against numpy"""
+
+
+def test_the_reference_is_what_the_slowest_mode_approaches(tiny_avatar, tmp_path) -> None:
+    truth = reference(tiny_avatar, WALK, SKY, 64, tmp_path)
+    avatar = Avatar.load(tiny_avatar)
+    motion = load_motion(WALK, avatar.skeleton)
+    decibels = {}
+    for mode in ("brute", "ao"):
+        renderer = FrameRenderer(avatar, load_light(SKY), bench_camera(64), shade=mode)
+        pictures = []
+        for number in COMPARED:
+            renderer.turn(TURN * number)
+            pictures.append(renderer.render(motion, STEP_S * number).radiance)
+        means = np.array([avatar.pose(motion, STEP_S * number).means for number in COMPARED])
+        found = errors(Drawn({}, np.array(pictures), means), truth)
+        decibels[mode] = found["psnr_db"]
+        assert found["position_mm"] < 0.01
+    assert decibels["brute"] > BRUTE_DB and decibels["ao"] < decibels["brute"] - 20
+    assert truth.radiance.max() > 0.01
+    kept = reference(tiny_avatar, WALK, SKY, 64, tmp_path)  # the second time from the folder
+    assert (kept.radiance == truth.radiance).all()
+
+
+def test_errors_are_those_of_the_definition() -> None:
+    grey = np.full((2, 4, 4, 3), 0.5)
+    truth = Reference(grey, np.zeros((2, 5, 3)))
+    assert errors(Drawn({}, grey, truth.means), truth)["psnr_db"] == MOST_DB
+    other = grey.copy()
+    other[1] = 1.0  # coded 0.7354 and 1: a difference of 0.2646
+    means = np.zeros((2, 5, 3))
+    means[1, 2, 0] = 0.003
+    found = errors(Drawn({}, other, means), truth)
+    assert found["psnr_db_worst"] == pytest.approx(-20 * np.log10(1 - 0.7353569), abs=1e-3)
+    assert found["psnr_db"] == pytest.approx(found["psnr_db_worst"] + 10 * np.log10(2), abs=1e-6)
+    assert found["position_mm"] == pytest.approx(3.0) and found["worst_frame"] == COMPARED[1]
+    assert errors(Drawn({}, grey, np.zeros((2, 4, 3))), truth)["position_mm"] is None
+
+
+def test_a_point_is_measured_in_a_process_of_its_own(tiny_avatar) -> None:
+    drawn = bench_frame.measure(
+        Point(str(tiny_avatar), str(WALK), str(SKY), size=48, shade="table", threads=1, frames=6)
+    )
+    row = drawn.row
+    assert 0 < row["ms_min"] <= row["ms_median"] <= row["ms_p95"] and row["frames"] == 6
+    assert {"encoders", "shading", "raster"} <= set(row["stages"])
+    assert sum(row["stages"].values()) < 1.5 * row["ms_p95"]
+    assert 50 < row["peak_mb"] < 2000 and row["file_mb"] == tiny_avatar.stat().st_size / 1e6
+    assert drawn.radiance.shape == (len(COMPARED), 48, 48, 3) and drawn.radiance.max() > 0
+    with pytest.raises(InputError, match="optix, table"):
+        bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table", "optix", 1, 1))
+
+
+def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
+    points = settings()
+    assert len(points) == len(set(points)) and points[0] == Setting()
+    values = {name: {getattr(p, name) for p in points} for name in dataclasses.asdict(Setting())}
+    assert values["n"] == {4_000, 8_000, 15_000, 30_000, 60_000} and values["size"] == {256, 512, 1024}
+    assert values["raster"] == {"cpu", "gl-egl", "gl-osmesa"} and values["threads"] == {1, 2}
+    assert values["encoder"] == {"full", "coarse", "static"} and values["precision"] == {"f32", "f16", "int8"}
+    assert {"ao", "table", "table+sun", "brute"} < values["shade"] and len(values["window"]) == 3
+    assert len(settings(quick=True)) < len(points) / 2
+
+
+def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
+    calls: list[Setting] = []
+
+    def pretend(setting: Setting, inputs: Inputs, **_: object) -> dict:
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        calls.append(setting)
+        if setting.raster == "gl-egl":
+            raise InputError("no OpenGL here")
+        return {**dataclasses.asdict(setting), "machine": "this one", "ms_median": 1.0}
+
+    monkeypatch.setattr(bench_grid, "measured", pretend)
+    monkeypatch.setattr(bench_grid, "machine", lambda: "this one")
+    inputs = Inputs(ASSETS / "body.npz", WALK, SKY, tmp_path / "work")
+    out = tmp_path / "grid.json"
+    seen: list[bool] = []
+    with pytest.raises(KeyboardInterrupt):
+        grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
+    assert len(read_rows(out)) == 3 == len(seen)
+    calls.clear()
+    monkeypatch.setattr(
+        bench_grid, "measured", lambda s, i, **k: pretend(s, i) if calls.clear() is None else {}
+    )
+    rows = grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
+    assert seen == [True] * 3 + [False] * 3 + [True] * (len(settings(True)) - 3)
+    assert [row for row in rows if "failed" in row] == [next(r for r in rows if r["raster"] == "gl-egl")]
+    assert {json.dumps(row, sort_keys=True) for row in read_rows(out)} == {
+        json.dumps(row, sort_keys=True) for row in rows
+    }
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    rows = [
+        {"ms_median": ms, "psnr_db": db} for ms, db in ((5, 30), (3, 20), (4, 20), (7, 29), (9, 40), (9, 35))
+    ]
+    assert [(r["ms_median"], r["psnr_db"]) for r in pareto(rows)] == [(3, 20), (5, 30), (9, 40)]
+
+
+def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
+    rows = [
+        {**dataclasses.asdict(Setting(n=n, encoder=encoder)), "ms_median": n / 1000, "psnr_db": 40 + n / 1e4,
+         "stages": {"encoders": 3.0, "raster": n / 1e4}, "machine": "this one"}
+        for n in (8_000, 30_000) for encoder in ("full", "coarse")
+    ]  # fmt: skip
+    files = [tmp_path / "chart.svg", tmp_path / "chart.png"]
+    draw_chart(rows, files)
+    svg = files[0].read_text("utf-8")
+    for words in (
+        "4 points on this one",
+        "encoders",
+        "raster",
+        "30 000 Gaussians",
+        "encoder coarse",
+        "8k · 512",
+    ):
+        assert words in svg, words
+    assert files[1].read_bytes()[:4] == b"\x89PNG"
+    draw_chart(rows, [tmp_path / "again.svg"])
+    assert (tmp_path / "again.svg").read_text("utf-8") == svg
+    with pytest.raises(InputError, match="at least one measured point"):
+        draw_chart([{"failed": "x"}], files)
+
+
+def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
+    """A larger one looks like a smaller one: the same fields at the same places, valid and not silent."""
+    small, large = (
+        load_checkpoint(seeded_checkpoint(n, ASSETS / "body.npz", tmp_path)).model for n in (300, 600)
+    )
+    looks = []
+    for model in (small, large):
+        with torch.no_grad():
+            static = model.attributes(model.encoded_nodes())
+        looks.append(static.albedo.numpy())
+        assert looks[-1].std() > 0.05 and float(static.opacity.mean()) > 0.9
+        assert float(model.skinning.logits.weight.detach().abs().max()) > 0
+    distances = np.linalg.norm(small.points.numpy()[:, None] - large.points.numpy()[None], axis=-1)
+    near = distances.argmin(1)
+    close = distances.min(1) < 0.01
+    ours, theirs = looks[0][close], looks[1][near[close]]
+    assert close.sum() > 10 and np.median(np.abs(ours - theirs)) < 0.05
+    assert Encoders("coarse", "f16", 5).words() == [
+        "--encoder", "coarse", "--precision", "f16", "--window-poses", "5",
+    ]  # fmt: skip
+
+
+def test_peers_say_the_same_and_growth_is_measured(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:
+    monkeypatch.setattr(bench_peers, "REPEATS", 3)
+    monkeypatch.setattr(bench_peers, "COPIED", 1 << 20)
+    monkeypatch.setattr(torch, "compile", lambda run: run)  # the compiler takes half a minute
+    rows = bench_peers.encoders(tiny_checkpoint, tiny_avatar, 1)
+    assert [row["peer"] for row in rows] == ["onnxruntime", "torch eager", "torch.compile"]
+    assert all(row["ms_median"] > 0 and row["nodes"] == 200 for row in rows)
+    amounts = bench_peers.Amounts((300, 600, 1200), (16, 32), (5, 24), (2, 4))
+    grown = bench_peers.growth(amounts, 32, 1)
+    assert {(row["stage"], row["of"]) for row in grown} == {
+        ("raster", "Gaussians"), ("raster", "picture side"), ("shading, table", "Gaussians"),
+        ("shading, lights", "lights"), ("posing", "joints"),
+    }  # fmt: skip
+    for row in grown:
+        assert len(row["ms"]) == len(row["amounts"]) and np.isfinite(row["exponent"]) and row["floor_ms"] > 0

@@ -1,0 +1,181 @@
+"""The search for the cheapest file: merging, dynamic skinning by need, and bounds that hold where nobody looked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from rnd_export.bake import BakedAvatar, bake
+from rnd_export.budget import LADDERS, Bound, Plan, given_up, search
+from rnd_export.candidates import Measured, Recipe, Scene, Workbench
+from rnd_export.export import random_motion
+from rnd_export.merge import fitted_albedo, merged
+from rnd_export.variant import Variant, static_where
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.errors import InputError
+from rnd_runtime.light import Light
+from rnd_runtime.raster_cpu import rasterize
+from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.config import ModelConfig
+
+
+def _clock(avatar: Avatar) -> float:
+    """Costs as a machine would have them, but the same every time: by Gaussians and by nodes with attention."""
+    variant = avatar.metadata.variant
+    return 1e-3 * avatar.gaussians + 4e-3 * variant.dynamic_nodes + 1e-3 * variant.nodes
+
+
+@pytest.fixture(scope="module")
+def bench(tiny_checkpoint) -> Workbench:
+    moves = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=60, seed=5)
+    light = Light(np.ones((32, 64, 3), np.float32))
+    return Workbench(tiny_checkpoint, Scene(moves, light, size=96, shade="table"), _clock)
+
+
+def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
+    steps = []
+    found = search(bench, Bound("psnr", 32.0), steps.append)
+    again = bench.measure(found.model, bench.held_out)
+    assert again.psnr == found.held_out.psnr >= 32.0
+    whole = steps[0].measured
+    assert found.measured.ms < 0.9 * whole.ms and whole.psnr > 100
+    seen, held_out = ({shot.time for shot in shots} for shots in (bench.seen, bench.held_out))
+    assert not seen & held_out
+
+
+class _Formula:
+    """A workbench whose files are their recipes and whose measures follow from them."""
+
+    seen, held_out = "seen", "held out"
+
+    def __init__(self, harder: float = 0.0) -> None:
+        self.config, self._harder = ModelConfig(), harder
+
+    def model(self, recipe: Recipe) -> Recipe:
+        return recipe
+
+    def measure(self, recipe: Recipe, shots: str) -> Measured:
+        variant = recipe.variant
+        n, m = recipe.gaussians or self.config.gaussians, variant.nodes or self.config.nodes
+        dynamic = 1 / (1 + recipe.dynamic_mm)
+        bits = {"f32": 1.0, "f16": 0.6, "int8": 0.4}[variant.precision]
+        square = (
+            1e-9 + 1e-5 * (1 - bits) + 1e-4 * (1 - n / 30_000) + 2e-5 * (1 - dynamic) + 1e-5 * (1 - m / 7_500)
+        )
+        square *= 1 + self._harder * (shots == "held out")
+        mb = bits * (1 + n / 10_000)
+        return Measured(float(-10 * np.log10(square)), 4 + n / 5_000 + m / 1_500 * dynamic, mb)
+
+    def still_share(self, limit_mm: float) -> float:
+        return 0.5
+
+
+@pytest.mark.parametrize(("kind", "value"), [("mb", 2.5), ("mb", 0.9), ("ms", 9.0)])
+def test_cost_bounds_hold_and_no_more_is_given_up_than_needed(kind, value) -> None:
+    bench, steps = _Formula(), []
+    found = search(bench, Bound(kind, value), steps.append)
+    assert getattr(found.held_out, kind) <= value < getattr(steps[-2].measured, kind)
+    psnr = [step.measured.psnr for step in steps]
+    assert psnr == sorted(psnr, reverse=True) and len(psnr) > 1
+    if kind == "mb":  # bits are cheaper than Gaussians in this formula
+        assert found.plan.precision == 1 + (value < 2) and (found.plan.gaussians > 0) == (value < 1)
+    else:
+        assert found.plan.nodes > 0 and found.plan.precision == 0  # bits save no time
+    assert given_up(bench, found.plan) != ["nothing"] == given_up(bench, Plan())
+
+
+def test_what_cannot_be_kept_is_refused() -> None:
+    with pytest.raises(InputError, match=r"no file keeps the bound of mb: expected 0\.01"):
+        search(_Formula(), Bound("mb", 0.01), lambda found: None)
+
+
+def test_a_file_that_fails_unseen_is_given_up_for_the_one_before() -> None:
+    easy, hard = (search(_Formula(harder), Bound("psnr", 45.0), lambda found: None) for harder in (0.0, 0.5))
+    assert easy.held_out.psnr >= 45 and hard.held_out.psnr >= 45
+    assert easy.measured.ms < hard.measured.ms
+    failing = _Formula(0.5).measure(easy.model, "held out")
+    assert failing.psnr < 45 <= easy.measured.psnr
+
+
+def test_dynamic_skinning_stays_where_it_moves_something(bench) -> None:
+    """By its own measure: nothing in the poses searched moves by more than the limit."""
+    limit = float(np.median(bench._moves))
+    model = bench.model(Recipe(dynamic_mm=limit))
+    dynamic = next(o for o in model.graph.node if o.name == "skinning/dynamic_nodes")
+    assert dynamic is not None
+    assert 0.4 < bench.still_share(limit) < 0.6
+    whole, less = (bench.measure(bench.model(r), bench.seen) for r in (Recipe(), Recipe(dynamic_mm=limit)))
+    static = bench.measure(bench.model(Recipe(Variant("static"))), bench.seen)
+    assert static.psnr + 3 < less.psnr < whole.psnr
+
+
+def test_rows_of_nodes_may_be_reordered(tiny_checkpoint) -> None:
+    baked = bake(load_checkpoint(tiny_checkpoint).model)
+    still = np.arange(len(baked.codes)) % 3 == 0
+    other = static_where(baked, still)
+    assert other.dynamic_nodes == (~still).sum()
+    assert (other.codes[other.neighbours] == baked.codes[baked.neighbours]).all()
+    assert (other.all_codes[other.node_rows] == other.codes).all()
+
+
+def test_merging_keeps_mass_and_valid_gaussians(tiny_checkpoint) -> None:
+    baked = bake(load_checkpoint(tiny_checkpoint).model)
+    rng = np.random.default_rng(0)
+    seen = rng.uniform(0.5, 1.5, len(baked.points))
+    seen[::7] = 0.0
+    fewer = merged(baked, 400, seen)
+    assert len(fewer.points) == 400 and len(fewer.node_rows) == len(baked.codes)
+    assert (fewer.all_codes[fewer.node_rows] == baked.codes).all()
+    unseen_kept = np.isin(fewer.all_codes[:, 0], baked.all_codes[seen == 0, 0])
+    assert set(np.flatnonzero(unseen_kept)) <= set(fewer.node_rows)  # only where a node needs one
+    assert np.allclose(np.linalg.norm(fewer.normals, axis=1), 1)
+    same = merged(baked, len(baked.points), np.ones(len(baked.points)))
+    assert np.abs(same.points - baked.points).max() < 1e-12
+    assert (
+        np.abs(
+            same.factors @ same.factors.transpose(0, 2, 1) - baked.factors @ baked.factors.transpose(0, 2, 1)
+        ).max()
+        < 1e-12
+    )
+
+
+def test_merging_keeps_the_moments(tiny_checkpoint) -> None:
+    """Σ mass, Σ mass·x and Σ mass·(Σ + x xᵀ) of all Gaussians are those of the fewer."""
+    baked = bake(load_checkpoint(tiny_checkpoint).model)
+    seen = np.random.default_rng(1).uniform(0.5, 1.5, len(baked.points))
+    fewer = merged(baked, 300, seen)
+    owner = cKDTree(fewer.all_codes).query(baked.all_codes)[1]
+    mass = np.bincount(owner, seen, len(fewer.points))
+
+    def moments(b: BakedAvatar, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        second = b.factors @ b.factors.transpose(0, 2, 1) + b.points[:, :, None] * b.points[:, None, :]
+        return mass @ b.points, np.einsum("n,nij->ij", mass, second)
+
+    for ours, theirs in zip(moments(fewer, mass), moments(baked, seen)):
+        assert np.allclose(ours, theirs, rtol=1e-9)
+
+
+def test_colours_are_fitted_to_the_pictures(bench) -> None:
+    views = bench._posed(bench._whole)
+    truth = views[0][0].albedo.astype(np.float64)
+    wanted = [
+        rasterize(g.means, g.covariances, g.opacities, g.albedo, c, depth=False).image for g, c in views
+    ]
+    fitted = fitted_albedo(np.full_like(truth, 0.5), views, wanted)
+
+    def off(albedo: np.ndarray) -> float:
+        drawn = (
+            rasterize(g.means, g.covariances, g.opacities, np.float32(albedo), c, depth=False)
+            for g, c in views
+        )
+        return float(np.mean([(d.image - w) ** 2 for d, w in zip(drawn, wanted)]))
+
+    assert off(fitted) < 0.02 * off(np.full_like(truth, 0.5))
+
+
+def test_every_rung_is_a_file(bench) -> None:
+    deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
+    what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
+    assert 5 < what.psnr < 60
+    assert len(given_up(bench, deepest)) == len(LADDERS) - 1  # no window where nothing is dynamic

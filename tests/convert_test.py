@@ -1,0 +1,362 @@
+"""rnd-convert: every file is read back by code that knows the format and not our writer, and drawn or posed again."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.body import Body
+from rnd_runtime.images import linear_to_srgb, to_bytes
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion, save_motion
+from rnd_runtime.npz import save_npz
+from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.shading import Shader
+from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.convert_cli import main
+from rnd_viewer.mesh_files import posed_vertices
+from rnd_viewer.player import Player
+from rnd_viewer.splat_files import TRANSFORM
+from tiny import ASSETS, body, motion
+
+AVATAR, WALK, SKY = ASSETS / "avatar.onnx", ASSETS / "walk.npz", ASSETS / "sky.exr"
+SIDE = 128
+FRAME = 20
+ONE_STEP = 1  # of 255: float32 logarithms and back
+INSIDE = 0.99  # alpha above which nothing behind the body shows
+CODED_PSNR = (
+    33.0  # dB inside the body, where coded colours are blended; measured 33.9 (27.9 without correction)
+)
+FITTED_MEAN = 1.5  # of 255: a degree-3 fit over all views against the shading of one; measured 0.93
+
+
+def _ply(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a binary PLY of floats, by name."""
+    content = path.read_bytes()
+    header, _, data = content.partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    names = [line.split()[2] for line in lines if line.startswith("property float ")]
+    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex "))
+    rows = np.frombuffer(data, "<f4").reshape(count, len(names))
+    return dict(zip(names, rows.T.astype(np.float64)))
+
+
+def _glb(path: Path):
+    """The JSON of a GLB and its accessors as arrays."""
+    content = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    size, kind = struct.unpack_from("<I4s", content, 12)
+    assert kind == b"JSON"
+    document = json.loads(content[20 : 20 + size])
+    start = 20 + size + 8
+    assert struct.unpack_from("<I4s", content, 20 + size) == (len(content) - start, b"BIN\0")
+    arrays = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        dtype = {5126: "<f4", 5121: "u1", 5123: "<u2", 5125: "<u4"}[accessor["componentType"]]
+        shape = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,), "MAT4": (4, 4)}[accessor["type"]]
+        assert view["byteOffset"] % 4 == 0
+        values = np.frombuffer(
+            content, dtype, accessor["count"] * math.prod(shape), start + view["byteOffset"]
+        )
+        arrays.append(values.reshape(-1, *shape))
+    return document, arrays
+
+
+def _covariances(quaternions_xyzw: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    axes = Rotation.from_quat(quaternions_xyzw).as_matrix() * scales[:, None, :]
+    full = axes @ np.swapaxes(axes, 1, 2)
+    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+
+def _drawn(means, covariances, opacities, colours) -> np.ndarray:
+    arrays = (np.ascontiguousarray(a, np.float32) for a in (means, covariances, opacities, colours))
+    return rasterize(*arrays, _camera()).image
+
+
+def _drawn_ply(path: Path, half_turn: bool) -> np.ndarray:
+    """The picture of a PLY with colours of one view, as 3DGS says; blended as stored."""
+    ply = _ply(path)
+    means = np.stack([ply[k] for k in "xyz"], axis=-1)
+    wxyz = np.stack([ply[f"rot_{k}"] for k in range(4)], axis=-1)
+    scales = np.exp(np.stack([ply[f"scale_{k}"] for k in range(3)], axis=-1))
+    covariances = _covariances(wxyz[:, [1, 2, 3, 0]], scales)
+    if half_turn:
+        means = means * [-1, -1, 1]
+        covariances = covariances * [1, 1, -1, 1, -1, 1]
+    colours = 0.5 + 0.28209479177387814 * np.stack([ply[f"f_dc_{k}"] for k in range(3)], axis=-1)
+    return _drawn(means, covariances, 1 / (1 + np.exp(-ply["opacity"])), colours)
+
+
+def _camera():
+    skeleton = Avatar.load(AVATAR, threads=1).skeleton
+    framing = frame_motion(skeleton, load_motion(WALK, skeleton))
+    return front_path(framing, View(SIDE, SIDE, math.radians(35), math.radians(5)))(0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def played():
+    """The frame that rnd-play shows."""
+    avatar = Avatar.load(AVATAR, threads=1)
+    walk, light = load_motion(WALK, avatar.skeleton), load_light(SKY)
+    player = Player(avatar, light, Shader(light, "table+sun"), rasterize)
+    return player.render(walk, FRAME / walk.fps, _camera())
+
+
+def _splats(folder: Path, *words: str) -> Path:
+    line = ["splats", str(AVATAR), "--motion", str(WALK), "--hdr", str(SKY), "--out", str(folder)]
+    assert main([*line, "--frames", f"{FRAME}:{FRAME + 1}", *words]) == 0
+    return folder / f"{FRAME:06d}.ply"
+
+
+def test_a_ply_shows_the_players_picture(played, tmp_path):
+    for words, half_turn in (((), True), (("--ply-axes", "y-up"), False)):
+        path = _splats(tmp_path, "--coding", "linear", *words)
+        again = to_bytes(linear_to_srgb(_drawn_ply(path, half_turn))).astype(int)
+        assert (played.alpha > INSIDE).sum() > 500
+        assert np.abs(again - played.srgb).max() <= ONE_STEP
+
+
+def test_a_ply_for_viewers_blends_coded_colours(played, tmp_path):
+    """Nearer by far than colours that are merely coded, and near enough to be the same picture to the eye."""
+    inside = played.alpha > INSIDE
+    path = _splats(tmp_path)
+    corrected = to_bytes(_drawn_ply(path, True)).astype(int)
+    psnr = 10 * np.log10(255**2 / np.mean((corrected - played.srgb)[inside] ** 2.0))
+    assert psnr > CODED_PSNR
+    _splats(tmp_path, "--coding", "linear")
+    ply = _ply(path)
+    merely = linear_to_srgb(0.5 + 0.28209479177387814 * np.stack([ply[f"f_dc_{k}"] for k in range(3)], -1))
+    gaussians = Avatar.load(AVATAR, threads=1)
+    posed = gaussians.pose(load_motion(WALK, gaussians.skeleton), FRAME / 30)
+    plain = to_bytes(_drawn(posed.means, posed.covariances, posed.opacities, merely)).astype(int)
+    assert np.mean((plain - played.srgb)[inside] ** 2.0) > 3 * np.mean(
+        (corrected - played.srgb)[inside] ** 2.0
+    )
+
+
+def test_ply_has_the_fields_of_3dgs_in_their_order(tmp_path):
+    ply = _ply(_splats(tmp_path))
+    assert list(ply)[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert list(ply)[9:54] == [f"f_rest_{k}" for k in range(45)]
+    assert list(ply)[54:] == ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    assert ply["y"].mean() < -0.5  # Y down: a standing body is at negative heights
+    lengths = sum(ply[f"n{k}"] ** 2 for k in "xyz")
+    np.testing.assert_allclose(lengths, 1, atol=1e-4)
+
+
+def test_fitted_harmonics_give_the_colour_of_any_view(played, tmp_path):
+    ply = _ply(_splats(tmp_path, "--coding", "linear", "--sh-degree", "3"))
+    means = np.stack([ply[k] for k in "xyz"], axis=-1)
+    eye = _camera().position * [-1, -1, 1]
+    x, y, z = ((means - eye) / np.linalg.norm(means - eye, axis=1, keepdims=True)).T
+    basis = [  # the constants of the 3DGS authors' sh_utils
+        np.full_like(x, 0.28209479177387814),
+        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
+        *(1.0925484305920792 * x * y, -1.0925484305920792 * y * z),
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        *(-1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y)),
+        *(-0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z),
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        *(1.445305721320277 * z * (x * x - y * y), -0.5900435899266435 * x * (x * x - 3 * y * y)),
+    ]
+    colours = np.empty((len(means), 3))
+    for k in range(3):
+        coefficients = [ply[f"f_dc_{k}"], *(ply[f"f_rest_{15 * k + j}"] for j in range(15))]
+        colours[:, k] = 0.5 + sum(c * b for c, b in zip(coefficients, basis))
+    wxyz = np.stack([ply[f"rot_{k}"] for k in range(4)], axis=-1)
+    covariances = _covariances(
+        wxyz[:, [1, 2, 3, 0]], np.exp(np.stack([ply[f"scale_{k}"] for k in range(3)], -1))
+    )
+    picture = _drawn(
+        means * [-1, -1, 1],
+        covariances * [1, 1, -1, 1, -1, 1],
+        1 / (1 + np.exp(-ply["opacity"])),
+        colours.clip(0),
+    )
+    again = to_bytes(linear_to_srgb(picture)).astype(int)
+    inside = played.alpha > INSIDE
+    assert np.abs(again - played.srgb)[inside].mean() < FITTED_MEAN
+    assert any(np.abs(ply[f"f_rest_{j}"]).max() > 1e-3 for j in range(45))
+
+
+def test_gltf_splats_show_the_players_picture(played, tmp_path):
+    _splats(tmp_path, "--format", "glb", "--coding", "linear")
+    document, arrays = _glb(tmp_path / f"{FRAME:06d}.glb")
+    assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    primitive = document["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0
+    extension = {"kernel": "ellipse", "colorSpace": "lin_rec709_display"}
+    assert primitive["extensions"] == {"KHR_gaussian_splatting": extension}
+    named = {name.split(":")[-1]: arrays[index] for name, index in primitive["attributes"].items()}
+    assert set(named) == {"POSITION", "COLOR_0", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"}
+    picture = _drawn(
+        named["POSITION"],
+        _covariances(named["ROTATION"], named["SCALE"]),
+        named["OPACITY"],
+        0.5 + 0.28209479177387814 * named["SH_DEGREE_0_COEF_0"],
+    )
+    again = to_bytes(linear_to_srgb(picture)).astype(int)
+    assert np.abs(again - played.srgb).max() <= ONE_STEP
+
+
+def test_albedo_is_the_materials(tmp_path):
+    ply = _ply(_splats(tmp_path, "--colour", "albedo", "--coding", "linear"))
+    albedo = Avatar.load(AVATAR, threads=1).pose(load_motion(WALK, body().skeleton), 0.0).albedo
+    for k in range(3):
+        np.testing.assert_allclose(0.5 + 0.28209479177387814 * ply[f"f_dc_{k}"], albedo[:, k], atol=1e-6)
+
+
+def test_spz_and_sog_name_the_program_they_need(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    line = ["splats", str(AVATAR), "--motion", str(WALK), "--out", str(tmp_path), "--format", "spz"]
+    assert main(line) == 2
+    error = capsys.readouterr().err
+    assert "splat-transform, which is not installed (npm install -g @playcanvas/splat-transform)" in error
+
+
+@pytest.mark.skipif(shutil.which(TRANSFORM) is None, reason="splat-transform is not installed")
+def test_splat_transform_understands_our_ply(tmp_path):
+    """Its glTF of our PLY, turned upright again with all harmonics, is our glTF; its SPZ holds the same cloud."""
+    ply = _splats(tmp_path, "--format", "ply,glb,spz", "--sh-degree", "3")
+    program = shutil.which(TRANSFORM)
+    for name in ("theirs.glb", "back.ply"):
+        source = ply if name == "theirs.glb" else ply.with_suffix(".spz")
+        subprocess.run([program, "--quiet", str(source), str(tmp_path / name)], check=True)
+    ours, theirs = (_glb(path) for path in (ply.with_suffix(".glb"), tmp_path / "theirs.glb"))
+    attributes = [document["meshes"][0]["primitives"][0]["attributes"] for document, _ in (ours, theirs)]
+    assert attributes[0].keys() == attributes[1].keys()
+    for name in attributes[0].keys() - {"COLOR_0"}:
+        a, b = (arrays[which[name]] for which, (_, arrays) in zip(attributes, (ours, theirs)))
+        if name.endswith("ROTATION"):
+            b = b * np.sign((a * b).sum(axis=1, keepdims=True))  # q and −q are one rotation
+        np.testing.assert_allclose(a, b, atol=1e-5, err_msg=name)
+    cloud, back = _ply(ply), _ply(tmp_path / "back.ply")
+    for key in "xyz":  # SPZ quantises and reorders: compare the clouds, not the rows
+        assert abs(np.sort(cloud[key]) - np.sort(back[key])).max() < 1e-3
+
+
+def _evaluated(document, arrays, time_s: float) -> np.ndarray:
+    """Vertices of a skinned GLB at a key time, by the words of the glTF specification."""
+    nodes = document["nodes"]
+    local = {k: [np.array(n.get("translation", [0, 0, 0])), Rotation.identity()] for k, n in enumerate(nodes)}
+    animation = document["animations"][0]
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        key = int(np.abs(arrays[sampler["input"]] - time_s).argmin())
+        value = arrays[sampler["output"]][key]
+        if channel["target"]["path"] == "rotation":
+            local[channel["target"]["node"]][1] = Rotation.from_quat(value)
+        else:
+            local[channel["target"]["node"]][0] = value
+    world: dict[int, np.ndarray] = {}
+
+    def visit(node: int, parent: np.ndarray) -> None:
+        own = np.eye(4)
+        own[:3, :3], own[:3, 3] = local[node][1].as_matrix(), local[node][0]
+        world[node] = parent @ own
+        for child in nodes[node].get("children", []):
+            visit(child, world[node])
+
+    for root in document["scenes"][0]["nodes"]:
+        visit(root, np.eye(4))
+    skin = document["skins"][0]
+    inverse = np.swapaxes(arrays[skin["inverseBindMatrices"]], 1, 2).astype(np.float64)
+    matrices = np.stack([world[joint] @ inverse[k] for k, joint in enumerate(skin["joints"])])
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    points = np.c_[arrays[attributes["POSITION"]].astype(np.float64), np.ones(len(arrays[0]))]
+    posed = np.zeros((len(points), 4))
+    for k in range(sum(name.startswith("JOINTS_") for name in attributes)):
+        joints, weights = (arrays[attributes[f"{what}_{k}"]] for what in ("JOINTS", "WEIGHTS"))
+        for slot in range(4):
+            posed += weights[:, slot, None] * np.einsum("vrc,vc->vr", matrices[joints[:, slot]], points)
+    return posed[:, :3]
+
+
+def test_rigged_glb_moves_like_the_template(tmp_path):
+    template, moves = body(), motion(body())
+    save_motion(tmp_path / "turn.npz", moves)
+    line = ["mesh", str(ASSETS / "body.npz"), "--motion", str(tmp_path / "turn.npz")]
+    assert main([*line, "--out", str(tmp_path), "--format", "glb,obj", "--frames", "2:3"]) == 0
+    document, arrays = _glb(tmp_path / "body.glb")
+    for frame in (0, 2, 5):
+        expected = posed_vertices(template, moves, frame / moves.fps)
+        assert np.abs(_evaluated(document, arrays, frame / moves.fps) - expected).max() < 1e-5
+    rotations = [s["output"] for s in document["animations"][0]["samplers"][1:]]
+    assert all((np.sum(arrays[r][1:] * arrays[r][:-1], axis=1) >= 0).all() for r in rotations)
+    scene = trimesh.load(tmp_path / "body.glb", process=False)
+    (mesh,) = scene.geometry.values()
+    np.testing.assert_allclose(mesh.vertices, template.vertices, atol=1e-6)
+    posed = trimesh.load(tmp_path / "000002.obj", process=False)
+    np.testing.assert_allclose(posed.vertices, posed_vertices(template, moves, 2 / moves.fps), atol=1e-6)
+    np.testing.assert_array_equal(posed.faces, template.faces)
+    assert 0.03 < posed.volume < 0.15  # m³: a person, and not inside out
+
+
+def test_amass_brings_the_motion_back(tmp_path):
+    skeleton = Body.load(ASSETS / "body.npz").skeleton
+    walk = load_motion(WALK, skeleton)
+    assert main(["motion", str(AVATAR), "--motion", str(WALK), "--out", str(tmp_path / "w.npz")]) == 0
+    with np.load(tmp_path / "w.npz") as archive:
+        assert archive["poses"].shape == (132, 156) and archive["betas"].shape == (16,)
+        assert float(archive["mocap_framerate"]) == 30 and str(archive["gender"]) == "neutral"
+        assert archive["trans"][:, 2].mean() > 0.5  # Z up
+    again = load_motion(tmp_path / "w.npz", skeleton)
+    np.testing.assert_allclose(again.rotations, walk.rotations, atol=1e-9)
+    np.testing.assert_allclose(again.translations, walk.translations, atol=1e-9)
+    assert (
+        main(["motion", str(ASSETS / "body.npz"), "--motion", str(WALK), "--out", str(tmp_path / "v.npz")])
+        == 0
+    )
+    assert (tmp_path / "w.npz").read_bytes() == (tmp_path / "v.npz").read_bytes()
+
+
+def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
+    template = body()
+    names = list(template.skeleton.names)
+    names[names.index("head")] = "antenna"
+    with np.load(ASSETS / "body.npz") as archive:
+        save_npz(tmp_path / "robot.npz", dict(archive) | {"joint_names": np.array(names)})
+    moves = motion(template)
+    angles = np.zeros((6, 24, 3))
+    angles[:, names.index("antenna"), 0] = 0.3
+    arrays = {"poses": angles.reshape(6, -1), "trans": moves.translations, "mocap_framerate": np.array(30.0)}
+    save_npz(tmp_path / "nod.npz", arrays | {"joint_names": np.array(names)})
+    line = ["motion", str(tmp_path / "robot.npz"), "--motion", str(tmp_path / "nod.npz")]
+    assert main([*line, "--out", str(tmp_path / "out.npz")]) == 0
+    assert "left out: antenna" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--format", "fbx"],
+            "--format: expected some of ply",
+        ),
+        (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--frames", "9:4"], "--frames"),
+        (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--camera", "above"], "--camera"),
+        (["splats", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz: not a readable ONNX model"),
+        (["mesh", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz"),
+        (["motion", "none.onnx", "--motion", WALK, "--out", "OUT"], "none.onnx: avatar or body not found"),
+    ],
+)
+def test_unusable_input_is_one_line_and_exit_2(words, message, tmp_path, capsys):
+    assert main([str(tmp_path / "out") if word == "OUT" else str(word) for word in words]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("rnd-convert: ") and message in printed.err
+    assert printed.err.count("\n") == 1 and not (tmp_path / "out").exists()

@@ -1,0 +1,158 @@
+"""The documentation is true: its commands run, their options exist, its errors are raised, its figures are the files'.
+
+A fenced ``sh`` block is run line by line in a folder that has ``assets``; blocks of one page share it. Above a block
+that takes too long or needs what a test machine lacks stands ``<!-- not run: reason -->``. A ``python`` block that
+starts with ``# file: NAME`` is written to NAME.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.motion import Motion
+from rnd_runtime.rotations import axis_angle_to_matrix
+from tiny import ASSETS
+
+ROOT = ASSETS.parent
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+BLOCK = re.compile(r"(?:<!-- not run: (?P<reason>.+?) -->\n)?```(?P<kind>\w+)\n(?P<body>.*?)```", re.DOTALL)
+FLOAT32_STEPS = 1e-5  # m: the example computes its bones in float64, the player in its own order
+
+
+def _page(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def _run(line: str, monkeypatch) -> None:
+    """One command of a page, in this process: starting Python for each would take most of the time."""
+    words = shlex.split(line)
+    monkeypatch.setattr(sys, "argv", words)
+    if words[0] == "python":
+        monkeypatch.setattr(sys, "argv", words[1:])
+        runpy.run_path(words[1], run_name="__main__")
+        return
+    assert words[0] in SCRIPTS, f"{line}: no command of ours; mark the block <!-- not run: reason -->"
+    module, function = SCRIPTS[words[0]].split(":")
+    try:
+        code = getattr(importlib.import_module(module), function)()
+    except SystemExit as leaving:
+        code = leaving.code
+    assert not code, line
+
+
+# own-video.md needs a video and poses: tests/own_video_test.py makes them and runs its commands
+@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "own-video"], ids=lambda page: page.stem)
+def test_commands_run(page, tmp_path, monkeypatch):
+    (tmp_path / "assets").symlink_to(ASSETS)
+    monkeypatch.chdir(tmp_path)
+    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        lines = block["body"].replace("\\\n", " ").splitlines()
+        if block["kind"] == "python" and lines[0].startswith("# file: "):
+            Path(lines[0].removeprefix("# file: ")).write_text(block["body"], encoding="utf-8")
+        elif block["kind"] == "sh" and block["reason"] is None:
+            for line in lines:
+                _run(line, monkeypatch)
+
+
+def _help(command: str, capsys, monkeypatch) -> str:
+    module, function = SCRIPTS[command.split()[0]].split(":")
+    monkeypatch.setattr(sys, "argv", [*command.split(), "--help"])
+    monkeypatch.setenv("COLUMNS", "300")
+    with pytest.raises(SystemExit):
+        raise SystemExit(getattr(importlib.import_module(module), function)())
+    return capsys.readouterr().out
+
+
+def test_options_exist(capsys, monkeypatch):
+    """Every option that a page or the README gives to a command of ours is in that command's help."""
+    wanted: dict[str, set[str]] = {}
+    for page in [*PAGES, ROOT / "README.md"]:
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        for name, rest in re.findall(r"\b(rnd-[a-z]+)((?: +[^\s`|]+)*)", text):
+            if name not in SCRIPTS:
+                continue
+            words = rest.split()
+            grouped = name in ("rnd-convert", "rnd-bench", "rnd-data")
+            command = (
+                f"{name} {words[0]}" if grouped and words and words[0].replace("-", "").isalpha() else name
+            )
+            options = {word.strip("(),.;:") for word in words if word.startswith("--")}
+            wanted.setdefault(command, set()).update(options - {"--help"})
+    assert len(wanted) > 5
+    for command, options in wanted.items():
+        if options:
+            shown = _help(command, capsys, monkeypatch)
+            missing = sorted(option for option in options if option.split("=")[0] not in shown)
+            assert not missing, (command, missing)
+
+
+def test_the_errors_explained_are_those_raised():
+    """Each message in the first column of a table is made by the sources; … stands for what differs each time."""
+    sources = "\n".join(
+        file.read_text(encoding="utf-8")
+        for folder in ("runtime", "trainer", "export", "viewer")
+        for file in (ROOT / folder).rglob("*.py")
+    )
+    literals = set(re.findall(r"""["']([^"'\n]+)["']""", re.sub(r'"\s*\n\s*f?"', "", sources)))
+    fixed = {text: re.sub(r"\{.*?\}", "", text) for text in literals}
+    patterns = [
+        re.compile(re.sub(r"\\\{.*?\\\}", ".+", re.escape(text)))
+        for text in literals
+        if "{" in text and "{}" not in text and re.search(r"[a-z]{2}", fixed[text])
+    ]
+    rows = re.findall(r"^\| (`.+?) \|", _page("docs/troubleshooting.md"), re.MULTILINE)
+    messages = [message for row in rows for message in re.findall(r"`([^`]+)`", row)]
+    assert len(messages) > 40
+    for message in messages:
+        for piece in re.split(r"^expected |: expected |, got |: |, no |\(|…", message):
+            words = piece.strip()
+            made = any(words in text for text in literals) or any(p.fullmatch(words) for p in patterns)
+            assert not words or words.endswith((".json", ".onnx")) or made, (message, words)
+
+
+def test_tables_are_those_of_the_files():
+    script = runpy.run_path(str(ROOT / "scripts/doc_tables.py"))
+    for page, pictures in script["PAGES"].items():
+        text = page.read_text(encoding="utf-8")
+        assert "| numba | forward |" in text
+        assert script["filled"](text, ASSETS / "bench", pictures) == text, "run: python scripts/doc_tables.py"
+
+
+def test_links_lead_somewhere():
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+            assert target.startswith("https://") or (page.parent / target).is_file(), (page.name, target)
+        for name in re.findall(r"`(?:\w+/)?(\w+\.py)`", page.read_text(encoding="utf-8")):
+            assert list(ROOT.glob(f"*/rnd_*/**/{name}")), (page.name, name)
+
+
+def test_the_example_without_our_code_poses_as_we_do(tmp_path, monkeypatch):
+    block = next(
+        b for b in BLOCK.finditer(_page("docs/avatar-onnx.md")) if b["body"].startswith("# file: pose.py")
+    )
+    assert len(block["body"].splitlines()) <= 60 and "rnd_" not in block["body"].replace('"rnd_avatar"', "")
+    (tmp_path / "pose.py").write_text(block["body"], encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["pose.py", str(ASSETS / "avatar.onnx")])
+    theirs = runpy.run_path("pose.py")
+    avatar = Avatar.load(ASSETS / "avatar.onnx", threads=1)
+    angles = np.zeros((1, len(avatar.skeleton), 3))
+    angles[0, avatar.skeleton.names.index("left_shoulder"), 2] = -1.2
+    angles[0, avatar.skeleton.names.index("right_shoulder"), 2] = 1.2
+    still = Motion(axis_angle_to_matrix(angles), np.zeros((1, 3)), 30.0, avatar.skeleton.names)
+    ours = avatar.pose(still, 0.0)
+    np.testing.assert_allclose(theirs["means"], ours.means, atol=FLOAT32_STEPS)
+    picture = np.frombuffer((tmp_path / "pose.ppm").read_bytes()[len(b"P6 400 400 255\n") :], np.uint8)
+    covered = picture.reshape(400, 400, 3).any(axis=2)
+    assert 0.08 < covered.mean() < 0.5

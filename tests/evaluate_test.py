@@ -1,0 +1,160 @@
+"""Held-out figures: against independent metrics, on perfect and on spoilt renderings, and as rows of JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rnd_runtime.images import srgb_to_linear
+from rnd_trainer.ablate import CAUSES, VARIANTS, ablate, encoder_cost, summarise
+from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.evaluate import Judge, evaluate, flicker
+from rnd_trainer.held_out import score
+from rnd_trainer.judge import Rendered
+from rnd_trainer.metrics import psnr, ssim_map
+from rnd_trainer.scores import frame_scores, normal_picture, to_srgb8
+
+CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
+
+
+def _truth(capture):
+    return capture.load_frame(capture.split("train")[0])
+
+
+def _perfect(truth) -> Rendered:
+    normal = truth.normal if truth.normal_gt is None else truth.normal_gt
+    linear = torch.from_numpy(srgb_to_linear(truth.image_srgb)).float()
+    mask = torch.from_numpy(truth.mask)
+    return Rendered(linear, torch.from_numpy(normal) * mask[..., None], linear, mask)
+
+
+def test_a_perfect_rendering_is_perfect_in_every_figure(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    scores = frame_scores(_perfect(truth), truth)
+    assert scores["psnr"] == scores["psnr_box"] == math.inf
+    assert scores["psnr_n"] > 120  # normals are scaled to unit length once more
+    assert scores["ssim"] == pytest.approx(1) and scores["ssim_n"] == pytest.approx(1)
+    assert scores["normal_deg"] == pytest.approx(0, abs=0.1)
+
+
+def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    perfect = _perfect(truth)
+    spoilt = dataclasses.replace(perfect, image=0.7 * perfect.image)
+    scores = frame_scores(spoilt, truth)
+    rows, columns = np.nonzero(truth.mask > 0)
+    box = (
+        slice(max(rows.min() - 8, 0), rows.max() + 9),
+        slice(max(columns.min() - 8, 0), columns.max() + 9),
+    )
+    target = torch.from_numpy(truth.image_srgb)
+    assert scores["psnr_box"] == pytest.approx(psnr(to_srgb8(spoilt.image)[box], target[box]))
+    assert scores["psnr_box"] < scores["psnr"] < 60
+
+
+def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
+    first, second = (
+        torch.from_numpy(tiny_capture.load_frame(f).image_srgb) for f in tiny_capture.split("train")[:2]
+    )
+    a, b = (np.round(x.numpy() * 255).astype(np.uint8) for x in (first, second))
+    expected = cv2.quality.QualityPSNR_compute(a, b)[0][:3]
+    mean_square = np.mean(10 ** (-np.array(expected) / 10))
+    assert psnr(first, second) == pytest.approx(-10 * math.log10(mean_square), abs=1e-3)
+    _, similarity = cv2.quality.QualitySSIM_compute(a, b)
+    ours = ssim_map(first, second).numpy()
+    assert np.abs(ours - similarity[5:-5, 5:-5, :3]).mean() < CV2_SSIM
+
+
+def test_normal_pictures_are_black_where_nothing_is() -> None:
+    normals = torch.tensor([[[0.0, 0.0, -0.5], [0.0, 0.0, -2.0]]])
+    picture = normal_picture(normals, torch.tensor([[0.01, 0.5]]))
+    assert torch.equal(picture, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
+
+
+def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_path) -> None:
+    rows = score(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture, method="m", pictures=tmp_path)
+    assert [row["split"] for row in rows] == ["novel_view"]
+    row = json.loads(json.dumps(rows[0]))
+    wanted = {"psnr", "ssim", "psnr_n", "ssim_n", "normal_deg", "psnr_box", "method", "seed", "minutes"}
+    assert wanted <= set(row) and row["frames"] == 2 and "lpips" not in row
+    assert (tmp_path / "novel_view.png").exists() and len(list((tmp_path / "novel_view").glob("*.png"))) == 2
+
+
+def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:
+    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    seen = []
+    result = evaluate(
+        judge, "novel_view", on_frame=lambda frame, rendered, target: seen.append((rendered, target))
+    )
+    expected = np.mean([psnr(to_srgb8(rendered.image), target) for rendered, target in seen])
+    assert result.scores["psnr"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_run, tiny_capture) -> None:
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    moves = tiny_capture.motion
+    still = dataclasses.replace(moves, rotations=np.repeat(moves.rotations[:1], 6, axis=0))
+    assert flicker(Judge(checkpoint, tiny_capture, motion=still), "train") == 0
+    jumping = dataclasses.replace(moves, rotations=moves.rotations[[0, 1, 0, 1, 0, 1]])
+    shaken = flicker(Judge(checkpoint, tiny_capture, motion=jumping), "train")
+    assert shaken is not None and shaken > 1
+    assert flicker(Judge(checkpoint, tiny_capture), "relight") is None
+
+
+def test_ablations_are_trained_once_and_compared_seed_by_seed(
+    tiny_capture, tiny_config, tmp_path, monkeypatch
+) -> None:
+    calls: list[tuple[str, int, int, int]] = []
+    config = dataclasses.replace(tiny_config, steps=4)
+
+    def go():
+        return ablate(
+            tiny_capture,
+            config,
+            tmp_path,
+            VARIANTS[:3],
+            seeds=(0, 1),
+            perceptual=None,
+            on_run=lambda *call: calls.append(call),
+        )
+
+    rows = go()
+    assert len(calls) == 6 and {row["seed"] for row in rows} == {0, 1}
+    written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
+    assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
+    table = summarise(rows, VARIANTS[:3])
+    assert [line["method"] for line in table] == ["ours", "LBS, plain colour", "static skinning"]
+    cell = table[2]["novel_view"]
+    both = [
+        next(r["psnr"] for r in rows if r["method"] == name and r["seed"] == seed)
+        for seed in (0, 1)
+        for name in ("static skinning", "ours")
+    ]
+    assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
+    assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
+
+
+def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_capture, tiny_config) -> None:
+    from rnd_trainer.train import Training
+
+    costs = {}
+    for variant in (*VARIANTS, *CAUSES[:5]):
+        model = dataclasses.replace(tiny_config.model, **variant.model)
+        config = dataclasses.replace(tiny_config, model=model, steps=2, **variant.train)
+        training = Training(tiny_capture, config)
+        assert not any(training.step().skipped for _ in range(2)), variant.name
+        costs[variant.name] = encoder_cost(training.model)["encoder_gflop"]
+    assert costs["d = 2"] < costs["d = 5"] < costs["d = 20"] < costs["d = 30"]
+    assert costs["spatial only"] < costs["ours"]
+
+
+def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar, tiny_capture) -> None:
+    rows = score(load_checkpoint(tiny_checkpoint), tiny_capture, method="m", avatar=tiny_avatar)
+    assert rows[0]["file_mb"] == tiny_avatar.stat().st_size / 1e6
+    assert rows[0]["fps"] > 0

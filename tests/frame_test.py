@@ -1,0 +1,112 @@
+"""One call from a pose to pixels, against its parts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.frame import FrameRenderer, facing
+from rnd_runtime.images import linear_to_srgb, to_bytes
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion
+from rnd_runtime.raster_cpu import Projected, rasterize
+from rnd_runtime.shading import Shader
+
+ASSETS = Path(__file__).parent.parent / "assets"
+LEAST = -0.2  # n·v of what is culled in these tests
+CULLED = 45.0  # dB that culling must leave against the whole picture
+CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
+
+
+@pytest.fixture(scope="module")
+def avatar():
+    return Avatar.load(ASSETS / "avatar.onnx")
+
+
+@pytest.fixture(scope="module")
+def motion(avatar):
+    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return load_light(ASSETS / "sky.exr")
+
+
+def test_a_frame_is_its_parts(avatar, motion, sky):
+    frame = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3)
+    gaussians = avatar.pose(motion, 0.3)
+    radiance = Shader(sky).shade(gaussians, CAMERA.position)
+    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, CAMERA)
+    np.testing.assert_array_equal(frame.radiance, expected.image)
+    np.testing.assert_array_equal(frame.alpha, expected.alpha)
+    np.testing.assert_array_equal(frame.image, to_bytes(linear_to_srgb(expected.image)))
+    assert frame.image.max() > 100 and min(frame.stage_seconds.values()) > 0
+
+
+def test_turning_the_light_equals_another_light(avatar, motion, sky):
+    turned, fresh = FrameRenderer(avatar, sky, CAMERA), FrameRenderer(avatar, sky, CAMERA)
+    still = turned.render(motion, 0.3).image
+    turned.turn(1.0)
+    fresh.relight(load_light(ASSETS / "sky.exr", yaw=1.0))
+    np.testing.assert_array_equal(turned.render(motion, 0.3).image, fresh.render(motion, 0.3).image)
+    assert (turned.render(motion, 0.3).image != still).any()
+
+
+def test_only_what_is_seen_is_shaded(avatar, motion, sky):
+    """A camera close to the head leaves most of the body unshaded, and the picture is the same."""
+    gaussians = avatar.pose(motion, 0.3)
+    close = Camera.look_at([0.2, 1.6, 1.2], [0, 1.5, 0], width=64, height=64, fov_y=0.4)
+    projected = Projected(gaussians.means, gaussians.covariances, gaussians.opacities, close)
+    assert 0.05 < projected.drawn.mean() < 0.5
+    shader = Shader(sky)
+    everything, seen = (shader.shade(gaussians, close.position, who) for who in (None, projected.drawn))
+    np.testing.assert_array_equal(seen[projected.drawn], everything[projected.drawn])
+    assert not seen[~projected.drawn].any()
+    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, everything, close)
+    np.testing.assert_array_equal(projected.draw(seen).image, expected.image)
+
+
+def test_a_radiance_that_is_no_number_is_not_drawn(avatar, motion):
+    gaussians = avatar.pose(motion, 0.3)
+    radiance = np.ones((len(gaussians.means), 3), np.float32)
+    radiance[::3] = np.nan
+    scene = (gaussians.means, gaussians.covariances, gaussians.opacities)
+    expected = rasterize(*scene, radiance, CAMERA)
+    ours = Projected(*scene, CAMERA).draw(radiance)
+    np.testing.assert_array_equal(ours.image, expected.image)
+    assert np.isfinite(ours.image).all() and ours.alpha.max() > 0.5
+
+
+def test_culling_keeps_what_faces_the_camera_and_the_picture(avatar, motion, sky):
+    gaussians = avatar.pose(motion, 0.3)
+    to_eye = CAMERA.position - gaussians.means
+    cosines = (gaussians.normals * to_eye).sum(1) / np.linalg.norm(to_eye, axis=1)
+    kept = facing(gaussians, CAMERA.position, LEAST)
+    sure = np.abs(cosines - LEAST) > 1e-5
+    np.testing.assert_array_equal(kept[sure], np.where(cosines >= LEAST, gaussians.opacities, 0)[sure])
+    whole = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3).image.astype(float)
+    culled = FrameRenderer(avatar, sky, CAMERA, cull=LEAST).render(motion, 0.3).image
+    assert 10 * np.log10(255**2 / np.mean((whole - culled) ** 2)) > CULLED
+
+
+def test_threads_change_no_byte(avatar, motion, sky):
+    images = []
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, before):
+            numba.set_num_threads(threads)
+            images.append(
+                FrameRenderer(Avatar.load(ASSETS / "avatar.onnx", threads=threads), sky, CAMERA).render(
+                    motion, 0.3
+                )
+            )
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
+    np.testing.assert_array_equal(images[0].image, images[1].image)

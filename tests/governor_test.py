@@ -1,0 +1,77 @@
+"""Holding a frame rate: when something is given up and taken back, and what that does to a picture."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.light import Light
+from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.shading import Shader
+from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.governor import FULL, LADDER, Governor, Quality, enlarged
+from rnd_viewer.player import Player
+
+MOTION = fake_motion()
+CAMERA = front_path(frame_motion(FakeAvatar().skeleton, MOTION), View(96, 80, 0.6, 0.1))(0, 0.0)
+
+
+def test_one_slow_frame_gives_nothing_up_and_steady_ones_do_step_by_step():
+    governor = Governor(fps=50)
+    for seconds in (0.01, 0.5, 0.01, 0.01, 0.019, 0.019):
+        governor.observe(seconds)
+    assert governor.quality == FULL
+    met = []
+    for _ in range(60):
+        governor.observe(0.021)
+        met.append(LADDER.index(governor.quality))
+    assert sorted(set(met)) == list(range(len(LADDER))) and met == sorted(met) and met[-1] == len(LADDER) - 1
+
+
+def test_room_is_used_only_after_a_calm_while():
+    governor = Governor(fps=50)
+    for _ in range(4):
+        governor.observe(0.03)
+    assert governor.quality == LADDER[1]
+    for _ in range(100):
+        governor.observe(0.015)  # within the budget, with no room for more
+    assert governor.quality == LADDER[1]
+    for _ in range(24):
+        governor.observe(0.01)
+    assert governor.quality == FULL
+
+
+def test_the_ladder_takes_shading_before_resolution():
+    assert LADDER[0] == FULL == Quality(1, 1.0)
+    assert all(a.shade_every <= b.shade_every and a.scale >= b.scale for a, b in pairwise(LADDER))
+    assert LADDER[1].scale == 1
+
+
+def test_enlarging_keeps_planes_and_constants():
+    y, x = np.mgrid[:12, :17].astype(np.float32) + np.float32(0.5)
+    plane = np.dstack([2 * x + 3 * y, np.ones_like(x)])
+    large = enlarged(plane, 24, 34)
+    v, u = np.mgrid[:24, :34] / 2 + 0.25
+    inside = np.s_[1:-1, 1:-1]
+    np.testing.assert_allclose(large[..., 0][inside], (2 * u + 3 * v)[inside], rtol=1e-5)
+    np.testing.assert_array_equal(large[..., 1], 1)
+    np.testing.assert_array_equal(enlarged(plane, 12, 17), plane)
+
+
+@pytest.mark.parametrize(("quality", "least"), [(Quality(2), 40), (Quality(4, 0.5), 20)])
+def test_less_quality_looks_like_more(quality, least):
+    """Against full quality in the same place of the motion, in dB; the first frame is shaded anew."""
+    light = Light(np.linspace(2, 0, 16, dtype=np.float32)[:, None, None] * np.ones((16, 32, 3), np.float32))
+    player = Player(FakeAvatar(), light, Shader(light, "table"), rasterize)
+    whole = [player.render(MOTION, time, CAMERA) for time in (0.1, 0.12)]
+    less = [player.draw(player.encode(MOTION, time), CAMERA, quality) for time in (0.1, 0.12)]
+    for ours, full in zip(less, whole):
+        assert ours.radiance.shape == full.radiance.shape and ours.alpha.shape == full.alpha.shape
+        error = np.mean((ours.radiance - full.radiance) ** 2)
+        assert error < 10 ** (-least / 10)
+    if quality.scale == 1:
+        np.testing.assert_array_equal(less[0].radiance, whole[0].radiance)
+    assert (less[1].radiance != whole[1].radiance).any()

@@ -1,0 +1,139 @@
+"""Every layout of one known scene imports to the same capture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import layouts
+from known_scene import FRAMES, HEIGHT, WIDTH, cameras, motion, see, shaped_body
+from rnd_runtime.camera import Camera
+from rnd_runtime.capture import Capture, load_capture
+from rnd_trainer.checking.check import check_capture
+from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
+from rnd_trainer.importing.write import Choice
+from rnd_trainer.silhouette import overlap, posed_vertices
+
+PLACE = 2e-5  # m: some layouts store float32, transforms are float32
+PIXEL = 1e-9  # of K: nothing but half a pixel is added
+EXACT_COLOUR = 1.01 / 255  # PNG: one rounding
+JPEG_COLOUR = 6 / 255  # quality 100, no chroma subsampling; also a lossless YUV video
+BENT_COLOUR = 0.03  # mean, of pictures resampled once when the lens is undone
+BENT_MASK = 0.95  # IoU of a mask resampled softly with one resampled to the nearest pixel
+
+EVERYTHING = Choice(held_out_every=1)
+
+
+def _imported(write: Callable[[Path], None], tmp_path: Path, **options: object) -> Capture:
+    source, out = tmp_path / "source", tmp_path / "capture"
+    source.mkdir()
+    write(source)
+    given = {"body": str(layouts.body_file(tmp_path)), "choice": EVERYTHING} | options
+    import_source(source, out, ImportOptions(**given))
+    return load_capture(out)
+
+
+def assert_the_scene(
+    capture: Capture, camera_of: Callable[[str, int], str], *, colour: float, bent: bool, fps: float
+) -> None:
+    """``capture`` is the known scene up to a choice of world; ``camera_of`` (camera, frame) is the scene's camera."""
+    assert capture.fps == fps and capture.motion.frame_count == FRAMES
+    assert_allclose(capture.body.vertices, shaped_body().vertices, atol=PLACE)
+    assert (capture.motion.rotations[:, 0, 1, 1]).mean() > 0.8  # stands upright
+    for frame in capture.frames:
+        name, camera = camera_of(frame.camera, frame.frame), capture.cameras[frame.camera]
+        truth = cameras()[name]
+        assert_allclose(camera.K, truth.K, atol=PIXEL)
+        theirs = posed_vertices(
+            capture.body, capture.motion.rotations[frame.frame], capture.motion.translations[frame.frame]
+        )
+        ours = posed_vertices(
+            shaped_body(), motion().rotations[frame.frame], motion().translations[frame.frame]
+        )
+        assert_allclose(_before(camera, theirs), _before(truth, ours), atol=PLACE)
+        images, seen = capture.load_frame(frame), see(name, frame.frame)
+        if bent:
+            straight, mask = _straight(name, frame.frame)
+            assert overlap(images.mask > 0.5, mask) > BENT_MASK
+            inside = mask & (images.mask > 0.99)
+            assert np.abs(images.image_srgb - straight / 255)[inside].mean() < BENT_COLOUR
+        else:
+            assert ((images.mask > 0.5) == seen.mask).all()
+            assert np.abs(images.image_srgb - seen.image / 255)[seen.mask].max() < colour
+        assert images.image_srgb[images.mask == 0].max() == 0
+        if images.normal is not None:
+            known = seen.mask & (np.abs(images.normal).max(-1) > 0)
+            assert known.sum() > 0.95 * seen.mask.sum()
+            assert (images.normal * seen.normals).sum(-1)[known].min() > 0.999
+
+
+def _before(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """``points`` [n, 3] in the camera's axes."""
+    return points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+
+
+def _straight(name: str, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The bent picture and mask undone by the definition of k1, nearest pixel by nearest pixel."""
+    bent, K = see(name, k, layouts.K1), cameras()[name].K
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    factor = 1 + layouts.K1 * (x * x + y * y)
+    u = np.floor(x * factor * K[0, 0] + K[0, 2]).astype(int).clip(0, WIDTH - 1)
+    v = np.floor(y * factor * K[1, 1] + K[1, 2]).astype(int).clip(0, HEIGHT - 1)
+    return bent.image[v, u], bent.mask[v, u]
+
+
+def _either(camera: str, frame: int) -> str:
+    """The scene's name of a camera called 00, 01, 1, 2, Camera_B1, …"""
+    return {"00": "0", "01": "1", "0000": "0", "0001": "1", "Camera_B1": "0", "Camera_B2": "1"}[camera]
+
+
+def _only(camera: str, frame: int) -> str:
+    return "0"
+
+
+def _counted_from_one(camera: str, frame: int) -> str:
+    return str(int(camera) - 1)
+
+
+def _moving(camera: str, frame: int) -> str:
+    return layouts.neuman_camera(frame)
+
+
+_prepared, _neuman, _easymocap = layouts.write_intrinsic_avatar, layouts.write_neuman, layouts.write_easymocap
+LAYOUTS: dict[str, tuple[str, Callable[[Path], None], Callable[[str, int], str], float, bool, float]] = {
+    # layout, writer, the scene's camera, colour tolerance, whether a lens is undone, fps
+    "ZJU-MoCap": ("zju", layouts.write_zju, _either, JPEG_COLOUR, True, 50),
+    "ZJU-MoCap refined": ("zju", partial(layouts.write_zju, refined=True), _either, JPEG_COLOUR, True, 50),
+    "ARAH": ("arah", layouts.write_arah, _counted_from_one, JPEG_COLOUR, True, 50),
+    "HumanNeRF": ("humannerf", layouts.write_humannerf, _only, EXACT_COLOUR, True, 30),
+    "PeopleSnapshot": ("snapshot", layouts.write_snapshot, _only, JPEG_COLOUR, True, 30),
+    "InstantAvatar": ("instant-avatar", layouts.write_instant_avatar, _only, EXACT_COLOUR, False, 30),
+    "RANA prepared": ("intrinsic-avatar", partial(_prepared, many=False), _only, EXACT_COLOUR, False, 30),
+    "SyntheticHuman": ("intrinsic-avatar", partial(_prepared, many=True), _either, EXACT_COLOUR, False, 30),
+    "RANA": ("rana", layouts.write_rana, _only, EXACT_COLOUR, False, 30),
+    "NeuMan": ("neuman", _neuman, _moving, EXACT_COLOUR, False, 30),
+    "NeuMan, HUGS": ("neuman", partial(_neuman, hugs=True), _moving, EXACT_COLOUR, False, 30),
+    "nerfstudio": ("nerfstudio", layouts.write_nerfstudio, _either, EXACT_COLOUR, True, 30),
+    "EasyMocap": ("easymocap", _easymocap, _counted_from_one, JPEG_COLOUR, True, 30),
+    "EasyVolcap": ("easymocap", partial(_easymocap, volcap=True), _counted_from_one, JPEG_COLOUR, True, 30),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_every_layout_is_the_same_scene(tmp_path, name) -> None:
+    layout, write, camera_of, colour, bent, fps = LAYOUTS[name]
+    if "NeuMan" in name:
+        pytest.importorskip("joblib")
+    if name == "PeopleSnapshot":
+        pytest.importorskip("h5py")
+    capture = _imported(write, tmp_path)
+    assert find_layout(tmp_path / "source")[0] == layout
+    assert_the_scene(capture, camera_of, colour=colour, bent=bent, fps=fps)
+    report = check_capture(tmp_path / "capture")
+    assert not [f for f in report.findings if f.level == "wrong"], report.findings

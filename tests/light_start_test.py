@@ -1,0 +1,65 @@
+"""The first light: a sun that is there is found, one that is not is not invented."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rnd_runtime.light import texel_directions, texel_solid_angles
+from rnd_trainer import light_start
+from rnd_trainer.light_start import Sightings, start_light
+
+COUNT, PICTURES = 700, 24
+WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide
+ENERGY = 0.25  # of the sun's share of the light, relative: the albedo is unknown and may take some of it
+
+
+def _turning_ball(sun: np.ndarray, strength: float) -> Sightings:
+    """A ball of random albedo that turns about Y under a white sky and one sun, seen from +Z."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=generator), dim=-1)
+    albedo = 0.2 + 0.5 * torch.rand(COUNT, 3, generator=generator)
+    who, colour, picture, posed = [], [], [], []
+    for k in range(PICTURES):
+        angle = 2 * math.pi * k / PICTURES
+        turn = torch.tensor(
+            [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+        )
+        normals = points @ turn.T
+        seen = (normals[:, 2] > light_start.FACING).nonzero()[:, 0]
+        arriving = 1 + strength / math.pi * (normals[seen] @ torch.as_tensor(sun).float()).clamp(min=0)
+        who.append(seen.numpy())
+        colour.append((albedo[seen] * arriving[:, None]).double().numpy())
+        picture.append(np.full(len(seen), k))
+        posed.append((normals, normals))
+    return Sightings(*(np.concatenate(x) for x in (who, colour, picture)), posed, 0.1)
+
+
+@pytest.mark.parametrize("strength", [0.0, 6.0])
+def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
+    sun = np.array([0.7, 0.5, 0.51])
+    sun /= np.linalg.norm(sun)
+    monkeypatch.setattr(light_start, "_sight", lambda *_: _turning_ball(sun, strength))
+    light = start_light(None, [], [])  # type: ignore[arg-type]  # the sightings are given
+    assert light is not None and light.shape == (32, 64, 3) and (light > 0).all()
+    solid_angles = texel_solid_angles(32, 64)
+    grey = light.mean(-1)
+    assert (grey * solid_angles).sum() / (4 * math.pi) == pytest.approx(1, abs=1e-3)
+    near = texel_directions(32, 64) @ sun > math.cos(math.radians(12))
+    share = (grey * solid_angles)[near].sum() / (grey * solid_angles).sum()
+    if strength:
+        brightest = texel_directions(32, 64).reshape(-1, 3)[grey.argmax()]
+        assert brightest @ sun > WITHIN
+        assert share == pytest.approx(strength / (strength + 4 * math.pi), rel=ENERGY)
+    else:
+        assert grey.max() < 2 * grey.mean()  # a white sky stays one
+
+
+def test_too_few_sightings_give_none(monkeypatch) -> None:
+    ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 0.0)
+    few = Sightings(ball.who[:20], ball.colour[:20], ball.picture[:20], ball.posed, 0.1)
+    monkeypatch.setattr(light_start, "_sight", lambda *_: few)
+    assert start_light(None, [], []) is None  # type: ignore[arg-type]

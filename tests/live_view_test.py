@@ -1,0 +1,130 @@
+"""rnd-train --view: what the page is told, to whom, and that it shows it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rnd_runtime.images import read_image, write_image
+from rnd_trainer import cli
+from rnd_trainer.live_view import POINTS, Metrics, live_view, state
+
+TOTAL = 1000
+
+
+def _row(step: int, **more: object) -> dict[str, object]:
+    stage = 1 if step < 250 else 2
+    return {"step": step, "stage": stage, "seconds": 0.5 * step, "image": 1 / (1 + step), **more}
+
+
+def _write_run(folder: Path, steps: int) -> Path:
+    lines = [json.dumps(_row(step)) + "\n" for step in range(steps)]
+    (folder / "metrics.jsonl").write_text("".join(lines), encoding="utf-8")
+    picture = np.zeros((8, 32, 3), np.uint8)
+    for step in (250, 500):
+        picture[:] = step // 4
+        write_image(folder / f"previews/step_{step:06d}.png", picture)
+    return folder
+
+
+def _get(url: str, host: str | None = None) -> tuple[int, bytes]:
+    request = urllib.request.Request(url, headers={"Host": host} if host else {})
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, b""
+
+
+def test_state_says_how_far_and_how_long_still():
+    rows = [_row(step) for step in range(501)]
+    now = state(rows, TOTAL, ["step_000250.png"])
+    assert (now["done"], now["total"], now["stage"], now["skipped"]) == (501, TOTAL, 2, 0)
+    assert now["seconds_left"] == pytest.approx(0.5 * 499)
+    assert set(now["curves"]) == {"image"} and len(now["curves"]["image"]) <= POINTS
+    step, value = now["curves"]["image"][0]
+    assert step == 2 and value == pytest.approx(
+        np.mean([1, 1 / 2, 1 / 3, 1 / 4])
+    )  # bins of 1000/300 → 4 steps
+
+
+def test_state_of_nothing_and_of_steps_that_failed():
+    assert state([], TOTAL, [])["seconds_left"] is None
+    rows = [_row(0), _row(1, image=float("nan"), skipped=True), _row(2, grey=0.5)]
+    now = state(rows, TOTAL, [])
+    assert now["skipped"] == 1 and now["curves"]["grey"] == [[2, 0.5]]
+    json.dumps(now, allow_nan=False)  # the browser's parser knows no NaN
+
+
+def test_metrics_are_read_on_and_torn_lines_wait(tmp_path):
+    metrics = Metrics(tmp_path / "metrics.jsonl")
+    assert metrics.read() == []
+    with metrics.path.open("w") as stream:
+        stream.write(json.dumps(_row(0)) + "\n" + '{"step": 1, "sta')
+        stream.flush()
+        assert [row["step"] for row in metrics.read()] == [0]
+        stream.write('ge": 1, "seconds": 0.5}\n')
+    assert [row["step"] for row in metrics.read()] == [0, 1]
+    metrics.path.write_text("")  # --resume kept nothing
+    assert metrics.read() == []
+
+
+def test_a_run_is_served_to_this_machine_alone(tmp_path):
+    folder = _write_run(tmp_path, 300)
+    (tmp_path / "secret.png").write_bytes(b"no")
+    with live_view(folder, TOTAL, port=0) as page:
+        assert page.startswith("http://127.0.0.1:")
+        status, html = _get(page)
+        assert (
+            status == 200 and b"<!doctype html>" in html and b"http" not in html.replace(b"http-equiv", b"")
+        )
+        now = json.loads(_get(page + "state.json")[1])
+        assert now["done"] == 300 and now["previews"] == ["step_000250.png", "step_000500.png"]
+        status, png = _get(page + "previews/step_000500.png")
+        (tmp_path / "back.png").write_bytes(png)
+        assert status == 200 and (read_image(tmp_path / "back.png") == 125).all()
+        for path in ("previews/../secret.png", "secret.png", "previews/step_999999.png", "metrics.jsonl"):
+            assert _get(page + path)[0] == 404, path
+        assert _get(page, host="evil.example")[0] == 403  # a page that had its own name resolve to us
+        with live_view(folder, TOTAL, port=int(page.rsplit(":")[-1][:-1])) as second:
+            assert second != page and _get(second)[0] == 200
+    with pytest.raises(urllib.error.URLError):
+        _get(page)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_the_page_shows_the_training(tmp_path):
+    folder = _write_run(tmp_path, 501)
+    with live_view(folder, TOTAL, port=0) as page:
+        line = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1500"]
+        line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page]
+        dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert "step 501 of 1000 · stage 2 · 4 min 10 s so far · 4 min 10 s left" in dom
+    assert 'src="/previews/step_000500.png"' in dom and "image (log)" in dom and "<path d=" in dom
+
+
+def test_view_is_an_option_of_rnd_train(tiny_capture, tmp_path, monkeypatch, capsys):
+    """The page is up while steps are made, and gone afterwards; the steps themselves are tested elsewhere."""
+    answers = []
+
+    def steps(training, folder, run) -> bool:
+        page = capsys.readouterr().err.split()[-1]
+        answers.append((page, _get(page)[0]))
+        return False
+
+    monkeypatch.setattr(cli, "_run_with_progress", steps)
+    monkeypatch.setattr(cli, "_score_after_training", lambda *_: None)
+    options = cli.TrainOptions(tiny_capture.folder, out=tmp_path / "run", gaussians=200, view=True)
+    cli._train(options)
+    ((page, status),) = answers
+    assert status == 200
+    with pytest.raises(urllib.error.URLError):
+        _get(page)

@@ -1,0 +1,50 @@
+"""rnd-data motion, as a user types it."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from rnd_runtime.body import Body
+from rnd_runtime.motion import load_motion
+from rnd_trainer.data_cli import main
+
+ASSETS = Path(__file__).parents[1] / "assets"
+
+
+def _run(monkeypatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["rnd-data", "motion", *map(str, arguments)])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    return int(exit_.value.code or 0)
+
+
+def test_a_walk_goes_out_as_amass_and_comes_back(tmp_path, monkeypatch, capsys):
+    body, out = ASSETS / "body.npz", tmp_path / "walk.npz"
+    assert _run(monkeypatch, ASSETS / "walk.npz", out, "--body", body) == 0
+    assert "132 frames, 30 per second" in capsys.readouterr().out
+    with np.load(out) as archive:
+        assert archive["poses"].shape == (132, 156) and archive["trans"].shape == (132, 3)
+        assert archive["mocap_framerate"] == 30
+    skeleton = Body.load(body).skeleton
+    before, after = load_motion(ASSETS / "walk.npz", skeleton), load_motion(out, skeleton)
+    assert_allclose(after.rotations, before.rotations, atol=1e-9)
+    assert_allclose(after.translations, before.translations, atol=1e-9)
+
+
+def test_edits_and_rates(tmp_path, monkeypatch, capsys):
+    arguments = ("--speed", 2, "--in-place", "--loop", "--smooth", 3, "--fps", 60)
+    assert _run(monkeypatch, ASSETS / "walk.npz", tmp_path / "w.npz", *arguments) == 0
+    with np.load(tmp_path / "w.npz") as archive:
+        assert archive["mocap_framerate"] == 60
+        assert np.ptp(archive["trans"][:, :2], axis=0).max() < 1e-9  # Z up: the floor's axes
+        assert 60 < len(archive["poses"]) < 120  # half of 4.4 s, less the seam, at 60
+
+
+def test_bad_use_is_one_line_and_exit_2(tmp_path, monkeypatch, capsys):
+    assert _run(monkeypatch, ASSETS / "walk.npz", tmp_path / "w.bvh") == 2
+    assert "ends in .npz" in capsys.readouterr().err
+    assert _run(monkeypatch, tmp_path / "none.bvh", tmp_path / "w.npz") == 2
+    assert "none.bvh" in capsys.readouterr().err

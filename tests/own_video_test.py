@@ -1,0 +1,106 @@
+"""Every command of docs/own-video.md, run as it stands there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import layouts
+from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
+from pose_files_test import write_wham
+from rnd_runtime.capture import load_capture
+from rnd_runtime.images import to_bytes, write_image
+from rnd_trainer import data_cli
+
+PAGE = Path(__file__).parent.parent / "docs" / "own-video.md"
+COMMANDS = [
+    line for block in re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.S) for line in block.splitlines()
+]
+
+
+def _run(line: str, monkeypatch) -> int:
+    words = shlex.split(line)
+    assert words[0] == "rnd-data"
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit) as ended:
+        data_cli.main()
+    return int(ended.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A folder with everything that the page's commands name."""
+    pytest.importorskip("joblib")
+    folder = tmp_path_factory.mktemp("own")
+    layouts.body_file(folder).rename(folder / "SMPL_NEUTRAL.npz")
+    layouts.write_zju(folder / "CoreView_377")
+    write_wham(folder)
+    wham, plain = layouts.video_camera(np.hypot(WIDTH, HEIGHT)), layouts.video_camera(77.0)
+    images = []
+    (folder / "normals").mkdir()
+    for k in range(FRAMES):
+        for camera, kept in ((wham, images), (plain, [])):
+            view = view_of(camera, k)
+            kept.append(
+                np.where(view.mask[..., None], to_bytes(0.2 + 0.35 * (view.normals + 1)), 90).astype(np.uint8)
+            )
+        write_image(folder / "frames" / f"{k:05d}.png", kept[0])
+        seen = view_of(wham, k)
+        write_image(folder / "masks" / f"{k:05d}.png", (255 * seen.mask).astype(np.uint8))
+        np.save(folder / "normals" / f"{k:05d}.npy", (seen.normals * [1, -1, -1]).astype(np.float32))
+    layouts.write_video(folder / "me.mp4", images)
+    world = layouts.camera_world()
+    np.savez(folder / "poses.npz", thetas=world.thetas, trans=world.trans, betas=BETAS)
+    return folder
+
+
+def test_every_command_of_the_page_runs(place, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(place)
+    assert [command.split()[1] for command in COMMANDS] == [
+        "convert-body",
+        "import",
+        "import",
+        "import",
+        "check",
+    ]
+    for command in COMMANDS:
+        assert _run(command, monkeypatch) == 0, (command, capsys.readouterr())
+    printed = capsys.readouterr().out
+    expected = (
+        "SMPL, 2340 vertices", "found video: a video", "found video: a folder of frames", "found zju: annots.npy",
+        "masks made from the template", "up, towards the viewer", "silhouette: mean IoU",
+    )  # fmt: skip
+    for words in expected:
+        assert words in printed, words
+    assert len(load_capture(place / "me").frames) == FRAMES
+    splits = {(frame.camera, frame.split) for frame in load_capture(place / "zju377").frames}
+    assert splits == {("Camera_B1", "train"), ("Camera_B1", "novel_pose"), ("Camera_B2", "novel_view")}
+
+
+def test_a_capture_is_not_overwritten(place, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(place)
+    if not (place / "me" / "capture.json").exists():
+        (place / "me").mkdir(exist_ok=True)
+        (place / "me" / "capture.json").write_text("{}")
+    assert _run(COMMANDS[1], monkeypatch) == 2
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    assert line.startswith("rnd-data: me: holds a capture already")
+
+
+def test_a_poor_root_is_named_and_mended_by_the_flag_it_names(place, monkeypatch, capsys, tmp_path) -> None:
+    """The issue's own sentence: Rh and Th under SMPL's names import badly, and --as easymocap mends it."""
+    monkeypatch.chdir(place)
+    world = layouts.camera_world()
+    np.savez(tmp_path / "em.npz", poses=world.thetas, trans=world.Th, betas=BETAS)
+    words = f"import frames {tmp_path}/%s --body SMPL_NEUTRAL.npz --poses {tmp_path}/em.npz"
+    words += f" --intrinsics 77 77 24 32 --masks {tmp_path}/masks"
+    for k in range(FRAMES):
+        mask = view_of(layouts.video_camera(77.0), k).mask
+        write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * mask).astype(np.uint8))
+    assert _run("rnd-data " + words % "wrong", monkeypatch) == 1
+    assert "EasyMocap's Rh/Th; try --as easymocap" in capsys.readouterr().out
+    assert _run("rnd-data " + words % "right" + " --as easymocap", monkeypatch) == 0

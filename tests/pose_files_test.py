@@ -1,0 +1,312 @@
+"""Body poses of a video, from every program that estimates them, put the same person before the camera."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import layouts
+from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, axis_angles, motion, shaped_body, view_of
+from rnd_runtime.body import Body
+from rnd_runtime.capture import load_capture
+from rnd_runtime.errors import InputError
+from rnd_runtime.images import to_bytes, write_image
+from rnd_runtime.motion_files import SMPLX_REST_ROOT
+from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
+from rnd_trainer.importing.pose_files import read_poses
+from rnd_trainer.importing.recording import easymocap_poses, smpl_poses
+from rnd_trainer.silhouette import overlap, posed_vertices
+
+PLACE = 2e-5  # m: float32 in the files and in bone transforms
+ROUGH = (
+    0.7  # IoU of a mask made at 48×64 pixels, where limbs are two wide: that it is made, not how good it is
+)
+FOCALS = {
+    "wham": np.hypot(WIDTH, HEIGHT),
+    "phalp": 5000.0,
+    "romp": 0.5 * HEIGHT / np.tan(np.radians(30)),
+    "gvhmr": 77.0,
+}
+
+
+# A small reference implementation of each convention
+
+
+def smpl_vertices(body: Body, poses, trans) -> np.ndarray:
+    """SMPL: the root turns about J0, then everything is moved by trans; ``poses`` [24, 3] axis-angle."""
+    return posed_vertices(body, axis_angle_to_matrix(poses), np.asarray(trans))
+
+
+def easymocap_vertices(body: Body, poses, Rh, Th) -> np.ndarray:
+    """EasyMocap: the body with an unturned root, turned by R(Rh) about the origin, moved by Th."""
+    unturned = np.asarray(poses).copy()
+    unturned[0] = 0
+    return posed_vertices(body, axis_angle_to_matrix(unturned), np.zeros(3)) @ axis_angle_to_matrix(Rh).T + Th
+
+
+def _vertices(poses, k: int) -> np.ndarray:
+    body = shaped_body()
+    places = poses.root(body.skeleton.rest_joints[0])
+    return posed_vertices(body, poses.rotations[k], places[k] - body.skeleton.rest_joints[0])
+
+
+def test_root_conventions_agree_with_their_definitions() -> None:
+    rng = np.random.default_rng(0)
+    angles, Rh, shift = axis_angles(), rng.normal(size=(FRAMES, 3)), rng.normal(size=(FRAMES, 3))
+    plain = angles.copy()
+    plain[:, 0] = 0
+    easymocap, smpl = (
+        easymocap_poses(range(FRAMES), plain, Rh, shift),
+        smpl_poses(range(FRAMES), angles, shift),
+    )
+    for k in range(FRAMES):
+        assert_allclose(
+            _vertices(easymocap, k), easymocap_vertices(shaped_body(), angles[k], Rh[k], shift[k]), atol=PLACE
+        )
+        assert_allclose(_vertices(smpl, k), smpl_vertices(shaped_body(), angles[k], shift[k]), atol=PLACE)
+
+
+# The programs' files, for the scene seen by its first camera
+
+
+def _joblib(path: Path, content: object) -> Path:
+    joblib = pytest.importorskip("joblib")
+    joblib.dump(content, path, compress=3 if "phalp" in path.name else 0)
+    return path
+
+
+def write_wham(folder: Path) -> Path:
+    """Two tracks; ours is the longer one."""
+    world = layouts.camera_world()
+    track = {
+        "pose": world.thetas.astype(np.float32), "trans": world.trans.astype(np.float32),
+        "pose_world": np.ones((FRAMES, 72)), "trans_world": np.ones((FRAMES, 3)),
+        "betas": np.tile(BETAS, (FRAMES, 1)), "verts": np.zeros((FRAMES, 7, 3)),
+        "frame_ids": np.arange(FRAMES),
+    }  # fmt: skip
+    other = {key: value[:1] for key, value in track.items()}
+    return _joblib(folder / "wham_output.pkl", {0: other, 1: track})
+
+
+def write_gvhmr(folder: Path) -> Path:
+    """SMPL-X: 21 joints, offsets from SMPL-X's own pelvis."""
+    torch = pytest.importorskip("torch")
+    world = layouts.camera_world()
+    incam = {
+        "body_pose": world.thetas[:, 3:66], "global_orient": world.thetas[:, :3],
+        "transl": world.places - SMPLX_REST_ROOT, "betas": np.tile(BETAS, (FRAMES, 1)),
+    }  # fmt: skip
+    K = layouts.video_camera(FOCALS["gvhmr"]).K
+    content = {
+        "smpl_params_incam": {key: torch.tensor(value, dtype=torch.float32) for key, value in incam.items()},
+        "smpl_params_global": {key: torch.zeros(FRAMES, 3) for key in incam},
+        "K_fullimg": torch.tensor(np.tile(K, (FRAMES, 1, 1)), dtype=torch.float32),
+    }
+    torch.save(content, folder / "hmr4d_results.pt")
+    return folder / "hmr4d_results.pt"
+
+
+def write_phalp(folder: Path) -> Path:
+    """Rotation matrices and a second person in every other picture, before ours."""
+    world = layouts.camera_world()
+    content = {}
+    for k in range(FRAMES):
+        matrices = axis_angle_to_matrix(world.thetas[k].reshape(24, 3)).astype(np.float32)
+        ours = {"global_orient": matrices[:1], "body_pose": matrices[1:], "betas": BETAS.astype(np.float32)}
+        moment = {
+            "time": k,
+            "tid": [5],
+            "smpl": [ours],
+            "camera": [world.trans[k].astype(np.float32)],
+            "bbox": [],
+        }
+        if k % 2:
+            moment |= {
+                "tid": [2, 5],
+                "smpl": [ours, ours],
+                "camera": [np.ones(3), world.trans[k].astype(np.float32)],
+            }
+        content[f"_DEMO/me/img/{k + 1:06d}.jpg"] = moment
+    return _joblib(folder / "phalp_me.pkl", content)
+
+
+def write_romp(folder: Path) -> Path:
+    """One results file a frame: a dict inside an array of objects."""
+    world = layouts.camera_world()
+    (folder / "romp").mkdir()
+    for k in range(FRAMES):
+        row = {
+            "smpl_thetas": world.thetas[k][None].astype(np.float32),
+            "smpl_betas": np.append(BETAS, 0)[None].astype(np.float32),
+            "cam_trans": world.trans[k][None].astype(np.float32), "cam": np.ones((1, 3)),
+        }  # fmt: skip
+        np.savez(folder / "romp" / f"{k:08d}.npz", results=np.array(row, dtype=object))
+    return folder / "romp"
+
+
+PROGRAMS = {"wham": write_wham, "gvhmr": write_gvhmr, "phalp": write_phalp, "romp": write_romp}
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_programs_poses_put_the_person_where_it_saw_it(tmp_path, program) -> None:
+    found = read_poses(PROGRAMS[program](tmp_path))
+    assert found.poses.frames.tolist() == list(range(FRAMES))
+    K = found.K if found.focal is None else None
+    focal = float(K[0, 0]) if K is not None else found.focal(WIDTH, HEIGHT)
+    assert focal == pytest.approx(FOCALS[program], rel=1e-6)
+    world, poses = layouts.camera_world(), found.poses
+    rest = SMPLX_REST_ROOT if program == "gvhmr" else shaped_body().skeleton.rest_joints[0]
+    assert poses.family == ("SMPL-X" if program == "gvhmr" else "SMPL")
+    assert_allclose(poses.root(rest), world.places, atol=PLACE)
+    joints = 22 if program == "gvhmr" else 24
+    expected = axis_angle_to_matrix(world.thetas.reshape(FRAMES, 24, 3)[:, :joints])
+    assert_allclose(poses.rotations, expected, atol=1e-6)
+    assert_allclose(poses.betas, BETAS, atol=1e-6)
+
+
+def test_a_track_is_chosen_by_number(tmp_path) -> None:
+    path = write_wham(tmp_path)
+    assert len(read_poses(path, person=0).poses.frames) == 1
+    assert "--person chooses another" in " ".join(read_poses(path).notes)
+    with pytest.raises(InputError, match="--person: expected 0 or 1, got 7"):
+        read_poses(path, person=7)
+
+
+def test_an_npz_is_read_by_its_keys_or_as_told(tmp_path) -> None:
+    world = layouts.World(layouts.Z_UP)
+    rest = shaped_body().skeleton.rest_joints[0]
+    np.savez(tmp_path / "smpl.npz", thetas=world.thetas, transl=world.trans, betas=BETAS)
+    np.savez(
+        tmp_path / "em.npz", poses=world.thetas, trans=world.Th, betas=BETAS
+    )  # Rh, Th under SMPL's names
+    assert_allclose(read_poses(tmp_path / "smpl.npz").poses.root(rest), world.places, atol=1e-9)
+    told = read_poses(tmp_path / "em.npz", convention="easymocap").poses
+    assert_allclose(told.root(rest), world.places, atol=1e-9)
+    assert_allclose(told.rotations[:, 0], world.roots, atol=1e-9)
+    assert np.abs(read_poses(tmp_path / "em.npz").poses.root(rest) - world.places).max() > 0.1
+
+
+def test_files_that_are_no_poses_are_refused_by_name(tmp_path) -> None:
+    (tmp_path / "a.json").write_text("{}")
+    np.savez(tmp_path / "b.npz", pictures=np.zeros(3))
+    with pytest.raises(InputError, match=r"b\.npz.*poses, thetas or body_pose"):
+        read_poses(tmp_path / "b.npz")
+    layouts._pickle(tmp_path / "c.pkl", {"nothing": 1})
+    with pytest.raises(InputError, match=r"c\.pkl.*WHAM"):
+        read_poses(tmp_path / "c.pkl")
+
+
+# A plain video
+
+
+def _film(folder: Path, focal: float, scale: int = 1) -> Path:
+    """me.mp4: the scene through a centred lens."""
+    camera = layouts.video_camera(focal).resized(scale * WIDTH, scale * HEIGHT)
+    images = []
+    for k in range(FRAMES):
+        view = view_of(camera, k)
+        colours = to_bytes(0.2 + 0.35 * (view.normals + 1))
+        images.append(np.where(view.mask[..., None], colours, 90).astype(np.uint8))
+    layouts.write_video(folder / "me.mp4", images, fps=25)
+    return folder / "me.mp4"
+
+
+def _options(folder: Path, **options: object) -> ImportOptions:
+    return ImportOptions(**({"body": str(layouts.body_file(folder)), "poses": write_romp(folder)} | options))
+
+
+def test_a_plain_video_becomes_a_capture(tmp_path) -> None:
+    focal = FOCALS["romp"]
+    film = _film(tmp_path, focal)
+    for k in range(FRAMES):
+        mask = view_of(layouts.video_camera(focal), k).mask
+        write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * mask).astype(np.uint8))
+        normals = view_of(layouts.video_camera(focal), k).normals * [1, -1, -1]  # right, up, to the viewer
+        (tmp_path / "normals").mkdir(exist_ok=True)
+        np.save(tmp_path / "normals" / f"{k:05d}.npy", normals.astype(np.float32))
+    assert find_layout(film) == ("video", "a video")
+    scene = import_source(
+        film, tmp_path / "out", _options(tmp_path, masks=tmp_path / "masks", normals=tmp_path / "normals")
+    )
+    assert any("up, towards the viewer" in note for note in scene.notes)
+    capture = load_capture(tmp_path / "out")
+    assert capture.fps == 25 and [f.split for f in capture.frames] == ["train"] * 3 + ["novel_pose"]
+    for frame in capture.frames:
+        camera, truth = capture.cameras["0"], layouts.video_camera(focal)
+        assert_allclose(camera.K, truth.K, atol=1e-9)
+        theirs = posed_vertices(
+            capture.body, capture.motion.rotations[frame.frame], capture.motion.translations[frame.frame]
+        )
+        ours = posed_vertices(
+            shaped_body(), motion().rotations[frame.frame], motion().translations[frame.frame]
+        )
+        local, expected = (
+            v @ c.world_to_camera[:3, :3].T + c.world_to_camera[:3, 3]
+            for v, c in ((theirs, camera), (ours, truth))
+        )
+        assert_allclose(local, expected, atol=PLACE)
+        images, view = capture.load_frame(frame), view_of(truth, frame.frame)
+        assert ((images.mask > 0.5) == view.mask).all()
+        known = view.mask & (np.abs(images.normal).max(-1) > 0)
+        assert (images.normal * view.normals).sum(-1)[known].min() > 0.999
+
+
+def test_rough_masks_are_made_where_there_are_none(tmp_path) -> None:
+    film = _film(tmp_path, FOCALS["romp"], scale=4)
+    scene = import_source(film, tmp_path / "out", _options(tmp_path))
+    assert any("masks made from the template" in note and "rough" in note for note in scene.notes)
+    capture = load_capture(tmp_path / "out")
+    camera = layouts.video_camera(FOCALS["romp"]).resized(4 * WIDTH, 4 * HEIGHT)
+    for frame in capture.frames:
+        truth = view_of(camera, frame.frame).mask
+        assert overlap(capture.load_frame(frame).mask > 0.5, truth) > ROUGH
+
+
+def test_the_sharpest_frame_of_a_pose_is_kept(tmp_path) -> None:
+    """Ten frames of two poses in turn, one sharp picture of each: those two are chosen."""
+    camera, world = layouts.video_camera(FOCALS["romp"]), layouts.camera_world()
+    poses = [0, 3, 0, 3, 0, 3, 0, 3, 0, 3]
+    sharp = {4, 5}
+    folder, cloth = tmp_path / "frames", np.random.default_rng(0).integers(0, 80, (HEIGHT, WIDTH, 1))
+    for k, pose in enumerate(poses):
+        view = view_of(camera, pose)
+        image = np.where(view.mask[..., None], 100 + cloth, 90).repeat(3, 2).astype(np.uint8)
+        write_image(folder / f"{k:03d}.png", image if k in sharp else cv2.GaussianBlur(image, (0, 0), 2.0))
+        write_image(tmp_path / "masks" / f"{k:03d}.png", (255 * view.mask).astype(np.uint8))
+    np.savez(tmp_path / "p.npz", thetas=world.thetas[poses], transl=world.trans[poses], betas=BETAS)
+    K = (camera.K[0, 0], camera.K[1, 1], WIDTH / 2, HEIGHT / 2)
+    options = dataclasses.replace(
+        _options(tmp_path), poses=tmp_path / "p.npz", masks=tmp_path / "masks", intrinsics=K, count=2
+    )
+    import_source(folder, tmp_path / "out", options)
+    capture = load_capture(tmp_path / "out")
+    assert {f.frame for f in capture.frames if f.split == "train"} == sharp
+
+
+def test_what_a_video_needs_is_asked_for(tmp_path) -> None:
+    film = _film(tmp_path, 60.0)
+    body = str(layouts.body_file(tmp_path))
+
+    def refusal(source: Path = film, **options: object) -> str:
+        with pytest.raises(InputError) as caught:
+            import_source(source, tmp_path / "out", ImportOptions(**options))
+        return str(caught.value)
+
+    assert "--body" in refusal()
+    assert "--poses" in refusal(body=body)
+    world = layouts.camera_world()
+    np.savez(tmp_path / "p.npz", thetas=world.thetas, transl=world.trans)
+    assert "--intrinsics" in refusal(body=body, poses=tmp_path / "p.npz")
+    assert "source not found" in refusal(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "known layout" in refusal(tmp_path / "empty")
+    assert "--as: expected zju" in refusal(layout="zoo")
+    (tmp_path / "cut.mp4").write_bytes(film.read_bytes()[:300])
+    assert "cut.mp4" in refusal(tmp_path / "cut.mp4", body=body, poses=tmp_path / "p.npz")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,75 @@
+"""Corrections of body poses: the same bones as the runtime's, bounded, and better after than before."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.skeleton import bone_transforms
+from rnd_trainer.pose_refinement import (
+    ROTATION_BOUND,
+    TRANSLATION_BOUND,
+    PoseRefinement,
+    joint_error_degrees,
+)
+from rnd_trainer.train import Training
+from tiny import body, motion
+
+FLOAT32 = 2e-6  # metres and matrix entries near 1, a chain of ten products
+
+
+def test_uncorrected_bones_are_the_runtimes() -> None:
+    skeleton, moves = body().skeleton, motion(body())
+    refinement = PoseRefinement(moves, skeleton, [0, 3])
+    expected = bone_transforms(skeleton, moves.rotations[3], moves.translations[3])
+    assert np.abs(refinement.bones(3).detach().numpy() - expected).max() < FLOAT32
+
+
+def test_the_corrected_motion_has_the_corrected_bones_and_stays_within_bounds() -> None:
+    skeleton, moves = body().skeleton, motion(body())
+    refinement = PoseRefinement(moves, skeleton, [1, 1, 4])
+    assert refinement.frames == [1, 4]
+    with torch.no_grad():
+        for raw in refinement.raw:
+            raw.copy_(torch.randn(raw.shape, generator=torch.Generator().manual_seed(0)))
+    turn, shift = refinement.bounded(4)
+    assert turn.abs().max() <= ROTATION_BOUND and shift.abs().max() <= TRANSLATION_BOUND
+    corrected = refinement.apply_to(moves)
+    expected = bone_transforms(skeleton, corrected.rotations[4], corrected.translations[4])
+    assert np.abs(refinement.bones(4).detach().numpy() - expected).max() < FLOAT32
+    assert np.array_equal(corrected.rotations[2], moves.rotations[2])
+
+
+def test_refinement_does_not_make_noisy_poses_worse(tiny_capture, tiny_config) -> None:
+    truth = tiny_capture.motion
+    rng = np.random.default_rng(0)
+    noise = np.radians(2) * rng.standard_normal((truth.frame_count, len(truth.joint_names), 3))
+    bad = Motion(
+        truth.rotations @ axis_angle_to_matrix(noise), truth.translations, truth.fps, truth.joint_names
+    )
+    config = dataclasses.replace(tiny_config, steps=150, refine_poses=True, light="none", refine_after=0.2)
+    training = Training(dataclasses.replace(tiny_capture, motion=bad), config)
+    for _ in range(config.steps):
+        training.step()
+    frames = range(truth.frame_count)
+    before = joint_error_degrees(bad, truth, frames)
+    after = joint_error_degrees(training.motion(), truth, frames)
+    assert after < before, (after, before)
+
+
+def test_a_refined_training_leaves_its_motion_and_resumes(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, refine_poses=True)
+    torch.set_num_threads(1)
+    training = Training(tiny_capture, config)
+    for _ in range(8):
+        training.step()
+    training.save(tmp_path)
+    written = load_motion(tmp_path / "refined_motion.npz", tiny_capture.body.skeleton)
+    assert np.abs(written.rotations - training.motion().rotations).max() < 1e-6
+    resumed = Training(tiny_capture, config)
+    resumed.resume(tmp_path / "training.state")
+    assert resumed.step().terms == training.step().terms

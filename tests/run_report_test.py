@@ -1,0 +1,195 @@
+"""rnd-report: one page, whole, offline, and true to the files of the run."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rnd_runtime.images import read_image, write_image
+from rnd_trainer.config import TrainConfig, to_dict
+from rnd_viewer import report_shots
+from rnd_viewer.html_parts import curve
+from rnd_viewer.report_cli import main
+from tiny import ASSETS
+
+VOID = {"meta", "img", "input", "link", "br"}
+ROW = {"split": "novel_view", "frames": 2, "psnr": 27.3456, "ssim": 0.95, "psnr_box": 22.0, "ssim_box": 0.8,
+       "normal_deg": 10.0, "lpips": None, "psnr_n": 19.0,
+       "minutes": 6.5, "capture": "me & <you>", "steps": 100, "seed": 0,
+       "gaussians": 800, "machine": "a test"}  # fmt: skip
+
+
+class _Page(HTMLParser):
+    """Every opened tag is closed in order; collects attributes and text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data) -> None:
+        self.text += data
+
+
+def _strip() -> np.ndarray:
+    """Truth 200, render 100, normals 50, albedo 150, error 90, of a person in the middle of 40²."""
+    tiles = np.zeros((5, 40, 40, 3), np.uint8)
+    for tile, value in zip(tiles, (200, 100, 50, 150, 90)):
+        tile[15:30, 18:24] = value
+    return np.concatenate(list(tiles), axis=1)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch) -> Path:
+    """The folder of a training, as far as the report reads it; small pictures of the avatar."""
+    monkeypatch.setattr(report_shots, "SIDE", 64)
+    monkeypatch.setattr(report_shots, "SECONDS", 0.1)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps(to_dict(TrainConfig(steps=100))))
+    rows = [{"step": k, "stage": 1 + (k >= 25), "seconds": k / 10, "image": 1 / (1 + k)} for k in range(100)]
+    rows[7] |= {"image": float("nan"), "skipped": True}
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (folder / "eval.json").write_text(json.dumps([ROW, ROW | {"split": "relight, albedo scaled"}]))
+    for name in ("a", "b", "c", "d"):
+        write_image(folder / f"eval/novel_view/{name}.png", _strip())
+    shutil.copy(ASSETS / "avatar.onnx", folder / "avatar.onnx")
+    return folder
+
+
+def _write(run: Path, *words: str) -> tuple[str, _Page]:
+    assert main([str(run), *words]) == 0
+    text = (run / "report.html").read_text(encoding="utf-8")
+    return text, _Page(text)
+
+
+def _pictures(page: _Page, tmp_path: Path) -> dict[str, np.ndarray]:
+    pictures = {}
+    for tag, attributes in page.tags:
+        if tag == "img" and "image/png" in attributes["src"]:
+            (tmp_path / "x.png").write_bytes(base64.b64decode(attributes["src"].partition(",")[2]))
+            pictures[attributes["alt"]] = read_image(tmp_path / "x.png")
+    return pictures
+
+
+def test_a_whole_run_is_on_the_page(run, tmp_path):
+    bench = tmp_path / "bench"
+    bench.mkdir()
+    (bench / "speed.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>')
+    (bench / "stability.json").write_text(
+        json.dumps([{"id": "P2", "what": "edges, <worst>", "measured": 0.61}])
+    )
+    sky = str(ASSETS / "sky.exr")
+    text, page = _write(run, "--hdr", sky, "--bench", str(bench), "--motion", str(ASSETS / "walk.npz"))
+    for tag, attributes in page.tags:  # nothing is fetched from anywhere
+        for name in ("src", "href"):
+            assert (attributes.get(name) or "data:").startswith("data:"), (tag, attributes)
+    assert "http" not in text and "url(" not in text
+    assert "me & <you>" in page.text and "800 Gaussians" in page.text
+    assert "27.35" in page.text and "PSNR of normals" in page.text
+    assert "LPIPS" not in page.text  # a column nobody measured is no column
+    assert "1 steps were not finite" in page.text
+    assert "P2" in page.text and "edges, <worst>" in page.text and "0.61" in page.text
+    (chart,) = [attributes["src"] for _, attributes in page.tags if attributes.get("alt") == "speed"]
+    assert base64.b64decode(chart.removeprefix("data:image/svg+xml;base64,")).startswith(b"<svg")
+    assert "weight_normal" in page.text and "model.gaussians" in page.text
+    pictures = _pictures(page, tmp_path)
+    assert {"learned light, 0°", "learned light, 270°", "sky", "albedo", "roughness"} <= set(pictures)
+    assert (pictures["sky"] != pictures["learned light, 0°"]).any()
+    strips = [name for name in pictures if name.startswith("truth, ")]
+    assert strips == ["truth, a", "truth, b", "truth, c"]  # three of four, spread
+    for what, value in (("truth", 200), ("render", 100), ("normals", 50), ("albedo", 150), ("error", 90)):
+        assert pictures[f"{what}, a"].max() == value
+    assert pictures["truth, a"].shape[:2] == (15 + 15, 6 + 15)  # cropped to the person and a margin
+    (clip,) = [attributes["src"] for tag, attributes in page.tags if tag == "video"]
+    assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
+
+
+def test_what_a_run_lacks_is_named(run):
+    for name in ("avatar.onnx", "eval.json", "metrics.jsonl"):
+        (run / name).unlink()
+    shutil.rmtree(run / "eval")
+    _, page = _write(run)
+    for words in ("rnd-export", "no eval.json", "--pictures RUN/eval", "no metrics.jsonl"):
+        assert words in page.text
+    assert not any(tag in ("img", "video", "svg") for tag, _ in page.tags)
+
+
+def test_pictures_are_shown_once(run, tmp_path):
+    (run / "avatar.onnx").unlink()
+    for words, expected in (
+        (("--pictures", "9"), "abcd"),
+        (("--pictures", "2"), "ac"),
+        (("--pictures", "0"), ""),
+    ):
+        _, page = _write(run, *words)
+        names = [name for name in _pictures(page, tmp_path) if name.startswith("truth, ")]
+        assert names == [f"truth, {letter}" for letter in expected]
+        assert sum(tag == "img" for tag, _ in page.tags) == 5 * len(expected)
+
+
+def test_a_curve_goes_through_the_points():
+    figure = curve(range(100), [10.0 ** (-k / 99) for k in range(100)], "image", 25)
+    (path,) = re.findall(r'<path d="([^"]+)"', figure)
+    points = np.array(re.findall(r"([\d.]+) ([\d.]+)", path), float)
+    assert len(points) == 100
+    np.testing.assert_allclose(np.diff(points[:, 0]), (320 - 42 - 8) / 99, atol=0.11)  # tenths are stored
+    slope = np.diff(points[:, 1])
+    assert slope.min() > 0 and np.ptp(slope) < 0.21  # a straight line downwards: y grows downwards in SVG
+    assert ">1<" in figure and ">0.1<" in figure and 'class="stage"' in figure and "last 0.1" in figure
+    assert "<path" not in curve([0, 1], [0.0, -1.0], "nothing", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("config.json", None, "config.json: config.json of rnd-train not found"),
+        ("eval.json", "{", "eval.json: not JSON"),
+        ("metrics.jsonl", '{"step": 0', "metrics.jsonl: not JSON lines"),
+        ("avatar.onnx", "onnx", "avatar.onnx: not a readable ONNX model"),
+    ],
+)
+def test_a_damaged_run_is_one_line_and_exit_2(run, name, content, message, capsys):
+    (run / name).unlink() if content is None else (run / name).write_text(content)
+    assert main([str(run)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_the_slider_moves_in_a_browser(run, tmp_path):
+    text, _ = _write(run)
+    script = """<script>const i = document.querySelector(".ab input"); i.value = 20;
+      i.dispatchEvent(new Event("input"));
+      const ok = [...document.images].every(p => p.complete && p.naturalWidth);
+      document.title = [ok, getComputedStyle(i.parentElement.children[1]).clipPath].join(" ");</script></body>"""
+    page = tmp_path / "page.html"
+    page.write_text(text.replace("</body>", script), encoding="utf-8")
+    line = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1500"]
+    line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
+    dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert "<title>true inset(0px 0px 0px 20%)</title>" in dom

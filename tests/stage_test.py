@@ -1,0 +1,417 @@
+"""The light stage: its physics against our own sum, its files against the capture format, parts against the whole."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("skimage")
+
+from rnd_runtime.body import Body  # noqa: E402
+from rnd_runtime.camera import Camera  # noqa: E402
+from rnd_runtime.capture import load_capture  # noqa: E402
+from rnd_runtime.errors import InputError  # noqa: E402
+from rnd_runtime.gaussians import Gaussians  # noqa: E402
+from rnd_runtime.images import read_image, srgb_to_linear  # noqa: E402
+from rnd_runtime.light import Light, texel_directions  # noqa: E402
+from rnd_runtime.motion import Motion, save_motion  # noqa: E402
+from rnd_runtime.rotations import axis_angle_to_matrix, matrix_to_axis_angle  # noqa: E402
+from rnd_runtime.shading_reference import shade_reference  # noqa: E402
+from rnd_runtime.skeleton import bone_transforms  # noqa: E402
+
+mi.set_variant("scalar_rgb")
+
+from rnd_trainer.stage import cli, estimates, film, lights, manifest, plan, subjects, variants  # noqa: E402
+from rnd_trainer.stage.cameras import ring_cameras  # noqa: E402
+from rnd_trainer.stage.cloth import SKIN_GAP, Cloth, Drape  # noqa: E402
+from rnd_trainer.stage.dances import dance  # noqa: E402
+from rnd_trainer.stage.dressing import Wearer  # noqa: E402
+from rnd_trainer.stage.render import Set, Surface  # noqa: E402
+
+ASSETS = Path(__file__).parent.parent / "assets"
+ENERGY = 0.01  # relative; what is left is Fresnel's exact term against Schlick's, 7 % of the gloss under a white sky
+RECIPE = plan.Recipe(
+    subject=0, frames=5, cameras=2, size=64, samples=9, lights=("red",), relight_cameras=1, step=0.018
+)  # coarse: seconds, not minutes
+
+
+@pytest.fixture(scope="module")
+def production(tmp_path_factory) -> film.Production:
+    """Twenty frames of the dance, five of which are filmed."""
+    folder, body = tmp_path_factory.mktemp("recipe"), Body.load(ASSETS / "body.npz")
+    whole = dance(body.skeleton)
+    part = replace(whole, rotations=whole.rotations[60:80], translations=whole.translations[60:80])
+    save_motion(folder / "part.npz", part)
+    return film.prepare(replace(RECIPE, motion=str(folder / "part.npz")), folder, body)
+
+
+@pytest.fixture(scope="module")
+def filmed(production, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("whole")
+    film.film(production, folder, on_picture=lambda name: None)
+    assert manifest.finish(production, folder, "scalar_rgb", None)
+    return folder
+
+
+def ball(rings: int = 48) -> Surface:
+    """A unit ball with true normals."""
+    polar, azimuth = np.meshgrid(
+        np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij"
+    )
+    points = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
+    index = np.arange(points[..., 0].size).reshape(points.shape[:2])
+    a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    points = points.reshape(-1, 3)
+    return Surface(
+        points, points, faces, np.tile([0.6, 0.5, 0.4], (len(points), 1)), np.full(len(points), 0.5)
+    )
+
+
+@pytest.mark.parametrize("name", ["white", "split", "rainbow"])
+def test_a_convex_body_has_the_energy_of_our_own_sum(name: str) -> None:
+    light = next(light for light in lights.stage_lights() if light.name == name)
+    eye = [0.0, 0, 40.0]  # far away: a pixel's rays are parallel, so its points follow from its place
+    camera = Camera.look_at(eye, [0.0, 0, 0], width=16, height=16, fov_y=2 * np.arctan(1.0 / 40))
+    theirs = Set(ball()).radiance(camera, light.radiance, samples=144, seed=1)
+    line = (np.arange(48) + 0.5) / 24 - 1
+    x, y = np.meshgrid(line, -line)
+    inside = x**2 + y**2 < 0.9
+    points = np.stack([x, y, np.sqrt(np.where(inside, 1 - x**2 - y**2, 0))], -1).reshape(-1, 3)
+    count = len(points)
+    seen = np.zeros((count, 16))
+    seen[:, 0] = np.sqrt(4 * np.pi)
+    gaussians = Gaussians(
+        points, np.zeros((count, 6)), np.ones(count), points, np.tile([0.6, 0.5, 0.4], (count, 1)),
+        np.full(count, 0.5), seen, np.eye(3),
+    )  # fmt: skip
+    ours = shade_reference(gaussians, Light(light.radiance), eye, texels=(64, 128))
+    whole = inside.reshape(16, 3, 16, 3).all((1, 3))
+    ours = ours.reshape(16, 3, 16, 3, 3).mean((1, 3))
+    assert ours[whole].mean() == pytest.approx(theirs[whole].mean(), rel=ENERGY)
+    np.testing.assert_allclose(ours[whole].mean(0), theirs[whole].mean(0), rtol=1.5 * ENERGY)
+
+
+def test_the_capture_is_one(filmed: Path, production) -> None:
+    capture = load_capture(filmed)
+    splits = {name: capture.split(name) for name in ("train", "novel_view", "novel_pose", "relight")}
+    assert {name: len(frames) for name, frames in splits.items()} == {
+        "train": 4, "novel_view": 4, "novel_pose": 2, "relight": 1,
+    }  # fmt: skip
+    assert {f.camera for f in splits["train"]} == {"cam00"} and {f.light for f in splits["train"]} == {
+        "white"
+    }
+    assert {f.frame for f in splits["novel_view"]} == {f.frame for f in splits["train"]}
+    assert min(f.frame for f in splits["novel_pose"]) > max(f.frame for f in splits["train"])
+    assert {f.light for f in splits["relight"]} == {"red"}
+    assert (filmed / "contact.png").exists() and "rnd-stage" in (filmed / "README.md").read_text()
+    exact, estimated = capture.motion, load_capture(filmed / manifest.ESTIMATED).motion
+    assert 0.5 < np.degrees(np.abs(matrix_to_axis_angle(_relative(exact, estimated))).mean()) < 4
+
+
+def _relative(a: Motion, b: Motion) -> np.ndarray:
+    return np.swapaxes(a.rotations, -1, -2) @ b.rotations
+
+
+def test_the_truth_beside_a_picture_is_true(filmed: Path) -> None:
+    capture = load_capture(filmed)
+    for frame in capture.split("train"):
+        place, images = f"{frame.camera}_{frame.frame:06d}", capture.load_frame(frame)
+        covered = images.mask > 0.99
+        assert (images.normal_gt[covered][:, 2] < 0).mean() > 0.98
+        camera = capture.cameras[frame.camera]
+        vertices = np.load(filmed / f"surface/{frame.frame:06d}.npz")["vertices"]
+        seen = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = read_image(filmed / f"depth/{place}.exr")[..., 0]
+        assert (
+            seen[:, 2].min() - 0.02 < depth[covered].min() and depth[covered].max() < seen[:, 2].max() + 0.02
+        )
+        pixels = seen @ camera.K.T
+        low, high = (pixels[:, :2] / pixels[:, 2:]).min(0), (pixels[:, :2] / pixels[:, 2:]).max(0)
+        rows, columns = np.nonzero(images.mask > 0.5)
+        np.testing.assert_allclose([columns.min(), rows.min()], low, atol=1.5)
+        np.testing.assert_allclose([columns.max() + 1, rows.max() + 1], high, atol=1.5)
+        visibility = np.load(filmed / f"visibility/{place}.npz")["visibility"] / 255.0
+        d = lights.module_directions()
+        world = images.normal_gt[covered] @ camera.world_to_camera[:3, :3]
+        facing = world @ d.T > 0.5
+        assert 0.7 < visibility[:, covered].T[facing].mean() < 1.0  # a body shadows itself a little
+        assert visibility[:, covered].T[world @ d.T < -0.1].max() == 0.0
+
+
+def test_a_diffuse_estimate_explains_the_pictures(filmed: Path) -> None:
+    """Albedo × irradiance × visibility, from disk alone, is the picture up to gloss and interreflection."""
+    capture = load_capture(filmed)
+    d, amplitudes = lights.module_directions(), np.ones((19, 3))
+    for frame in capture.split("train"):
+        images = capture.load_frame(frame)
+        place = f"{frame.camera}_{frame.frame:06d}"
+        covered = images.mask > 0.99
+        seen = np.load(filmed / f"visibility/{place}.npz")["visibility"][:, covered] / 255.0
+        world = images.normal_gt[covered] @ capture.cameras[frame.camera].world_to_camera[:3, :3]
+        flux = 2 * np.pi / lights.SHARPNESS * amplitudes * capture.lights["white"].scale[0]
+        irradiance = (np.maximum(world @ d.T, 0) * seen.T) @ flux
+        predicted = srgb_to_linear(images.albedo_srgb[covered]) * irradiance / np.pi
+        picture = srgb_to_linear(images.image_srgb[covered])
+        assert 0.75 < predicted.mean() / picture.mean() < 1.05
+        assert np.corrcoef(predicted.ravel(), picture.ravel())[0, 1] > 0.95
+
+
+def test_shards_make_the_whole(filmed: Path, production, tmp_path: Path) -> None:
+    few = replace(
+        production, shots=[shot for shot in production.shots if shot.frame in production.frames[1:3]]
+    )
+    film.film(few, tmp_path, shard=(1, 2), on_picture=lambda name: None)
+    assert not manifest.finish(few, tmp_path, "scalar_rgb", None)  # the other shard is missing
+    film.film(few, tmp_path, shard=(0, 2), on_picture=lambda name: None)
+    pictures = [path for path in tmp_path.rglob("*") if path.suffix in (".png", ".exr", ".npz")]
+    assert len(pictures) > 20
+    for path in pictures:
+        assert path.read_bytes() == (filmed / path.relative_to(tmp_path)).read_bytes(), path
+
+
+def test_what_is_there_is_not_filmed_again(filmed: Path, production) -> None:
+    lost = filmed / production.shots[0].image("white")
+    before = lost.read_bytes()
+    times = {path: path.stat().st_mtime_ns for path in filmed.rglob("*.png")}
+    lost.unlink()
+    named: list[str] = []
+    film.film(production, filmed, on_picture=named.append)
+    assert lost.read_bytes() == before
+    assert len(named) == plan.picture_count(production.shots)
+    kept = [path for path, time in times.items() if path.stat().st_mtime_ns == time]
+    assert len(times) - len(kept) == len(
+        production.shots[0].truth_files(False)
+    )  # the one shot's PNGs and its picture
+
+
+def test_another_recipe_is_refused(tmp_path: Path) -> None:
+    film.keep_recipe(RECIPE, tmp_path)
+    film.keep_recipe(RECIPE, tmp_path)
+    assert json.loads((tmp_path / film.RECIPE_FILE).read_text())["samples"] == 9
+    with pytest.raises(InputError, match="samples"):
+        film.keep_recipe(replace(RECIPE, samples=10), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"frames": 4}, {"cameras": 0}, {"size": 8}, {"max_depth": 1}, {"step": 0.5}]
+)
+def test_impossible_recipes_are_refused(change: dict) -> None:
+    with pytest.raises(InputError):
+        replace(RECIPE, **change).check()
+
+
+@pytest.mark.parametrize("text", ["1", "2/2", "a/b", "-1/2", "1/0"])
+def test_bad_shards_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="--shard"):
+        cli.parse_shard(text)
+    assert cli.parse_shard("1/3") == (1, 3)
+
+
+def test_unknown_lights_are_refused() -> None:
+    with pytest.raises(InputError, match="--lights"):
+        film._chosen(replace(RECIPE, lights=("mauve",)))
+
+
+def test_there_are_nineteen_modules_eight_colours_and_a_white_light() -> None:
+    assert lights.module_directions().shape == (19, 3)
+    made = lights.stage_lights()
+    assert made[0].name == "white" and len(made) == 9
+    directions = texel_directions(64, 128).reshape(-1, 3)
+    nearest = (directions @ lights.module_directions().T).argmax(0)
+    white = made[0].file_radiance.reshape(-1, 3)
+    assert (white[nearest] > 0.9).all()  # a peak of one at every module
+    for light in made:
+        mean = Light(light.radiance).mean_radiance
+        assert mean.max() == pytest.approx(lights.EXPOSURE, rel=1e-5)
+    colours = np.array([Light(light.radiance).mean_radiance for light in made])
+    apart = np.linalg.norm(colours[:, None] - colours[None], axis=-1) + np.eye(9)
+    patterns = np.array([light.radiance.ravel() / light.radiance.max() for light in made])
+    assert apart.min() > 0.02 and np.abs(np.corrcoef(patterns) - np.eye(9)).max() < 0.99
+
+
+def test_cameras_stand_on_three_rings_and_see_the_whole_person() -> None:
+    cameras = ring_cameras(30, 128)
+    assert len(cameras) == 30
+    heights = {round(float(camera.position[1]), 3) for camera in cameras.values()}
+    assert len(heights) == 3
+    assert abs(cameras["cam00"].position[0]) < 1e-9 and cameras["cam00"].position[2] > 4
+    places = np.array([camera.position for camera in cameras.values()])
+    assert min(np.linalg.norm(a - b) for i, a in enumerate(places) for b in places[:i]) > 0.3
+    for camera in cameras.values():
+        for point in ([0, 0, 0], [0, 1.8, 0], [0.6, 1.8, 0], [-0.6, 1.8, 0.2]):
+            pixel = camera.K @ (camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3])
+            assert (pixel[:2] / pixel[2] > 0).all() and (pixel[:2] / pixel[2] < 128).all()
+    assert len(ring_cameras(1, 16)) == 1
+
+
+def test_estimates_are_the_truth_at_strength_zero_and_the_same_for_a_seed(production) -> None:
+    rng = np.random.default_rng(0)
+    normals = np.zeros((64, 64, 3))
+    normals[..., 2] = -1
+    coverage = np.zeros((64, 64))
+    coverage[16:48, 20:44] = 1
+    np.testing.assert_allclose(
+        estimates.estimated_normals(normals, coverage, 1, 0.0)[coverage > 0], normals[coverage > 0], atol=1e-6
+    )
+    np.testing.assert_array_equal(estimates.estimated_mask(coverage, 1, 0.0), coverage)
+    motion = production.motion
+    still = estimates.estimated_motion(motion, 1, 0.0)
+    np.testing.assert_allclose(still.rotations, motion.rotations, atol=1e-12)
+    a, b, c = (estimates.estimated_normals(normals, coverage, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a, b)
+    assert np.abs(a - c).max() > 0.05
+    angle = np.degrees(np.arccos(np.clip(-a[coverage > 0][:, 2], -1, 1)))
+    assert 3 < angle.mean() < 20
+    mask = estimates.estimated_mask(np.kron(coverage, np.ones((8, 8))), 1)
+    truth = np.kron(coverage, np.ones((8, 8))) > 0.5
+    iou = ((mask > 0.5) & truth).sum() / ((mask > 0.5) | truth).sum()
+    assert 0.9 < iou < 0.995
+    drift = estimates.estimated_motion(motion, 1).translations - motion.translations
+    assert 0.002 < drift.std() < 0.04
+    assert not np.array_equal(drift, rng.normal(size=drift.shape))
+
+
+def test_people_differ() -> None:
+    people = [subjects.subject(seed) for seed in range(6)]
+    assert len({person.title for person in people}) == 6
+    assert len({person.palette.top.kind for person in people[:4]}) == 4
+    points = Body.load(ASSETS / "body.npz").vertices
+    shapes = np.array([person.shape.warp(points) for person in people])
+    assert np.ptp(shapes[:4, :, 1].max(axis=1)) > 0.05  # heights
+    assert subjects.subject(17) == subjects.subject(17) != subjects.subject(18)
+    with pytest.raises(InputError, match="--subject"):
+        subjects.subject(-1)
+
+
+def sheet() -> tuple[np.ndarray, np.ndarray, np.ndarray, Drape]:
+    """A square of cloth, 20 cm wide, lying 2 cm above the plane that carries it."""
+    x, z = np.meshgrid(np.arange(-0.1, 0.1, 0.008), np.arange(-0.1, 0.1, 0.008))
+    points = np.stack([x.ravel(), np.full(x.size, 0.02), z.ravel()], axis=1)
+    count = len(points)
+    drape = Drape(
+        np.full(count, 0.05),
+        np.full(count, 0.02),
+        np.full(count, 0.04),
+        np.ones(count, np.int64),
+        np.zeros(count, bool),
+    )
+    return points, np.tile([0.0, 1, 0], (count, 1)), np.ones((count, 1)), drape
+
+
+def moving(positions: np.ndarray) -> np.ndarray:
+    bones = np.zeros((len(positions), 1, 3, 4), np.float32)
+    bones[:, :, :, :3] = np.eye(3)
+    bones[:, 0, :, 3] = positions
+    return bones
+
+
+def test_cloth_remembers_and_stays_out_of_the_body() -> None:
+    from rnd_trainer.stage.cloth import Capsules
+
+    points, normals, weights, drape = sheet()
+    none = Capsules(np.zeros(0, np.int64), np.zeros((0, 2, 3)), np.zeros(0))
+    cloth = Cloth(points, normals, weights, drape, none)
+    still, swung = np.zeros((30, 3)), np.zeros((30, 3))
+    swung[:, 0] = 0.3 * np.sin(np.arange(30) / 29 * 2 * np.pi)  # ends where the other stands
+    a = cloth.simulate(moving(still), 30.0, [29])[29]
+    b = cloth.simulate(moving(swung), 30.0, [29])[29]
+    assert np.linalg.norm(a - b, axis=1).max() > 0.003  # the same pose, another history
+    for moved in (a, b):
+        assert (moved[:, 1] > -(0.02 - SKIN_GAP) - 1e-6).all()
+        assert (np.linalg.norm(moved, axis=1) < 0.05 + 1e-9).all()
+    np.testing.assert_array_equal(b, cloth.simulate(moving(swung), 30.0, [29])[29])
+    assert a[:, 1].mean() < -0.005  # it sags onto what is below
+
+
+def test_clothes_fold_with_the_pose(production) -> None:
+    """The filmed shirt is off its skinned place, differently in different frames, and never far."""
+    wearer = Wearer(production.dressed, production.motion, production.frames[:3])
+    moves = [wearer._moves[frame] for frame in production.frames[:3]]
+    for move in moves:
+        assert 0.001 < np.linalg.norm(move, axis=1).mean() < 0.03
+    assert np.linalg.norm(moves[0] - moves[2], axis=1).mean() > 0.001
+
+
+def test_the_template_is_the_unclothed_body(production) -> None:
+    """The capture's template, posed, lies inside the filmed surface: its clothes stand off, they do not sink in."""
+    from scipy.spatial import cKDTree
+
+    body, frame = production.dressed.body, production.frames[0]
+    bones = bone_transforms(
+        body.skeleton, production.motion.rotations[frame], production.motion.translations[frame]
+    )
+    blend = np.tensordot(body.skinning_weights, bones, axes=1)
+    posed = np.einsum("vij,vj->vi", blend[:, :, :3], body.vertices) + blend[:, :, 3]
+    wearer = Wearer(production.dressed, production.motion, [frame])
+    surface = wearer.surface(frame)
+    _, nearest = cKDTree(surface.vertices).query(posed)
+    outside = np.sum((posed - surface.vertices[nearest]) * surface.normals[nearest], axis=1)
+    assert np.quantile(outside, 0.95) < 0.006  # m; an 18 mm mesh cuts off fingers, nose and toes
+
+
+def test_an_llvm_that_does_not_work_is_not_used(monkeypatch, tmp_path: Path) -> None:
+    broken = tmp_path / "libLLVM-99.so"
+    broken.write_bytes(b"no library")
+    monkeypatch.setenv(variants.LIBRARY_VARIABLE, str(broken))
+    assert not variants._renders(str(broken))
+    monkeypatch.setattr(variants, "_renders", lambda library: False)
+    assert variants.use_variant("auto") == "scalar_rgb"
+    with pytest.raises(InputError, match="LLVM"):
+        variants.use_variant("llvm_ad_rgb")
+
+
+def test_the_first_working_llvm_is_chosen(monkeypatch) -> None:
+    monkeypatch.setattr(variants, "_candidates", lambda: iter(["old", "good", "other"]))
+    monkeypatch.setattr(variants, "_renders", lambda library: library != "old")
+    assert variants.working_llvm() == "good"
+
+
+def test_a_turned_light_turns_the_picture() -> None:
+    """The footlight shines from below: the ball's lower half is brighter; the red light from the person's left (+X)."""
+    camera = Camera.look_at([0.0, 0, 6], [0.0, 0, 0], width=16, height=16, fov_y=0.35)
+    stage = Set(ball(16))
+    by_name = {light.name: light for light in lights.stage_lights()}
+    foot = stage.radiance(camera, by_name["footlight"].radiance, samples=16, seed=0)[..., 0]
+    assert foot[9:].mean() > 2 * foot[:7].mean()
+    red = stage.radiance(camera, by_name["red"].radiance, samples=16, seed=0)[..., 0]
+    assert red[:, 9:].mean() > 1.3 * red[:, :7].mean()  # seen from +Z, +X is right
+    turned = axis_angle_to_matrix([0.0, np.pi, 0.0])
+    behind = Camera.look_at((turned @ [0, 0, 6]).tolist(), [0.0, 0, 0], width=16, height=16, fov_y=0.35)
+    red = stage.radiance(behind, by_name["red"].radiance, samples=16, seed=0)[..., 0]
+    assert red[:, :7].mean() > 1.3 * red[:, 9:].mean()
+
+
+def test_means_count_a_subject_once_however_many_seeds_it_has() -> None:
+    from rnd_trainer.stage.benchmark import means
+
+    rows = [
+        {"method": "ours", "split": "relight", "subject": subject, "seed": seed, "psnr": value}
+        for subject, seed, value in ((0, 0, 20.0), (0, 1, 22.0), (1, 0, 30.0))
+    ]
+    assert means(rows, "psnr") == [("ours", {"relight": 25.5})]
+
+
+def test_the_benchmark_trains_scores_and_does_nothing_twice(
+    filmed: Path, tmp_path: Path, monkeypatch
+) -> None:
+    from rnd_trainer.stage import benchmark
+
+    monkeypatch.setattr(benchmark, "SUBJECTS", (0,))
+    monkeypatch.setattr(benchmark, "SEEDS", (0,))
+    monkeypatch.setattr(benchmark, "METHODS", ("ours",))
+    (tmp_path / "subject0").symlink_to(filmed)
+    cost = {"pictures": 11, "seconds": 22.0, "variant": "scalar_rgb"}
+    (filmed / benchmark.COST_FILE).write_text(json.dumps(cost))
+    options = plan.BenchmarkOptions(steps=4, gaussians=400)
+    result = benchmark.run_benchmark(options, tmp_path, perceptual=None, on_run=lambda *told: None)
+    assert {row["split"] for row in result["rows"]} >= {"novel_view", "novel_pose", "relight"}
+    assert all(row["subject"] == 0 and row["method"] == "ours" for row in result["rows"])
+    assert result["cost"]["seconds_per_picture"] == pytest.approx(2.0)
+    again = benchmark.run_benchmark(options, tmp_path, perceptual=None, on_run=lambda *told: None)
+    assert again["rows"] == result["rows"]

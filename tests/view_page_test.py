@@ -1,0 +1,218 @@
+"""rnd-view's page in Chromium: loads, plays, relights, compares, keeps; its pixels are rnd-play's."""
+
+from __future__ import annotations
+
+import base64
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from browser import CHROMIUM, Page, chromium
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.capture import load_capture
+from rnd_runtime.images import read_image
+from rnd_runtime.motion import load_motion, save_motion
+from rnd_viewer.cli import main as play
+from rnd_viewer.view_options import ViewOptions
+from rnd_viewer.view_scene import Scene
+from rnd_viewer.view_server import serve
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+ASSETS = Path(__file__).parent.parent / "assets"
+SIZE = 192
+FRAME = 20
+
+
+@pytest.fixture(scope="module")
+def motion(tmp_path_factory) -> Path:
+    """The walk's first second."""
+    walk = load_motion(ASSETS / "walk.npz", Avatar.load(ASSETS / "avatar.onnx").skeleton)
+    path = tmp_path_factory.mktemp("motion") / "walk.npz"
+    save_motion(path, replace(walk, rotations=walk.rotations[:31], translations=walk.translations[:31]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(motion):
+    """The embedded avatar with its capture."""
+    files = ASSETS / "avatar.onnx", motion, (ASSETS / "sky.exr",), ASSETS / "capture"
+    scene = Scene(ViewOptions(*files, size=SIZE, raster="cpu"))
+    yield scene
+    scene.close()
+
+
+@contextmanager
+def _serving(scene: Scene, token: str | None = None) -> Iterator[str]:
+    with serve(scene, "127.0.0.1", 0, token) as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield url
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def page(scene, tmp_path_factory):
+    """The page open in a browser."""
+    with _serving(scene) as url, chromium(tmp_path_factory.mktemp("profile")) as browser:
+        browser.open(url)
+        browser.wait("window.rnd && rnd.scene()")
+        yield browser
+        assert browser.messages == []
+
+
+@pytest.fixture(scope="module")
+def played(motion, tmp_path_factory) -> dict[str, Path]:
+    """The same frame by rnd-play: as it is, and with the light turned."""
+    folders = {}
+    for name, yaw in (("straight", 0), ("turned", 90)):
+        folder = folders[name] = tmp_path_factory.mktemp(name)
+        inputs = [
+            str(ASSETS / "avatar.onnx"),
+            "--motion",
+            str(motion),
+            "--hdr",
+            str(ASSETS / "sky.exr"),
+        ]
+        options = [
+            "--size",
+            str(SIZE),
+            "--frames",
+            f"{FRAME}:{FRAME + 1}",
+            "--format",
+            "png",
+            "--raster",
+            "cpu",
+        ]
+        assert (
+            play([*inputs, *options, "--background", "#000000", "--hdr-yaw", str(yaw), "--out", str(folder)])
+            == 0
+        )
+    return {name: folder / f"frames/{FRAME:06d}.png" for name, folder in folders.items()}
+
+
+def _pixels(page: Page, canvas: str = "picture") -> np.ndarray:
+    """[H, W, 3] of a canvas as it is now."""
+    url = page.run(f"document.getElementById('{canvas}').toDataURL()")
+    return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
+
+
+def _picture(page: Page, changes: str = "") -> np.ndarray:
+    page.run(f"Object.assign(rnd.state, {{{changes}}}); rnd.picture().then(() => 1)")
+    return _pixels(page)
+
+
+def _set(page: Page, control: str, value: str) -> None:
+    element = f"document.getElementById('{control}')"
+    events = "".join(f"{element}.dispatchEvent(new Event('{name}'));" for name in ("input", "change"))
+    page.run(f"{element}.value = '{value}'; {events}")
+
+
+def test_the_canvas_shows_rnd_plays_frame_and_relights(page, played):
+    page.run("rnd.play(false)")
+    fps = page.run("rnd.scene().motion.fps")
+    assert (_picture(page, f"time: {FRAME} / {fps}") == read_image(played["straight"])).all()
+    _set(page, "yaw", "90")
+    assert (_picture(page) == read_image(played["turned"])).all()
+    # shift and drag turn the light too: 0.01 rad for each pixel
+    page.drag((300, 300), (-100, 0), shift=True)
+    assert page.run("rnd.state.yaw") == pytest.approx(np.pi / 2 - 1)
+    _set(page, "yaw", "0")
+    assert (_picture(page) == read_image(played["straight"])).all()
+
+
+def test_it_plays_and_stops(page):
+    page.run("rnd.state.time = 0; rnd.play(true)")
+    page.wait("rnd.state.time > 0.3")
+    first = _pixels(page)
+    page.wait("rnd.state.time > 0.6 || rnd.state.time < 0.3")
+    assert (_pixels(page) != first).any()
+    page.wait("document.querySelectorAll('#times tr').length > 5 && rnd.rate() > 1")
+    page.run("rnd.play(false)")
+    stopped = page.run("rnd.state.time")
+    _set(page, "time", "0.5")
+    assert page.run("rnd.state.time") == pytest.approx(0.5, abs=0.02) != stopped
+    assert (_picture(page) != first).any()
+
+
+def test_drag_turns_and_reset_comes_back(page):
+    before = _picture(page)
+    page.drag((300, 300), (80, 30))
+    turned = _picture(page)
+    assert (turned != before).any() and page.run("rnd.state.elevation") > 0.3
+    page.press("KeyR")
+    assert (_picture(page) == before).all()
+
+
+def test_outputs_sliders_and_skeleton(page):
+    seen = {_picture(page).tobytes()}
+    for name in ("light", "albedo", "normal", "roughness", "visibility", "lit"):
+        page.run(f"document.querySelector('[data-value={name}]').click()")
+        seen.add(_picture(page).tobytes())
+    assert len(seen) == 6
+    _set(page, "size", "256")
+    _set(page, "gaussians", "20")
+    assert page.run("rnd.picture().then(p => [p.width, p.height])") == [256, 256]
+    assert page.run("rnd.state.gaussians") == round(page.run("rnd.scene().gaussians") / 5)
+    page.run("document.getElementById('skeleton').click(); rnd.picture().then(() => 1)")
+    assert _pixels(page, "overlay").any()
+    page.run("document.getElementById('skeleton').click()")
+    _set(page, "gaussians", "100")
+
+
+def test_ground_truth_stands_beside(page):
+    capture = load_capture(ASSETS / "capture")
+    page.run("document.getElementById('truth-on').click()")
+    index = len(capture.frames) // 2
+    _set(page, "truth-index", str(index))
+    page.wait("document.getElementById('truth').width > 300 || document.getElementById('truth').height > 200")
+    image = read_image(capture.folder / capture.frames[index].image)
+    page.wait(f"document.getElementById('truth').width === {image.shape[1]}")
+    picture = _picture(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
+    assert picture.shape == image.shape
+    assert (_pixels(page, "truth") == image).all()
+    # the avatar was trained on this capture: 20 dB over the whole picture is far from what another pose gives
+    assert np.mean((picture.astype(float) - image) ** 2) < 255**2 / 10**2.0
+    page.run("document.getElementById('truth-on').click()")
+    assert page.run("document.getElementById('truth-pane').hidden")
+    _set(page, "size", str(SIZE))
+
+
+def test_screenshot_and_clip_are_downloads(page, tmp_path):
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    shown = _picture(page)
+    page.run("document.getElementById('screenshot').click()")
+    _set(page, "size", "128")
+    page.run("document.getElementById('clip').click()")
+    page.wait("!document.getElementById('clip').disabled")
+    for _ in range(100):
+        files = {file.suffix: file for file in tmp_path.iterdir()}
+        if {".png", ".mp4"} <= files.keys():
+            break
+        page.wait("new Promise(done => setTimeout(() => done(true), 50))")
+    assert (read_image(files[".png"])[..., :3] == shown).all()
+    assert files[".mp4"].stat().st_size > 10_000
+
+
+def test_with_a_token_and_in_jpeg(page, scene):
+    exact = _picture(page, f"width: {SIZE}, height: {SIZE}, time: 0.5").astype(int)
+    back = page.run("location.href")
+    with _serving(scene, token="s3cret") as url:
+        page.open(f"{url}&encoding=jpeg")
+        page.wait("location.search.includes('s3cret') && window.rnd && rnd.scene()")
+        page.run("Object.assign(rnd.state, {time: 0.5}); rnd.picture(false).then(() => 1)")
+        error = np.abs(_pixels(page) - exact)
+        assert 0 < error.mean() < 2  # halved chroma at the edges
+        assert (_picture(page) == exact).all()  # a screenshot is exact all the same
+        page.open(url.split("?")[0])  # the cookie is enough
+        page.wait("!location.search && window.rnd && rnd.scene()")
+    page.open(back)
+    page.wait("window.rnd && rnd.scene()")

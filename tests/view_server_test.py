@@ -1,0 +1,260 @@
+"""rnd-view's server: what it answers, whom it refuses, and that pictures are rnd-play's."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+import rnd_viewer.view_scene
+from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.images import write_image
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion, save_motion
+from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.shading import Shader
+from rnd_viewer.background import Background
+from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.options import frame_count
+from rnd_viewer.player import Player
+from rnd_viewer.view_cli import main
+from rnd_viewer.view_options import ViewOptions
+from rnd_viewer.view_scene import Scene
+from rnd_viewer.view_server import serve
+
+SIZE = 64
+FRAMES = 6
+# JPEG of quality 90 halves the chroma: dark and light neighbours of different colours differ by this many levels.
+JPEG_MEAN_ERROR = 4
+
+
+class CountedAvatar(FakeAvatar):
+    """A fake that says how large it is."""
+
+    gaussians = 24 * 120
+
+
+@pytest.fixture
+def options(tmp_path, monkeypatch) -> ViewOptions:
+    monkeypatch.setattr(rnd_viewer.view_scene.Avatar, "load", lambda path, threads=None: CountedAvatar())
+    save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
+    sky = np.random.default_rng(0).uniform(0.2, 1, (16, 32, 3)).astype(np.float32)
+    sky[5, 9] = 200  # a sun
+    write_image(tmp_path / "sky.exr", sky)
+    return ViewOptions(
+        Path("avatar.onnx"), tmp_path / "walk.npz", (tmp_path / "sky.exr",), size=SIZE, raster="cpu"
+    )
+
+
+@contextmanager
+def _serving(options: ViewOptions, token: str | None = None) -> Iterator[tuple[int, Scene]]:
+    scene = Scene(options)
+    with serve(scene, "127.0.0.1", 0, token) as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield int(url.split(":")[2].split("/")[0]), scene
+        finally:
+            server.shutdown()
+            thread.join()
+            scene.close()
+
+
+class Visitor:
+    """A page without a browser."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        self.scene = json.loads(socket.recv())["scene"]
+
+    def state(self, **changes: Any) -> dict[str, Any]:
+        return {"time": 0.0, "width": SIZE, "height": SIZE, "light": 1} | self.scene["view"] | changes
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        self.socket.send(json.dumps(request))
+        return json.loads(self.socket.recv())
+
+    def picture(self, **changes: Any) -> np.ndarray:
+        """[H, W, 3] of the state with ``changes``."""
+        header = self.ask(ask="render", number=7, state=self.state(**changes))
+        assert header["kind"] == "picture" and header["number"] == 7, header
+        data = self.socket.recv()
+        if header["encoding"] == "jpeg":
+            return np.asarray(Image.open(BytesIO(data)))
+        rgba = np.frombuffer(data, np.uint8).reshape(header["height"], header["width"], 4)
+        assert (rgba[..., 3] == 255).all()
+        return rgba[..., :3]
+
+
+@contextmanager
+def _visiting(port: int, **headers: Any) -> Iterator[Visitor]:
+    url = f"ws://127.0.0.1:{port}/socket"
+    with connect(url, max_size=None, compression=None, **headers) as socket:
+        yield Visitor(socket)
+
+
+def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
+    """What rnd-play draws in its first view."""
+    avatar = FakeAvatar()
+    motion = load_motion(options.motion, avatar.skeleton)
+    light = load_light(options.hdr[0], yaw=changes.pop("yaw", 0.0), exposure=changes.pop("exposure", 0.0))
+    shader = Shader(light, changes.pop("shade", "table+sun"))
+    view = View(SIZE, SIZE, np.radians(35), np.radians(5))
+    camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
+    return Player(avatar, light, shader, make_rasterizer("cpu"), **changes).render(motion, time, camera).srgb
+
+
+def test_the_first_view_is_rnd_plays_to_the_bit(options):
+    with _serving(options) as (port, _), _visiting(port) as visitor:
+        for time in (0.0, 0.1):
+            assert (visitor.picture(time=time) == _played(options, time)).all()
+        hdr = visitor.picture(background="hdr", yaw=0.7, shade="table")
+        expected = _played(options, 0.0, yaw=0.7, shade="table", background=Background("hdr"))
+        assert (hdr == expected).all()
+        bright = visitor.picture(exposure=1.3)
+        # the light is scaled before or after shading: float32 rounds differently
+        assert np.abs(bright.astype(int) - _played(options, 0.0, exposure=1.3)).max() <= 1
+        assert np.abs(bright.astype(int) - visitor.picture()).max() > 20
+
+
+def test_every_output_fewer_gaussians_and_jpeg(options):
+    with _serving(options) as (port, scene), _visiting(port) as visitor:
+        pictures = {
+            name: visitor.picture(output=name)
+            for name in ("lit", "light", "albedo", "normal", "roughness", "visibility")
+        }
+        body = pictures["normal"].any(-1)
+        assert 0.1 < body.mean() < 0.6
+        assert np.isin(pictures["roughness"][body], (127, 128)).all()  # 0.5, over the whole body
+        assert (pictures["visibility"][body] == 255).all()
+        assert len({picture.tobytes() for picture in pictures.values()}) == 6
+        for channel, albedo in enumerate((0.6, 0.4, 0.2)):
+            srgb = round(255 * (1.055 * albedo ** (1 / 2.4) - 0.055))
+            assert abs(int(pictures["albedo"][..., channel].max()) - srgb) <= 1
+        half = visitor.picture(gaussians=scene.avatar.gaussians // 2)
+        assert half.any() and (half != pictures["lit"]).any()
+        smooth = visitor.picture(encoding="jpeg")
+        assert np.abs(smooth.astype(int) - pictures["lit"]).mean() < JPEG_MEAN_ERROR
+
+
+def test_the_clip_has_every_frame(options):
+    with _serving(options) as (port, scene), _visiting(port) as visitor:
+        header = visitor.ask(ask="clip", state=visitor.state(), fps=30, turn=6.28)
+        seen = 0
+        while header["kind"] == "progress":
+            seen, header = header["done"], json.loads(visitor.socket.recv())
+        assert header["kind"] == "clip" and seen == frame_count(scene.motion.duration, 30) == FRAMES
+        with av.open(BytesIO(visitor.socket.recv())) as container:
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert len(frames) == FRAMES and frames[0].shape == (SIZE, SIZE, 3)
+        assert np.abs(frames[0].astype(int) - frames[3]).max() > 50  # the camera has turned
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"width": 10**6}, "width"),
+        ({"light": 9}, "light: expected 0 to 1, got 9"),
+        ({"shade": "magic"}, "shading mode"),
+        ({"truth": 0}, "--capture"),
+        ({"background": "#12"}, "--background"),
+        ({"distance": -1}, "distance"),
+        ({"speed": 1}, "speed"),
+        ({"target": [0, float("nan"), 0]}, "malformed"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_answered_with_one_line(options, changes, reason):
+    with _serving(options) as (port, _), _visiting(port) as visitor:
+        answer = visitor.ask(ask="render", number=1, state=visitor.state(**changes))
+        assert answer["kind"] == "error" and reason in answer["message"] and "\n" not in answer["message"]
+        assert visitor.picture().any()  # and the connection lives
+
+
+def _knock(port: int, **headers: Any) -> None:
+    with _visiting(port, **headers):
+        pass
+
+
+def _get(port: int, path: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request(
+        "GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()}
+    )
+    response = connection.getresponse()
+    result = response.status, response.read(), dict(response.getheaders())
+    connection.close()
+    return result
+
+
+def test_static_files_and_nothing_else(options):
+    with _serving(options) as (port, _):
+        status, body, headers = _get(port, "/")
+        assert status == 200 and b'src="app.js"' in body and headers["Content-Type"].startswith("text/html")
+        assert "default-src 'self'" in headers["Content-Security-Policy"]
+        assert _get(port, "/app.js")[0] == 200
+        for path in ("/../view_server.py", "/%2e%2e/view_server.py", "/etc/passwd", "/page", "/nothing.js"):
+            assert _get(port, path)[0] == 404, path
+
+
+def test_on_loopback_other_names_and_other_sites_are_refused(options):
+    with _serving(options) as (port, _):
+        assert _get(port, "/", Host=f"localhost:{port}")[0] == 200
+        for host in ("evil.example", f"evil.example:{port}", "127.0.0.1", ""):  # DNS rebinding
+            assert _get(port, "/", Host=host)[0] == 403, host
+        with _visiting(port, origin=f"http://127.0.0.1:{port}") as visitor:
+            assert visitor.scene["gaussians"] == CountedAvatar.gaussians
+        for origin in ("http://evil.example", "http://127.0.0.1:1", "null"):
+            with pytest.raises(InvalidStatus, match="403"):
+                _knock(port, origin=origin)
+
+
+def test_a_token_is_asked_for_everywhere(options):
+    with _serving(options, token="s3cret") as (port, _):
+        for path in ("/", "/app.js", "/?token=wrong", "/?token=", "/socket"):
+            assert _get(port, path)[0] == 401, path
+        with pytest.raises(InvalidStatus, match="401"):
+            _knock(port)
+        status, _, headers = _get(port, "/?token=s3cret")
+        cookie = headers["Set-Cookie"]
+        assert status == 200 and "HttpOnly" in cookie and "SameSite=Strict" in cookie
+        given = {"Cookie": cookie.split(";")[0]}
+        assert _get(port, "/app.js", **given)[0] == 200
+        with _visiting(port, additional_headers=given) as visitor:
+            assert visitor.picture().any()
+        with pytest.raises(InvalidStatus, match="403"):
+            _knock(port, additional_headers=given, origin="http://evil.example")
+
+
+def test_options_and_refusals(options, capsys, tmp_path, monkeypatch):
+    assert ViewOptions(Path("a")).local and ViewOptions(Path("a"), host="::1").local
+    assert not ViewOptions(Path("a"), host="0.0.0.0").local
+    assert not ViewOptions(Path("a"), host="example.org").local
+    assert main(["avatar.onnx", "--motion", str(tmp_path / "none.npz")]) == 2
+    assert main(["avatar.onnx", "--port", "99999"]) == 2
+    with _serving(options) as (port, _):
+        arguments = ["avatar.onnx", "--port", str(port), "--no-browser"]
+        assert main(arguments) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 3 and "--port" in errors[1] and "cannot listen" in errors[2]
+    monkeypatch.setitem(__import__("sys").modules, "websockets.sync.server", None)
+    assert main(["avatar.onnx"]) == 2
+    assert "rnd-avatar[view]" in capsys.readouterr().err
+
+
+def test_without_motion_or_light_the_avatar_stands_in_its_own(options):
+    bare = ViewOptions(Path("avatar.onnx"), size=SIZE, raster="cpu")
+    with _serving(bare) as (port, _), _visiting(port) as visitor:
+        assert visitor.scene["motion"]["duration"] == 0 and visitor.scene["light"] == 0
+        assert visitor.picture(light=0).any()

@@ -1,0 +1,253 @@
+"""The page for static hosts in Chromium: dropped files play, relight, and match the Python player's pixels."""
+
+from __future__ import annotations
+
+import base64
+import http.server
+import json
+import threading
+from dataclasses import replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image
+
+from browser import CHROMIUM, Page, chromium
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.images import read_image, write_image
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion, save_motion
+from rnd_viewer.cli import main as play
+from rnd_viewer.view_options import ViewOptions
+from rnd_viewer.view_scene import Scene
+from rnd_viewer.view_state import ViewState
+
+ROOT = Path(__file__).parent.parent
+ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
+SIZE, FRAME = 192, 20
+
+# Every pixel within 3/255, but for those where a threshold flips (α below 1/255, a texel of a shadow map), because
+# onnxruntime's two builds differ by 1e-7 m. Such a flip is one Gaussian, some 10 pixels at this size.
+TOLERANCE, FLIPPED = 3, 10
+MEAN_TOLERANCE = 0.01
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+    pytest.mark.skipif(
+        not (DIST / "worker.js").is_file(), reason="needs npm ci && npm run build in viewer/web"
+    ),
+]
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    """A static host that keeps a list of what it was asked for."""
+
+    asked: list[str] = []  # noqa: RUF012
+
+    def log_message(self, format: str, *arguments: Any) -> None:
+        self.asked.append(self.path)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The built page with files to load beside it."""
+    folder = tmp_path_factory.mktemp("site")
+    for entry in DIST.iterdir():
+        (folder / entry.name).symlink_to(entry)
+    avatar = Avatar.load(ASSETS / "avatar.onnx")
+    (folder / "avatar.onnx").symlink_to(ASSETS / "avatar.onnx")
+    (folder / "sky.exr").symlink_to(ASSETS / "sky.exr")
+    walk = load_motion(ASSETS / "walk.npz", avatar.skeleton)
+    first = replace(walk, rotations=walk.rotations[:31], translations=walk.translations[:31])
+    save_motion(folder / "walk.npz", first)
+    rng = np.random.default_rng(3)
+    # AMASS' SMPL-H: Z up, joints by number, fingers beside
+    poses = np.zeros((8, 52, 3))
+    poses[:, 0] = [1.4, 0.2, 0.1]
+    poses[:, 1:] = rng.normal(0, 0.15, (8, 51, 3)).cumsum(0) * 0.4
+    np.savez(
+        folder / "amass.npz",
+        poses=poses.reshape(8, 156).astype(np.float32),
+        trans=rng.normal(0.3, 0.05, (8, 3)),
+        betas=np.zeros(16),
+        gender="neutral",
+        mocap_framerate=24.0,
+    )
+    window = rng.uniform(0.05, 0.3, (64, 128, 3)).astype(np.float32)
+    window[20:24, 30:35] = [90, 70, 40]
+    window[10, 7:60] = 0.2  # runs, for the run-length coder
+    _write_hdr(folder / "window.hdr", window)
+    broken = window.copy()
+    broken[40, 3:6, 1] = np.nan
+    broken[41, 4] = -1
+    write_image(folder / "broken.exr", broken)
+    (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
+    return folder
+
+
+def _write_hdr(path: Path, radiance: np.ndarray) -> None:
+    target = oiio.ImageOutput.create(str(path))
+    assert target.open(str(path), oiio.ImageSpec(radiance.shape[1], radiance.shape[0], 3, "float"))
+    assert target.write_image(radiance) and target.close()
+
+
+@pytest.fixture(scope="module")
+def page(site, tmp_path_factory):
+    """The page in a browser, nothing loaded."""
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with chromium(tmp_path_factory.mktemp("profile"), webgl=True) as browser:
+            browser.open(f"http://127.0.0.1:{server.server_port}/")
+            browser.wait("window.rnd && document.getElementById('message').textContent.includes('drop')")
+            yield browser
+            assert browser.messages == []
+        server.shutdown()
+        thread.join()
+
+
+def _drop(page: Page, *names: str) -> None:
+    """Drop files of the site on the page, as from a folder, and wait until they are in or refused."""
+    page.run(f"""(async () => {{
+        const data = new DataTransfer();
+        for (const name of {json.dumps(names)})
+            data.items.add(new File([await (await fetch(name)).blob()], name));
+        const before = rnd.scene();
+        document.getElementById("stage").dispatchEvent(new DragEvent("drop", {{ dataTransfer: data, bubbles: true }}));
+        const wrong = () => document.querySelector("#message.wrong");
+        while (rnd.scene() === before && !wrong()) await new Promise((done) => setTimeout(done, 20));
+    }})()""")
+
+
+def _picture(page: Page, **changes: Any) -> np.ndarray:
+    """[H, W, 3] of the state with ``changes``."""
+    page.run(f"Object.assign(rnd.state, {json.dumps(changes)}); rnd.picture().then(() => 1)")
+    url = page.run("document.getElementById('picture').toDataURL()")
+    return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
+
+
+@pytest.fixture(scope="module")
+def loaded(page, site) -> Page:
+    """The page with avatar, walk and two lights dropped on it."""
+    _drop(page, "walk.npz", "avatar.onnx", "sky.exr", "window.hdr")
+    page.run("rnd.play(false)")
+    return page
+
+
+def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
+    error = np.abs(got.astype(int) - expected)
+    far = int((error.max(-1) > TOLERANCE).sum())
+    assert far <= FLIPPED and error.mean() < MEAN_TOLERANCE, (far, error.max(), error.mean())
+
+
+def _scene(site: Path, motion: str = "walk.npz") -> Scene:
+    lights = (site / "sky.exr", site / "window.hdr", site / "broken.exr")
+    return Scene(ViewOptions(site / "avatar.onnx", site / motion, lights, size=SIZE, raster="cpu"))
+
+
+def _python_picture(page: Page, scene: Scene) -> np.ndarray:
+    """What rnd-view draws of the page's state."""
+    return scene.render(msgspec.convert(page.run("rnd.state"), ViewState)).srgb
+
+
+def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
+    inputs = [str(site / "avatar.onnx"), "--motion", str(site / "walk.npz"), "--hdr", str(site / "sky.exr")]
+    options = ["--size", str(SIZE), "--frames", f"{FRAME}:{FRAME + 1}", "--format", "png", "--raster", "cpu"]
+    light = ["--background", "hdr", "--hdr-yaw", "40", "--exposure", "0.5"]
+    assert play([*inputs, *options, *light, "--out", str(tmp_path)]) == 0
+    state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1}
+    got = _picture(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
+    expected = read_image(tmp_path / f"frames/{FRAME:06d}.png")
+    _assert_close(got, expected)
+    # were the light not turned, or the frame its neighbour, hundreds of pixels would be off
+    assert (np.abs(_picture(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
+
+
+def test_every_state_has_rnd_views_pixels(loaded, site):
+    scene = _scene(site)
+    straight = {
+        "light": 1,
+        "yaw": 0.0,
+        "exposure": 0.0,
+        "output": "lit",
+        "shade": "table+sun",
+        "background": "none",
+        "gaussians": None,
+    }
+    states: list[dict[str, Any]] = [
+        {"shade": "table", "time": 0.21},
+        {"light": 2, "yaw": 2.5, "background": "#c08040", "time": 0.9},
+        {"light": 0, "exposure": -1.3, "shade": "table"},
+        {"azimuth": 2.0, "elevation": 0.5, "distance": 1.9, "fov": 0.9},
+        *({"output": name} for name in ("light", "albedo", "normal", "roughness", "visibility")),
+        {"gaussians": 3000, "azimuth": -1.0},
+    ]
+    seen = set()
+    for changes in states:
+        got = _picture(loaded, **(straight | changes))
+        _assert_close(got, _python_picture(loaded, scene))
+        seen.add(got.tobytes())
+    assert len(seen) == len(states)
+    scene.close()
+
+
+def test_it_plays_and_relights_by_hand(loaded):
+    loaded.run("rnd.state.time = 0; rnd.play(true)")
+    loaded.wait("rnd.state.time > 0.3")
+    loaded.wait("rnd.rate() > 1 && document.querySelectorAll('#times tr').length > 4")
+    loaded.run("rnd.play(false)")
+    before = _picture(loaded, time=0.5, output="lit")
+    loaded.drag((300, 300), (-100, 0), shift=True)
+    assert (_picture(loaded) != before).mean() > 0.02
+
+
+def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
+    _drop(loaded, "amass.npz")
+    assert loaded.run("rnd.scene().motion") == pytest.approx(
+        {"name": "amass.npz", "duration": 7 / 24, "fps": 24}
+    )
+    _drop(loaded, "broken.exr")
+    assert "4 broken texels" in loaded.run("document.getElementById('notes').textContent")
+    assert load_light(site / "broken.exr").repaired == 4
+    assert loaded.run("rnd.state.light") == 3
+    scene = _scene(site, "amass.npz")
+    view = loaded.run("rnd.scene().view")
+    for name, value in scene.description()["view"].items():
+        assert view[name] == pytest.approx(value, abs=1e-9), name
+    got = _picture(loaded, time=0.1, yaw=1.0)
+    assert got.any()
+    _assert_close(got, _python_picture(loaded, scene))
+    scene.close()
+    _drop(loaded, "walk.npz")
+
+
+def test_the_clip_is_a_download(loaded, tmp_path):
+    loaded.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    loaded.run("Object.assign(rnd.state, {width: 128, height: 128}); document.getElementById('clip').click()")
+    loaded.wait("!document.getElementById('clip').disabled")
+    for _ in range(100):
+        if files := [file for file in tmp_path.iterdir() if file.stem == "clip"]:
+            break
+        loaded.wait("new Promise(done => setTimeout(() => done(true), 50))")
+    assert files[0].suffix in (".webm", ".mp4") and files[0].stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("torn.onnx", "cut short"),
+        ("index.html", "expected .onnx, .npz, .hdr or .exr"),
+    ],
+)
+def test_a_file_that_is_none_of_ours_is_refused_in_one_line(loaded, name, reason):
+    _drop(loaded, name)
+    message = loaded.run("document.getElementById('message').textContent")
+    assert reason in message and "\n" not in message
+    loaded.run("document.getElementById('message').className = ''")
+    assert _picture(loaded).any()  # what was there still plays

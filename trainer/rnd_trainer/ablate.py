@@ -1,0 +1,218 @@
+"""Studies on one capture: same steps, same seeds, and the spread of the seeds beside every gain.
+
+``VARIANTS`` are the paper's ablations; ``CAUSES`` tell what holds the figures back: each takes one doubt away (true
+light, true normals) or adds one (noisy poses, fewer Gaussians).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from rnd_runtime.capture import Capture, load_capture
+from rnd_runtime.files import atomic_path
+
+from .checkpoint import load_checkpoint
+from .config import TrainConfig
+from .held_out import score
+from .model import AvatarModel
+from .perceptual import Perceptual
+from .pose_refinement import joint_error_degrees
+from .train import Training, run
+
+POSE_SECONDS = 0.3 / 9
+"""between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
+NOISY_MOTION = "motion_noisy.npz"
+"""beside a capture's exact motion"""
+TIMED = 20
+"""evaluations of the motion encoder whose median is reported"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the table: what is switched, beside which row it is to be read, and on which split it should show.
+
+    ``model`` and ``train`` are the fields of the configuration that differ from ours; ``noisy`` trains on the
+    capture's ``motion_noisy.npz`` and scores with the exact poses.
+    """
+
+    name: str
+    what: str
+    beside: str | None
+    model: dict[str, Any] = dataclasses.field(default_factory=dict)
+    train: dict[str, Any] = dataclasses.field(default_factory=dict)
+    noisy: bool = False
+
+
+def _window(d: int) -> Variant:
+    model = {"window_poses": d, "window_seconds": (d - 1) * POSE_SECONDS}
+    return Variant(f"d = {d}", f"a window of {d} poses instead of 10", "ours", model)
+
+
+_NO_GC = {"weight_consistency": 0.0}
+VARIANTS = (
+    Variant("ours", "everything", None),
+    Variant(
+        "LBS, plain colour",
+        "template skinning and colours that no light changes: the core of 3DGS-Avatar and GauHuman",
+        "ours",
+        {"dynamic_skinning": False},
+        {"light": "none", **_NO_GC},
+    ),
+    Variant(
+        "static skinning", "the template's weights, no L_gc", "ours", {"dynamic_skinning": False}, _NO_GC
+    ),
+    Variant("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
+    Variant("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
+    *(_window(d) for d in (2, 5, 20, 30)),
+    Variant("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),
+    Variant("light from white", "no search for sky and suns", "ours", {}, {"light_search": False}),
+    Variant("paper's visibility", "of the direction to the camera", "ours", {"visibility": "paper"}),
+    Variant("no visibility", "no shadows", "ours", {"visibility": "none"}),
+    Variant("mesh normals", "the template's normals for shading", "ours", {"learned_normals": False}),
+)
+
+
+def _gaussians(count: int) -> Variant:
+    model = {"gaussians": count, "nodes": count // 4}
+    return Variant(f"N = {count}", f"{count} Gaussians", "ours", model)
+
+
+CAUSES = (
+    Variant("ours", "everything learned, exact poses", None),
+    Variant("true light", "the capture's own light map", "ours", {}, {"light": "capture"}),
+    Variant("true normals", "exact normals instead of estimated ones", "ours", {}, {"normals": "true"}),
+    Variant("noisy poses", "the capture's noisy poses", "ours", {}, {}, noisy=True),
+    Variant("noisy poses, refined", "and corrected", "noisy poses", {}, {"refine_poses": True}, noisy=True),
+    *(_gaussians(count) for count in (7_500, 15_000, 60_000, 120_000)),
+)
+STUDIES = {"ablations": VARIANTS, "causes": CAUSES}
+
+
+def ablate(
+    capture: Capture,
+    base: TrainConfig,
+    folder: Path,
+    variants: Sequence[Variant],
+    *,
+    seeds: Sequence[int],
+    perceptual: Perceptual | None,
+    mode: str = "table+sun",
+    on_run: Callable[[str, int, int, int], None],
+) -> list[dict[str, Any]]:
+    """Train and score every variant with every seed; rows as of rnd-eval with the encoder's cost added.
+
+    Each run leaves ``rows.json`` in ``folder/NAME-SEED``, and is not done again where that exists. ``on_run`` is
+    called with the variant's name, the seed, how many runs are done and how many there are.
+    """
+    rows: list[dict[str, Any]] = []
+    jobs = [(variant, seed) for seed in seeds for variant in variants]
+    for done, (variant, seed) in enumerate(jobs):
+        on_run(variant.name, seed, done, len(jobs))
+        place = folder / f"{_slug(variant.name)}-{seed}"
+        if not (place / "rows.json").exists():
+            model = dataclasses.replace(base.model, **variant.model)
+            config = dataclasses.replace(base, model=model, seed=seed, **variant.train)
+            seen = load_capture(capture.folder, motion_file=NOISY_MOTION) if variant.noisy else capture
+            extra = _train(seen, config, place, perceptual, capture)
+            checkpoint = load_checkpoint(place / "avatar.ckpt")
+            scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
+            cost = encoder_cost(checkpoint.model)
+            with atomic_path(place / "rows.json") as temporary:
+                temporary.write_text(
+                    json.dumps([row | cost | extra for row in scored], indent=1), encoding="utf-8"
+                )
+        rows += json.loads((place / "rows.json").read_text(encoding="utf-8"))
+    return rows
+
+
+def summarise(
+    rows: Sequence[dict[str, Any]], variants: Sequence[Variant], figure: str = "psnr"
+) -> list[dict[str, Any]]:
+    """One row for each variant: mean and spread (standard deviation) over seeds of ``figure`` on every split.
+
+    ``gain`` is the mean over seeds of the difference to the variant that it is to be read beside, seed by seed,
+    and ``shows`` whether it exceeds the spread of those differences.
+    """
+    by_key = {(row["method"], row["split"], row["seed"]): row for row in rows}
+    splits = list(dict.fromkeys(row["split"] for row in rows))
+    seeds = sorted({row["seed"] for row in rows})
+    table = []
+    for variant in variants:
+        cells: dict[str, Any] = {"method": variant.name, "what": variant.what, "beside": variant.beside}
+        for split in splits:
+            own = {
+                s: by_key[variant.name, split, s][figure] for s in seeds if (variant.name, split, s) in by_key
+            }
+            if not own:
+                continue
+            cells[split] = {"mean": statistics.fmean(own.values()), "spread": _spread(list(own.values()))}
+            gains = [
+                value - by_key[variant.beside, split, s][figure]
+                for s, value in own.items()
+                if variant.beside and (variant.beside, split, s) in by_key
+            ]
+            if gains:
+                spread = _spread(gains)
+                gain = statistics.fmean(gains)
+                cells[split] |= {"gain": gain, "gain_spread": spread, "shows": abs(gain) > spread}
+        costs = [row for row in rows if row["method"] == variant.name]
+        if costs:
+            cells["encoder_gflop"] = costs[0]["encoder_gflop"]
+            cells["encoder_ms"] = statistics.median(row["encoder_ms"] for row in costs)
+        table.append(cells)
+    return table
+
+
+@torch.no_grad()
+def encoder_cost(model: AvatarModel) -> dict[str, float]:
+    """FLOPs (2 per multiply-add) and median milliseconds in torch of the motion encoder D_W at its nodes."""
+    if not model.config.dynamic_skinning:
+        return {"encoder_gflop": 0.0, "encoder_ms": 0.0}
+    joints = model.log_weights.shape[1] - 1
+    window, velocity = torch.zeros(model.config.window_poses, joints, 6), torch.zeros(joints, 3)
+    encoded = model.encoded_nodes()
+    with FlopCounterMode(display=False) as counter:
+        model.skinning(encoded, window, velocity)
+    times = []
+    for _ in range(TIMED):
+        started = time.perf_counter()
+        model.skinning(encoded, window, velocity)
+        times.append(1e3 * (time.perf_counter() - started))
+    return {"encoder_gflop": counter.get_total_flops() / 1e9, "encoder_ms": statistics.median(times)}
+
+
+def _train(
+    seen: Capture, config: TrainConfig, place: Path, perceptual: Perceptual | None, truth: Capture
+) -> dict[str, float]:
+    """Train on ``seen``; what the poses were off by before and after, in degrees, where they were not exact."""
+    place.mkdir(parents=True, exist_ok=True)
+    training = Training(seen, config, perceptual)
+    if (place / "training.state").exists():
+        training.resume(place / "training.state")
+    if run(training, place, on_step=lambda step: None, on_preview=lambda: None):
+        raise KeyboardInterrupt
+    if seen is truth:
+        return {}
+    frames = [view.frame.frame for view in training.views]
+    return {
+        "pose_error_before_deg": joint_error_degrees(seen.motion, truth.motion, frames),
+        "pose_error_after_deg": joint_error_degrees(training.motion(), truth.motion, frames),
+    }
+
+
+def _spread(values: list[float]) -> float:
+    return statistics.stdev(values) if len(values) > 1 else float("nan")
+
+
+def _slug(name: str) -> str:
+    return "".join(c if c.isalnum() else "_" for c in name).strip("_").lower()

@@ -1,0 +1,121 @@
+"""Avatars to measure: a trained one, or untrained ones of any size that cost as much and look like something.
+
+**The seeded avatar** stands on the embedded body. Its networks are drawn at random, their highest frequencies damped
+as in trained ones, and scaled so that they say what trained ones say: weights that move a few per cent, offsets of
+millimetres, visibility around 1. Its albedo follows from the place by a formula (stripes and patches), opacities are
+those of a training's start. It is no likeness of anybody: it has a trained avatar's cost and its kind of errors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+
+NODES_PER_GAUSSIAN = 0.25
+SEED = 7
+# out layers of the networks, as multiples of their usual start: set by eye on trained ones
+LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
+OPACITY = 2.5  # raw: 0.99 after the sigmoid of model.py, as trained avatars come out
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What of an avatar's encoders a file holds; options of ``rnd-export``."""
+
+    encoder: str = "full"
+    precision: str = "f32"
+    window: int | None = None
+
+    def words(self) -> list[str]:
+        """As on the command line."""
+        words = ["--encoder", self.encoder, "--precision", self.precision]
+        return words + (["--window-poses", str(self.window)] if self.window else [])
+
+
+def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
+    """avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless it is there already."""
+    stem = hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:8]
+    name = "_".join([stem, *(w for w in encoders.words() if not w.startswith("--"))])
+    out = folder / f"{name}.onnx"
+    if not out.exists():
+        code = "from rnd_export.cli import main; main()"
+        line = [
+            sys.executable,
+            "-c",
+            code,
+            str(checkpoint),
+            "--out",
+            str(out),
+            "--frames",
+            "2",
+            *encoders.words(),
+        ]
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError("rnd-export", got=(done.stderr.strip().splitlines() or ["failed"])[-1])
+    return out
+
+
+def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
+    """avatar.ckpt of the seeded avatar with ``count`` Gaussians, made once."""
+    out = folder / f"seeded_{count}.ckpt"
+    if out.exists():
+        return out
+    import torch
+
+    from .checkpoint import save_checkpoint
+    from .config import ModelConfig, TrainConfig
+    from .model import AvatarModel
+    from .template import sample_template
+
+    body = Body.load(body_file)
+    nodes = max(16, int(NODES_PER_GAUSSIAN * count))
+    config = TrainConfig(model=ModelConfig(gaussians=count, nodes=nodes))
+    torch.manual_seed(SEED)
+    model = AvatarModel(config.model, sample_template(body, count, nodes, seed=SEED))
+    with torch.no_grad():
+        _speak(model)
+        appearance = model.appearance_residual
+        appearance[:, 3:6] = torch.from_numpy(_albedo(model.points.numpy()))
+        model.geometry_residual[:, 0] = OPACITY
+    light = torch.ones(32, 64, 3)
+    info = {"body_license": body.license, "made": "rnd-bench, untrained"}
+    save_checkpoint(out, model, light, body.skeleton, dataclasses.replace(config, seed=SEED), info)
+    return out
+
+
+def _speak(model: object) -> None:
+    """Let networks that are silent at the start of a training say something."""
+    import torch
+
+    frequencies = model.config.frequencies  # type: ignore[attr-defined]
+    damping = torch.ones(3 + 6 * frequencies)
+    for band in range(frequencies):
+        for start in (3, 3 + 3 * frequencies):
+            damping[start + 3 * band : start + 3 * band + 3] = 0.5**band
+    for name, strength in (("skinning", LOGITS), ("offsets", OFFSETS), ("visibility", VISIBILITY)):
+        network = getattr(model, name)
+        network.position.hidden.weight.mul_(damping)
+        last = network.logits if name == "skinning" else network.out
+        last.weight.copy_(strength * torch.randn_like(last.weight) / last.weight.shape[1])
+
+
+def _albedo(points: np.ndarray) -> np.ndarray:
+    """Raw albedo [N, 3] before the sigmoid: a striped shirt, plain trousers, light skin."""
+    height, side = points[:, 1:2], points[:, :1]
+    stripes = np.tanh(8 * np.sin(70 * height))
+    shirt = np.array([[0.9, -0.4, -0.9]]) + stripes * np.array([[0.3, 0.9, 0.8]])
+    trousers = np.array([[-1.2, -0.8, 0.4]]) + 0.4 * np.sin(40 * side)
+    skin = np.array([[1.8, 1.0, 0.5]]) + 0.2 * np.sin(90 * height) * np.sin(90 * side)
+    covered = np.where(height > 0.95, shirt, trousers)
+    bare = (height > 1.42) | (np.abs(side) > 0.45) | (height < 0.1)
+    return np.where(bare, skin, covered).astype(np.float32)

@@ -1,0 +1,116 @@
+"""The speed–accuracy chart: every point, the front that nothing beats, one panel for each stage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path
+
+from .bench_grid import Row, pareto
+
+BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
+USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
+COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
+MARKERS = {"full": "o", "coarse": "s", "static": "^"}
+
+
+def draw_chart(rows: list[Row], files: list[Path]) -> None:
+    """Write the chart of ``rows`` to every file, SVG or PNG by its suffix.
+
+    Raises :class:`InputError` where matplotlib is missing.
+    """
+    try:
+        import matplotlib
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "matplotlib is not installed",
+            hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
+        ) from error
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    rows = [row for row in rows if "psnr_db" in row]
+    if not rows:
+        raise InputError("chart", expected="at least one measured point", got="none")
+    stages = list(dict.fromkeys(name for row in rows for name in row["stages"]))
+    columns = 3
+    below = -(-len(stages) // columns)
+    with matplotlib.rc_context({"svg.hashsalt": "rnd-bench", "font.size": 9, "svg.fonttype": "none"}):
+        figure = plt.figure(figsize=(11, 5.2 + 2.5 * below), layout="constrained")
+        grid = figure.add_gridspec(1 + below, columns, height_ratios=[2.2, *[1] * below])
+        _overview(figure.add_subplot(grid[0, :]), rows)
+        for k, stage in enumerate(stages):
+            _stage(figure.add_subplot(grid[1 + k // columns, k % columns]), rows, stage)
+        for file in files:
+            with atomic_path(file) as temporary:
+                metadata: dict[str, Any] = {"Date": None} if file.suffix == ".svg" else {}
+                figure.savefig(temporary, dpi=110, metadata=metadata)
+        plt.close(figure)
+
+
+def _overview(axes: Any, rows: list[Row]) -> None:
+    """All points; the front is drawn for pictures of one size, since smaller ones are always faster."""
+    size = rows[0]["size"]
+    front = list(pareto([row for row in rows if row["size"] == size]))
+    axes.plot([r["ms_median"] for r in front], [r["psnr_db"] for r in front], color="#777", lw=1, zorder=1)
+    axes.axvline(BUDGET_MS, color="#999", lw=0.8, ls="--")
+    axes.axhline(BUDGET_DB, color="#999", lw=0.8, ls="--")
+    _points(axes, rows, "ms_median")
+    named = [f"front at {size}²:"]
+    for number, row in enumerate(front, 1):
+        axes.annotate(
+            str(number), (row["ms_median"], row["psnr_db"]), xytext=(0, 6), textcoords="offset points",
+            fontsize=8, ha="center", weight="bold",
+        )  # fmt: skip
+        named.append(f"{number}  {_label(row)}: {row['ms_median']:.1f} ms, {row['psnr_db']:.1f} dB")
+    axes.text(1.01, 1.0, "\n".join(named), transform=axes.transAxes, fontsize=8, va="top", linespacing=1.5)
+    axes.set_xlabel("ms per frame, pose to pixels (median); dashed: 60 frames a second")
+    axes.set_ylabel("PSNR to the full reference, dB; dashed: 45")
+    axes.set_title(f"Speed against accuracy: {len(rows)} points on {rows[0]['machine']}", loc="left")
+    handles = [axes.scatter([], [], color=colour, label=f"{n:,} Gaussians".replace(",", " "))
+               for n, colour in COLOURS.items() if any(row["n"] == n for row in rows)]  # fmt: skip
+    handles += [
+        axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()
+    ]
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8, frameon=False)
+
+
+def _stage(axes: Any, rows: list[Row], stage: str) -> None:
+    had = [{**row, "stage_ms": row["stages"][stage]} for row in rows if row["stages"].get(stage, 0) > 0]
+    _points(axes, had, "stage_ms")
+    axes.set_title(stage, loc="left", fontsize=9)
+    axes.set_xlabel("ms")
+    axes.set_ylabel("dB")
+
+
+def _points(axes: Any, rows: list[Row], cost: str) -> None:
+    import matplotlib.ticker
+
+    for row in rows:
+        axes.scatter(
+            row[cost], row["psnr_db"], color=COLOURS.get(row["n"], "#333"), marker=MARKERS[row["encoder"]],
+            s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, edgecolor="white", zorder=2,
+        )  # fmt: skip
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    axes.grid(True, color="#eee", lw=0.6)
+    axes.set_axisbelow(True)
+
+
+def _label(row: Row) -> str:
+    """What distinguishes a point, in few words."""
+    words = [f"{row['n'] // 1000}k", str(row["size"]), row["shade"]]
+    words += [
+        str(row[name])
+        for name, usual in USUAL.items()
+        if row[name] != usual and name not in ("window", "threads")
+    ]
+    if row["window"] is not None:
+        words.append(f"d={row['window']}")
+    if row["threads"] != USUAL["threads"]:
+        words.append(f"{row['threads']} thread")
+    return " · ".join(words)

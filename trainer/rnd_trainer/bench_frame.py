@@ -1,0 +1,150 @@
+"""One point of the speed–accuracy chart: frames of an avatar, timed in a process of their own.
+
+The process that draws imports no torch and computes no reference, so that its memory and its time are a player's.
+Motion and light both change from frame to frame.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.errors import InputError
+
+Floats32 = NDArray[np.float32]
+
+WARMUP = 5
+STEP_S = 1 / 30  # of the motion, from frame to frame
+TURN = 0.02  # radians that the light turns from frame to frame
+COMPARED = (12, 75)  # frames whose pixels and places are compared with the reference
+DEADLINE_S = 300.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames."""
+
+    avatar: str
+    motion: str
+    hdr: str
+    size: int = 512
+    shade: str = "table+sun"
+    raster: str = "cpu"
+    threads: int = 2
+    frames: int = 90
+    seconds: float = 6.0
+
+
+class Drawn(NamedTuple):
+    """Times of a point, and what it drew at the frames ``COMPARED``.
+
+    ``row``: ms_median, ms_p95, fps, stages (median ms), start_ms, peak_mb, file_mb, frames. ``radiance``
+    [K, H, W, 3] linear, premultiplied; ``means`` [K, N, 3] m.
+    """
+
+    row: dict[str, Any]
+    radiance: Floats32
+    means: Floats32
+
+
+def measure(point: Point) -> Drawn:
+    """Run ``point`` in a process of its own. Raises :class:`InputError` where it cannot be drawn here."""
+    environment = os.environ | {
+        "NUMBA_NUM_THREADS": str(point.threads), "OMP_NUM_THREADS": str(point.threads), "OMP_WAIT_POLICY": "PASSIVE",
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
+        code = "import sys; from rnd_trainer.bench_frame import draw; draw(sys.argv[1])"
+        line = [sys.executable, "-c", code, folder]
+        done = subprocess.run(
+            line, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+        )
+        if done.returncode:
+            why = (done.stderr.strip().splitlines() or ["no answer"])[-1]
+            raise InputError(f"{point.raster}, {point.shade}", got=why[:200])
+        row = json.loads((out / "row.json").read_text("utf-8"))
+        with np.load(out / "drawn.npz") as drawn:
+            return Drawn(row, drawn["radiance"], drawn["means"])
+
+
+def draw(folder: str) -> None:
+    """What the process does: reads point.json, leaves row.json and drawn.npz."""
+    started = time.perf_counter()
+    from rnd_runtime.avatar import Avatar
+    from rnd_runtime.frame import FrameRenderer
+    from rnd_runtime.light import load_light
+    from rnd_runtime.motion import load_motion
+
+    out = Path(folder)
+    point = Point(**json.loads((out / "point.json").read_text("utf-8")))
+    avatar = Avatar.load(point.avatar, threads=point.threads)
+    motion = load_motion(Path(point.motion), avatar.skeleton)
+    light = load_light(Path(point.hdr))
+    raster: Any = point.raster
+    renderer = FrameRenderer(avatar, light, bench_camera(point.size), shade=point.shade, raster=raster)
+
+    def frame(number: int) -> Any:
+        renderer.turn(TURN * number)
+        return renderer.render(motion, STEP_S * number)
+
+    frame(0)
+    first_ms = 1e3 * (time.perf_counter() - started)
+    for number in range(1, WARMUP):
+        frame(number)
+    taken: list[float] = []
+    stages: dict[str, list[float]] = {}
+    until = time.perf_counter() + point.seconds
+    while len(taken) < point.frames and (len(taken) < 5 or time.perf_counter() < until):
+        before = time.perf_counter()
+        drawn = frame(WARMUP + len(taken))
+        taken.append(1e3 * (time.perf_counter() - before))
+        for name, seconds in drawn.stage_seconds.items():
+            stages.setdefault(name, []).append(1e3 * seconds)
+    peak_mb = _peak_mb()
+    compared = [frame(number).radiance for number in COMPARED]
+    means = [avatar.pose(motion, STEP_S * number).means for number in COMPARED]
+    row = {
+        "ms_median": float(np.median(taken)),
+        "ms_p95": float(np.percentile(taken, 95)),
+        "ms_min": float(np.min(taken)),
+        "stages": {name: float(np.median(values)) for name, values in stages.items()},
+        "first_frame_ms": first_ms,
+        "peak_mb": peak_mb,
+        "file_mb": Path(point.avatar).stat().st_size / 1e6,
+        "frames": len(taken),
+        "warmup": WARMUP,
+    }
+    (out / "row.json").write_text(json.dumps(row), encoding="utf-8")
+    np.savez(out / "drawn.npz", radiance=np.array(compared), means=np.array(means))
+    renderer.close()
+
+
+def bench_camera(size: int) -> Any:
+    """A square view of a standing person, 1.75 m filling 70 % of the height, 20° to the side."""
+    from rnd_runtime.camera import Camera
+
+    distance, angle = 3.4, np.radians(20)
+    eye = [distance * np.sin(angle), 0.9, distance * np.cos(angle)]
+    fov = 2 * np.arctan(0.5 * 1.75 / 0.7 / distance)
+    return Camera.look_at(eye, [0, 0.875, 0], width=size, height=size, fov_y=fov)
+
+
+def _peak_mb() -> float:
+    import resource
+
+    try:  # this program's own peak; ru_maxrss would also hold that of the parent it was forked from
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -1,0 +1,171 @@
+"""The grid of the speed–accuracy chart: one factor at a time around the usual case, and a crossed core.
+
+Every point is one row of JSON. Rows that are there already, measured on this machine, are not measured again: an
+interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime import __version__
+from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, existing_file, output_folder
+
+from .bench_avatars import Encoders, exported, seeded_checkpoint
+from .bench_frame import Point, measure
+from .bench_reference import errors, reference
+
+FULL_N = 30_000
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point: everything that is varied."""
+
+    n: int = FULL_N
+    size: int = 512
+    shade: str = "table+sun"
+    encoder: str = "full"
+    window: int | None = None
+    precision: str = "f32"
+    raster: str = "cpu"
+    threads: int = 2
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files that the points share. ``checkpoint`` stands in for the seeded avatar where N is its own."""
+
+    body: Path
+    motion: Path
+    hdr: Path
+    work: Path
+    checkpoint: Path | None = None
+
+    def checked(self) -> Inputs:
+        """Refuse missing files before minutes are spent."""
+        for what, file in (("body", self.body), ("motion", self.motion), ("light", self.hdr)):
+            existing_file(file, what=what)
+        output_folder(self.work)
+        return self
+
+    def source(self, n: int) -> tuple[Path, str]:
+        """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
+        if self.checkpoint is not None and self._checkpoint_size() == n:
+            return self.checkpoint, "trained"
+        return seeded_checkpoint(n, self.body, self.work), "seeded"
+
+    def avatar(self, n: int, encoders: Encoders) -> tuple[Path, str]:
+        """The file, and which avatar it is."""
+        checkpoint, which = self.source(n)
+        return exported(checkpoint, encoders, self.work), which
+
+    def _checkpoint_size(self) -> int:
+        from .checkpoint import SCHEMA, read_tensors
+
+        assert self.checkpoint is not None
+        return int(read_tensors(self.checkpoint, SCHEMA)[1]["config"]["model"]["gaussians"])
+
+
+def settings(quick: bool = False) -> list[Setting]:
+    """The points, the usual case first, none twice."""
+    usual = Setting(n=8_000, size=256) if quick else Setting()
+    factors: dict[str, tuple[Any, ...]] = {
+        "n": (4_000, 8_000, 15_000, 60_000),
+        "size": (256, 1024),
+        "shade": ("ao", "table", "lights:32", "brute"),
+        "encoder": ("coarse", "static"),
+        "precision": ("f16", "int8"),
+        "window": (2, 5),
+        "raster": ("gl-egl", "gl-osmesa"),
+        "threads": (1,),
+    }
+    if quick:
+        factors = {"n": (4_000,), "shade": ("ao", "table"), "encoder": ("coarse", "static"), "threads": (1,),
+                   "raster": ("gl-egl",)}  # fmt: skip
+    points = [
+        usual,
+        *(replace(usual, **{name: value}) for name, values in factors.items() for value in values),
+    ]
+    if not quick:
+        crossed = product((8_000, 15_000, FULL_N), ("full", "coarse", "static"), ("table", "table+sun"))
+        points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in crossed]
+    return list(dict.fromkeys(points))
+
+
+def measured(
+    setting: Setting, inputs: Inputs, *, seconds: float = 4.0, compare: bool = True, full_n: int | None = None
+) -> Row:
+    """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
+
+    ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
+    ones follow one formula, so that is what fewer Gaussians cost.
+    """
+    encoders = Encoders(setting.encoder, setting.precision, setting.window)
+    file, which = inputs.avatar(setting.n, encoders)
+    point = Point(
+        str(file), str(inputs.motion), str(inputs.hdr), setting.size, setting.shade, setting.raster,
+        setting.threads, seconds=seconds,
+    )  # fmt: skip
+    drawn = measure(point)
+    row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
+    if compare:
+        whole, _ = inputs.avatar(setting.n, Encoders())
+        row |= errors(drawn, reference(whole, inputs.motion, inputs.hdr, setting.size, inputs.work))
+        largest, kind = inputs.avatar(full_n or setting.n, Encoders())
+        if kind == which:
+            truth = reference(largest, inputs.motion, inputs.hdr, setting.size, inputs.work)
+            row["psnr_full_db"], row["full_n"] = errors(drawn, truth)["psnr_db"], full_n or setting.n
+    return row
+
+
+def grid(inputs: Inputs, out: Path, *, quick: bool = False, on_row: Callable[[Row, bool], None]) -> list[Row]:
+    """Measure what ``out`` does not hold yet; calls ``on_row(row, new)`` for every point, writes after each."""
+    inputs.checked()
+    wanted, rows = settings(quick), read_rows(out) if out.exists() else []
+    here = {_key(row): row for row in rows if row["machine"] == machine()}
+    done: list[Row] = []
+    for setting in wanted:
+        row = here.get(_key(asdict(setting)))
+        new = row is None
+        if row is None:
+            try:
+                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, full_n=wanted[0].n)
+            except InputError as error:  # no such rasteriser here: say so and go on
+                row = {**asdict(setting), "machine": machine(), "failed": str(error)}
+        done.append(row)
+        on_row(row, new)
+        with atomic_path(out) as temporary:
+            kept = {_key(r): r for r in (*rows, *done)}
+            temporary.write_text(json.dumps([*kept.values()], indent=1) + "\n", encoding="utf-8")
+    return done
+
+
+def read_rows(file: Path) -> list[Row]:
+    """Rows of an earlier run."""
+    try:
+        rows = json.loads(file.read_text("utf-8"))
+        return [row for row in rows if {"n", "machine"} <= set(row)]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError("not rows of rnd-bench", got=error, file=file) from error
+
+
+def pareto(rows: list[Row], cost: str = "ms_median", worth: str = "psnr_db") -> Iterator[Row]:
+    """Rows that no other beats in both, by rising cost."""
+    best = -1.0
+    for row in sorted(rows, key=lambda row: (row[cost], -row[worth])):
+        if row[worth] > best:
+            best = row[worth]
+            yield row
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return tuple(row[name] for name in asdict(Setting()))

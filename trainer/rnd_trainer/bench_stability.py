@@ -1,0 +1,219 @@
+"""``rnd-bench --stability``: every row of the stability list at full size, as JSON, Markdown and pictures.
+
+Rows that were measured before stay in the file until they are measured again, so a run can be stopped and split.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.files import atomic_path
+
+from .eval_cli import need_extra
+
+if TYPE_CHECKING:
+    from .stability.figures import Figure, Result
+    from .stability.subject import Subject
+
+SHARED_CAPTURE = Path("../shared/data/capture")
+EMBEDDED_CAPTURE = Path("assets/capture")
+STUDIO_STEPS, STUDIO_SIZE, STUDIO_FRAMES = 600, 128, 24
+
+
+@dataclass(frozen=True)
+class StabilityOptions:
+    """Run the rows of the stability list at full size; with --fuzz, --soak or --kill also what takes hours."""
+
+    checkpoint: Path | None = None
+    """avatar.ckpt trained on the capture; without one a small avatar is trained for the rows, on a filmed spin"""
+    capture: Path | None = None
+    """the pictures it was trained on; by default ../shared/data/capture where present, else assets/capture"""
+    json: Path = Path("assets/bench/stability.json")
+    """the table; a .md and a folder of pictures stand beside it"""
+    rows: Annotated[str, tyro.conf.arg(metavar="LIST")] = "all"
+    """such as P1,L8; 'none' for only what is asked for below"""
+    size: int = 512
+    """side of the pictures in pixels"""
+    fuzz: int = 0
+    """broken inputs for every reader"""
+    soak: int = 0
+    """frames of playback, and a tenth as many steps of training; resumes"""
+    kill: int = 0
+    """times that training, export and play are each killed"""
+    determinism: bool = False
+    """compare the bytes of export and play at one and at two threads, and EGL with OSMesa"""
+    work: Path | None = None
+    """folder for files in between, kept; by default a temporary one"""
+
+
+def stability_main(argv: Sequence[str]) -> int:
+    """Run ``rnd-bench --stability`` with ``argv``; the exit code is 0 whatever the rows say, 2 for bad options."""
+
+    def command() -> None:
+        _stability(tyro.cli(StabilityOptions, prog="rnd-bench --stability", args=argv))
+
+    return run_command("rnd-bench", command)
+
+
+def _stability(options: StabilityOptions) -> None:
+    need_extra()
+    from rich.console import Console
+
+    try:
+        from .stability.rows import ROWS, TIMES
+    except ModuleNotFoundError as error:
+        hint = 'needs the extra: pip install "rnd-avatar[dev]", in a clone ".[dev]"'
+        raise InputError(f"{error.name} is not installed", hint=hint) from error
+
+    known = [row.id for row in (*ROWS, TIMES)]
+    wanted = known if options.rows == "all" else [] if options.rows == "none" else options.rows.split(",")
+    if unknown := set(wanted) - set(known):
+        raise InputError("--rows", expected=f"some of {','.join(known)}", got=",".join(sorted(unknown)))
+    console = Console()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = options.work or Path(temporary)
+        work.mkdir(parents=True, exist_ok=True)
+        subject = _subject(options, work)
+        for row in (*ROWS, TIMES):
+            if row.id in wanted:
+                with console.status(f"{row.id} {row.failure}"):
+                    result = row.measure(subject)
+                _keep(options, row.id, row.failure, result.figures, result)
+                _show(console, row.id, result.figures)
+        for name, failure, figures in _long_runs(options, subject):
+            _keep(options, name, failure, figures, None)
+            _show(console, name, figures)
+
+
+def _subject(options: StabilityOptions, work: Path) -> Subject:
+    """The avatar of the checkpoint, exported here, or one trained in a minute on a filmed spin."""
+    from rnd_runtime.capture import load_capture
+
+    from .stability.commands import EXPORT, run_commands
+    from .stability.studio import write_studio
+    from .stability.subject import Subject
+    from .stability.trainings import train_small
+
+    checkpoint, folder = options.checkpoint, options.capture
+    if folder is None:
+        folder = SHARED_CAPTURE if SHARED_CAPTURE.exists() else EMBEDDED_CAPTURE
+    capture = load_capture(folder)
+    if checkpoint is None:
+        capture = write_studio(work / "capture", capture.body, size=STUDIO_SIZE, frames=STUDIO_FRAMES)
+        checkpoint = train_small(work / "run", capture, STUDIO_STEPS, 30_000)
+    avatar = work / "avatar.onnx"
+    done = run_commands(work, [(EXPORT, [str(checkpoint.resolve()), "--out", str(avatar.resolve())])])[0]
+    if done.code != 0:
+        raise InputError("the checkpoint cannot be exported", got=done.errors.strip()[-200:], file=checkpoint)
+    return Subject(
+        avatar.resolve(), checkpoint.resolve(), capture, work.resolve(), small=False, size=options.size
+    )
+
+
+def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[str, str, Sequence[Figure]]]:
+    """What is asked for by --fuzz, --soak, --kill and --determinism."""
+    if options.fuzz:
+        from .stability.fuzz import fuzz, prepare
+        from .stability.trainings import studio, train_small
+
+        folder = subject.work / "fuzz"
+        capture = studio(subject)
+        small = train_small(folder / "run", capture, 12, 200)
+        from .stability.commands import EXPORT, run_commands
+
+        run_commands(folder, [(EXPORT, [str(small), "--out", str(folder / "small.onnx")])])
+        prepare(folder / "files", folder / "small.onnx", small, capture.folder)
+        figures, record = fuzz(folder / "files", options.fuzz)
+        with atomic_path(options.json.with_name("stability_fuzz.json")) as temporary:
+            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        yield "F", "hostile files", figures
+    if options.soak:
+        from .stability.soak import soak_playback, soak_training
+
+        state = subject.work / "soak.json"
+        yield "S1", "soak, playback", soak_playback(subject, options.soak, state)
+        yield "S2", "soak, training", soak_training(subject, options.soak // 10, state)
+    if options.kill:
+        from .stability.kill import kill_all
+
+        yield "K", "kill -9", kill_all(subject, options.kill)
+    if options.determinism:
+        from .stability.determinism import same_bytes
+
+        yield "D", "determinism", same_bytes(subject).figures
+
+
+def _keep(
+    options: StabilityOptions, name: str, failure: str, figures: Sequence[Figure], result: Result | None
+) -> None:
+    """Replace the row's figures in the JSON, write the table again, and the pictures."""
+    from rnd_runtime.images import write_image
+
+    rows: list[dict[str, Any]] = []
+    if options.json.exists():
+        rows = json.loads(options.json.read_text(encoding="utf-8"))
+    rows = [row for row in rows if row["id"] != name]
+    rows += [
+        {
+            "id": name, "failure": failure, "what": figure.what, "measured": figure.measured, "unit": figure.unit,
+            "line": figure.line, "verdict": _verdict(figure), "baseline": figure.baseline,
+            "baseline_name": figure.baseline_name,
+        }
+        for figure in figures
+    ]  # fmt: skip
+    rows.sort(key=lambda row: _place(row["id"]))
+    with atomic_path(options.json) as temporary:
+        temporary.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    with atomic_path(options.json.with_suffix(".md")) as temporary:
+        temporary.write_text(markdown(rows), encoding="utf-8")
+    if result is not None and result.pictures is not None:
+        import numpy as np
+
+        ours, reference = result.pictures
+        write_image(options.json.with_suffix("") / f"{name}.png", np.concatenate([ours, reference], axis=1))
+
+
+def _place(name: str) -> tuple[int, int]:
+    """Rows in the order of the list: P, G, L, R, then the rest."""
+    return "PGLRTFSKD".find(name[0]), int(name[1:] or 0)
+
+
+def _verdict(figure: Figure) -> str:
+    if not figure.line:
+        return "reported"
+    return "pass" if figure.passes else "fail"
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as a table."""
+    lines = [
+        "| id | failure | measured | | line | | the plain method |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        baseline = (
+            "" if row["baseline"] is None else f"{row['baseline_name']}: {row['baseline']:.4g} {row['unit']}"
+        )
+        mark = {"pass": "✓", "fail": "**✗**", "reported": ""}[row["verdict"]]
+        what = row["what"].replace("|", "\\|").replace("\n", " ")
+        lines.append(
+            f"| {row['id']} | {row['failure']} | {what} | {row['measured']:.4g} {row['unit']} | {row['line']} | {mark} "
+            f"| {baseline} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _show(console: Any, name: str, figures: Sequence[Figure]) -> None:
+    for figure in figures:
+        baseline = "" if figure.baseline is None else f"  ({figure.baseline_name}: {figure.baseline:.4g})"
+        mark = {"pass": "✓", "fail": "✗", "reported": " "}[_verdict(figure)]
+        line = f"{mark} {name:4} {figure.what}: {figure.measured:.4g} {figure.unit} {figure.line}{baseline}"
+        console.print(line, highlight=False, markup=False)

@@ -1,0 +1,74 @@
+"""Which axes a capture's normal maps have, by the template's own normals."""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_trainer.silhouette import View
+
+Floats = NDArray[np.float64]
+
+GAIN = 0.15
+"""mean cosine that other axes must win; our own estimated normals are about 10° (0.015) off"""
+_AXES = "xyz"
+
+
+class NormalAxes(NamedTuple):
+    """How normal maps agree with the template.
+
+    Attributes:
+        cosine: mean cosine to the template's normals, as they are.
+        facing: share of normals that face the camera (z < 0).
+        best_cosine, best_axes: the best reading, as "x,-y,-z": our x is their x, our y their −y, …
+    """
+
+    cosine: float
+    facing: float
+    best_cosine: float
+    best_axes: str
+
+    @property
+    def wrong(self) -> bool:
+        return self.best_axes != "x,y,z" and self.best_cosine > self.cosine + GAIN
+
+
+def parse_axes(text: str) -> Floats:
+    """The signed permutation [3, 3] that "x,-y,-z" means. ValueError for anything else."""
+    matrix = np.zeros((3, 3))
+    for row, part in enumerate(text.replace(" ", "").split(",")):
+        sign, axis = part[:-1], part[-1:]
+        if row > 2 or sign not in ("", "-", "+") or axis not in tuple(_AXES):
+            raise ValueError(text)
+        matrix[row, _AXES.index(axis)] = -1 if sign == "-" else 1
+    if not np.allclose(matrix @ matrix.T, np.eye(3)):
+        raise ValueError(text)
+    return matrix
+
+
+def judge(pairs: list[tuple[Floats, Floats]]) -> NormalAxes:
+    """Judge (map's normals [n, 3], template's normals [n, 3]) at the same pixels, both in OpenCV camera axes."""
+    ours = np.concatenate([a for a, _ in pairs])
+    template = np.concatenate([b for _, b in pairs])
+    products = template.T @ ours / len(ours)  # [3, 3]: mean of template_i · map_j
+    best, axes = -2.0, ""
+    for order in permutations(range(3)):
+        for signs in product((1, -1), repeat=3):
+            score = sum(sign * products[i, j] for i, (j, sign) in enumerate(zip(order, signs)))
+            if score > best + 1e-9:
+                best = float(score)
+                axes = ",".join(("" if s > 0 else "-") + _AXES[j] for j, s in zip(order, signs))
+    return NormalAxes(float(np.trace(products)), float((ours[:, 2] < 0).mean()), best, axes)
+
+
+def pixels(normals: NDArray[np.float32], view: View) -> tuple[Floats, Floats]:
+    """Pairs of normals [n, 3] where the map ``normals`` [H, W, 3] and the template's ``view`` [h, w] both have one."""
+    height, width = view.mask.shape
+    rows = ((np.arange(height) + 0.5) * normals.shape[0] / height).astype(int)
+    columns = ((np.arange(width) + 0.5) * normals.shape[1] / width).astype(int)
+    small = normals[rows][:, columns].astype(np.float64)
+    both = view.mask & (np.abs(small).max(-1) > 0)
+    return small[both], view.normals[both]

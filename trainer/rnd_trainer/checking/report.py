@@ -1,0 +1,47 @@
+"""The check as a command shows it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+
+from rnd_runtime.files import atomic_path
+
+from .check import Report, check_capture
+from .overlay import save_overlay
+
+_MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
+
+
+def check_and_report(capture: Path, out: Path) -> int:
+    """Check ``capture``, print the findings, write ``check.json`` and ``check.png`` into ``out``; 1 when wrong."""
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("checking")
+        report = check_capture(
+            capture, on_frame=lambda done, total: progress.update(task, completed=done, total=total)
+        )
+    save_report(report, out)
+    console = Console()
+    for finding in report.findings:
+        console.print(
+            f"{_MARKS[finding.level]:>5} {finding.subject}: {escape(finding.sentence)}", soft_wrap=True
+        )
+    console.print(f"      overlay: {escape(str(out / 'check.png'))}", soft_wrap=True)
+    return 1 if report.wrong else 0
+
+
+def save_report(report: Report, out: Path) -> None:
+    """Write ``check.json`` and ``check.png`` into ``out``."""
+    save_overlay(out / "check.png", report)
+    record = {
+        "mean_iou": report.mean_iou,
+        "findings": [dataclasses.asdict(finding) for finding in report.findings],
+        "frames": [dataclasses.asdict(entry) for entry in report.overlaps],
+    }
+    with atomic_path(out / "check.json") as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

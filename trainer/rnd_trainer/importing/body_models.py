@@ -1,0 +1,167 @@
+"""Parametric bodies from the files they come in: SMPL, SMPL-H, SMPL-X, our own ``body.npz``, and Anny."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
+from rnd_runtime.npz import Npz
+from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
+from rnd_runtime.unpickle import read_pickle
+from rnd_trainer.silhouette import posed_vertices
+
+from .anny_body import anny_body
+
+Floats = NDArray[np.float64]
+
+SMPL_LICENSE = "the licence of the body model it was made from; SMPL's forbids passing its shape on"
+_FAMILIES = {24: ("SMPL", SMPL_NAMES), 52: ("SMPL-H", SMPLH_NAMES), 55: ("SMPL-X", SMPLX_NAMES)}
+_MEMBERS = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
+_NO_PARENT = 2**32 - 1  # SMPL's files hold the root's parent, −1, as an unsigned integer
+
+
+@dataclass(frozen=True, eq=False)
+class BodyModel:
+    """A body whose shape depends on ``betas`` and, softly, on its pose (Loper et al. 2015, equations 2–10).
+
+    Attributes:
+        family: "SMPL", "SMPL-H", "SMPL-X"; "Anny" or "template", which have no shape parameters here.
+        template: the body for betas 0.
+        shape_dirs: [V, 3, B] m per unit of each beta; B may be 0.
+        joint_regressor: [J, V], joints from shaped vertices.
+        pose_dirs: [V, 3, 9(J−1)] m per unit of each entry of R_1…R_{J−1} minus the identity, or None.
+    """
+
+    family: str
+    template: Body
+    shape_dirs: Floats
+    joint_regressor: Floats | None = None
+    pose_dirs: Floats | None = None
+
+    def shaped(self, betas: Floats | None = None) -> Body:
+        """The body for ``betas`` [≤ B] in its rest pose: v = T + S β, joints = 𝒥 v.
+
+        Raises:
+            InputError: for more betas than the model has, unless the rest are zero.
+        """
+        if betas is None or self.joint_regressor is None:
+            return self.template
+        betas = np.asarray(betas, np.float64).reshape(-1)
+        count = self.shape_dirs.shape[2]
+        if betas[count:].any():
+            raise InputError("betas", expected=f"at most {count} for this {self.family} file", got=len(betas))
+        used = betas[:count]
+        vertices = self.template.vertices + self.shape_dirs[:, :, : len(used)] @ used
+        joints = self.joint_regressor @ vertices
+        old = self.template.skeleton
+        skeleton = Skeleton(old.names, old.parents, joints)
+        return Body(
+            vertices, self.template.faces, self.template.skinning_weights, skeleton, self.template.license
+        )
+
+    def posed(self, betas: Floats | None, rotations: Floats, translation: Floats) -> Floats:
+        """Vertices [V, 3] m under local ``rotations`` [J, 3, 3] and root ``translation`` [3]."""
+        body = self.shaped(betas)
+        if self.pose_dirs is not None:
+            feature = (rotations[1:] - np.eye(3)).reshape(-1)
+            vertices = body.vertices + self.pose_dirs @ feature
+            body = Body(vertices, body.faces, body.skinning_weights, body.skeleton, body.license)
+        return posed_vertices(body, rotations, translation)
+
+
+def load_body_model(path: str | Path) -> BodyModel:
+    """Read a body model; which one is told by its members and shapes.
+
+    ============================  =================================================================
+    file                          what
+    ============================  =================================================================
+    ``.npz`` with ``vertices``    our own ``body.npz``: no shape parameters
+    ``.npz``, ``.pkl``            SMPL (24 joints), SMPL-H (52), SMPL-X (55) as published; a pickle
+                                  is read without executing anything and without chumpy
+    the word ``anny``             Anny's default person, through the package ``anny`` (Apache-2.0)
+    ============================  =================================================================
+    """
+    if str(path) == "anny":
+        return BodyModel("Anny", anny_body(), np.zeros((1, 3, 0)))
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        with Npz(path, what="body model") as archive:
+            if "rest_joints" in archive.names:
+                return BodyModel("template", Body.load(path), np.zeros((1, 3, 0)))
+            _need(archive.names, path)
+            members: dict[str, Any] = {name: archive.numbers(name) for name in _MEMBERS}
+            if "posedirs" in archive.names:
+                members["posedirs"] = archive.numbers("posedirs")
+    else:
+        content = read_pickle(path, what="body model")
+        if not isinstance(content, dict):
+            raise InputError("body model", expected="a dict", got=type(content).__name__, file=path)
+        _need(tuple(content), path)
+        members = {name: content[name] for name in (*_MEMBERS, "posedirs") if name in content}
+    try:
+        return _from_members(members)
+    except InputError as error:
+        raise error.at(file=path) from error
+
+
+def convert_body_model(
+    model: str | Path, out: str | Path, betas: tuple[float, ...] = (), license: str | None = None
+) -> str:
+    """Write the body of ``model`` for ``betas`` to ``out`` as ``body.npz``; say in a line what it is."""
+    loaded = load_body_model(model)
+    body = loaded.shaped(np.array(betas) if betas else None)
+    if license is not None:
+        body = replace(body, license=license)
+    body.save(out)
+    size = np.ptp(body.vertices, axis=0).max()
+    count = f"{len(body.vertices)} vertices, {len(body.skeleton)} joints, {size:.2f} m"
+    return f"{out}: {loaded.family}, {count}; licence: {body.license}"
+
+
+def _need(names: tuple[str, ...], path: Path) -> None:
+    missing = [name for name in _MEMBERS if name not in names]
+    if missing:
+        raise InputError(
+            "body model", expected="vertices … rest_joints (ours) or " + ", ".join(_MEMBERS),
+            got=", ".join(map(str, names[:8])) or "nothing", file=path,
+        )  # fmt: skip
+
+
+def _from_members(members: dict[str, Any]) -> BodyModel:
+    arrays: dict[str, Floats] = {}
+    for name, value in members.items():
+        try:
+            arrays[name] = np.asarray(value, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(name, expected="numbers", got=type(value).__name__) from error
+    vertices = arrays["v_template"]
+    count = len(vertices)
+    joints = arrays["weights"].shape[-1]
+    if joints not in _FAMILIES:
+        known = ", ".join(f"{n} ({name})" for n, (name, _) in _FAMILIES.items())
+        raise InputError("joints of the body model", expected=known, got=joints)
+    family, names = _FAMILIES[joints]
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "v_template": (count, 3), "weights": (count, joints), "J_regressor": (joints, count),
+        "kintree_table": (2, joints), "shapedirs": (count, 3, None), "f": (None, 3),
+        "posedirs": (count, 3, 9 * (joints - 1)),
+    }  # fmt: skip
+    for name, array in arrays.items():
+        wanted = shapes[name]
+        if array.ndim != len(wanted) or any(w not in (None, h) for w, h in zip(wanted, array.shape)):
+            expected = "×".join("n" if want is None else str(want) for want in wanted)
+            raise InputError(f"shape of {name}", expected=expected, got="×".join(map(str, array.shape)))
+        if not np.isfinite(array).all():
+            raise InputError(name, expected="finite numbers")
+    parents = np.where(arrays["kintree_table"][0] >= _NO_PARENT, -1, arrays["kintree_table"][0])
+    skeleton = Skeleton(names, parents.astype(np.int32), arrays["J_regressor"] @ vertices)
+    weights = arrays["weights"].astype(np.float32)
+    body = Body(vertices, arrays["f"].astype(np.int32), weights, skeleton, SMPL_LICENSE)
+    return BodyModel(family, body, arrays["shapedirs"], arrays["J_regressor"], arrays.get("posedirs"))

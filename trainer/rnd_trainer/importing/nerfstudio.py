@@ -1,0 +1,107 @@
+"""nerfstudio's and instant-ngp's transforms.json, with body poses from a file beside it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.images import read_header
+
+from .pictures import camera_of, read_json, read_mask, read_rgb, sized
+from .pose_files import read_poses
+from .recording import Lens, Recording, Shot
+
+FPS = 30.0
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_BENT = ("k1", "k2", "p1", "p2", "k3")
+_FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "FISHEYE")
+_POSES = ("poses.npz", "smpl.npz", "motion.npz", "smpl_params.npz")
+
+
+def detect(source: Path) -> str | None:
+    """ "transforms.json" with frames."""
+    file = source / "transforms.json" if source.is_dir() else source
+    if file.name != "transforms.json" or not file.is_file():
+        return None
+    return "transforms.json" if "frames" in read_json(file) else None
+
+
+def read(source: Path, *, poses: Path | None = None, convention: str | None = None) -> Recording:
+    """Read cameras (OpenGL's camera-to-world, pixel centres at +0.5) and pictures.
+
+    Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given, else
+    the n-th picture of each camera. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a file
+    called poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
+    """
+    file = source / "transforms.json" if source.is_dir() else source
+    record = read_json(file)
+    if record.get("camera_model") in _FISHEYE:
+        raise InputError(
+            "camera_model",
+            expected="a pinhole with OpenCV's distortion",
+            got=record["camera_model"],
+            file=file,
+        )
+    lenses: dict[str, Lens] = {}
+    names: dict[bytes, str] = {}
+    seen: dict[str, int] = {}
+    shots = []
+    for entry in record["frames"]:
+        picture = _picture(file.parent, entry.get("file_path"), file)
+        lens, key = _lens({**record, **entry}, picture, file)
+        name = names.setdefault(key, f"{len(names):04d}")
+        lenses.setdefault(name, lens)
+        number = next((int(entry[k]) for k in ("time_index", "frame") if k in entry), seen.get(name, 0))
+        seen[name] = number + 1
+        mask = entry.get("mask_path")
+        read_it = partial(read_mask, file.parent / mask) if mask else _alpha(picture)
+        shots.append(Shot(name, number, partial(read_rgb, picture), read_it))
+    if len(names) == len(shots) > 1 and not any("time_index" in e or "frame" in e for e in record["frames"]):
+        shots = [Shot(s.camera, k, s.image, s.mask) for k, s in enumerate(shots)]  # one camera that moves
+    pose_file = poses or next((file.parent / name for name in _POSES if (file.parent / name).is_file()), None)
+    if pose_file is None:
+        raise InputError(
+            "body poses", expected="--poses FILE, as transforms.json has none", got="none", file=file
+        )
+    found = read_poses(pose_file, convention=convention)
+    return Recording("nerfstudio transforms.json", lenses, shots, found.poses, found.fps or FPS, found.notes)
+
+
+def _picture(folder: Path, name: Any, file: Path) -> Path:
+    if not isinstance(name, str):
+        raise InputError("file_path", expected="a path in every frame", got=name, file=file)
+    path = folder / name
+    return path if path.suffix else path.with_suffix(".png")  # instant-ngp's synthetic scenes leave it out
+
+
+def _lens(entry: dict[str, Any], picture: Path, file: Path) -> tuple[Lens, bytes]:
+    try:
+        width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else sized(picture)
+        fx = (
+            float(entry["fl_x"])
+            if "fl_x" in entry
+            else 0.5 * width / np.tan(0.5 * float(entry["camera_angle_x"]))
+        )
+        fy, cx, cy = (
+            float(entry.get(k, d)) for k, d in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
+        )
+        pose = np.linalg.inv(np.asarray(entry["transform_matrix"], np.float64).reshape(4, 4) @ _FLIP)
+    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+        raise InputError(
+            "frame", expected="fl_x or camera_angle_x, transform_matrix", got=repr(error), file=file
+        ) from error
+    bent = tuple(float(entry.get(k, 0)) for k in _BENT)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    camera = camera_of(K, pose[:3, :3], pose[:3, 3], (width, height), corner=0)
+    return Lens(camera, bent if any(bent) else ()), camera.K.tobytes() + np.round(pose, 9).tobytes() + bytes(
+        str(bent), "ascii"
+    )
+
+
+def _alpha(picture: Path):
+    """The picture's own alpha, where it has one."""
+    return partial(read_mask, picture) if len(read_header(picture).channels) == 4 else None

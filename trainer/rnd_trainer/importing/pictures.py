@@ -1,0 +1,137 @@
+"""Pictures, masks and calibration as other programs store them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.camera import Camera
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import existing_file
+from rnd_runtime.images import read_header, read_image
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+PICTURES = (".jpg", ".jpeg", ".png")
+_LABELS = 32
+"""a mask of fewer different values, none above 127, holds labels (0/1, body parts), not coverage"""
+
+
+def read_rgb(path: Path) -> Bytes:
+    """A picture [H, W, 3] as 8-bit sRGB; grey is repeated, alpha dropped, 16 bit rounded."""
+    pixels = read_image(path)
+    if pixels.dtype == np.uint16:
+        pixels = np.round(pixels / 257).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise InputError("picture", expected="8 or 16 bit", got=str(pixels.dtype), file=path)
+    return np.ascontiguousarray(np.repeat(pixels[..., :1], 3, 2) if pixels.shape[2] < 3 else pixels[..., :3])
+
+
+def read_mask(path: Path) -> Bytes:
+    """A mask [H, W] as coverage 0…255, from what people store.
+
+    Alpha where there is one; 0/255 and soft greys as they are; 0/1, body-part labels and coloured palettes: all
+    that is not zero is the person. ``.npy`` holds [H, W] of the same.
+    """
+    if path.suffix == ".npy":
+        try:
+            pixels = np.load(existing_file(path, what="mask"), allow_pickle=False)
+        except (ValueError, OSError, EOFError) as error:
+            raise InputError("mask cannot be read", expected="an array of numbers", file=path) from error
+        pixels = pixels.reshape(*pixels.shape[:2], -1)
+    else:
+        pixels = read_image(path)
+    if pixels.dtype.kind not in "bui" and pixels.size and pixels.max() <= 1:
+        pixels = np.round(255 * np.clip(pixels, 0, 1))  # floats are coverage
+    elif pixels.dtype == np.uint16:
+        pixels = np.round(pixels / 257)
+    return as_coverage(pixels)
+
+
+def as_coverage(pixels: NDArray[Any]) -> Bytes:
+    """[H, W, C] of any of :func:`read_mask`'s kinds as coverage [H, W]."""
+    pixels = pixels.astype(np.int64)
+    if pixels.shape[2] in (2, 4) and np.ptp(pixels[..., -1]) > 0:
+        mask = pixels[..., -1]
+    elif pixels.shape[2] >= 3 and (pixels[..., :1] != pixels[..., 1:3]).any():
+        mask = 255 * (pixels[..., :3].max(-1) > 0)  # a palette's colours
+    else:
+        mask = pixels[..., 0]
+    if mask.size and mask.max() <= 127 and len(np.unique(mask)) <= _LABELS:
+        mask = 255 * (mask > 0)
+    return np.clip(mask, 0, 255).astype(np.uint8)
+
+
+def sized(path: Path) -> tuple[int, int]:
+    """Width and height of a picture, from its header."""
+    header = read_header(path)
+    return header.width, header.height
+
+
+def listed(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> list[Path]:
+    """The files of ``folder`` with one of ``suffixes``, by name; at least one."""
+    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in suffixes) if folder.is_dir() else []
+    if not found:
+        raise InputError("pictures", expected=f"{' or '.join(suffixes)} files", got="none", file=folder)
+    return found
+
+
+def beside(path: Path, *folders: Path) -> Path | None:
+    """The first file called like ``path`` (any suffix of a mask) in ``folders``."""
+    for folder in folders:
+        for suffix in (".png", ".npy", ".jpg", ".jpg.png"):
+            candidate = folder / (path.stem + suffix)
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def read_json(path: Path) -> Any:
+    """A JSON file's content."""
+    try:
+        return json.loads(existing_file(path, what="file").read_text(encoding="utf-8"))
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError("cannot be read", expected="JSON", got=str(error), file=path) from error
+
+
+def camera_of(
+    K: ArrayLike, R: ArrayLike, T: ArrayLike, size: tuple[int, int], *, corner: float = 0.5
+) -> Camera:
+    """A camera of world-to-camera R, T (metres).
+
+    ``corner`` is added to the principal point: 0.5 where a source, like OpenCV's calibration, puts pixel centres
+    at whole numbers; 0 where, like ours and COLMAP's, they lie at +0.5.
+    """
+    intrinsics = np.array(K, np.float64).reshape(3, 3).copy()
+    intrinsics[:2, 2] += corner
+    pose = np.eye(4)
+    pose[:3, :3] = nearest_rotation(np.array(R, np.float64).reshape(3, 3))
+    pose[:3, 3] = np.array(T, np.float64).reshape(3)
+    return Camera(*size, intrinsics, pose)
+
+
+def nearest_rotation(matrix: Floats) -> Floats:
+    """The rotation nearest to a 3×3 that rounding has bent; what is no rotation at all stays what it is."""
+    u, _, v = np.linalg.svd(matrix)
+    rotation: Floats = u @ v
+    return rotation if np.abs(rotation - matrix).max() < 1e-2 else matrix
+
+
+def undistorted(
+    pixels: NDArray[Any], camera: Camera, distortion: tuple[float, ...], interpolation: int = cv2.INTER_LINEAR
+) -> NDArray[Any]:
+    """``pixels`` [H, W, …] as a lens without ``distortion`` would have given them, K unchanged; zero beyond."""
+    if not any(distortion):
+        return pixels
+    K = camera.K.copy()
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres lie at whole numbers
+    maps = cv2.initUndistortRectifyMap(
+        K, np.array(distortion), None, K, (camera.width, camera.height), cv2.CV_32FC1
+    )
+    return cv2.remap(pixels, *maps, interpolation)

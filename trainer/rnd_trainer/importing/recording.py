@@ -1,0 +1,194 @@
+"""What every layout is read into before it becomes a capture: lenses, shots and poses in the source's own world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.camera import Camera
+from rnd_runtime.capture_format import Split
+from rnd_runtime.errors import InputError
+from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
+from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.skeleton import SMPL_NAMES
+
+from .pictures import undistorted
+
+Floats = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_NAMES = {22: SMPL_NAMES[:22], 24: SMPL_NAMES, 52: SMPLH_NAMES, 55: SMPLX_NAMES}
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A camera as its source calibrated it.
+
+    Attributes:
+        camera: our conventions (pixel centres at +0.5, metres), in the source's world.
+        distortion: OpenCV's coefficients k1 k2 p1 p2 [k3 …]; empty where the pictures are undistorted already.
+        undone: the coefficients that we undid.
+    """
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    undone: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture, read when asked for.
+
+    Attributes:
+        camera, frame: the lens, and the number that :class:`Poses` knows the moment by.
+        image: gives [H, W, 3] uint8 sRGB.
+        mask: gives [H, W] uint8 coverage; None where there is none.
+        normals: gives [H, W, 3] in OpenCV's camera axes, zero where unknown; None where there are none.
+        split: None to have it chosen.
+    """
+
+    camera: str
+    frame: int
+    image: Callable[[], Bytes]
+    mask: Callable[[], Bytes] | None = None
+    normals: Callable[[], NDArray[np.float32]] | None = None
+    split: Split | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Body poses in the source's world.
+
+    Attributes:
+        frames: [F] ascending, the moments they belong to.
+        rotations: [F, J, 3, 3] local, the root first.
+        root: gives the root's places [F, 3] m for a rest place [3] m: where conventions differ.
+        joint_names: J.
+        family: "SMPL" or "SMPL-X": whose rest pelvis ``root`` wants.
+        betas: shape, or None.
+    """
+
+    frames: NDArray[np.int64]
+    rotations: Floats
+    root: Callable[[Floats], Floats]
+    joint_names: tuple[str, ...] = SMPL_NAMES
+    family: str = "SMPL"
+    betas: Floats | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.frames)
+        if count == 0:
+            raise InputError("body poses", expected="at least one frame", got="none")
+        if self.rotations.shape != (count, len(self.joint_names), 3, 3):
+            raise InputError(
+                "body poses", expected=f"{count} × {len(self.joint_names)} rotations", got=list(self.rotations.shape)
+            )  # fmt: skip
+        finite = np.isfinite(self.rotations).all((1, 2, 3))
+        if not finite.all():
+            raise InputError("body poses", expected="finite numbers", frame=int(self.frames[~finite][0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A source, read.
+
+    Attributes:
+        kind: what it was found to be.
+        lenses: by camera name.
+        shots: every picture.
+        fps: pictures' frames per second.
+        notes: what was assumed, one sentence each.
+        up: the world's axis that points up ("y", "-y", "z", …) where the layout says so; None to ask the poses.
+    """
+
+    kind: str
+    lenses: dict[str, Lens]
+    shots: Sequence[Shot]
+    poses: Poses
+    fps: float = 30.0
+    notes: tuple[str, ...] = field(default=())
+    up: str | None = None
+
+
+def straightened(recording: Recording) -> Recording:
+    """``recording`` with every lens's distortion undone, once, in pictures, masks and normals as they are read."""
+
+    def straight(read: Callable[[], NDArray] | None, lens: Lens) -> Callable[[], NDArray] | None:
+        return None if read is None else lambda: undistorted(read(), lens.camera, lens.distortion)
+
+    shots = []
+    for shot in recording.shots:
+        lens = recording.lenses[shot.camera]
+        if any(lens.distortion):
+            image = straight(shot.image, lens)
+            assert image is not None
+            shot = replace(
+                shot, image=image, mask=straight(shot.mask, lens), normals=straight(shot.normals, lens)
+            )
+        shots.append(shot)
+    lenses = {name: Lens(lens.camera, (), lens.distortion) for name, lens in recording.lenses.items()}
+    return replace(recording, lenses=lenses, shots=shots)
+
+
+def smpl_poses(
+    frames: Sequence[int] | NDArray[np.int64],
+    axis_angles: ArrayLike,
+    trans: ArrayLike,
+    betas: ArrayLike | None = None,
+    *,
+    family: str = "SMPL",
+) -> Poses:
+    """Poses in SMPL's own convention: the root turns about its rest place J0 and lies at J0 + trans.
+
+    Args:
+        axis_angles: [F, 3J] or [F, J, 3] rad, the root first; J is 22, 24, 52 or 55.
+        trans: [F, 3] m.
+    """
+    rotations, names = _rotations(axis_angles)
+    offsets = np.asarray(trans, np.float64).reshape(-1, 3)
+    return Poses(
+        np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas)
+    )
+
+
+def easymocap_poses(
+    frames: Sequence[int] | NDArray[np.int64],
+    axis_angles: ArrayLike,
+    Rh: ArrayLike,
+    Th: ArrayLike,
+    betas: ArrayLike | None = None,
+    *,
+    family: str = "SMPL",
+) -> Poses:
+    """Poses in EasyMocap's convention: a body with an unturned root, then x = R(Rh) X + Th about the origin.
+
+    A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first.
+    """
+    rotations, names = _rotations(axis_angles)
+    turn = axis_angle_to_matrix(np.asarray(Rh, np.float64).reshape(-1, 3))
+    offsets = np.asarray(Th, np.float64).reshape(-1, 3)
+    rotations[:, 0] = turn @ rotations[:, 0]
+    return Poses(
+        np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas)
+    )  # fmt: skip
+
+
+def mean_betas(betas: ArrayLike | None) -> Floats | None:
+    """One shape [B] of one or many ([F, B] → their mean)."""
+    if betas is None:
+        return None
+    array = np.asarray(betas, np.float64)
+    return array.reshape(-1, array.shape[-1]).mean(0)
+
+
+def _rotations(axis_angles: ArrayLike) -> tuple[Floats, tuple[str, ...]]:
+    angles = np.asarray(axis_angles, np.float64)
+    angles = angles.reshape(len(angles), -1, 3)
+    names = _NAMES.get(angles.shape[1])
+    if names is None:
+        known = ", ".join(map(str, _NAMES))
+        raise InputError("joints of the body poses", expected=known, got=angles.shape[1])
+    return axis_angle_to_matrix(angles), names

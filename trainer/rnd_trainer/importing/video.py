@@ -1,0 +1,156 @@
+"""A plain video of one person, or a folder of its frames, with body poses from a program that estimates them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rnd_runtime.capture_format import Split
+from rnd_runtime.errors import InputError
+from rnd_trainer.silhouette import posed_vertices, silhouette
+
+from .body_models import BodyModel
+from .frames import Film
+from .pictures import PICTURES, Bytes, camera_of, listed, read_rgb, sized
+from .pose_files import FoundPoses
+from .recording import Floats, Lens, Recording, Shot
+from .select import select_frames, sharpness
+from .write import TRAIN_SHARE, Scene, placed
+
+SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
+FPS = 30.0
+_SMALL = (
+    320  # pixels, the side at which sharpness is measured: motion blur shows there, sensor noise does not
+)
+
+
+def detect(source: Path) -> str | None:
+    """A video file, or a folder that holds nothing but pictures."""
+    if source.is_file() and source.suffix.lower() in SUFFIXES:
+        return "a video"
+    if source.is_dir() and any(p.suffix.lower() in PICTURES for p in source.iterdir() if p.is_file()):
+        return "a folder of frames"
+    return None
+
+
+class _Folder:
+    """A folder of frames with a :class:`Film`'s face."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.pictures = listed(path)
+        self.path, self.fps, self.count = path, fps, len(self.pictures)
+        self.width, self.height = sized(self.pictures[0])
+
+    def frame(self, number: int) -> Bytes:
+        return read_rgb(self.pictures[number])
+
+
+def read(
+    source: Path,
+    model: BodyModel,
+    found: FoundPoses,
+    *,
+    intrinsics: Sequence[float] = (),
+    distortion: Sequence[float] = (),
+    count: int = 100,
+    fps: float | None = None,
+) -> Recording:
+    """Read a video; of its frames, keep the sharpest of each pose.
+
+    The lens is ``intrinsics`` (fx, fy, cx, cy in pixels), else the pose file's, else what its program assumed. Poses
+    fit the pictures through the lens they were estimated with; another one is noted. The first 4/5 of the frames give
+    ``count`` training pictures, the last 1/5 a quarter of that as novel poses.
+    """
+    film = Film(source) if source.is_file() else _Folder(source, FPS)
+    rate = fps or (film.fps if source.is_file() else found.fps or FPS)
+    K, notes = _lens(found, film.width, film.height, intrinsics)
+    lens = Lens(camera_of(K, np.eye(3), np.zeros(3), (film.width, film.height), corner=0), tuple(distortion))
+    poses = found.poses
+    if poses.frames[0] >= film.count:
+        raise InputError(
+            "body poses", expected=f"frames below {film.count}", got=int(poses.frames[0]), file=source
+        )
+    recording = Recording(
+        f"a video with {found.kind}'s poses", {"0": lens}, [], poses, rate, (*found.notes, *notes)
+    )
+    chosen = _choose(film, placed(recording, model), recording, count)
+    stills = _stills(film, [frame for frame, _ in chosen])
+    shots = [
+        Shot("0", frame, partial(stills.__getitem__, k), split=split)
+        for k, (frame, split) in enumerate(chosen)
+    ]
+    kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
+    return Recording(recording.kind, recording.lenses, shots, poses, rate, (*recording.notes, kept))
+
+
+def _lens(
+    found: FoundPoses, width: int, height: int, intrinsics: Sequence[float]
+) -> tuple[Floats, tuple[str, ...]]:
+    own = found.K
+    if own is None and found.focal is not None:
+        focal = found.focal(width, height)
+        own = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    if len(intrinsics) not in (0, 4):
+        raise InputError("--intrinsics", expected="fx fy cx cy", got=" ".join(map(str, intrinsics)))
+    if intrinsics:
+        fx, fy, cx, cy = intrinsics
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        differs = own is not None and np.abs(K - own).max() > 0.02 * own[0, 0]
+        if own is not None and differs:
+            return K, (
+                f"{found.kind} assumed a focal length of {own[0, 0]:.0f}, --intrinsics says {fx:.0f}: poses may miss",
+            )
+        return K, ()
+    if own is None:
+        raise InputError("lens", expected="--intrinsics fx fy cx cy, as the pose file has none", got="none")
+    return own, (f"focal length {own[0, 0]:.0f} pixels, as {found.kind} has it",)
+
+
+def _choose(film: Film | _Folder, scene: Scene, recording: Recording, count: int) -> list[tuple[int, Split]]:
+    """(frame, split) of the frames to keep, ascending."""
+    first = int(recording.poses.frames[0])
+    frames = min(scene.motion.frame_count, film.count - first)
+    given = {int(frame) - first for frame in recording.poses.frames}
+    camera = scene.cameras["0"]
+    factor = min(1.0, _SMALL / max(camera.width, camera.height))
+    small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+    sharp = np.full(scene.motion.frame_count, -np.inf)
+    for k in range(frames):
+        if k not in given:
+            continue
+        picture = cv2.resize(film.frame(first + k), (small.width, small.height), interpolation=cv2.INTER_AREA)
+        vertices = posed_vertices(scene.body, scene.motion.rotations[k], scene.motion.translations[k])
+        covered = silhouette(vertices, scene.body.faces, small)
+        if covered.any():
+            sharp[k] = sharpness(picture, np.where(covered, 255, 0).astype(np.uint8))
+    border = max(1, round(TRAIN_SHARE * frames))
+    early, late = sharp.copy(), sharp.copy()
+    early[border:], late[:border] = -np.inf, -np.inf
+    if not np.isfinite(early).any():
+        raise InputError(
+            "frames", expected="some with poses and the person in view", got="none", file=film.path
+        )
+    chosen: list[tuple[int, Split]] = []
+    parts: list[tuple[np.ndarray, int, Split]] = [
+        (early, count, "train"),
+        (late, max(1, count // 4), "novel_pose"),
+    ]
+    for scores, number, split in parts:
+        if np.isfinite(scores).any():
+            picked = select_frames(scene.motion, scene.body.skeleton, scores, number)
+            chosen += [(first + int(k), split) for k in picked]
+    return sorted(chosen)
+
+
+def _stills(film: Film | _Folder, frames: list[int]) -> np.ndarray:
+    """The frames [n, H, W, 3] uint8 on disk: masks need them in any order, a video gives them in its own."""
+    with tempfile.TemporaryFile() as file:
+        stills = np.memmap(file, np.uint8, "w+", shape=(len(frames), film.height, film.width, 3))
+        for k, frame in enumerate(frames):
+            stills[k] = film.frame(frame)
+    return stills

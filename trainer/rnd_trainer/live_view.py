@@ -1,0 +1,149 @@
+"""``rnd-train --view``: a page on this machine that shows a training while it runs.
+
+A thread serves what the run folder holds anyway, ``metrics.jsonl`` and ``previews/``; the training knows nothing
+of it. It answers to 127.0.0.1 alone, and only when asked by that name, so that no page of the web can read it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+PORT = 7860
+"""tried first; any free one when it is taken"""
+POINTS = 300
+"""of a curve: more than the page has pixels for helps nobody"""
+RECENT = 200
+"""steps whose speed gives the time left"""
+_PREVIEW = re.compile(r"step_\d+\.png")
+
+
+class Metrics:
+    """``metrics.jsonl`` as far as it is written, read on from where the last call stopped."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.rows = path, list[dict[str, Any]]()
+        self._offset = 0
+        self._lock = threading.Lock()
+
+    def read(self) -> list[dict[str, Any]]:
+        """All rows so far; a line still being written waits for the next call, a file cut by --resume starts anew."""
+        with self._lock:
+            if not self.path.exists():
+                return []
+            if self.path.stat().st_size < self._offset:
+                self.rows, self._offset = [], 0
+            with self.path.open("rb") as stream:
+                stream.seek(self._offset)
+                content = stream.read()
+            whole = content[: content.rfind(b"\n") + 1]
+            self.rows += [json.loads(line) for line in whole.splitlines() if line]
+            self._offset += len(whole)
+            return list(self.rows)
+
+
+def state(rows: list[dict[str, Any]], total: int, previews: list[str]) -> dict[str, Any]:
+    """What the page shows: progress, seconds left, one binned curve for each loss term, the preview's names.
+
+    Curves are ``[[step, mean], …]`` with at most ``POINTS`` points.
+    """
+    seconds_left = None
+    if len(rows) > 1:
+        first, last = rows[max(0, len(rows) - RECENT)], rows[-1]
+        seconds_left = (total - 1 - last["step"]) * (last["seconds"] - first["seconds"]) / (
+            last["step"] - first["step"]
+        )  # fmt: skip
+    curves: dict[str, list[list[float]]] = {}
+    terms = list(dict.fromkeys(name for row in rows for name in row))
+    for term in terms:
+        if term not in ("step", "stage", "seconds", "skipped"):
+            points = [(row["step"], row[term]) for row in rows if term in row]
+            curves[term] = _binned(points, -(-total // POINTS))
+    return {
+        "done": rows[-1]["step"] + 1 if rows else 0,
+        "total": total,
+        "stage": rows[-1]["stage"] if rows else 1,
+        "seconds": rows[-1]["seconds"] if rows else 0,
+        "seconds_left": seconds_left,
+        "skipped": sum("skipped" in row for row in rows),
+        "curves": curves,
+        "previews": previews,
+    }
+
+
+def _binned(points: list[tuple[int, float]], width: int) -> list[list[float]]:
+    """Means of the finite values of each ``width`` steps."""
+    bins: dict[int, list[float]] = {}
+    for step, value in points:
+        if abs(value) < float("inf"):
+            bins.setdefault(step // width, []).append(value)
+    return [[width * k + width / 2, sum(values) / len(values)] for k, values in sorted(bins.items())]
+
+
+@contextmanager
+def live_view(folder: Path, total_steps: int, port: int = PORT) -> Iterator[str]:
+    """Serve the run in ``folder`` while the block runs; yields the page's address."""
+    try:
+        server = _Server(("127.0.0.1", port), _Handler)
+    except OSError:  # somebody else's, perhaps another training's
+        server = _Server(("127.0.0.1", 0), _Handler)
+    server.folder, server.total = folder, total_steps
+    server.metrics = Metrics(folder / "metrics.jsonl")
+    thread = threading.Thread(target=server.serve_forever, name="live view", daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    folder: Path
+    total: int
+    metrics: Metrics
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def do_GET(self) -> None:
+        if self.headers.get("Host") not in {
+            f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")
+        }:
+            self.send_error(HTTPStatus.FORBIDDEN)
+            return
+        previews = self.server.folder / "previews"
+        names = sorted(p.name for p in previews.glob("step_*.png")) if previews.is_dir() else []
+        name = self.path.removeprefix("/previews/")
+        if self.path == "/":
+            page = files("rnd_trainer").joinpath("live_view.html").read_bytes()
+            self._answer(page, "text/html; charset=utf-8")
+        elif self.path == "/state.json":
+            now = state(self.server.metrics.read(), self.server.total, names)
+            self._answer(json.dumps(now).encode(), "application/json")
+        elif name in names and _PREVIEW.fullmatch(name):
+            self._answer((previews / name).read_bytes(), "image/png")
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _answer(self, content: bytes, kind: str) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Nothing: the terminal belongs to the training."""

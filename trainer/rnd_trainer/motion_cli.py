@@ -1,0 +1,76 @@
+"""rnd-data motion: any motion file rewritten as an .npz in AMASS' form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from rnd_runtime.amass import write_amass
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import existing_file
+from rnd_runtime.motion import load_motion
+from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
+from rnd_runtime.skeleton import Skeleton, smpl_skeleton
+
+# Joints of an adult in cm, SMPL's order, standing about SMPL's origin: what matters are the proportions of the legs.
+# fmt: off
+_MEAN_PERSON = (
+    (-0.18, -22.33, 2.82), (7, -31, 2), (-7, -31, 2), (0, -11, 0), (10, -69, 2), (-10, -69, 2), (0, 2, 0),
+    (9, -109, -3), (-9, -109, -3), (0, 7, 3), (12, -114, 9), (-12, -114, 9), (0, 29, -1), (8, 20, -1), (-8, 20, -1),
+    (0, 35, 4), (17, 23, -2), (-17, 23, -2), (43, 21, -4), (-43, 21, -4), (68, 22, -4), (-68, 22, -4), (77, 21, -6),
+    (-77, 21, -6),
+)
+# fmt: on
+
+
+def motion(
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.Positional],
+    body: Path | None = None,
+    up: Literal["auto", "y", "z"] = "auto",
+    source_fps: float | None = None,
+    fps: float | None = None,
+    joint_map: Path | None = None,
+    edits: Annotated[MotionEdits, tyro.conf.arg(name="")] = MotionEdits(),  # noqa: B008  # frozen
+) -> int:
+    """Rewrite a motion of any kind as an .npz in AMASS' form (SMPL-H, Z up), which most tools read.
+
+    Args:
+        source: .npz, .pkl, .pt, .npy, .bvh, or .amc with its .asf beside it
+        out: the .npz to write
+        body: body.npz or avatar.onnx whose skeleton BVH and AMC are retargeted to; SMPL's mean body when not given
+        up: the axis that points up in the source
+        source_fps: frames per second of the source, where it does not say
+        fps: frames per second to write; the source's when not given
+        joint_map: TOML or JSON file with SMPL's joints and what the source calls them
+        edits: what to do to the motion
+    """
+    if out.suffix.lower() != ".npz":
+        raise InputError("output", expected="a name that ends in .npz", got=out.name)
+    skeleton = _skeleton(body)
+    made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
+    if fps is not None:
+        made = resampled(made, fps)
+    lost = write_amass(out, made, skeleton)
+    console = Console()
+    for note in [
+        *made.notes,
+        *([f"joints that SMPL-H lacks are left out: {', '.join(lost)}"] if lost else []),
+    ]:
+        console.print(f"note: {note}", soft_wrap=True, highlight=False)
+    seconds = f"{made.fps:g} per second, {made.duration:.1f} s"
+    console.print(f"{out}: {made.frame_count} frames, {seconds}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _skeleton(body: Path | None) -> Skeleton:
+    if body is None:
+        return smpl_skeleton(np.array(_MEAN_PERSON) / 100)
+    file = existing_file(body, what="body")
+    return Avatar.load(file).skeleton if file.suffix.lower() == ".onnx" else Body.load(file).skeleton

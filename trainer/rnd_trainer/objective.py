@@ -1,0 +1,167 @@
+"""What a training step minimises: the weighted loss terms of one picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from rnd_runtime.camera import Camera
+
+from .config import TrainConfig
+from .consistency import POINTS, consistency_loss, covisible, project, virtual_camera
+from .data import View
+from .light import LightProbe, Texels, all_texels, draw_texels
+from .losses import geometry_prior, grey_prior, image_loss, linear_to_srgb, skinning_divergence, sky_prior
+from .model import AvatarModel, Posed, PoseInput
+from .perceptual import Perceptual
+from .render import Splat, shade_visible, splat
+from .shading import sh_basis, traced_visibility
+
+LEAST_MATCHES = 16
+"""points that two views must share for the consistency term to mean anything"""
+
+
+class Objective:
+    """The loss of a picture in either stage.
+
+    Args:
+        config: weights and schedule.
+        probe: the learned light.
+        fixed_light: [32, 64, 3] a known light to use instead, or None.
+        perceptual: feature network of the LPIPS and consistency terms; without one both are off, and the
+            structural term looks at several scales instead.
+        generator: of all random draws.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        probe: LightProbe,
+        fixed_light: Tensor | None,
+        perceptual: Perceptual | None,
+        generator: torch.Generator,
+    ) -> None:
+        self.config, self.probe, self.fixed_light = config, probe, fixed_light
+        self.perceptual, self.generator = perceptual, generator
+
+    def light(self) -> Tensor:
+        """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
+        return self.probe.radiance() if self.fixed_light is None else self.fixed_light
+
+    def __call__(
+        self, model: AvatarModel, view: View, pose: PoseInput, step: int, stage: int
+    ) -> dict[str, Tensor]:
+        """Weighted loss terms of one picture by name; their sum is minimised."""
+        config = self.config
+        posed = model(pose)
+        decay = 0.1 ** (step / config.steps)
+        terms = {
+            "skinning": config.weight_skinning
+            * decay
+            * skinning_divergence(posed.weights, model.log_weights),
+            "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
+        }
+        if config.model.visibility == "pose":
+            terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
+        texels = None if stage == 1 else self._texels(step)
+        if stage == 2 and self.fixed_light is None:
+            light, probe = self.light(), self.probe
+            terms["grey"] = config.weight_light_grey * grey_prior(light, probe.solid_angles)
+            terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
+        picture = self._picture(model, posed, pose, texels, view.camera)
+        device = posed.means.device
+        background = torch.rand(3, generator=self.generator)
+        target, mask = (x.to(device) for x in view.target(background))
+        background = background.to(device)
+        image_srgb, target_srgb = _over(picture, background), linear_to_srgb(target)
+        terms |= self._image_terms(image_srgb, target_srgb, step)
+        terms["mask"] = config.weight_mask * (picture.alpha - mask).abs().mean()
+        normals = view.normals()
+        if normals is not None:
+            terms["normal"] = config.weight_normal * (picture.normals - normals.to(device)).abs().mean()
+        if texels is not None and self._due(step, config.weight_consistency, config.consistency_every):
+            agreement = self._consistency(model, posed, pose, texels, view.camera, image_srgb, background)
+            if agreement is not None:
+                terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
+        return terms
+
+    def _picture(
+        self, model: AvatarModel, posed: Posed, pose: PoseInput, texels: Texels | None, camera: Camera
+    ) -> Splat:
+        """The posed avatar from ``camera``: plain colours, or shaded under ``texels``."""
+        if texels is None:
+            return splat(posed, posed.attributes.colour, camera)
+        traced = self.config.traced_texels
+        return splat(posed, shade_visible(posed, pose, texels, camera, model, traced), camera)
+
+    def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
+        """L1 with a structural term; LPIPS where there is a network and the picture is large enough for it."""
+        config = self.config
+        scales = 1 if self.perceptual is not None else config.dssim_scales
+        terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
+        if self.perceptual is not None and self._due(step, config.weight_lpips, config.lpips_every):
+            distance = self.perceptual(image_srgb.clamp(max=1), target_srgb)
+            terms["lpips"] = config.lpips_every * config.weight_lpips * distance
+        return terms
+
+    def _due(self, step: int, weight: float, every: int) -> bool:
+        """Whether a term that is computed every so many steps is due; it then counts that many times."""
+        return self.perceptual is not None and weight > 0 and step % every == 0
+
+    def _texels(self, step: int) -> Texels:
+        config = self.config
+        maps = (self.light(), self.probe.directions, self.probe.solid_angles)
+        if step >= config.steps * (1 - config.full_light_fraction):
+            return all_texels(*maps)
+        return draw_texels(*maps, config.light_texels, self.generator)
+
+    def _consistency(
+        self,
+        model: AvatarModel,
+        posed: Posed,
+        pose: PoseInput,
+        texels: Texels,
+        camera: Camera,
+        image_srgb: Tensor,
+        background: Tensor,
+    ) -> Tensor | None:
+        """L_gc between this picture and one from a virtual camera nearby; None where they share too little."""
+        assert self.perceptual is not None
+        nodes = self.config.model.nodes
+        centre = posed.means[:nodes].detach().mean(dim=0)
+        virtual = virtual_camera(camera, centre, self.generator)
+        shared = covisible(posed, camera, virtual, nodes)
+        if len(shared) < LEAST_MATCHES:
+            return None
+        drawn = shared[torch.randperm(len(shared), generator=self.generator)[:POINTS].to(shared.device)]
+        second = _over(self._picture(model, posed, pose, texels, virtual), background)
+        points = posed.means[drawn].detach()
+        pixels = project(points, camera), project(points, virtual)
+        return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, self.perceptual)
+
+    def _visibility_loss(self, model: AvatarModel, posed: Posed, pose: PoseInput) -> Tensor:
+        """Square error of the harmonics against shadow-mapped visibility at the nodes, in random directions."""
+        nodes = self.config.model.nodes
+        directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
+        directions = torch.nn.functional.normalize(directions, dim=-1).to(posed.means.device)
+        spacing = float(model.spacing) * math.sqrt(self.config.model.gaussians / nodes)
+        means, normals = posed.means[:nodes], posed.normals[:nodes]
+        truth = traced_visibility(means, normals, directions, spacing)
+        above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
+        predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3].detach()).T
+        return (above * (predicted - truth).square()).mean()
+
+
+def noisy(pose: PoseInput, sigma: float, generator: torch.Generator) -> PoseInput:
+    """The encoders' input with noise of ``sigma`` radians; the bones, which place the picture, stay as they are."""
+    noise = (sigma * torch.randn(pose.window.shape[1:], generator=generator)).to(pose.window)
+    shake = (10 * sigma * torch.randn(pose.velocity.shape, generator=generator)).to(pose.velocity)
+    return dataclasses.replace(pose, window=pose.window + noise, velocity=pose.velocity + shake)
+
+
+def _over(picture: Splat, background: Tensor) -> Tensor:
+    """sRGB picture [H, W, 3] over a linear background [3]."""
+    return linear_to_srgb(picture.image + (1 - picture.alpha[..., None]) * background)

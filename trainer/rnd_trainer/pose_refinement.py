@@ -1,0 +1,104 @@
+"""Corrections of estimated body poses, learned with the avatar: bounded, delayed, one row a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rnd_runtime.motion import Motion
+from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.skeleton import Skeleton
+
+ROTATION_BOUND = 0.12
+"""radians that a joint may be corrected by about each axis, 7°: estimators err by one to three"""
+TRANSLATION_BOUND = 0.05
+"""metres that the root may be moved along each axis"""
+
+
+class PoseRefinement(nn.Module):
+    """Local rotations R_k exp(δ_k) and root translations of the training frames.
+
+    Each frame is a parameter of its own: Adam then steps only the frame that was looked at.
+
+    Args:
+        motion: the estimated poses.
+        skeleton: whose rest joints place the bones.
+        frames: motion frames of the training pictures; a frame seen twice is corrected once.
+    """
+
+    rotations: Tensor
+    translations: Tensor
+    rest_joints: Tensor
+
+    def __init__(self, motion: Motion, skeleton: Skeleton, frames: Sequence[int]) -> None:
+        super().__init__()
+        self.frames = sorted(set(frames))
+        self.row = {frame: k for k, frame in enumerate(self.frames)}
+        self.parents = [int(p) for p in skeleton.parents]
+        arrays = {
+            "rotations": motion.rotations[self.frames],
+            "translations": motion.translations[self.frames],
+            "rest_joints": skeleton.rest_joints,
+        }
+        for name, value in arrays.items():
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+        joints = len(self.parents)
+        self.raw = nn.ParameterList(torch.zeros(joints + 1, 3) for _ in self.frames)
+
+    def bounded(self, frame: int) -> tuple[Tensor, Tensor]:
+        """δ [J, 3] as rotation vectors, radians, and the root's shift [3] m, of a motion frame."""
+        raw = self.raw[self.row[frame]]
+        turn = ROTATION_BOUND * torch.tanh(raw[:-1] / ROTATION_BOUND)
+        return turn, TRANSLATION_BOUND * torch.tanh(raw[-1] / TRANSLATION_BOUND)
+
+    def bones(self, frame: int) -> Tensor:
+        """Bone transforms [J, 3, 4] of a motion frame, corrected; differentiable in the correction."""
+        turn, shift = self.bounded(frame)
+        row = self.row[frame]
+        local = self.rotations[row] @ torch.linalg.matrix_exp(_cross_matrices(turn))
+        rotation: list[Tensor] = []
+        position: list[Tensor] = []
+        for k, parent in enumerate(self.parents):
+            if parent < 0:
+                rotation.append(local[k])
+                position.append(self.rest_joints[k] + self.translations[row] + shift)
+            else:
+                rotation.append(rotation[parent] @ local[k])
+                lever = self.rest_joints[k] - self.rest_joints[parent]
+                position.append(position[parent] + rotation[parent] @ lever)
+        turned, moved = torch.stack(rotation), torch.stack(position)
+        return torch.cat([turned, (moved - (turned @ self.rest_joints[..., None])[..., 0])[..., None]], dim=2)
+
+    def prior(self, frame: int) -> Tensor:
+        """Mean square of a frame's correction in units of its bounds."""
+        turn, shift = self.bounded(frame)
+        return (turn / ROTATION_BOUND).square().mean() + (shift / TRANSLATION_BOUND).square().mean()
+
+    @torch.no_grad()
+    def apply_to(self, motion: Motion) -> Motion:
+        """``motion`` with its training frames corrected; frames in between keep what they had."""
+        rotations, translations = motion.rotations.copy(), motion.translations.copy()
+        for frame in self.frames:
+            turn, shift = (x.double().cpu().numpy() for x in self.bounded(frame))
+            rotations[frame] = rotations[frame] @ axis_angle_to_matrix(turn)
+            translations[frame] += shift
+        return Motion(rotations, translations, motion.fps, motion.joint_names)
+
+
+def joint_error_degrees(motion: Motion, truth: Motion, frames: Sequence[int]) -> float:
+    """Mean angle between the local rotations of two motions over ``frames``, degrees."""
+    frames = list(frames)
+    relative = np.swapaxes(motion.rotations[frames], -1, -2) @ truth.rotations[frames]
+    cosine = (np.trace(relative, axis1=-2, axis2=-1) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).mean())
+
+
+def _cross_matrices(vectors: Tensor) -> Tensor:
+    """[..., 3] → [..., 3, 3] with [v]× u = v × u."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

@@ -1,0 +1,71 @@
+"""What one rendering is worth beside its truth: image, normals and albedo, whole frame and the person's box."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rnd_runtime.capture import FrameImages
+from rnd_runtime.images import linear_to_srgb
+
+from .judge import Rendered
+from .metrics import mask_box, normal_degrees, psnr, ssim
+from .perceptual import Perceptual
+
+BOX_MARGIN = 8
+"""pixels around the mask's box in which the second figure of each pair is computed"""
+COVERED = 0.05
+"""coverage below which a pixel has no normal, in the truth as in ours"""
+
+
+def frame_scores(
+    rendered: Rendered, truth: FrameImages, perceptual: Perceptual | None = None, scale: Tensor | None = None
+) -> dict[str, float]:
+    """Figures of one picture by name; what the capture or the weights do not allow is left out.
+
+    ``psnr, ssim, lpips`` of the sRGB picture on black, in the full frame and (``*_box``) in the mask's bounding
+    box: the full frame is nine tenths background, so its figures flatter everybody. ``psnr_n, ssim_n`` of normal
+    pictures (n + 1)/2, ``normal_deg`` the mean angle; ``psnr_albedo`` in the mask, sRGB, after ``scale`` [3].
+    """
+    target, mask = torch.from_numpy(truth.image_srgb).float(), torch.from_numpy(truth.mask)
+    image = to_srgb8(rendered.image)
+    box = mask_box(mask > 0, BOX_MARGIN)
+    scores = {
+        "psnr": psnr(image, target),
+        "ssim": ssim(image, target),
+        "psnr_box": psnr(image[box], target[box]),
+        "ssim_box": ssim(image[box], target[box]),
+    }
+    if perceptual is not None:
+        scores["lpips"] = float(perceptual(image, target))
+        if min(image[box].shape[:2]) >= perceptual.smallest:
+            scores["lpips_box"] = float(perceptual(image[box], target[box]))
+    inside = (mask > 0.5) & (rendered.alpha > 0.5)
+    normal = truth.normal_gt if truth.normal_gt is not None else truth.normal
+    if normal is not None:
+        expected = torch.from_numpy(normal).float()
+        scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside)
+        ours = normal_picture(rendered.normals, rendered.alpha)
+        theirs = normal_picture(expected, mask)
+        scores |= {
+            "psnr_n": psnr(ours, theirs),
+            "ssim_n": ssim(ours, theirs),
+            "psnr_n_box": psnr(ours[box], theirs[box]),
+        }
+    if truth.albedo_srgb is not None:
+        albedo = rendered.albedo if scale is None else rendered.albedo * scale
+        expected = torch.from_numpy(truth.albedo_srgb).float()
+        scores["psnr_albedo"] = psnr(to_srgb8(albedo), expected, inside)
+    return scores
+
+
+def normal_picture(normals: Tensor, coverage: Tensor) -> Tensor:
+    """Unit normals [H, W, 3] as a picture (n + 1)/2, black where less than 5 % is covered [H, W]."""
+    unit = torch.nn.functional.normalize(normals, dim=-1)
+    return torch.where((coverage > COVERED)[..., None], (unit + 1) / 2, torch.zeros_like(unit))
+
+
+def to_srgb8(image: Tensor) -> Tensor:
+    """Linear premultiplied [H, W, 3] on black → sRGB as a PNG holds it."""
+    return torch.from_numpy(np.round(np.clip(linear_to_srgb(image.numpy()), 0, 1) * 255) / 255).float()

@@ -1,0 +1,128 @@
+"""Soak: hours of playback and of training, watched for memory, pace and bits.
+
+Resumable: every process adds its segment to ``soak.json`` in the work folder; slopes are taken within segments.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from rnd_runtime.files import atomic_path
+from rnd_runtime.raster_cpu import rasterize
+
+from .figures import Figure, at_most, below
+from .subject import Subject
+from .trainings import studio, tiny_config
+
+SLOPE_BYTES = 1000.0
+WARM = 200
+"""frames or steps before memory is watched: caches fill"""
+EVERY = 20
+"""frames or steps between two readings"""
+PACE = 1.2
+"""median of the last tenth over that of the first"""
+
+
+def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
+    """Play ``frames`` frames, over and over the same motion; counts what earlier processes did."""
+    walk, camera = subject.walk(4.0), subject.camera()
+    count = walk.frame_count
+
+    def frame(number: int) -> str:
+        posed = subject.avatar.pose(walk, (number % count) / walk.fps)
+        shader = subject.shader.turned(2 * np.pi * (number % count) / count)
+        radiance = shader.shade(posed, camera.position)
+        raster = rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera)
+        return hashlib.sha256(raster.image.tobytes()).hexdigest()
+
+    return _soak("playback", frame, frames, state, same=count)
+
+
+def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
+    """Train for ``steps`` steps in one go (a resumed training is R11's)."""
+    from rnd_trainer.train import Training
+
+    training = Training(studio(subject), tiny_config(steps=steps + 1, gaussians=subject.few(400, 4000)))
+
+    def step(number: int) -> str:
+        training.step()
+        return ""
+
+    return _soak("training", step, steps, state, same=0)
+
+
+def _soak(name: str, work: Callable[[int], str], total: int, state: Path, *, same: int) -> list[Figure]:
+    """``same``: after how many frames the same bits must come back; 0 where nothing repeats."""
+    record: dict[str, Any] = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {}
+    segments = record.setdefault(name, [])
+    done = sum(segment["frames"] for segment in segments) if same else 0
+    if not same:
+        segments.clear()
+    first = record.setdefault(f"{name}_bits", {})
+    memory: list[int] = []
+    seconds: list[float] = []
+    wrong = 0
+    segment: dict[str, Any] = {"frames": 0, "memory": memory, "seconds": seconds, "wrong": 0}
+    segments.append(segment)
+    for number in range(done, total):
+        started = perf_counter()
+        bits = work(number)
+        seconds.append(perf_counter() - started)
+        if same and number % same % 30 == 0:  # every second's first frame is remembered
+            wrong += first.setdefault(str(number % same), bits) != bits
+        if len(seconds) > WARM and number % EVERY == 0:
+            memory.append(_resident())
+        segment["frames"] += 1
+        segment["wrong"] = wrong
+        if number % 500 == 499:
+            _save(state, record)
+    _save(state, record)
+    return _figures(name, segments, bool(same))
+
+
+def _figures(name: str, segments: list[dict[str, Any]], same: bool) -> list[Figure]:
+    slopes = [_slope(s["memory"]) for s in segments if len(s["memory"]) > 10]
+    paces = [_pace(s["seconds"]) for s in segments if len(s["seconds"]) > 10 * WARM // 2]
+    frames = sum(segment["frames"] for segment in segments)
+    figures = [
+        below(f"{name}, {frames}: memory a frame", max(slopes, default=float("nan")), SLOPE_BYTES, "bytes")
+    ]
+    if paces:
+        from dataclasses import replace
+
+        pace = below(f"{name}, {frames}: pace of the end over the start", max(paces), PACE, "×")
+        figures.append(replace(pace, timing=True))
+    if same:
+        wrong = sum(segment["wrong"] for segment in segments)
+        figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
+    return figures
+
+
+def _slope(readings: list[int]) -> float:
+    """Bytes a frame, least squares over the readings."""
+    return float(np.polyfit(EVERY * np.arange(len(readings)), readings, 1)[0])
+
+
+def _pace(seconds: list[float]) -> float:
+    tenth = max(1, len(seconds) // 10)
+    return float(np.median(seconds[-tenth:]) / np.median(seconds[WARM // 4 : WARM // 4 + tenth]))
+
+
+def _resident() -> int:
+    """Bytes of memory that are this process's own."""
+    fields = dict(
+        line.split(":", 1) for line in Path("/proc/self/smaps_rollup").read_text("ascii").splitlines()[1:]
+    )
+    return 1024 * sum(int(fields[name].split()[0]) for name in ("Private_Clean", "Private_Dirty"))
+
+
+def _save(state: Path, record: dict[str, Any]) -> None:
+    with atomic_path(state) as temporary:
+        temporary.write_text(json.dumps(record), encoding="utf-8")

@@ -1,0 +1,188 @@
+"""Our renderer, given the truth, against Mitsuba: a ball and a person under every light of the stage.
+
+Gaussians with the true places, normals, albedo and roughness, and with visibility fitted to shadows traced through the
+true surface, are shaded and splatted by the runtime. Mitsuba films the same surface with direct light alone, which is
+what our model claims to be, and with interreflection, which it leaves out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
+
+from rnd_runtime.camera import Camera
+from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.images import linear_to_srgb
+from rnd_runtime.light import Light
+from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.sh import sh_basis, sphere_quadrature
+from rnd_runtime.shading import Shader
+from rnd_runtime.shadow import directional_visibility
+
+from .lights import stage_lights
+from .render import Set, Surface
+
+Floats = NDArray[np.float64]
+
+DIRECTIONS = 192  # in which visibility is traced for the fit of its 16 coefficients
+SHADOW_TEXELS = 384
+DISC, THICKNESS = (
+    0.55,
+    0.05,
+)  # standard deviations of a Gaussian in its plane and across, in units of the spacing
+OPACITY = 0.99
+RIM = 2  # pixels at the silhouette that "inside" leaves out: a splat's edge is softer than a surface's
+DIRECT, FULL = 2, 5  # path depths
+PROBE = (32, 64)  # texels that our sums run over, as in training; a module spans 18°, a texel 6°
+
+
+@dataclass(frozen=True)
+class AgreementOptions:
+    """How pictures are compared."""
+
+    size: int = 256
+    """pixels, square"""
+    samples: int = 256
+    """Mitsuba's paths a pixel"""
+    modes: tuple[str, ...] = ("brute", "table+sun")
+    """shading modes of the runtime"""
+
+
+def ball(radius: float = 0.5, height: float = 0.92, rings: int = 96) -> Surface:
+    """A ball before the stage's cameras, with true normals, a checked albedo and roughness from 0.25 to 0.8."""
+    polar, azimuth = np.meshgrid(
+        np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij"
+    )
+    normals = np.stack([np.sin(polar) * np.cos(azimuth), np.cos(polar), np.sin(polar) * np.sin(azimuth)], -1)
+    index = np.arange(polar.size).reshape(polar.shape)
+    a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, c, b], 1), np.stack([a, d, c], 1)])
+    normals = normals.reshape(-1, 3)
+    smooth = 0.5 + 0.5 * np.sin(4 * azimuth.ravel()) * np.sin(3 * polar.ravel())
+    colour = np.stack([0.15 + 0.5 * smooth, 0.45 - 0.2 * smooth, 0.6 - 0.45 * smooth], axis=1)
+    return Surface(radius * normals + [0, height, 0], normals, faces, colour, 0.25 + 0.55 * smooth)
+
+
+def true_gaussians(surface: Surface) -> Gaussians:
+    """A Gaussian at every vertex (vertices closer than half the usual spacing are merged), all attributes true."""
+    vertices, spacing = surface.vertices, _spacing(surface)
+    chosen = _thinned(vertices, 0.5 * spacing)
+    points, normals = vertices[chosen], surface.normals[chosen]
+    local = cKDTree(points).query(points, k=5)[0][:, 1:].mean(axis=1)
+    sigma = DISC * np.clip(local, 0.5 * spacing, 2 * spacing)
+    outer = normals[:, :, None] * normals[:, None, :]
+    flat = np.eye(3) - outer
+    covariance = sigma[:, None, None] ** 2 * (flat + THICKNESS**2 * outer)
+    upper = covariance[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    visibility = fitted_visibility(points, normals, 1.25 * local.mean())
+    return Gaussians(
+        means=np.ascontiguousarray(points, np.float32),
+        covariances=np.ascontiguousarray(upper, np.float32),
+        opacities=np.full(len(points), OPACITY, np.float32),
+        normals=np.ascontiguousarray(normals, np.float32),
+        albedo=np.ascontiguousarray(surface.colour[chosen], np.float32),
+        roughness=np.ascontiguousarray(surface.roughness[chosen], np.float32),
+        visibility=visibility.astype(np.float32),
+        root_rotation=np.eye(3, dtype=np.float32),
+    )
+
+
+def fitted_visibility(points: Floats, normals: Floats, radius: float) -> Floats:
+    """Harmonics [N, 16] that fit traced shadows best where they count: least squares weighted by the cosine."""
+    directions, _ = sphere_quadrature(DIRECTIONS)
+    traced = directional_visibility(points, normals, directions, radii=radius, resolution=SHADOW_TEXELS)
+    basis = sh_basis(directions)
+    weight = np.maximum(normals @ directions.T, 0)
+    result = np.empty((len(points), basis.shape[1]))
+    ridge = 1e-3 * np.eye(basis.shape[1])
+    clear = np.zeros(basis.shape[1])
+    clear[0] = np.sqrt(4 * np.pi)  # what is below the horizon is pulled towards "visible"
+    for start in range(0, len(points), 2048):
+        part = slice(start, start + 2048)
+        weighted = weight[part, :, None] * basis
+        rows = weighted.swapaxes(1, 2)  # [n, 16, K]
+        normal_matrix = rows @ basis + ridge
+        right = (rows @ traced[part, :, None])[..., 0] + ridge @ clear
+        result[part] = np.linalg.solve(normal_matrix, right[..., None])[..., 0]
+    return result
+
+
+def compare(
+    name: str,
+    surface: Surface,
+    camera: Camera,
+    options: AgreementOptions,
+    on_row: Callable[[dict[str, Any]], None],
+) -> list[dict[str, Any]]:
+    """Rows for one body under every light.
+
+    ``psnr`` is of sRGB pictures against direct light, ``psnr_inside`` of the pixels well inside the silhouette;
+    ``energy`` is ours over theirs there; ``interreflection_*`` is Mitsuba's direct light against its full paths, and
+    ``noise_psnr`` two of its own pictures against each other: no figure can be higher.
+    """
+    gaussians = true_gaussians(surface)
+    direct, full = Set(surface, max_depth=DIRECT), Set(surface, max_depth=FULL)
+    coverage = full.truth(camera, samples=16, seed=0).coverage
+    inside = binary_erosion(coverage > 0.99, iterations=RIM)
+    rows = []
+    for light in stage_lights():
+        first, second = (
+            direct.radiance(camera, light.radiance, samples=options.samples // 2, seed=seed)
+            for seed in (1, 2)
+        )
+        truth = 0.5 * (first + second)
+        paths = full.radiance(camera, light.radiance, samples=options.samples, seed=3)
+        row: dict[str, Any] = {
+            "body": name,
+            "light": light.name,
+            "gaussians": len(gaussians.means),
+            "size": options.size,
+            "samples": options.samples,
+            "noise_psnr": _psnr(first, second, inside)
+            + 10 * np.log10(4),  # each mean of half has 4 times the error
+            "interreflection_psnr": _psnr(truth, paths, inside),
+            "interreflection_energy": float(paths[inside].sum() / truth[inside].sum() - 1),
+        }
+        for mode in options.modes:
+            shader = Shader(Light(light.radiance.astype(np.float32)), mode, texels=PROBE)
+            radiance = shader.shade(gaussians, camera.position)
+            ours = rasterize(
+                gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera
+            ).image
+            row[mode] = {
+                "psnr": _psnr(ours, truth, np.ones_like(inside)),
+                "psnr_inside": _psnr(ours, truth, inside),
+                "psnr_inside_full": _psnr(ours, paths, inside),
+                "energy": float(ours[inside].sum() / truth[inside].sum()),
+            }
+        rows.append(row)
+        on_row(row)
+    return rows
+
+
+def _psnr(a: NDArray[np.floating], b: NDArray[np.floating], where: NDArray[np.bool_]) -> float:
+    first, second = (linear_to_srgb(np.clip(x, 0, 1))[where] for x in (a, b))
+    return float(-10 * np.log10(max(float(np.mean((first - second) ** 2)), 1e-12)))
+
+
+def _spacing(surface: Surface) -> float:
+    """The square root of the area of a vertex: what the distance between even samples would be."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return float(np.sqrt(area / len(surface.vertices)))
+
+
+def _thinned(points: Floats, distance: float) -> NDArray[np.int64]:
+    """Indices of points of which no two are closer than ``distance``; the first of each cluster stays."""
+    gone = np.zeros(len(points), bool)
+    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    for i, j in pairs[np.lexsort(pairs.T[::-1])]:
+        if not gone[i]:
+            gone[j] = True
+    return np.flatnonzero(~gone)

@@ -1,0 +1,239 @@
+"""rnd-stage: the command around the light stage: filming, and the two studies that stand on it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.files import atomic_path, output_folder
+
+from .plan import BenchmarkOptions, Recipe
+from .variants import Variant, need_extra, use_variant
+
+_DESCRIPTION = """Film a coded person on a light stage: many views, many lights, the truth beside every picture.
+
+Instead of OUT, "agreement JSON" compares our renderer with Mitsuba, "benchmark OUT" films four people and trains."""
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """Film a coded person on a light stage: many views, many lights, and the truth beside every picture."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """folder for the capture; what is there already is kept"""
+    recipe: Annotated[Recipe, tyro.conf.arg(name="")] = field(default_factory=Recipe)
+    shard: str = "0/1"
+    """K/N: film only the instants K, K+N, K+2N …; whoever finishes last writes capture.json"""
+    variant: Variant = "auto"
+    """Mitsuba's back end; auto takes LLVM where it works"""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Our renderer with true attributes of a ball and of a person against Mitsuba, under every light of the stage."""
+
+    json: Annotated[Path, tyro.conf.Positional]
+    """write the rows here"""
+    subject: int = 0
+    """seed of the person"""
+    frame: int = 40
+    """of the dance"""
+    size: int = 256
+    """pixels, square"""
+    samples: int = 256
+    """Mitsuba's paths a pixel"""
+    step: float = 0.006
+    """metres between the person's vertices, and Gaussians"""
+    variant: Variant = "auto"
+    """Mitsuba's back end"""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Film four people, train on one camera's white light, score novel views, poses and lights; continues itself."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """folder for captures and trainings"""
+    json: Path | None = None
+    """write summary, cost and rows here"""
+    perceptual_weights: Path | None = None
+    """adds LPIPS to the metrics and to the training, as in rnd-train"""
+    film_only: bool = False
+    """stop when all is filmed"""
+    sizes: Annotated[BenchmarkOptions, tyro.conf.arg(name="")] = field(default_factory=BenchmarkOptions)
+    variant: Variant = "auto"
+    """Mitsuba's back end"""
+
+
+def main() -> None:
+    """Entry point of ``rnd-stage``: ``rnd-stage OUT``, ``rnd-stage agreement JSON``, ``rnd-stage benchmark OUT``."""
+    words = sys.argv[1:]
+    if words[:1] == ["agreement"]:
+        study = tyro.cli(Agreement, prog="rnd-stage agreement", args=words[1:])
+        sys.exit(run_command("rnd-stage", lambda: _agreement(study)))
+    if words[:1] == ["benchmark"]:
+        benchmark = tyro.cli(Benchmark, prog="rnd-stage benchmark", args=words[1:])
+        sys.exit(run_command("rnd-stage", lambda: _benchmark(benchmark)))
+    options = tyro.cli(StageOptions, prog="rnd-stage", description=_DESCRIPTION)
+    sys.exit(run_command("rnd-stage", lambda: _stage(options)))
+
+
+def _stage(options: StageOptions) -> None:
+    need_extra()
+    shard = parse_shard(options.shard)
+    options.recipe.check()
+    variant = use_variant(options.variant)
+    from rich.console import Console
+
+    from .film import prepare
+    from .manifest import finish
+
+    console = Console(stderr=True)
+    with console.status("dressing"):
+        production = prepare(options.recipe, options.out)
+    for note in production.motion.notes:
+        console.print(f"rnd-stage: {note}")
+    seconds = _film_with_progress(production, options, shard, console)
+    if finish(production, options.out, variant, seconds):
+        console.print(f"{options.out / 'capture.json'}: {production.title}")
+    else:
+        console.print("rnd-stage: this shard is filmed; others are missing, so there is no capture.json yet")
+
+
+def _film_with_progress(production, options: StageOptions, shard: tuple[int, int], console) -> float | None:
+    """Film a shard with a progress bar; seconds per picture, None where all was there."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from .film import film
+    from .plan import missing, picture_count
+
+    own = set(production.frames[shard[0] :: shard[1]])
+    shots = [shot for shot in production.shots if shot.frame in own]
+    fresh = picture_count([s for s in shots if missing(options.out, s, production.recipe.visibility)])
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, speed_estimate_period=120) as progress:
+        task = progress.add_task("filming", total=picture_count(shots))
+        seconds = film(production, options.out, shard=shard, on_picture=lambda name: progress.advance(task))
+    return seconds / fresh if fresh else None
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """ "K/N" as (K, N) with 0 ≤ K < N.
+
+    Raises:
+        InputError: anything else.
+    """
+    part, _, parts = text.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
+        raise InputError("--shard", expected="K/N with K from 0 to N - 1", got=text)
+    return int(part), int(parts)
+
+
+def _agreement(options: Agreement) -> None:
+    need_extra()
+    if options.size < 16 or options.samples < 2:
+        raise InputError(
+            "--size, --samples", expected="at least 16, 2", got=f"{options.size}, {options.samples}"
+        )
+    use_variant(options.variant)
+    from rich.console import Console
+    from rich.table import Table
+
+    from .agreement import AgreementOptions, ball, compare
+    from .cameras import ring_cameras
+    from .dances import dance
+    from .dressing import Wearer, dress
+    from .subjects import subject
+
+    settings = AgreementOptions(options.size, options.samples)
+    camera = ring_cameras(1, options.size)["cam00"]
+    dressed = dress(subject(options.subject), options.step)
+    motion = dance(dressed.body.skeleton)
+    if not 0 <= options.frame < motion.frame_count:
+        raise InputError("--frame", expected=f"below {motion.frame_count}", got=options.frame)
+    person = Wearer(dressed, motion, [options.frame]).surface(options.frame)
+    table = Table(
+        "body", "light", *settings.modes, "noise", "interreflection", "its energy", title="PSNR inside, dB"
+    )
+    rows = []
+    console = Console(stderr=True)
+    with console.status("comparing"):
+        for name, surface in (("ball", ball()), ("person", person)):
+            for row in compare(name, surface, camera, settings, lambda row: None):
+                ours = [
+                    f"{row[mode]['psnr_inside']:.1f} ({row[mode]['energy'] - 1:+.1%})"
+                    for mode in settings.modes
+                ]
+                table.add_row(
+                    name, row["light"], *ours, f"{row['noise_psnr']:.1f}", f"{row['interreflection_psnr']:.1f}",
+                    f"{row['interreflection_energy']:+.1%}",
+                )  # fmt: skip
+                rows.append(row)
+    Console().print(table)
+    _write_json(options.json, rows)
+
+
+def _benchmark(options: Benchmark) -> None:
+    need_extra()
+    variant = use_variant(options.variant)
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from rnd_trainer.perceptual import load_perceptual
+
+    from .benchmark import film_subjects, means, run_benchmark
+
+    settings = options.sizes
+    if settings.steps < 1 or settings.gaussians < 64:
+        got = f"{settings.steps}, {settings.gaussians}"
+        raise InputError("--steps, --gaussians", expected="at least 1, 64", got=got)
+    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    output_folder(options.out)
+    with Progress(console=Console(stderr=True)) as progress:
+        filming = progress.add_task("filming", total=None)
+        film_subjects(
+            settings,
+            options.out,
+            variant,
+            lambda done, total: progress.update(filming, completed=done, total=total),
+        )
+        if options.film_only:
+            return
+        training = progress.add_task("training", total=None)
+        result = run_benchmark(
+            settings,
+            options.out,
+            perceptual=perceptual,
+            on_run=lambda what, done, total: progress.update(
+                training, description=what, completed=done, total=total
+            ),
+        )
+    splits = list(dict.fromkeys(row["split"] for row in result["rows"]))
+    table = Table("method", *splits, title=f"PSNR, mean of {len(result['summary'])} subjects")
+    for method, cells in means(result["rows"], "psnr"):
+        table.add_row(method, *(f"{cells[split]:.2f}" if split in cells else "" for split in splits))
+    Console().print(table)
+    if options.json is not None:
+        _write_json(options.json, result)
+
+
+def _write_json(path: Path, content: object) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

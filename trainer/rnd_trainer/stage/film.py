@@ -1,0 +1,206 @@
+"""Filming a recipe into a folder: shot by shot, to be continued, in shards, and the manifest when all is there."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.npz import save_npz
+
+from . import plan as plans
+from .cameras import VISIBLE_HEIGHT, ring_cameras
+from .dances import dance
+from .dressing import Dressed, Wearer
+from .estimates import estimated_mask, estimated_normals
+from .lights import WHITE, StageLight, module_directions, stage_lights
+from .plan import Recipe, Shot
+from .render import Set, Truth
+
+Floats = NDArray[np.float64]
+
+RECIPE_FILE = "stage.json"
+TRUTH_SAMPLES = 16  # a truth has no noise but at edges
+VISIBILITY_SAMPLES = 16
+FINEST, COARSEST = 0.003, 0.007  # m between a dressed surface's vertices
+
+
+@dataclass
+class Production:
+    """A recipe with everything it names loaded: what is filmed, by which cameras, under which lights."""
+
+    recipe: Recipe
+    dressed: Dressed
+    title: str
+    motion: Motion
+    frames: list[int]
+    lights: list[StageLight]
+    shots: list[Shot]
+
+    @property
+    def cameras(self):
+        return ring_cameras(self.recipe.cameras, self.recipe.size)
+
+
+def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Production:
+    """Load and dress what ``recipe`` names; ``template`` as in :func:`.dressing.dress`.
+
+    Raises:
+        InputError: a part that cannot be had, or a folder that holds another recipe's pictures.
+    """
+    recipe.check()
+    keep_recipe(recipe, folder)
+    dressed, title = _cast(recipe, template)
+    motion = dance(dressed.body.skeleton)
+    if recipe.motion is not None:
+        motion = load_motion(recipe.motion, dressed.body.skeleton)
+    motion = _on_the_spot(motion)
+    frames = plans.instants(recipe, motion.frame_count)
+    if len(frames) < 5:
+        raise InputError("motion", expected="at least 5 frames", got=motion.frame_count, file=motion.source)
+    lights = _chosen(recipe)
+    names = [light.name for light in lights]
+    shots = plans.plan(recipe, frames, list(ring_cameras(recipe.cameras, recipe.size)), names)
+    return Production(recipe, dressed, title, motion, frames, lights, shots)
+
+
+def film(
+    production: Production,
+    folder: Path,
+    *,
+    shard: tuple[int, int] = (0, 1),
+    on_picture: Callable[[str], None],
+) -> float:
+    """Film what is missing of one shard (k, n): the instants whose number is k modulo n. Returns seconds of filming.
+
+    ``on_picture`` is called with the name of each picture that is there, filmed or found.
+    """
+    part, parts = shard
+    own = set(production.frames[part::parts])
+    todo = [shot for shot in production.shots if shot.frame in own]
+    missing = [shot for shot in todo if plans.missing(folder, shot, production.recipe.visibility)]
+    for light in production.lights:
+        if not (folder / _light_file(light.name)).exists():
+            write_image(folder / _light_file(light.name), light.file_radiance)
+    for shot in todo:
+        if shot not in missing:
+            for _, name in shot.uses:
+                on_picture(shot.image(name))
+    if not missing:
+        return 0.0
+    wearer = Wearer(production.dressed, production.motion, sorted({shot.frame for shot in missing}))
+    started = time.perf_counter()
+    for frame in sorted({shot.frame for shot in missing}):
+        stage = Set(wearer.surface(frame), max_depth=production.recipe.max_depth)
+        save_npz(folder / f"surface/{frame:06d}.npz", {"vertices": stage.surface.vertices.astype(np.float32)})
+        for shot in missing:
+            if shot.frame == frame:
+                _shoot(production, stage, shot, folder)
+                for _, name in shot.uses:
+                    on_picture(shot.image(name))
+    return time.perf_counter() - started
+
+
+def _shoot(production: Production, stage: Set, shot: Shot, folder: Path) -> None:
+    """One camera at one instant: the truth, then a picture for each light."""
+    recipe, camera = production.recipe, production.cameras[shot.camera]
+    numbers = {light.name: k for k, light in enumerate(production.lights)}
+    seed = 1000 * shot.frame + 31 * int(shot.camera[3:])
+    truth = stage.truth(camera, samples=TRUTH_SAMPLES, seed=seed)
+    _write_truth(folder, shot, truth, recipe)
+    if recipe.visibility and shot.camera == plans.TRAIN_CAMERA:
+        seen = stage.visibility(
+            camera, module_directions(), truth.normals, samples=VISIBILITY_SAMPLES, seed=seed
+        )
+        save_npz(folder / f"visibility/{shot.place}.npz", {"visibility": to_bytes(seen)})
+    for _, name in shot.uses:
+        light = production.lights[numbers[name]]
+        radiance = stage.radiance(
+            camera, light.radiance, samples=recipe.samples, seed=seed + 7919 * (1 + numbers[name])
+        )
+        write_image(folder / shot.image(name), to_bytes(linear_to_srgb(np.clip(radiance, 0, 1))))
+
+
+def _write_truth(folder: Path, shot: Shot, truth: Truth, recipe: Recipe) -> None:
+    place, covered = shot.place, (truth.coverage >= 0.05)[..., None]
+    write_image(folder / f"masks/{place}.png", to_bytes(truth.coverage))
+    write_image(folder / f"normals_gt/{place}.png", to_bytes(0.5 * (truth.normals + 1) * covered))
+    write_image(folder / f"albedo/{place}.png", to_bytes(linear_to_srgb(np.clip(truth.albedo, 0, 1))))
+    write_image(folder / f"roughness/{place}.png", to_bytes(truth.roughness))
+    write_image(folder / f"depth/{place}.exr", truth.depth.astype(np.float32), channel_names=("Z",))
+    if shot.trains:
+        seed, strength = recipe.estimate_seed + 1000 * shot.frame, recipe.estimate_strength
+        normals = estimated_normals(truth.normals, truth.coverage, seed, strength)
+        write_image(folder / f"normals/{place}.png", to_bytes(0.5 * (normals + 1) * covered))
+        mask = estimated_mask(truth.coverage, seed, strength)
+        write_image(folder / f"masks_estimated/{place}.png", to_bytes(mask))
+
+
+def keep_recipe(recipe: Recipe, folder: Path) -> None:
+    """Write the recipe, or hold it against the one that is there."""
+    file = output_folder(folder) / RECIPE_FILE
+    mine = json.loads(json.dumps(asdict(recipe)))
+    if file.exists():
+        try:
+            theirs = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise InputError("not a recipe", got=str(error), file=file) from error
+        different = sorted(key for key in mine if theirs.get(key) != mine[key])
+        if different:
+            raise InputError(
+                "holds another recipe",
+                expected=f"the same {', '.join(different)}",
+                file=file,
+                hint="or another OUT",
+            )
+        return
+    with atomic_path(file) as temporary:
+        temporary.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")
+
+
+def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:
+    if recipe.character is not None:
+        from .characters import load_character
+
+        return load_character(Path(recipe.character)), Path(recipe.character).stem
+    from .dressing import dress
+    from .subjects import subject
+
+    person = subject(recipe.subject)
+    step = (
+        float(np.clip(0.7 * VISIBLE_HEIGHT / recipe.size, FINEST, COARSEST))
+        if recipe.step is None
+        else recipe.step
+    )
+    return dress(person, step, template), person.title
+
+
+def _on_the_spot(motion: Motion) -> Motion:
+    """The motion about the middle of the stage."""
+    middle = np.median(motion.translations, axis=0) * [1, 0, 1]
+    return replace(motion, translations=motion.translations - middle)
+
+
+def _chosen(recipe: Recipe) -> list[StageLight]:
+    lights = stage_lights(tuple(Path(name) for name in recipe.hdr))
+    names = [light.name for light in lights]
+    unknown = [name for name in recipe.lights if name not in names]
+    if unknown:
+        raise InputError("--lights", expected=", ".join(names), got=", ".join(unknown))
+    given = {Path(name).stem for name in recipe.hdr}
+    wanted = {WHITE, *given, *(recipe.lights or names)}
+    return [light for light in lights if light.name in wanted]
+
+
+def _light_file(name: str) -> str:
+    return f"lights/{name}.exr"

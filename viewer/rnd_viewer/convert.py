@@ -1,0 +1,145 @@
+"""What ``rnd-convert`` does with its options."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.amass import write_amass
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import existing_file, output_folder
+from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.shading import Shader
+from rnd_runtime.skeleton import Skeleton
+
+from .cameras import CameraPath, View, file_path, frame_motion, front_path
+from .convert_cli import MeshOptions, MotionOptions, Options, SplatOptions
+from .mesh_files import posed_vertices, write_obj, write_rigged_glb
+from .options import parse_frames
+from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
+from .splats import Splats, fixed_colour, make_splats, stored_colours, turned_over, view_dependent_colour
+
+Floats = NDArray[np.float64]
+SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog"), ("glb", "obj")
+# The front camera of rnd-play; only where it stands matters here.
+FRONT = View(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
+
+
+def convert(options: Options) -> Iterator[str]:
+    """Write what ``options`` ask for; yields one line for the user about each kind of file written.
+
+    Raises:
+        InputError: for whatever cannot be used; what was finished before stays.
+    """
+    if isinstance(options, SplatOptions):
+        return _splats(options)
+    if isinstance(options, MeshOptions):
+        return _mesh(options)
+    return _motion(options)
+
+
+def _splats(options: SplatOptions) -> Iterator[str]:
+    formats = _formats(options.format, SPLAT_FORMATS)
+    program = splat_transform() if {"spz", "sog"} & set(formats) else None
+    avatar = Avatar.load(options.avatar)
+    motion = load_motion(options.motion, avatar.skeleton)
+    frames = parse_frames(options.frames, motion.frame_count)
+    shader = Shader(_light(options, avatar), mode=options.shade)
+    camera_at = _camera_path(options.camera, avatar.skeleton, motion)
+    out = output_folder(options.out)
+    for number in frames:
+        gaussians = avatar.pose(motion, number / motion.fps)
+        eye = camera_at(number, number / motion.fps).position
+        splats = make_splats(gaussians, _harmonics(options, avatar, gaussians, shader, eye))
+        stored = turned_over(splats) if options.ply_axes == "3dgs" else splats
+        if "ply" in formats:
+            write_ply(out / f"{number:06d}.ply", stored)
+        if "glb" in formats:
+            write_splat_glb(out / f"{number:06d}.glb", splats, options.coding)
+        if program is not None:
+            _transformed(program, out / f"{number:06d}", stored, formats)
+    sizes = [(suffix, (out / f"{number:06d}.{suffix}").stat().st_size / 1e6) for suffix in formats]
+    listed = ", ".join(f"{suffix} ({size:.2f} MB)" for suffix, size in sizes)
+    yield f"{len(frames)} frames of {avatar.gaussians} Gaussians in {out}: {listed}"
+
+
+def _harmonics(
+    options: SplatOptions, avatar: Avatar, gaussians: Gaussians, shader: Shader, eye: Floats
+) -> Floats:
+    def stored(linear: NDArray[np.float32]) -> Floats:
+        return stored_colours(gaussians, linear, options.coding, avatar.spacing)
+
+    if options.colour == "albedo":
+        return fixed_colour(stored(gaussians.albedo))
+    if options.sh_degree == 0:
+        return fixed_colour(stored(shader.shade(gaussians, eye)))
+    return view_dependent_colour(
+        gaussians, lambda position: stored(shader.shade(gaussians, position)), options.sh_degree
+    )
+
+
+def _transformed(program: str, stem: Path, splats: Splats, formats: tuple[str, ...]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder) / "splats.ply"
+        write_ply(ply, splats)
+        for suffix in ("spz", "sog"):
+            if suffix in formats:
+                transform_ply(program, ply, stem.with_suffix(f".{suffix}"))
+
+
+def _mesh(options: MeshOptions) -> Iterator[str]:
+    formats = _formats(options.format, MESH_FORMATS)
+    body = Body.load(options.body)
+    motion = load_motion(options.motion, body.skeleton)
+    frames = parse_frames(options.frames, motion.frame_count)
+    out = output_folder(options.out)
+    if "glb" in formats:
+        write_rigged_glb(out / "body.glb", body, motion)
+        yield f"{out / 'body.glb'}: {len(body.vertices)} vertices, {motion.duration:.1f} s of motion"
+    if "obj" in formats:
+        for number in frames:
+            vertices = posed_vertices(body, motion, number / motion.fps)
+            write_obj(out / f"{number:06d}.obj", vertices, body.faces)
+        yield f"{len(frames)} posed meshes as obj in {out}"
+
+
+def _motion(options: MotionOptions) -> Iterator[str]:
+    file = existing_file(options.skeleton, what="avatar or body")
+    skeleton = Body.load(file).skeleton if file.suffix == ".npz" else Avatar.load(file).skeleton
+    motion = load_motion(options.motion, skeleton)
+    lost = write_amass(options.out, motion, skeleton)
+    if lost:
+        yield f"joints that SMPL-H lacks were left out: {', '.join(lost)}"
+    yield f"{options.out}: {motion.frame_count} frames at {motion.fps:g} per second"
+
+
+def _light(options: SplatOptions, avatar: Avatar) -> Light:
+    yaw = math.radians(options.hdr_yaw)
+    if options.hdr is None:
+        return replace(Light(avatar.trained_light).scaled(2.0**options.exposure), yaw=yaw)
+    return load_light(options.hdr, yaw=yaw, exposure=options.exposure)
+
+
+def _camera_path(text: str, skeleton: Skeleton, motion: Motion) -> CameraPath:
+    if text == "front":
+        return front_path(frame_motion(skeleton, motion), FRONT)
+    if ".json" not in text:
+        raise InputError("--camera", expected="front, FILE.json or FILE.json:NAME", got=text)
+    return file_path(text, None)
+
+
+def _formats(text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    if not names or names - set(known):
+        raise InputError("--format", expected=f"some of {','.join(known)}", got=text or "nothing")
+    return tuple(name for name in known if name in names)

@@ -1,0 +1,99 @@
+"""The command ``rnd-convert``: avatars, bodies and motions in the formats of other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from rnd_runtime.errors import run_command
+
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """Posed, relit frames as plain 3D Gaussians: .ply and .glb, and .spz or .sog where splat-transform is installed."""
+
+    avatar: Annotated[Path, tyro.conf.Positional]
+    """avatar.onnx"""
+    motion: Path
+    """body poses over time"""
+    out: Path
+    """folder for 000000.ply and so on"""
+    format: str = "ply"
+    """some of ply,glb,spz,sog"""
+    frames: str = "0:1"
+    """frames of the motion, START:END, END excluded, either may be missing"""
+    colour: Literal["lit", "albedo"] = "lit"
+    """shaded by the light, or the material's own colour"""
+    hdr: Annotated[Path | None, _NO_HINT] = None
+    """light probe, lat-long EXR or HDR. Default: the light the avatar was captured under"""
+    hdr_yaw: float = 0.0
+    """turn the light, degrees"""
+    exposure: float = 0.0
+    """stops by which the light is made brighter"""
+    shade: str = "table+sun"
+    """shading, as of rnd-play"""
+    camera: str = "front"
+    """front, FILE.json or FILE.json:NAME: from where highlights are seen when --sh-degree is 0"""
+    sh_degree: Literal[0, 1, 2, 3] = 0
+    """above 0: the colour's change with the view, fitted from all around"""
+    coding: Literal["srgb", "linear"] = "srgb"
+    """srgb: what viewers show as it is. linear: radiance, for renderers that code the blended picture"""
+    ply_axes: Literal["3dgs", "y-up"] = "3dgs"
+    """3dgs: Y down, as viewers of .ply, .spz and .sog expect. The .glb is always Y up"""
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """The posed template: .obj for each frame, or one .glb with skeleton, weights and the motion as an animation."""
+
+    body: Annotated[Path, tyro.conf.Positional]
+    """body.npz, as in a capture's folder (an avatar holds Gaussians, no mesh)"""
+    motion: Path
+    """body poses over time"""
+    out: Path
+    """folder for body.glb, 000000.obj and so on"""
+    format: str = "glb"
+    """some of glb,obj"""
+    frames: str = "0:1"
+    """frames to write as .obj, START:END, END excluded, either may be missing"""
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """A motion as an AMASS .npz (SMPL-H, Z up), which SMPL tools for Blender and others read."""
+
+    skeleton: Annotated[Path, tyro.conf.Positional]
+    """avatar.onnx or body.npz: whose joints they are"""
+    motion: Path
+    """body poses over time, in any format that rnd-play reads"""
+    out: Path
+    """the .npz to write"""
+
+
+Options = SplatOptions | MeshOptions | MotionOptions
+_COMMANDS: dict[str, Callable[..., Options]] = {
+    "splats": SplatOptions,
+    "mesh": MeshOptions,
+    "motion": MotionOptions,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rnd-convert`` with ``arguments`` (the process's own when None) and return its exit code."""
+
+    def command() -> int:
+        options: Options = tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="rnd-convert", args=arguments)
+        from .convert import convert  # here, so that --help needs no heavy library
+        from .report import say
+
+        for line in convert(options):
+            say(line)
+        return 0
+
+    return run_command("rnd-convert", command)

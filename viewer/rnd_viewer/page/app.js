@@ -1,0 +1,287 @@
+// The page: its controls make a state, an engine makes pictures of states.
+
+import { connect } from "./engine.js";
+import { orbit, wrapped } from "./orbit.js";
+
+const IN_FLIGHT = 2;  // one picture is drawn while the next is made
+const RADIANS = Math.PI / 180;
+const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
+const $ = (id) => document.getElementById(id);
+
+const state = {
+  time: 0, width: 512, height: 512, azimuth: 0, elevation: 0, distance: 3, target: [0, 1, 0], fov: 0.6,
+  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", gaussians: null, truth: null,
+};
+let scene = null, engine = null, playing = false, playedSince = 0;
+let number = 0, wanted = false, flying = new Map();
+let waiting = [];  // {number, done, failed} of those who want a picture for themselves
+let times = {}, rates = [];
+
+function redraw() { wanted = true; }
+
+function step(now) {
+  if (playing && scene.motion.duration > 0) {
+    state.time = ((now - playedSince) / 1000) % scene.motion.duration;
+    wanted = true;
+  }
+  if (wanted && scene && flying.size < IN_FLIGHT) {
+    wanted = false;
+    ask(false);
+    showState();
+  }
+  requestAnimationFrame(step);
+}
+
+function ask(exact) {
+  number += 1;
+  flying.set(number, performance.now());
+  engine.render(number, { ...state }, exact);
+  return number;
+}
+
+function show(picture) {
+  const sent = flying.get(picture.number);
+  for (const old of [...flying.keys()]) if (old <= picture.number) flying.delete(old);
+  const canvas = $("picture"), context = canvas.getContext("2d");
+  if (canvas.width !== picture.width || canvas.height !== picture.height) {
+    canvas.width = picture.width;
+    canvas.height = picture.height;
+  }
+  if (picture.image instanceof ImageData) context.putImageData(picture.image, 0, 0);
+  else context.drawImage(picture.image, 0, 0);
+  drawSkeleton(picture);
+  const now = performance.now();
+  rates = [...rates.filter((at) => now - at < 1000), now];
+  times = picture.times;
+  times["to the page and back"] = Math.max(now - sent - Object.values(times).reduce((a, b) => a + b, 0), 0);
+  for (const one of waiting) if (one.number <= picture.number) one.done(picture);
+  waiting = waiting.filter((one) => one.number > picture.number);
+  if ($("message").textContent && !$("message").classList.contains("wrong")) say("");
+}
+
+function drawSkeleton(picture) {
+  const canvas = $("overlay"), context = canvas.getContext("2d");
+  const scale = Math.max(1, Math.round(1024 / picture.height));
+  canvas.width = picture.width * scale;
+  canvas.height = picture.height * scale;
+  if (!$("skeleton").checked) return;
+  context.scale(scale, scale);
+  context.lineWidth = picture.height / 300;
+  context.strokeStyle = "#f2b25c";
+  context.fillStyle = "#fff";
+  picture.joints.forEach(([x, y, z], joint) => {
+    const parent = scene.parents[joint];
+    if (parent < 0 || z <= 0 || picture.joints[parent][2] <= 0) return;
+    context.beginPath();
+    context.moveTo(x, y);
+    context.lineTo(picture.joints[parent][0], picture.joints[parent][1]);
+    context.stroke();
+  });
+  for (const [x, y, z] of picture.joints) {
+    if (z <= 0) continue;
+    context.beginPath();
+    context.arc(x, y, picture.height / 200, 0, 2 * Math.PI);
+    context.fill();
+  }
+}
+
+function showTimes() {
+  const now = performance.now();
+  rates = rates.filter((at) => now - at < 1000);
+  const rows = Object.entries(times).map(([name, ms]) => [name, `${ms.toFixed(1)} ms`]);
+  rows.push(["pictures a second", playing || rates.length > 1 ? String(rates.length) : "–"]);
+  $("times").replaceChildren(...rows.map((cells) => {
+    const row = document.createElement("tr");
+    for (const text of cells) row.appendChild(document.createElement("td")).textContent = text;
+    return row;
+  }));
+}
+
+function showState() {
+  $("time").value = state.time;
+  $("clock").textContent = `${state.time.toFixed(2)} of ${scene.motion.duration.toFixed(2)} s`;
+  $("yaw").value = state.yaw / RADIANS;
+  $("yaw").nextElementSibling.textContent = `${Math.round(state.yaw / RADIANS)}°`;
+  $("exposure").value = state.exposure;
+  $("exposure").nextElementSibling.textContent = `${state.exposure > 0 ? "+" : ""}${state.exposure.toFixed(1)}`;
+  $("size").value = state.height;
+  $("size").nextElementSibling.textContent = String(state.height);
+  $("gaussians").nextElementSibling.textContent = String(state.gaussians ?? scene.gaussians);
+  for (const name of ["light", "shade", "background"]) $(name).value = String(state[name]);
+  for (const button of $("output").children) button.ariaPressed = String(button.dataset.value === state.output);
+  $("play").textContent = playing ? "❚❚" : "▶";
+}
+
+function play(on) {
+  playing = on && scene.motion.duration > 0;
+  playedSince = performance.now() - 1000 * state.time;
+  redraw();
+}
+
+function say(text, wrong = false) {
+  $("message").textContent = text;
+  $("message").classList.toggle("wrong", wrong);
+}
+
+function options(select, entries) {
+  select.replaceChildren(...entries.map(([value, text]) => new Option(text, value)));
+}
+
+function home() {
+  Object.assign(state, structuredClone(scene.view));
+  redraw();
+}
+
+function setScene(description) {
+  const first = scene === null;
+  const moved = first || JSON.stringify(scene.view) !== JSON.stringify(description.view);
+  scene = description;
+  $("title").textContent = scene.avatar;
+  $("subtitle").textContent = `${scene.gaussians} Gaussians · ${scene.motion.name} · ${scene.raster}`;
+  options($("light"), scene.lights.map((name, index) => [index, name]));
+  options($("shade"), (scene.shades ?? SHADES).map((name) => [name, name]));
+  options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
+  $("compare").hidden = scene.truths.length === 0;
+  $("time").max = scene.motion.duration || 1;
+  $("time").step = 1 / scene.motion.fps;
+  for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
+  $("clip").disabled = $("play").disabled = scene.motion.duration === 0;
+  state.time = Math.min(state.time, scene.motion.duration);
+  state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
+  if (first) {
+    Object.assign(state, { width: scene.size, height: scene.size });
+    state.shade = scene.shade ?? state.shade;
+  }
+  if (moved) home();
+  $("notes").textContent = scene.notes.join(" · ");
+  redraw();
+}
+
+async function setTruth() {
+  const on = $("truth-on").checked, index = Number($("truth-index").value);
+  state.truth = on ? index : null;
+  $("truth-pane").hidden = !on;
+  $("light").disabled = on;  // the picture's own shines
+  if (on) {
+    play(false);
+    engine.truth(index);
+  }
+  redraw();
+}
+
+function showTruth(index, bitmap) {
+  const canvas = $("truth");
+  canvas.width = bitmap.width;
+  canvas.height = bitmap.height;
+  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+}
+
+function download(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+/** A promise of the picture of the state as it is now; with exact pixels unless told otherwise. */
+function picture(exact = true) {
+  return new Promise((done, failed) => { waiting.push({ number: ask(exact), done, failed }); });
+}
+
+async function screenshot() {
+  if (!await picture().catch(() => null)) return;  // the page says why
+  const canvas = document.createElement("canvas");
+  Object.assign(canvas, { width: $("picture").width, height: $("picture").height });
+  canvas.getContext("2d").drawImage($("picture"), 0, 0);
+  canvas.getContext("2d").drawImage($("overlay"), 0, 0, canvas.width, canvas.height);
+  canvas.toBlob((blob) => download(blob, `avatar_${state.time.toFixed(2)}s.png`));
+}
+
+function clip() {
+  play(false);
+  $("clip").disabled = true;
+  say("making a clip …");
+  const turn = $("turntable").checked ? 2 * Math.PI : 0;
+  engine.clip({ ...state }, scene.motion.fps, turn, scene.motion.duration);
+}
+
+function slider(id, apply) {
+  $(id).addEventListener("input", () => { apply(Number($(id).value)); redraw(); });
+}
+
+function bind() {
+  slider("yaw", (degrees) => { state.yaw = wrapped(degrees * RADIANS); });
+  slider("exposure", (stops) => { state.exposure = stops; });
+  slider("size", (pixels) => { state.width = state.height = pixels; });
+  slider("gaussians", (percent) => {
+    state.gaussians = percent < 100 ? Math.max(Math.round(scene.gaussians * percent / 100), 1) : null;
+  });
+  slider("time", (seconds) => { state.time = seconds; play(false); });
+  for (const name of ["shade", "background"])
+    $(name).addEventListener("change", () => { state[name] = $(name).value; redraw(); });
+  $("light").addEventListener("change", () => { state.light = Number($("light").value); redraw(); });
+  $("output").addEventListener("click", (event) => {
+    if (!event.target.dataset.value) return;
+    state.output = event.target.dataset.value;
+    redraw();
+  });
+  $("skeleton").addEventListener("change", redraw);
+  $("truth-on").addEventListener("change", setTruth);
+  $("truth-index").addEventListener("change", setTruth);
+  $("play").addEventListener("click", () => play(!playing));
+  $("screenshot").addEventListener("click", screenshot);
+  $("clip").addEventListener("click", clip);
+  document.addEventListener("keydown", (event) => {
+    if (event.target.matches("select") || !scene) return;
+    if (event.code === "Space") { event.preventDefault(); event.target.blur?.(); play(!playing); }
+    else if (event.code === "KeyR") home();
+    else if (event.code === "Comma" || event.code === "Period") {
+      const frames = event.code === "Comma" ? -1 : 1;
+      state.time = Math.min(Math.max(state.time + frames / scene.motion.fps, 0), scene.motion.duration);
+      play(false);
+    }
+  });
+  orbit($("stage"), state, redraw);
+}
+
+function bindFiles() {
+  $("files").hidden = false;
+  const load = async (files) => {
+    say(`reading ${[...files].map((file) => file.name).join(", ")} …`);
+    await engine.load([...files]);
+  };
+  $("choose").addEventListener("change", () => load($("choose").files));
+  document.addEventListener("dragover", (event) => { event.preventDefault(); document.body.classList.add("over"); });
+  document.addEventListener("dragleave", () => document.body.classList.remove("over"));
+  document.addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("over");
+    load(event.dataTransfer.files);
+  });
+}
+
+function fail(text) {
+  say(text, true);
+  $("clip").disabled = !scene?.motion.duration;
+  flying.clear();
+  for (const one of waiting) one.failed(new Error(text));
+  waiting = [];
+}
+
+const handlers = {
+  scene: setScene,
+  picture: show,
+  truth: showTruth,
+  message: (text) => say(text),
+  progress: (done, of) => say(`making a clip: ${done} of ${of}`),
+  clip: (blob, name) => { $("clip").disabled = false; say(""); download(blob, name); },
+  error: fail,
+};
+
+bind();
+engine = await connect(handlers);
+if (engine.load) bindFiles();
+requestAnimationFrame(step);
+setInterval(() => scene && showTimes(), 250);
+window.rnd = { state, redraw, picture, play, scene: () => scene, times: () => times, rate: () => rates.length };

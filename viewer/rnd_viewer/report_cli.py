@@ -1,0 +1,53 @@
+"""The command ``rnd-report``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from rnd_runtime.errors import InputError, run_command
+
+_NO_HINT = tyro.conf.arg(help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options."""
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """folder of rnd-train"""
+    out: Annotated[Path | None, _NO_HINT] = None
+    """the page. Default: report.html in RUN"""
+    motion: Annotated[Path | None, _NO_HINT] = None
+    """body poses for the turntable. Default: the rest pose"""
+    hdr: tuple[Path, ...] = ()
+    """light probes to show the avatar under, beside the learned light"""
+    bench: Annotated[Path | None, _NO_HINT] = None
+    """folder with charts (*.svg) and stability.json, such as assets/bench"""
+    pictures: int = 3
+    """pictures of each held-out split"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rnd-report`` with ``arguments`` (the process's own when None) and return its exit code."""
+
+    def command() -> int:
+        options = tyro.cli(ReportOptions, prog="rnd-report", args=arguments)
+        if options.pictures < 0:
+            raise InputError("--pictures", expected="0 or more", got=options.pictures)
+        from .report import say
+        from .run_report import write_run_report
+
+        out = options.out or options.run / "report.html"
+        write_run_report(
+            options.run, out, motion=options.motion, hdrs=options.hdr, bench=options.bench,
+            pictures=options.pictures,
+        )  # fmt: skip
+        say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
+        return 0
+
+    return run_command("rnd-report", command)

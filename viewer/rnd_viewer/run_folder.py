@@ -1,0 +1,54 @@
+"""One folder for a run, also where several processes render parts of it.
+
+A run is known by its settings and inputs. The process that finds no mark of its run in the folder leaves one and takes
+away the frames of other runs, but none that is younger than the mark: those are of processes that render other parts of
+the same run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+_MARK = ".run-"
+_FRAME = re.compile(
+    r"\d{6,}\.(png|exr)"
+)  # a picture as writers.py names it, and nothing that a user put there
+_FOLDERS = ("frames", "frames_exr", "aov")
+
+
+def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path | None]) -> None:
+    """Make ``folder`` the folder of the run with ``settings`` on ``inputs``, and free of frames of any other run."""
+    mark = folder / f"{_MARK}{_identity(settings, inputs)}"
+    try:
+        mark.touch(exist_ok=False)
+    except FileExistsError:
+        return
+    for other in folder.glob(f"{_MARK}*"):
+        if other != mark:
+            other.unlink(missing_ok=True)
+    oldest = mark.stat().st_mtime_ns
+    for kind in _FOLDERS:
+        for file in (folder / kind).rglob("*"):
+            if _FRAME.fullmatch(file.name) and file.is_file() and file.stat().st_mtime_ns < oldest:
+                file.unlink(missing_ok=True)
+
+
+def part_name(stem: str, frames: range, count: int) -> str:
+    """``play`` for a run of all ``count`` frames, ``play_000010-000050`` for a part, so that parts share a folder."""
+    whole = frames.start == 0 and frames.stop == count
+    return stem if whole else f"{stem}_{frames.start:06d}-{frames.stop:06d}"
+
+
+def _identity(settings: Mapping[str, object], inputs: Iterable[Path | None]) -> str:
+    """What two processes of one run agree on: settings, and name, size and time of every input."""
+    files = []
+    for path in inputs:
+        if path is not None and path.is_file():
+            status = path.stat()
+            files.append((str(path.resolve()), status.st_size, status.st_mtime_ns))
+    text = json.dumps([settings, files], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

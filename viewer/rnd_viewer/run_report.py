@@ -1,0 +1,212 @@
+"""``rnd-report``: everything about a training run on one HTML page that needs no network and no other file."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, existing_file
+from rnd_runtime.images import read_image
+
+from .html_parts import compare, curve, data_uri, figure, png, rows_table, table
+from .report_shots import Shots
+from .video import INSTALL
+
+Bytes = NDArray[np.uint8]
+TILES = ("truth", "render", "normals", "albedo", "error")  # side by side in rnd-eval's strips
+MARGIN = 8  # pixels kept around the person
+# Columns of rnd-eval's rows, and what else a row says of the run as a whole.
+METRICS = {
+    "split": ("split", "{}"), "frames": ("pictures", "{}"),
+    "psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_box": ("PSNR in the box", "{:.2f}"), "ssim_box": ("SSIM in the box", "{:.4f}"),
+    "lpips_box": ("LPIPS in the box", "{:.4f}"), "psnr_n": ("PSNR of normals", "{:.2f}"),
+    "ssim_n": ("SSIM of normals", "{:.4f}"), "normal_deg": ("normals °", "{:.1f}"),
+    "psnr_albedo": ("PSNR of albedo", "{:.2f}"),
+}  # fmt: skip
+FACTS = {
+    "capture": "capture {}", "gaussians": "{} Gaussians", "steps": "{} steps", "minutes": "{:.1f} minutes",
+    "seed": "seed {}", "file_mb": "avatar.onnx {:.1f} MB", "fps": "plays at {:.0f} frames a second",
+    "flicker": "flicker {:.2f} of 255", "machine": "{}",
+}  # fmt: skip
+
+
+def write_run_report(
+    run: Path,
+    out: Path,
+    *,
+    motion: Path | None = None,
+    hdrs: tuple[Path, ...] = (),
+    bench: Path | None = None,
+    pictures: int = 3,
+) -> None:
+    """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
+
+    Args:
+        motion: played in the turntable. hdrs: relit under these. bench: a folder with the speed–accuracy
+            charts (\\*.svg) and ``stability.json``. pictures: shown of each held-out split.
+
+    Raises:
+        InputError: ``run`` holds no training, or a file of it is damaged.
+    """
+    config = _json(existing_file(run / "config.json", what="config.json of rnd-train"))
+    rows = _json(run / "eval.json") if (run / "eval.json").is_file() else []
+    name = run.resolve().name
+    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(run / "metrics.jsonl", config)]
+    read += [
+        _bench(bench),
+        _configuration(config),
+    ]  # before the avatar is filmed: what is damaged is found at once
+    sections = [f"<h1>{escape(name)}</h1>", _facts(rows), _turntable_and_relights(run, motion, hdrs), *read]
+    page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
+    with atomic_path(out) as temporary:
+        text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _facts(rows: Sequence[dict[str, Any]]) -> str:
+    row = rows[0] if rows else {}
+    facts = [form.format(row[key]) for key, form in FACTS.items() if row.get(key) is not None]
+    return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
+
+
+def _turntable_and_relights(run: Path, motion: Path | None, hdrs: tuple[Path, ...]) -> str:
+    avatar = run / "avatar.onnx"
+    if not avatar.is_file():
+        return _missing("The avatar", f"no avatar.onnx in the run: rnd-export {run / 'avatar.ckpt'} makes it")
+    shots = Shots(avatar, motion)
+    cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs)]
+    if importlib.util.find_spec("av"):
+        clip = data_uri(shots.turntable(), "video/mp4")
+        video = f'<video src="{clip}" autoplay loop muted playsinline controls></video>'
+        cells.insert(0, figure(video, "turntable, learned light"))
+    else:
+        cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
+    materials = [figure(png(picture, caption), caption) for caption, picture in shots.materials()]
+    return (
+        f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
+        f'<h3>What the light falls on</h3><div class="grid tiles">{"".join(materials)}</div>'
+    )
+
+
+def _metrics(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return _missing(
+            "Held-out quality", "no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json"
+        )
+    names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
+    cells = [
+        ["" if row.get(name) is None else METRICS[name][1].format(row[name]) for name in names]
+        for row in rows
+    ]
+    return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells)
+
+
+def _comparisons(folder: Path, count: int) -> str:
+    splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if not splits or count == 0:
+        return _missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
+    how = "Drag across a picture: truth to the left, render to the right; then normals, albedo, error × 4."
+    parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
+    for split in splits:
+        strips = sorted(split.glob("*.png"))
+        shown = min(count, len(strips))
+        chosen = [strips[k * len(strips) // shown] for k in range(shown)]
+        shots = "".join(_shot(strip) for strip in chosen)
+        parts.append(f'<h3>{escape(split.name.replace("_", " "))}</h3><div class="grid shots">{shots}</div>')
+    return "".join(parts)
+
+
+def _shot(strip: Path) -> str:
+    """One strip of rnd-eval, cropped to the person: a slider between truth and render, then the other tiles."""
+    pixels = read_image(strip)[..., :3]
+    if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
+        raise InputError("picture of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
+    tiles: list[Bytes] = np.split(pixels.astype(np.uint8), len(TILES), axis=1)
+    rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > MARGIN)
+    if len(rows):
+        window = tuple(
+            slice(max(int(places.min()) - MARGIN, 0), int(places.max()) + MARGIN)
+            for places in (rows, columns)
+        )
+        tiles = [np.ascontiguousarray(tile[window]) for tile in tiles]
+    truth, render, *others = (png(tile, f"{what}, {strip.stem}") for what, tile in zip(TILES, tiles))
+    pair = compare(truth, render, f"truth or render of {strip.stem}")
+    return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
+
+
+def _curves(path: Path, config: dict[str, Any]) -> str:
+    rows = _json_lines(path) if path.is_file() else []
+    if not rows:
+        return _missing("Losses", "no metrics.jsonl in the run")
+    terms = dict.fromkeys(name for row in rows for name in row)
+    terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
+    for name in ("step", "stage", "seconds", "skipped"):
+        terms.pop(name, None)
+    steps = config.get("steps", 0)
+    mark = round(config["stage1_fraction"] * steps) if "stage1_fraction" in config else None
+    figures = []
+    for term in terms:
+        having = [row for row in rows if term in row]
+        if having:
+            figures.append(curve([row["step"] for row in having], [row[term] for row in having], term, mark))
+    skipped = sum(bool(row.get("skipped")) for row in rows)
+    note = f" {skipped} steps were not finite and were skipped." if skipped else ""
+    return (
+        "<h2>Losses</h2><p>Weighted terms of what is minimised, on a logarithmic scale; the dashed line is where "
+        f'the second stage, the light, begins.{note}</p><div class="grid curves">{"".join(figures)}</div>'
+    )
+
+
+def _bench(folder: Path | None) -> str:
+    """Charts and the stability table of a folder such as ``assets/bench``."""
+    if folder is None:
+        return ""
+    # as pictures, not inline: two charts may use one id for different things
+    charts = [
+        (path.stem, data_uri(path.read_bytes(), "image/svg+xml")) for path in sorted(folder.glob("*.svg"))
+    ]
+    parts = [f'<img class="chart" alt="{escape(name)}" src="{chart}">' for name, chart in charts]
+    stability = folder / "stability.json"
+    if stability.is_file():
+        parts.append("<h3>Stability</h3>" + rows_table(_json(stability)))
+    if not parts:
+        return _missing("Speed, accuracy, stability", f"neither *.svg nor stability.json in {folder}")
+    return "<h2>Speed, accuracy, stability</h2>" + "".join(parts)
+
+
+def _configuration(config: dict[str, Any]) -> str:
+    flat = {key: value for key, value in config.items() if not isinstance(value, dict)}
+    nested = {f"{outer}.{key}": value for outer, inner in config.items() if isinstance(inner, dict)
+              for key, value in inner.items()}  # fmt: skip
+    rows = [(key, str(value)) for key, value in (flat | nested).items()]
+    content = table(("option", "value"), rows)
+    return f"<h2>Configuration</h2><details><summary>{len(rows)} options</summary>{content}</details>"
+
+
+def _missing(title: str, reason: str) -> str:
+    return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError("not JSON", got=error, file=path) from error
+
+
+def _json_lines(path: Path) -> list[dict[str, Any]]:
+    try:
+        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError("not JSON lines", got=error, file=path) from error

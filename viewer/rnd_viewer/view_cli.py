@@ -1,0 +1,56 @@
+"""The command ``rnd-view``."""
+
+from __future__ import annotations
+
+import secrets
+import webbrowser
+from collections.abc import Sequence
+
+import numba
+import tyro
+from rich.console import Console
+
+from rnd_runtime.errors import InputError, run_command
+
+from .view_options import ViewOptions
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rnd-view`` with ``arguments`` (the process's own when None) until Ctrl-C; 2 for unusable input."""
+
+    def command() -> int:
+        options = tyro.cli(ViewOptions, prog="rnd-view", args=arguments)
+        return view(options)
+
+    return run_command("rnd-view", command)
+
+
+def view(options: ViewOptions) -> int:
+    """Serve the scene that ``options`` describe until the process is interrupted.
+
+    Raises:
+        InputError: for whatever cannot be used.
+    """
+    from .view_scene import Scene  # here, so that --help works where a library does not load
+    from .view_server import load_websockets, serve
+
+    load_websockets()
+    if options.threads is not None:
+        most = numba.config.NUMBA_NUM_THREADS
+        if not 1 <= options.threads <= most:
+            raise InputError("--threads", expected=f"1 to {most}", got=options.threads)
+        numba.set_num_threads(options.threads)
+    console = Console(highlight=False)
+    with console.status("loading; the first run compiles, up to a minute"):
+        scene = Scene(options)
+        scene.warm_up()
+    try:
+        token = None if options.local else secrets.token_urlsafe(16)
+        with serve(scene, options.host, options.port, token) as (server, url):
+            console.print(f"rnd-view: {url}", soft_wrap=True, markup=False)
+            if options.browser and options.local:
+                webbrowser.open(url)
+            server.serve_forever()
+    finally:
+        scene.close()
+    return 0

@@ -1,0 +1,268 @@
+"""What ``rnd-view`` shows: an avatar, a motion, lights, a capture; and one picture of it for each state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.capture import Capture, load_capture
+from rnd_runtime.errors import InputError
+from rnd_runtime.frame import draw
+from rnd_runtime.gaussians import Gaussians, Raster
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.shading import Shader
+from rnd_runtime.tone import tone_map
+
+from .aov import aov_picture, aov_values, splat_features
+from .background import Background
+from .cameras import View, frame_motion, front_path
+from .view_options import ViewOptions
+from .view_state import ViewState
+
+Floats32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
+ELEVATION, FIELD_OF_VIEW = math.radians(5), math.radians(35)  # rnd-play's own
+SHADERS_KEPT = 12  # tables of 0.6 MB each; building one takes 30–300 ms
+
+
+class Picture:
+    """One rendered view.
+
+    Attributes:
+        srgb: [H, W, 3] uint8.
+        joints: [J, 2] px, and z in metres as third column; what lies behind the camera has z ≤ 0.
+        seconds: time of each stage.
+    """
+
+    def __init__(self, srgb: Bytes, joints: Floats32, seconds: dict[str, float]) -> None:
+        self.srgb, self.joints, self.seconds = srgb, joints, seconds
+
+
+class Scene:
+    """Loads everything that ``options`` name; renders any :class:`ViewState`, one at a time.
+
+    Raises:
+        InputError: for whatever cannot be used.
+    """
+
+    def __init__(self, options: ViewOptions) -> None:
+        self.avatar = Avatar.load(options.avatar, threads=options.threads)
+        self.capture: Capture | None = load_capture(options.capture) if options.capture else None
+        self.motion = self._motion(options)
+        self._files = _probes(options.hdr)
+        self.rasterizer = make_rasterizer(options.raster)
+        self.name, self.size = options.avatar.name, options.size
+        self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
+        self._behind: tuple[tuple[Any, ...], Floats32] | None = None
+        self._posed: tuple[Motion, float, Gaussians] | None = None
+
+    def description(self) -> dict[str, Any]:
+        """What a page needs to know before it asks for pictures."""
+        framing = frame_motion(self.avatar.skeleton, self.motion)
+        view = View(self.size, self.size, FIELD_OF_VIEW, ELEVATION)
+        home = front_path(framing, view)(0, 0.0)
+        return {
+            "avatar": self.name,
+            "gaussians": self.avatar.gaussians,
+            "parents": self.avatar.skeleton.parents.tolist(),
+            "motion": {
+                "name": Path(self.motion.source).name,
+                "duration": self.motion.duration,
+                "fps": self.motion.fps,
+            },
+            "lights": ["the avatar's own", *(file.name for file in self._files)],
+            "light": 1 if self._files else 0,
+            "size": self.size,
+            "raster": self.rasterizer.name,
+            "view": {
+                "azimuth": framing.facing,
+                "elevation": ELEVATION,
+                "distance": float(np.linalg.norm(home.position - framing.centre)),
+                "target": tuple(framing.centre.tolist()),
+                "fov": FIELD_OF_VIEW,
+            },
+            "truths": self._truths(),
+            "notes": list(self.motion.notes),
+        }
+
+    def warm_up(self) -> None:
+        """Draw the first view once: a first run compiles the kernels, up to a minute."""
+        about = self.description()
+        self.render(
+            ViewState(time=0.0, width=self.size, height=self.size, light=about["light"], **about["view"])
+        )
+
+    def render(self, state: ViewState) -> Picture:
+        """The picture of ``state`` with the time that each stage took."""
+        seconds: dict[str, float] = {}
+        camera, motion, time_s = self._view(state)
+        gaussians = _fewer(self._pose(motion, time_s, seconds), state.gaussians)
+        if state.output in ("lit", "light"):
+            raster = self._draw_lit(state, gaussians, camera)
+        else:
+            features = splat_features((state.output,), gaussians, camera)[0].astype(np.float32)
+            arrays = gaussians.means, gaussians.covariances, gaussians.opacities
+            raster = self.rasterizer(*arrays, features, camera, depth=False)
+        started = perf_counter()
+        if state.output in ("lit", "light", "albedo"):
+            srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))
+        else:
+            values = aov_values(state.output, raster.image, raster.alpha)
+            shown = aov_picture(state.output, values, raster.alpha, (0, 1))
+            srgb = np.broadcast_to(shown, (*raster.alpha.shape, 3))
+        seconds |= {**raster.seconds, "tone map": perf_counter() - started}
+        return Picture(srgb, self._joints(motion, time_s, camera), seconds)
+
+    def truth_file(self, index: int) -> Path:
+        """The capture's picture ``index``."""
+        return self._capture_frame(index)[0].folder / self._capture_frame(index)[1].image
+
+    def close(self) -> None:
+        self.rasterizer.close()
+
+    def _motion(self, options: ViewOptions) -> Motion:
+        if options.motion:
+            return load_motion(
+                options.motion, self.avatar.skeleton, up=options.motion_up, fps=options.motion_fps
+            )
+        if self.capture:
+            return self._captured_motion
+        joints = len(self.avatar.skeleton)
+        rest = np.broadcast_to(np.eye(3), (1, joints, 3, 3))
+        return Motion(rest, np.zeros((1, 3)), 30.0, self.avatar.skeleton.names, "at rest")
+
+    @cached_property
+    def _captured_motion(self) -> Motion:
+        """The capture's motion for the avatar's skeleton; it may have been captured with another."""
+        assert self.capture
+        motion = self.capture.motion
+        if motion.joint_names == self.avatar.skeleton.names:
+            return motion
+        return load_motion(motion.source, self.avatar.skeleton, joint_names=self.capture.body.skeleton.names)
+
+    def _truths(self) -> list[dict[str, Any]]:
+        if not self.capture:
+            return []
+        return [
+            {
+                "label": f"{frame.split} · {frame.camera} · frame {frame.frame} · {frame.light or 'own light'}",
+                "width": self.capture.cameras[frame.camera].width,
+                "height": self.capture.cameras[frame.camera].height,
+            }
+            for frame in self.capture.frames
+        ]
+
+    def _capture_frame(self, index: int) -> tuple[Capture, Any]:
+        if self.capture is None or index >= len(self.capture.frames):
+            raise InputError("truth", expected="a picture of --capture", got=index)
+        return self.capture, self.capture.frames[index]
+
+    def _view(self, state: ViewState) -> tuple[Camera, Motion, float]:
+        if state.truth is None:
+            return state.camera(), self.motion, float(np.clip(state.time, 0, self.motion.duration))
+        capture, frame = self._capture_frame(state.truth)
+        camera = capture.cameras[frame.camera]
+        scale = min(state.width / camera.width, state.height / camera.height)
+        size = (max(round(side * scale), 1) for side in (camera.width, camera.height))
+        return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
+
+    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> Gaussians:
+        """The posed avatar, kept while only camera and light move."""
+        if self._posed is None or self._posed[0] is not motion or self._posed[1] != time_s:
+            started = perf_counter()
+            encoded = self.avatar.encode(motion, time_s)
+            known = perf_counter()
+            self._posed = motion, time_s, self.avatar.posed(encoded)
+            seconds |= {"encoders": known - started, "posing": perf_counter() - known}
+        return self._posed[2]
+
+    def _draw_lit(self, state: ViewState, gaussians: Gaussians, camera: Camera) -> Raster:
+        if state.output == "light":
+            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
+        shader = self._shader(self._light_name(state), state.shade)
+        raster = draw(gaussians, shader.turned(shader.light.yaw + state.yaw), camera, self.rasterizer)
+        if state.exposure == 0:
+            return raster
+        return replace(raster, image=raster.image * np.float32(2.0**state.exposure))
+
+    def _light_name(self, state: ViewState) -> str | Path | None:
+        """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""
+        if state.truth is not None:
+            light = self._capture_frame(state.truth)[1].light
+            return str(light) if light else None
+        if state.light > len(self._files):
+            raise InputError("light", expected=f"0 to {len(self._files)}", got=state.light)
+        return self._files[state.light - 1] if state.light else None
+
+    def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
+        if name is None:
+            light = Light(self.avatar.trained_light)
+        elif isinstance(name, Path):
+            light = load_light(name)
+        else:
+            assert self.capture
+            light = self.capture.load_light(name)
+        return Shader(light, shade)
+
+    def _radiance_behind(self, state: ViewState, camera: Camera) -> Floats32:
+        """The background; a map's is kept for as long as neither it nor the camera moves."""
+        background = Background.parse(state.background)
+        if background.kind != "hdr":
+            return np.array(background.colour, np.float32)
+        light = self._shader(self._light_name(state), state.shade).light
+        key = (id(light), state.yaw, camera.width, camera.K.tobytes(), camera.world_to_camera.tobytes())
+        if self._behind is None or self._behind[0] != key:
+            turned = replace(light, yaw=light.yaw + state.yaw)
+            self._behind = key, background.radiance(camera, turned)
+        return self._behind[1] * np.float32(2.0**state.exposure)
+
+    def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
+        now = motion.at([time_s])
+        world = self.avatar.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]
+        seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = np.where(np.abs(seen[:, 2:]) > 1e-6, seen[:, 2:], 1e-6)
+        pixels = (seen / depth) @ camera.K.T
+        return np.column_stack([pixels[:, :2], seen[:, 2]]).astype(np.float32)
+
+
+def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
+    """The first ``count``, which lie evenly over the body (farthest first), grown to cover the same area."""
+    total = len(gaussians.means)
+    if count is None or count >= total:
+        return gaussians
+    return Gaussians(
+        gaussians.means[:count],
+        gaussians.covariances[:count] * np.float32(total / count),
+        gaussians.opacities[:count],
+        gaussians.normals[:count],
+        gaussians.albedo[:count],
+        gaussians.roughness[:count],
+        gaussians.visibility[:count],
+        gaussians.root_rotation,
+    )
+
+
+def _probes(paths: tuple[Path, ...]) -> list[Path]:
+    """The light probes among ``paths``, folders opened."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise InputError("light probe not found", file=path)
+    return files

@@ -1,0 +1,264 @@
+"""The page and its websocket on one port, for this machine alone unless told otherwise.
+
+A page in the same browser must not be able to reach the viewer behind its user's back, so on a loopback address
+only requests that name that address as their host are answered (against DNS rebinding), and a websocket only when
+its origin is the very host it connects to. On any other address everything asks for a token, given once in the
+page's URL and kept in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from importlib import resources
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from types import ModuleType
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from msgspec.structs import replace
+
+from rnd_runtime.errors import InputError
+
+from .options import frame_count
+from .video import mp4_writer
+from .view_scene import Bytes, Picture, Scene
+from .view_state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, TruthRequest, parse_request
+
+INSTALL = "pip install 'rnd-avatar[view]'"
+COOKIE = "rnd_view_token"
+JPEG_QUALITY = 90
+MOST_BYTES_IN = 1 << 16  # a request is a few hundred
+CONTENT_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+# Nothing from elsewhere runs in the page, and nobody frames it.
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may talk to the server.
+
+    Attributes:
+        token: what every request must bring; None on a loopback address.
+        hosts: names by which a browser on this machine may call it; None for any, with the token.
+    """
+
+    token: str | None
+    hosts: frozenset[str] | None
+
+    @classmethod
+    def local(cls, host: str, port: int) -> Access:
+        """For a loopback ``host``: no token, but nobody else's name for it."""
+        names = {"localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host}
+        return cls(None, frozenset(f"{name}:{port}" for name in names))
+
+    def refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
+        """Why a request is not answered, or None if it is."""
+        host, origin = headers.get("Host", "").lower(), headers.get("Origin")
+        if self.hosts is not None and host not in self.hosts:
+            return HTTPStatus.FORBIDDEN, "rnd-view answers to this machine's own address only\n"
+        if origin is not None and urlsplit(origin).netloc.lower() != host:
+            return HTTPStatus.FORBIDDEN, "another site's page may not use rnd-view\n"
+        if self.token is not None and not self._has_token(path, headers):
+            return HTTPStatus.UNAUTHORIZED, "open the address that rnd-view printed, token included\n"
+        return None
+
+    def _has_token(self, path: str, headers: Any) -> bool:
+        assert self.token is not None
+        try:
+            cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
+        except CookieError:
+            cookie = None
+        given = [*parse_qs(urlsplit(path).query).get("token", []), *([cookie.value] if cookie else [])]
+        return any(hmac.compare_digest(text.encode(), self.token.encode()) for text in given)
+
+
+def load_websockets() -> ModuleType:
+    """Import websockets' server or say which extra brings it."""
+    try:
+        import websockets.sync.server
+    except ImportError as error:
+        raise InputError("rnd-view needs websockets, which is not installed", hint=INSTALL) from error
+    return websockets.sync.server
+
+
+@contextmanager
+def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tuple[Any, str]]:
+    """Yield a listening server, to be run by its ``serve_forever``, and the URL to open.
+
+    Raises:
+        InputError: websockets is missing, or nothing can listen there.
+    """
+    server_module = load_websockets()
+    visitor = _Visitor(scene)
+    access: list[Access] = []  # known once the port is
+
+    def answer(connection: Any, request: Any) -> Any:
+        refusal = access[0].refusal(request.path, request.headers)
+        if refusal is not None:
+            return connection.respond(*refusal)
+        path = urlsplit(request.path).path
+        return None if path == "/socket" else _static(connection, path, access[0])
+
+    try:
+        server = server_module.serve(
+            visitor.talk,
+            host,
+            port,
+            process_request=answer,
+            compression=None,
+            max_size=MOST_BYTES_IN,
+            server_header=None,
+            logger=_quiet_logger(),
+        )
+    except OSError as error:
+        raise InputError(
+            "cannot listen", got=f"{error.strerror} on {host}:{port}", hint="--port picks another"
+        ) from error
+    with server:
+        port = server.socket.getsockname()[1]
+        access.append(Access(token, None) if token else Access.local(host, port))
+        name = f"[{host}]" if ":" in host else host
+        yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+
+
+def _static(connection: Any, path: str, access: Access) -> Any:
+    """A file of the page."""
+    folder = resources.files(__package__) / "page"
+    name = path.removeprefix("/") or "index.html"
+    known = {file.name for file in folder.iterdir()}
+    suffix = Path(name).suffix
+    if name not in known or suffix not in CONTENT_TYPES:
+        return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
+    response = connection.respond(HTTPStatus.OK, "")
+    response.body = (folder / name).read_bytes()
+    del response.headers["Content-Length"], response.headers["Content-Type"]
+    response.headers["Content-Length"] = str(len(response.body))
+    response.headers["Content-Type"] = CONTENT_TYPES[suffix]
+    for header, value in HEADERS.items():
+        response.headers[header] = value
+    if access.token:
+        response.headers["Set-Cookie"] = f"{COOKIE}={access.token}; Path=/; HttpOnly; SameSite=Strict"
+    return response
+
+
+def _quiet_logger() -> logging.Logger:
+    """websockets reports every connection that breaks; only our own mistakes are worth a traceback."""
+    logger = logging.getLogger("rnd_viewer.websockets")
+    logger.setLevel(logging.ERROR)
+    logger.filters = [lambda record: record.msg == "connection handler failed"]
+    return logger
+
+
+class _Visitor:
+    """Answers pages; several may look at one scene, which draws for one at a time."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._drawing = threading.Lock()
+
+    def talk(self, socket: Any) -> None:
+        """Serve one websocket until it closes. A refused request is answered with its reason."""
+        from websockets.exceptions import ConnectionClosed
+
+        with suppress(ConnectionClosed):  # while a picture was on its way
+            self._send(socket, {"kind": "scene", "scene": self._scene.description()})
+            for message in socket:
+                try:
+                    self._answer(socket, parse_request(message))
+                except InputError as error:
+                    self._send(socket, {"kind": "error", "message": str(error)})
+
+    def _answer(self, socket: Any, request: Request) -> None:
+        if isinstance(request, RenderRequest):
+            self._render(socket, request)
+        elif isinstance(request, ClipRequest):
+            self._clip(socket, request)
+        else:
+            self._truth(socket, request)
+
+    def _render(self, socket: Any, request: RenderRequest) -> None:
+        with self._drawing:
+            picture = self._scene.render(request.state)
+        pixels, encoding_ms = encode(picture, request.state.encoding)
+        header = {
+            "kind": "picture",
+            "number": request.number,
+            "width": picture.srgb.shape[1],
+            "height": picture.srgb.shape[0],
+            "encoding": request.state.encoding,
+            "joints": picture.joints.round(2).tolist(),
+            "times": {name: 1e3 * seconds for name, seconds in picture.seconds.items()}
+            | {"encoding": encoding_ms},
+        }
+        self._send(socket, header, pixels)
+
+    def _clip(self, socket: Any, request: ClipRequest) -> None:
+        motion, state = self._scene.motion, replace(request.state, truth=None)
+        frames = frame_count(motion.duration, request.fps)
+        if frames > MOST_CLIP_FRAMES:
+            raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "clip.mp4"
+            with mp4_writer(file, fps=request.fps) as append:
+                for number in range(frames):
+                    azimuth = state.azimuth + request.turn * number / frames
+                    now = replace(state, time=number / request.fps, azimuth=azimuth)
+                    with self._drawing:
+                        append(np.ascontiguousarray(self._scene.render(now).srgb))
+                    self._send(socket, {"kind": "progress", "done": number + 1, "of": frames})
+            self._send(socket, {"kind": "clip"}, file.read_bytes())
+
+    def _truth(self, socket: Any, request: TruthRequest) -> None:
+        data = self._scene.truth_file(request.index).read_bytes()
+        self._send(socket, {"kind": "truth", "index": request.index}, data)
+
+    @staticmethod
+    def _send(socket: Any, header: dict[str, Any], body: bytes | Bytes | None = None) -> None:
+        """A header as JSON text; what it announces follows in a binary message of its own."""
+        socket.send(json.dumps(header))
+        if body is not None:
+            socket.send(body if isinstance(body, bytes) else body.data.cast("B"))
+
+
+def encode(picture: Picture, encoding: str) -> tuple[bytes | Bytes, float]:
+    """The pixels as ``raw`` RGBA [H, W, 4] or as ``jpeg``, and the milliseconds that took."""
+    started = perf_counter()
+    data: bytes | Bytes
+    if encoding == "jpeg":
+        data = _jpeg(picture.srgb)
+    else:
+        data = np.full((*picture.srgb.shape[:2], 4), 255, np.uint8)
+        data[..., :3] = picture.srgb
+    return data, 1e3 * (perf_counter() - started)
+
+
+def _jpeg(srgb: Bytes) -> bytes:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise InputError("JPEG needs Pillow, which is not installed", hint=INSTALL) from error
+    stream = BytesIO()
+    Image.fromarray(srgb).save(stream, "jpeg", quality=JPEG_QUALITY)
+    return stream.getvalue()

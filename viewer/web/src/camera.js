@@ -1,0 +1,61 @@
+// Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/camera.py, rnd_viewer/cameras.py).
+
+import { jointsAt } from "./avatar.js";
+
+const PADDING = 0.14;  // of the skeleton's height: what the body reaches beyond its joints
+const ELEVATION = 5 * Math.PI / 180, FIELD_OF_VIEW = 35 * Math.PI / 180;
+
+/** The camera of a state: {width, height, focal, rotation [9], translation [3], position [3]}. */
+export function cameraOf({ azimuth, elevation, distance, target, fov, width, height }) {
+  const flat = Math.cos(elevation);
+  const back = [flat * Math.sin(azimuth), Math.sin(elevation), flat * Math.cos(azimuth)];
+  const position = target.map((x, k) => x + distance * back[k]), forward = back.map((x) => -x);
+  const length = Math.hypot(forward[2], forward[0]);  // right = forward × (0, 1, 0)
+  const right = [-forward[2] / length, 0, forward[0] / length];
+  const down = [
+    forward[1] * right[2] - forward[2] * right[1],
+    forward[2] * right[0] - forward[0] * right[2],
+    forward[0] * right[1] - forward[1] * right[0],
+  ];
+  const rotation = [...right, ...down, ...forward];
+  const translation = [0, 1, 2].map((row) =>
+    -(rotation[3 * row] * position[0] + rotation[3 * row + 1] * position[1] + rotation[3 * row + 2] * position[2]));
+  return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), rotation, translation, position };
+}
+
+/** rnd-play's front view of `motion` in a square picture. */
+export function homeView(skeleton, motion) {
+  const frames = Array.from({ length: motion.frames }, (_, f) => jointsAt(skeleton, motion, f / motion.fps));
+  const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x), tall = [[...low], [...high]];
+  const widen = (points, below, above) => points.forEach((value, k) => {
+    below[k % 3] = Math.min(below[k % 3], value);
+    above[k % 3] = Math.max(above[k % 3], value);
+  });
+  for (const joints of frames) widen(joints, low, high);
+  widen(skeleton.rest, ...tall);
+  const padding = PADDING * Math.max(...tall[1].map((x, k) => x - tall[0][k]));
+  const target = low.map((x, k) => (x + high[k]) / 2);
+  const fx = motion.rotations[2], fz = motion.rotations[8];  // a body at rest faces +Z
+  const azimuth = Math.hypot(fx, fz) > 1e-3 ? Math.atan2(fx, fz) : 0;
+  const view = { azimuth, elevation: ELEVATION, distance: 1, target, fov: FIELD_OF_VIEW };
+  const { rotation } = cameraOf({ ...view, width: 1, height: 1 });
+  let distance = 0;
+  for (const joints of frames)
+    for (let k = 0; k < joints.length; k += 3) {
+      const [x, y, z] = [0, 1, 2].map((row) =>
+        [0, 1, 2].reduce((sum, c) => sum + rotation[3 * row + c] * (joints[k + c] - target[c]), 0));
+      for (const offset of [x, y])
+        distance = Math.max(distance, (Math.abs(offset) * Math.cos(view.fov / 2) + padding) / Math.sin(view.fov / 2) - z);
+    }
+  return { ...view, distance };
+}
+
+/** Pixels and depth [J][3] of `joints` [J·3]. */
+export function projectJoints(joints, { rotation, translation, focal, width, height }) {
+  return Array.from({ length: joints.length / 3 }, (_, j) => {
+    const [x, y, z] = [0, 1, 2].map((row) =>
+      [0, 1, 2].reduce((sum, c) => sum + rotation[3 * row + c] * joints[3 * j + c], translation[row]));
+    const depth = Math.abs(z) > 1e-6 ? z : 1e-6;
+    return [focal * x / depth + width / 2, focal * y / depth + height / 2, z];
+  });
+}

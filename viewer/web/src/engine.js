@@ -1,0 +1,86 @@
+// The pictures come from a worker of this page: nothing is asked of any server once the files are here.
+
+const MOST_CLIP_FRAMES = 900;
+const CLIP_TYPES = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
+
+/**
+ * Start the worker. `on` gets: scene, picture, progress, clip, error as from rnd-view, and message(text).
+ * Files named in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
+ */
+export async function connect(on) {
+  const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
+  const taken = new Map();  // pictures that are not for the page: number → resolve
+  worker.onerror = (event) => on.error(event.message || "the worker cannot start");
+  worker.onmessage = ({ data }) => {
+    if (data.kind === "scene") on.scene(data.scene);
+    else if (data.kind === "message") on.message(data.text);
+    else if (data.kind === "error") on.error(data.message);
+    else if (taken.has(data.number)) take(taken, data);
+    else on.picture(data);
+  };
+  const render = (number, state) => worker.postMessage({ ask: "render", number, state });
+  const load = async (files) => {
+    const contents = await Promise.all(files.map(async (file) => ({ name: file.name, bytes: new Uint8Array(await file.arrayBuffer()) })));
+    worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
+  };
+  let clipNumber = 0;
+  const picture = (state) => new Promise((done) => {
+    clipNumber -= 1;  // the page's own numbers are positive
+    taken.set(clipNumber, done);
+    render(clipNumber, state);
+  });
+  const clip = (state, fps, turn, duration) => record(picture, state, { fps, turn, duration }, on).catch((error) => on.error(error.message));
+
+  const named = addressed();
+  if (named.length) fetchFiles(named).then(load).catch((error) => on.error(error.message));
+  else on.message("drop an avatar (.onnx), a motion (.npz) and a light (.hdr, .exr) here");
+  return { render, clip, load, truth() {} };
+}
+
+function take(taken, data) {
+  taken.get(data.number)(data);
+  taken.delete(data.number);
+}
+
+function addressed() {
+  const query = new URLSearchParams(location.search);
+  return ["avatar", "motion", "hdr"].flatMap((key) => (query.get(key) ?? "").split(",").filter(Boolean));
+}
+
+function fetchFiles(names) {
+  return Promise.all(names.map(async (name) => {
+    const answer = await fetch(name);
+    if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+    return new File([await answer.blob()], new URL(name, location.href).pathname.split("/").pop());
+  }));
+}
+
+/** All frames first, then played to a recorder at their own pace: it stamps them with the time of day. */
+async function record(picture, state, { fps, turn, duration }, on) {
+  const type = CLIP_TYPES.find((name) => globalThis.MediaRecorder?.isTypeSupported(name));
+  if (!type) throw new Error("this browser cannot record a clip");
+  const count = Math.floor(duration * fps + 1e-6) + 1;
+  if (count > MOST_CLIP_FRAMES) throw new Error(`a clip has at most ${MOST_CLIP_FRAMES} frames`);
+  const frames = [];
+  for (let k = 0; k < count; k++) {
+    frames.push((await picture({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
+    on.progress(k + 1, count);
+  }
+  const canvas = document.createElement("canvas");
+  Object.assign(canvas, { width: frames[0].width, height: frames[0].height });
+  const context = canvas.getContext("2d");
+  context.drawImage(frames[0], 0, 0);
+  const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: type, videoBitsPerSecond: 12e6 });
+  const parts = [];
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  const stopped = new Promise((done) => { recorder.onstop = done; });
+  recorder.start();
+  for (const frame of frames) {
+    context.drawImage(frame, 0, 0);
+    frame.close();
+    await new Promise((done) => { setTimeout(done, 1000 / fps); });
+  }
+  recorder.stop();
+  await stopped;
+  on.clip(new Blob(parts, { type }), `clip.${type.slice(6, type.indexOf(";") < 0 ? undefined : type.indexOf(";"))}`);
+}

@@ -1,0 +1,162 @@
+// Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/light.py).
+
+import parseExr from "parse-exr";
+
+const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
+const LARGEST_FLOAT = 3.4028234663852886e38;
+
+/** {height, width, radiance: Float32Array [H·W·3]} of an .exr or .hdr file. */
+export function readLight(bytes, name) {
+  const image = name.toLowerCase().endsWith(".exr") ? readExr(bytes) : readHdr(bytes);
+  if (image.width !== 2 * image.height) throw new Error(`${name}: expected a 2:1 lat-long map, got ${image.width} x ${image.height}`);
+  return repair({ ...image, name });
+}
+
+function readExr(bytes) {
+  const { width, height, data } = parseExr(bytes.slice().buffer, FLOAT_TYPE);
+  const channels = data.length / (width * height);
+  if (channels < 3) throw new Error("the .exr needs channels R, G and B");
+  const radiance = new Float32Array(width * height * 3);
+  for (let row = 0; row < height; row++)  // the reader's rows run bottom to top
+    for (let column = 0; column < width; column++)
+      for (let c = 0; c < 3; c++)
+        radiance[3 * (row * width + column) + c] = data[channels * ((height - 1 - row) * width + column) + c];
+  return { width, height, radiance };
+}
+
+/** Radiance's RGBE, run-length coded or flat (Ward 1991, "Real Pixels"). */
+function readHdr(bytes) {
+  let at = 0;
+  const line = () => {
+    const end = bytes.indexOf(10, at);
+    if (end < 0) throw new Error("the .hdr file has no header");
+    const text = new TextDecoder("latin1").decode(bytes.subarray(at, end));
+    at = end + 1;
+    return text;
+  };
+  if (!line().startsWith("#?")) throw new Error("not a Radiance .hdr file");
+  while (line() !== "");
+  const size = /^-Y (\d+) \+X (\d+)/.exec(line());
+  if (!size) throw new Error("the .hdr file must be stored top to bottom, left to right");
+  const height = Number(size[1]), width = Number(size[2]);
+  const radiance = new Float32Array(width * height * 3), row = new Uint8Array(4 * width);
+  for (let y = 0; y < height; y++) {
+    at = readScanline(bytes, at, width, row);
+    for (let x = 0; x < width; x++) {
+      const exponent = row[3 * width + x];
+      const scale = exponent ? 2 ** (exponent - 136) : 0;  // mantissas are 0.x in 256ths, exponents start at 128
+      for (let c = 0; c < 3; c++) radiance[3 * (y * width + x) + c] = row[c * width + x] * scale;
+    }
+  }
+  return { width, height, radiance };
+}
+
+/** One scanline into `row`, plane by plane; where the next one starts. */
+function readScanline(bytes, at, width, row) {
+  const coded = bytes[at] === 2 && bytes[at + 1] === 2 && bytes[at + 2] * 256 + bytes[at + 3] === width;
+  if (!coded) {
+    if (at + 4 * width > bytes.length) throw new Error("the .hdr file is cut short");
+    for (let x = 0; x < width; x++) for (let c = 0; c < 4; c++) row[c * width + x] = bytes[at + 4 * x + c];
+    return at + 4 * width;
+  }
+  at += 4;
+  for (let filled = 0; filled < 4 * width;) {
+    if (at + 1 >= bytes.length) throw new Error("the .hdr file is cut short");
+    const length = bytes[at++];
+    if (length > 128) row.fill(bytes[at++], filled, filled += length - 128);
+    else {
+      row.set(bytes.subarray(at, at + length), filled);
+      at += length;
+      filled += length;
+    }
+  }
+  return at;
+}
+
+/** NaN, infinite and negative values filled from their valid neighbours, holes from the rim inwards. */
+function repair(light) {
+  const { height, width, radiance } = light;
+  const invalid = (value) => !(value >= 0 && value <= LARGEST_FLOAT);
+  let holes = [];
+  radiance.forEach((value, k) => { if (invalid(value)) holes.push(k); });
+  light.repaired = new Set(holes.map((k) => Math.floor(k / 3))).size;
+  while (holes.length) {
+    const filled = [];
+    for (const k of holes) {
+      const c = k % 3, x = Math.floor(k / 3) % width, y = Math.floor(k / 3 / width);
+      let total = 0, count = 0;
+      for (let dy = -1; dy <= 1; dy++)
+        for (let dx = -1; dx <= 1; dx++) {
+          const row = Math.min(Math.max(y + dy, 0), height - 1), column = (x + dx + width) % width;
+          const value = radiance[3 * (row * width + column) + c];
+          if (!invalid(value)) { total += value; count += 1; }
+        }
+      if (count) filled.push([k, total / count]);
+    }
+    if (!filled.length) throw new Error(`${light.name}: no valid radiance in some channel`);
+    for (const [k, value] of filled) radiance[k] = value;
+    const done = new Set(filled.map(([k]) => k));
+    holes = holes.filter((k) => !done.has(k));
+  }
+  return light;
+}
+
+/** Unit directions [H·W·3] of all texels' centres in the light's frame. */
+export function texelDirections(height, width) {
+  const directions = new Float64Array(3 * height * width);
+  for (let row = 0; row < height; row++)
+    for (let column = 0; column < width; column++) {
+      const polar = (row + 0.5) / height * Math.PI, azimuth = (column + 0.5) / width * 2 * Math.PI - Math.PI;
+      const k = 3 * (row * width + column), ring = Math.sin(polar);
+      directions[k] = ring * Math.cos(azimuth);
+      directions[k + 1] = Math.cos(polar);
+      directions[k + 2] = ring * Math.sin(azimuth);
+    }
+  return directions;
+}
+
+/** Solid angle [H] sr of a texel in each row, exact. */
+export function texelSolidAngles(height, width) {
+  return Float64Array.from({ length: height }, (_, row) =>
+    (Math.cos(row / height * Math.PI) - Math.cos((row + 1) / height * Math.PI)) * 2 * Math.PI / width);
+}
+
+/** The light on another grid, each texel the mean over its solid angle, so that no energy is lost. */
+export function downsize(light, height, width) {
+  const vertical = overlaps(edges(light.height, height, (t) => 1 - Math.cos(t * Math.PI)));
+  const horizontal = overlaps(edges(light.width, width, (t) => t));
+  const rows = new Float64Array(height * light.width * 3), result = new Float32Array(height * width * 3);
+  vertical.forEach((parts, row) => {
+    for (const [source, share] of parts)
+      for (let k = 0; k < 3 * light.width; k++)
+        rows[row * 3 * light.width + k] += share * light.radiance[source * 3 * light.width + k];
+  });
+  for (let row = 0; row < height; row++)
+    horizontal.forEach((parts, column) => {
+      for (let c = 0; c < 3; c++) {
+        let sum = 0;
+        for (const [source, share] of parts) sum += share * rows[3 * (row * light.width + source) + c];
+        result[3 * (row * width + column) + c] = sum;
+      }
+    });
+  return { ...light, height, width, radiance: result };
+}
+
+function edges(from, to, place) {
+  return [from, to].map((count) => Float64Array.from({ length: count + 1 }, (_, k) => place(k / count)));
+}
+
+/** For each target interval the sources it covers and their shares of it. */
+function overlaps([source, target]) {
+  const parts = [];
+  for (let k = 0, first = 0; k + 1 < target.length; k++) {
+    const list = [];
+    while (source[first + 1] <= target[k]) first++;
+    for (let s = first; s + 1 < source.length && source[s] < target[k + 1]; s++) {
+      const share = Math.min(source[s + 1], target[k + 1]) - Math.max(source[s], target[k]);
+      if (share > 0) list.push([s, share / (target[k + 1] - target[k])]);
+    }
+    parts.push(list);
+  }
+  return parts;
+}

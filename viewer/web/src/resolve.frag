@@ -1,0 +1,50 @@
+// The splatted picture over its background, coded as sRGB; or what a material map shows (rnd_viewer/aov.py).
+
+uniform sampler2D splatted;  // premultiplied; the first row is the picture's top
+uniform sampler2D sky;       // lat-long radiance
+uniform int show;            // 0 radiance, 1 normals, 2 a number
+uniform int behind;          // 0 one colour, 1 the sky
+uniform vec3 colour;         // linear
+uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's frame
+uniform float gain;
+out vec4 picture;
+
+const float MIN_COVERAGE = 0.05;
+const float PI = 3.14159265358979;
+
+vec3 texel(ivec2 at, ivec2 size) {
+    return texelFetch(sky, ivec2((at.x + size.x) % size.x, clamp(at.y, 0, size.y - 1)), 0).rgb;
+}
+
+vec3 sample_sky(vec3 d) {
+    ivec2 size = textureSize(sky, 0);
+    float column = (0.5 + atan(d.z, d.x) / (2.0 * PI)) * float(size.x) - 0.5;
+    float row = clamp(atan(length(d.xz), d.y) / PI * float(size.y) - 0.5, 0.0, float(size.y - 1));
+    ivec2 corner = ivec2(floor(column), floor(row));
+    vec2 part = vec2(column, row) - floor(vec2(column, row));
+    vec3 upper = mix(texel(corner, size), texel(corner + ivec2(1, 0), size), part.x);
+    vec3 lower = mix(texel(corner + ivec2(0, 1), size), texel(corner + ivec2(1, 1), size), part.x);
+    return mix(upper, lower, part.y);
+}
+
+vec3 srgb(vec3 linear) {
+    vec3 x = max(linear, 0.0);
+    return mix(1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
+}
+
+void main() {
+    ivec2 size = textureSize(splatted, 0);
+    ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
+    vec4 value = texelFetch(splatted, at, 0);
+    vec3 result;
+    if (show == 0) {
+        vec3 far = behind == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
+        result = srgb(value.rgb + (1.0 - value.a) * far);
+    } else if (value.a < MIN_COVERAGE) {
+        result = vec3(0.0);
+    } else {
+        vec3 mean = value.rgb / value.a;
+        result = show == 1 ? (mean / max(length(mean), 1e-6) + 1.0) / 2.0 : mean.rrr;
+    }
+    picture = vec4(result, 1.0);
+}

@@ -1,0 +1,58 @@
+// Rotations as in rnd_runtime/rotations.py: axis-angle at file borders, row-major 3×3 matrices inside.
+
+/** Rodrigues' formula: axis-angle (x, y, z) rad → nine numbers of `out` from `at`. */
+export function axisAngleToMatrix(x, y, z, out, at) {
+  const angle = Math.hypot(x, y, z);
+  const sine = angle > 1e-8 ? Math.sin(angle) / angle : 1;
+  const half = angle > 1e-8 ? Math.sin(angle / 2) / (angle / 2) : 1;
+  const versine = 0.5 * half * half;
+  out[at] = 1 - versine * (y * y + z * z);
+  out[at + 1] = -sine * z + versine * x * y;
+  out[at + 2] = sine * y + versine * x * z;
+  out[at + 3] = sine * z + versine * x * y;
+  out[at + 4] = 1 - versine * (x * x + z * z);
+  out[at + 5] = -sine * x + versine * y * z;
+  out[at + 6] = -sine * y + versine * x * z;
+  out[at + 7] = sine * x + versine * y * z;
+  out[at + 8] = 1 - versine * (x * x + y * y);
+}
+
+/** Axis-angle, angle in [0, π], of the matrix at `at`; through the quaternion's largest component (Shepperd 1978). */
+export function matrixToAxisAngle(m, at) {
+  const xx = m[at], yy = m[at + 4], zz = m[at + 8];
+  const squares = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz];  // 4q²
+  const wx = m[at + 7] - m[at + 5], wy = m[at + 2] - m[at + 6], wz = m[at + 3] - m[at + 1];
+  const xy = m[at + 1] + m[at + 3], yz = m[at + 5] + m[at + 7], zx = m[at + 2] + m[at + 6];
+  const largest = squares.indexOf(Math.max(...squares));
+  let q = [[squares[0], wx, wy, wz], [wx, squares[1], xy, zx], [wy, xy, squares[2], yz], [wz, zx, yz, squares[3]]][largest];
+  const sign = (q[0] < 0 ? -1 : 1) / Math.hypot(...q);
+  q = q.map((value) => value * sign);
+  const sine = Math.hypot(q[1], q[2], q[3]);
+  const scale = sine < 1e-9 ? 2 : 2 * Math.atan2(sine, q[0]) / sine;
+  return [scale * q[1], scale * q[2], scale * q[3]];
+}
+
+/** out = a · b, 3×3 each, at their places. */
+export function multiply(a, atA, b, atB, out, at) {
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j < 3; j++)
+      out[at + 3 * i + j] =
+        a[atA + 3 * i] * b[atB + j] + a[atA + 3 * i + 1] * b[atB + 3 + j] + a[atA + 3 * i + 2] * b[atB + 6 + j];
+}
+
+/** out = aᵀ · b. */
+export function transposedTimes(a, atA, b, atB, out, at) {
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j < 3; j++)
+      out[at + 3 * i + j] = a[atA + i] * b[atB + j] + a[atA + 3 + i] * b[atB + 3 + j] + a[atA + 6 + i] * b[atB + 6 + j];
+}
+
+const step = new Float64Array(9);
+
+/** The rotation `t` of the way from `a` to `b`, on the shortest path. */
+export function slerp(a, atA, b, atB, t, out, at) {
+  transposedTimes(a, atA, b, atB, step, 0);
+  const [x, y, z] = matrixToAxisAngle(step, 0);
+  axisAngleToMatrix(t * x, t * y, t * z, step, 0);
+  multiply(a, atA, step, 0, out, at);
+}

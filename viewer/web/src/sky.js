@@ -1,0 +1,144 @@
+// Shading by tables over the normal that depend on the light alone (rnd_runtime/shading_tables.py).
+
+import { downsize, texelDirections, texelSolidAngles } from "./light.js";
+import { WIDTHS, lobeAt, lobeTable } from "./lobe.js";
+import { shBasis, shRotation } from "./sh.js";
+
+const TEXELS = [32, 64], DIFFUSE = 33, SPECULAR = 49;
+
+/** {diffuse [33²·3·16], specular [7·49²·3]} of a light. */
+export function buildSky(light) {
+  const [height, width] = TEXELS, count = height * width;
+  const { radiance } = downsize(light, height, width);
+  const directions = texelDirections(height, width), angles = texelSolidAngles(height, width);
+  const weighted = new Float64Array(count * 48), basis = new Float64Array(16), flux = new Float64Array(count * 4);
+  for (let k = 0; k < count; k++) {
+    const angle = angles[Math.floor(k / width)];
+    shBasis(directions[3 * k], directions[3 * k + 1], directions[3 * k + 2], basis);
+    flux[4 * k] = angle;
+    for (let c = 0; c < 3; c++) {
+      flux[4 * k + 1 + c] = radiance[3 * k + c] * angle;
+      for (let j = 0; j < 16; j++) weighted[48 * k + 16 * c + j] = flux[4 * k + 1 + c] * basis[j];
+    }
+  }
+  return { diffuse: diffuseTable(directions, weighted), specular: specularTable(directions, flux) };
+}
+
+function diffuseTable(directions, weighted) {
+  const nodes = octahedralNodes(DIFFUSE), table = new Float32Array(DIFFUSE * DIFFUSE * 48), sum = new Float64Array(48);
+  for (let i = 0; i < DIFFUSE * DIFFUSE; i++) {
+    sum.fill(0);
+    for (let k = 0; 3 * k < directions.length; k++) {
+      const cosine = nodes[3 * i] * directions[3 * k] + nodes[3 * i + 1] * directions[3 * k + 1] + nodes[3 * i + 2] * directions[3 * k + 2];
+      if (cosine > 0) for (let j = 0; j < 48; j++) sum[j] += cosine * weighted[48 * k + j];
+    }
+    table.set(sum, 48 * i);
+  }
+  return table;
+}
+
+function specularTable(directions, flux) {
+  const nodes = octahedralNodes(SPECULAR), count = SPECULAR * SPECULAR;
+  const table = new Float32Array(WIDTHS.length * count * 3), cosines = new Float64Array(directions.length / 3);
+  for (let i = 0; i < count; i++) {
+    for (let k = 0; k < cosines.length; k++)
+      cosines[k] = nodes[3 * i] * directions[3 * k] + nodes[3 * i + 1] * directions[3 * k + 1] + nodes[3 * i + 2] * directions[3 * k + 2];
+    WIDTHS.forEach((width, level) => {
+      let total = 0, red = 0, green = 0, blue = 0;
+      for (let k = 0; k < cosines.length; k++) {
+        const away = 1 + width - cosines[k], weight = 1 / (away * away);
+        total += weight * flux[4 * k];
+        red += weight * flux[4 * k + 1];
+        green += weight * flux[4 * k + 2];
+        blue += weight * flux[4 * k + 3];
+      }
+      table.set([red / total, green / total, blue / total], 3 * (level * count + i));
+    });
+  }
+  return table;
+}
+
+/** Unit directions [size²·3] of the nodes of a square grid folded into an octahedron. */
+function octahedralNodes(size) {
+  const nodes = new Float64Array(3 * size * size);
+  for (let row = 0; row < size; row++)
+    for (let column = 0; column < size; column++) {
+      const a = -1 + 2 * column / (size - 1), b = -1 + 2 * row / (size - 1), c = 1 - Math.abs(a) - Math.abs(b);
+      const fold = Math.max(-c, 0), x = a - (a >= 0 ? fold : -fold), y = b - (b >= 0 ? fold : -fold);
+      const length = Math.hypot(x, y, c);
+      nodes.set([x / length, y / length, c / length], 3 * (row * size + column));
+    }
+  return nodes;
+}
+
+/** Cell of the octahedral grid for the direction in `d` and the place within it, into `out`: node, s, t. */
+function octahedralCell(x, y, z, size, out) {
+  const scale = 1 / Math.max(Math.abs(x) + Math.abs(y) + Math.abs(z), 1e-12);
+  let a = x * scale, b = y * scale;
+  if (z < 0) [a, b] = [(1 - Math.abs(b)) * (a >= 0 ? 1 : -1), (1 - Math.abs(a)) * (b >= 0 ? 1 : -1)];
+  a = (a + 1) / 2 * (size - 1);
+  b = (b + 1) / 2 * (size - 1);
+  const column = Math.min(Math.max(Math.floor(a), 0), size - 2), row = Math.min(Math.max(Math.floor(b), 0), size - 2);
+  out[0] = row * size + column;
+  out[1] = a - column;
+  out[2] = b - row;
+}
+
+/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, turned by the 3×3 `lightToWorld`. */
+export function shadeSky(sky, gaussians, count, eye, lightToWorld, radiance) {
+  const { means, normals, albedo, roughness, visibility, root } = gaussians, lobes = lobeTable(), r = lightToWorld;
+  const rootToLight = new Float64Array(9);  // lightToWorldᵀ · root
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j < 3; j++)
+      rootToLight[3 * i + j] = r[i] * root[j] + r[3 + i] * root[3 + j] + r[6 + i] * root[6 + j];
+  const diffuse = turned(sky.diffuse, shRotation(rootToLight)), { specular } = sky, q = rootToLight;
+  const n = [0, 0, 0], v = [0, 0, 0], lobe = new Float64Array(8), basis = new Float64Array(16);
+  const cell = new Float64Array(3), node = new Float64Array(3), level = 3 * SPECULAR * SPECULAR;
+  for (let i = 0; i < count; i++) {
+    const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
+    const distance = Math.max(Math.hypot(dx, dy, dz), 1e-12);
+    for (let k = 0; k < 3; k++) {
+      n[k] = r[k] * normals[3 * i] + r[3 + k] * normals[3 * i + 1] + r[6 + k] * normals[3 * i + 2];
+      v[k] = (r[k] * dx + r[3 + k] * dy + r[6 + k] * dz) / distance;
+    }
+    lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
+    const mx = lobe[1], my = lobe[2], mz = lobe[3], place = lobe[4];
+    shBasis(q[0] * mx + q[3] * my + q[6] * mz, q[1] * mx + q[4] * my + q[7] * mz, q[2] * mx + q[5] * my + q[8] * mz, basis);
+    let seen = visibility[16 * i] * basis[0];  // averaged over the lobe
+    for (let j = 1; j < 16; j++) seen += lobe[j < 4 ? 5 : j < 9 ? 6 : 7] * visibility[16 * i + j] * basis[j];
+    const low = Math.min(Math.floor(place), WIDTHS.length - 2), up = place - low;
+    octahedralCell(mx, my, mz, SPECULAR, cell);
+    octahedralCell(n[0], n[1], n[2], DIFFUSE, node);
+    const at = node[0] * 48, below = at + DIFFUSE * 48, s = node[1], t = node[2];
+    const w00 = (1 - s) * (1 - t), w01 = s * (1 - t), w10 = (1 - s) * t, w11 = s * t;
+    for (let c = 0; c < 3; c++) {
+      const corner = 3 * cell[0] + c + low * level;
+      const lower = bilinear(specular, corner, cell[1], cell[2]), upper = bilinear(specular, corner + level, cell[1], cell[2]);
+      const shine = lobe[0] * Math.max(seen, 0) * (lower + up * (upper - lower));
+      let irradiance = 0;
+      for (let j = 16 * c; j < 16 * c + 16; j++)
+        irradiance += visibility[16 * i + j - 16 * c] *
+          (w00 * diffuse[at + j] + w01 * diffuse[at + 48 + j] + w10 * diffuse[below + j] + w11 * diffuse[below + 48 + j]);
+      radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * irradiance + shine, 0);
+    }
+  }
+}
+
+function bilinear(table, corner, s, t) {
+  const top = table[corner] + s * (table[corner + 3] - table[corner]), next = corner + 3 * SPECULAR;
+  return top + t * (table[next] + s * (table[next + 3] - table[next]) - top);
+}
+
+/** The diffuse tables for coefficients of the root's frame: each of their rows times `turn` [16·16]. */
+function turned(diffuse, turn) {
+  const result = new Float32Array(diffuse.length), sum = new Float64Array(16);
+  for (let row = 0; row < diffuse.length; row += 16) {
+    sum.fill(0);
+    for (let source = 0; source < 16; source++) {
+      const value = diffuse[row + source];
+      for (let target = 0; target < 16; target++) sum[target] += value * turn[16 * source + target];
+    }
+    result.set(sum, row);
+  }
+  return result;
+}

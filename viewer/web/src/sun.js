@@ -1,0 +1,73 @@
+// Taking the sun out of a light probe (rnd_runtime/sun.py): sky + suns = map.
+
+import { downsize, texelDirections, texelSolidAngles } from "./light.js";
+
+const LUMINANCE = [0.2126, 0.7152, 0.0722];
+const CAP = 6 * Math.PI / 180, RING = 10 * Math.PI / 180, LEAST_SHARE = 0.05, LARGEST = 512, LIMIT = 2;
+
+const luminance = (r, g, b) => LUMINANCE[0] * r + LUMINANCE[1] * g + LUMINANCE[2] * b;
+
+/** {sky: light, suns: [{direction, irradiance, spread}]}, strongest first. */
+export function extractSuns(light) {
+  const map = light.height > LARGEST ? downsize(light, LARGEST, 2 * LARGEST) : light;
+  const { height, width } = map, radiance = Float64Array.from(map.radiance);
+  const angles = texelSolidAngles(height, width), directions = texelDirections(height, width);
+  let total = 0;
+  for (let k = 0; k < height * width; k++)
+    total += luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]) * angles[Math.floor(k / width)];
+  const suns = [];
+  while (suns.length < LIMIT) {
+    let peak = 0, best = -1;
+    for (let k = 0; k < height * width; k++) {
+      const value = luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]);
+      if (value > best) { best = value; peak = k; }
+    }
+    const found = peakAround({ radiance, directions, angles, height, width }, [...directions.subarray(3 * peak, 3 * peak + 3)]);
+    if (!found || !(luminance(...found.sun.irradiance) >= Math.max(LEAST_SHARE * total, 1e-30))) break;
+    for (const [k, ...value] of found.sky) radiance.set(value, 3 * k);
+    suns.push(found.sun);
+  }
+  suns.sort((a, b) => luminance(...b.irradiance) - luminance(...a.irradiance));
+  return { sky: { ...map, radiance: Float32Array.from(radiance) }, suns };
+}
+
+/** The excess near `centre` over its surroundings, and the texels [index, r, g, b] without it. */
+function peakAround({ radiance, directions, angles, height, width }, centre) {
+  let sun = null, sky = [];
+  for (let pass = 0; pass < 3; pass++) {  // the brightest texel is not the middle of a lamp
+    const inside = [], ring = [[], [], []];
+    const polar = Math.acos(Math.min(Math.max(centre[1], -1), 1));
+    const first = Math.max(Math.floor((polar - RING) / Math.PI * height), 0);
+    const last = Math.min(Math.ceil((polar + RING) / Math.PI * height) + 1, height);
+    for (let k = first * width; k < last * width; k++) {
+      const cosine = directions[3 * k] * centre[0] + directions[3 * k + 1] * centre[1] + directions[3 * k + 2] * centre[2];
+      if (cosine > Math.cos(CAP)) inside.push(k);
+      else if (cosine > Math.cos(RING)) for (let c = 0; c < 3; c++) ring[c].push(radiance[3 * k + c]);
+    }
+    if (!inside.length || !ring[0].length) return null;  // a map too coarse to hold a sun
+    const background = ring.map(median);
+    const irradiance = [0, 0, 0], mean = [0, 0, 0];
+    let weights = 0;
+    sky = inside.map((k) => {
+      const left = [0, 1, 2].map((c) => Math.fround(Math.min(radiance[3 * k + c], background[c])));
+      const flux = left.map((value, c) => (radiance[3 * k + c] - value) * angles[Math.floor(k / width)]);
+      const weight = luminance(...flux);
+      for (let c = 0; c < 3; c++) {
+        irradiance[c] += flux[c];
+        mean[c] += weight * directions[3 * k + c];
+      }
+      weights += weight;
+      return [k, ...left];
+    });
+    const length = Math.hypot(...mean);
+    if (!(length > 0)) return null;
+    centre = mean.map((value) => value / length);
+    sun = { direction: centre, irradiance, spread: Math.sqrt(Math.max(2 * (1 - length / weights), 0)) };
+  }
+  return { sun, sky };
+}
+
+function median(values) {
+  const sorted = Float64Array.from(values).sort(), half = sorted.length >> 1;
+  return sorted.length % 2 ? sorted[half] : (sorted[half - 1] + sorted[half]) / 2;
+}

@@ -1,0 +1,152 @@
+// Everything but the page: reads the files, makes pictures of states; the same states and answers as rnd-view's.
+
+import { Avatar } from "./avatar.js";
+import { cameraOf, homeView, projectJoints } from "./camera.js";
+import { downsize, readLight } from "./light.js";
+import { readMotion, restMotion } from "./motion.js";
+import { project } from "./project.js";
+import { shBasis } from "./sh.js";
+import { addSuns } from "./shadow.js";
+import { buildSky, shadeSky } from "./sky.js";
+import { Splatter } from "./splat.js";
+import { extractSuns } from "./sun.js";
+
+const CLAY = 0.8;  // albedo of a body that shows the light alone
+const LARGEST_SKY = 1024;  // rows behind the avatar
+const SIZE = 512;
+const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
+
+const splatter = new Splatter();
+const lights = [];  // {name, light, tables: Map of shade → {sky, suns}}
+let avatar = null, motion = null, motionFile = null, posed = null, shownSky = null;
+
+/** Take in files [{name, bytes}]; the page learns of the new scene. */
+async function load(files) {
+  for (const { name, bytes } of files) {
+    const kind = name.toLowerCase().split(".").pop();
+    if (kind === "onnx") {
+      avatar = await Avatar.load(bytes, name);
+      const own = { height: 32, width: 64, radiance: avatar.trainedLight };
+      lights.splice(0, lights.length && lights[0].own ? 1 : 0, { name: "the avatar's own", own: true, light: own, tables: new Map() });
+      motion = motionFile ? readMotion(motionFile.bytes, motionFile.name, avatar.skeleton) : restMotion(avatar.skeleton);
+    } else if (kind === "npz") {
+      if (avatar) motion = readMotion(bytes, name, avatar.skeleton);
+      motionFile = { name, bytes };
+    } else if (kind === "hdr" || kind === "exr") lights.push({ name, light: readLight(bytes, name), tables: new Map() });
+    else throw new Error(`${name}: expected .onnx, .npz, .hdr or .exr`);
+  }
+  posed = null;
+  if (avatar) postMessage({ kind: "scene", scene: description(files) });
+  else postMessage({ kind: "message", text: "drop an avatar (.onnx) too" });
+}
+
+function description(files) {
+  const lit = files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
+  const repaired = lights.filter(({ light }) => light.repaired).map(({ name, light }) => `${name}: ${light.repaired} broken texels filled in`);
+  return {
+    avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
+    motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
+    lights: lights.map(({ name }) => name), light: lit ? lights.length - 1 : undefined,
+    shades: ["table", "table+sun"], size: SIZE, raster: splatter.name, view: homeView(avatar.skeleton, motion),
+    truths: [], notes: [...motion.notes, ...repaired],
+  };
+}
+
+async function render({ number, state }) {
+  const clock = lap();
+  if (!posed || posed.time !== state.time) posed = { time: state.time, gaussians: await avatar.pose(motion, state.time) };
+  clock("encoders");
+  const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
+  const grown = avatar.gaussians / count, { gaussians } = posed;
+  const features = state.output === "lit" || state.output === "light"
+    ? radianceOf(state, gaussians, count, camera, grown) : material(state.output, gaussians, count, camera);
+  clock("shading");
+  const records = project(gaussians, count, features, camera, grown);
+  clock("sorting");
+  splatter.draw(records, state.width, state.height, look(state, camera));
+  const image = splatter.canvas.transferToImageBitmap();
+  clock("splatting");
+  const joints = projectJoints(gaussians.joints, camera);
+  const answer = { kind: "picture", number, width: state.width, height: state.height, image, joints, times: clock.times };
+  postMessage(answer, [image]);
+}
+
+function radianceOf(state, gaussians, count, camera, grown) {
+  const entry = lights[state.light];
+  if (!entry.tables.has(state.shade)) {
+    const { sky, suns } = state.shade === "table+sun" ? extractSuns(entry.light) : { sky: entry.light, suns: [] };
+    entry.tables.set(state.shade, { sky: buildSky(sky), suns });
+  }
+  const { sky, suns } = entry.tables.get(state.shade), turn = lightToWorld(state.yaw);
+  const shown = state.output === "light" ? { ...gaussians, albedo: new Float32Array(3 * count).fill(CLAY) } : gaussians;
+  const radiance = new Float32Array(3 * count), gain = 2 ** state.exposure;
+  shadeSky(sky, shown, count, camera.position, turn, radiance);
+  const turned = suns.map((sun) => ({ ...sun, direction: rotate(turn, sun.direction) }));
+  addSuns(turned, shown, count, camera.position, grown, radiance);
+  return gain === 1 ? radiance : radiance.map((value) => value * gain);
+}
+
+/** Three features [count·3] of a material map. */
+function material(output, { albedo, normals, roughness, visibility, root }, count, { rotation }) {
+  if (output === "albedo") return albedo;
+  const features = new Float32Array(3 * count), basis = new Float64Array(16);
+  for (let i = 0; i < count; i++) {
+    const [x, y, z] = normals.subarray(3 * i, 3 * i + 3);
+    if (output === "normal")
+      for (let k = 0; k < 3; k++) features[3 * i + k] = rotation[3 * k] * x + rotation[3 * k + 1] * y + rotation[3 * k + 2] * z;
+    else if (output === "roughness") features[3 * i] = roughness[i];
+    else {
+      shBasis(root[0] * x + root[3] * y + root[6] * z, root[1] * x + root[4] * y + root[7] * z, root[2] * x + root[5] * y + root[8] * z, basis);
+      let sum = 0;
+      for (let j = 0; j < 16; j++) sum += visibility[16 * i + j] * COSINE_LOBE[j] * basis[j];
+      features[3 * i] = Math.min(Math.max(sum, 0), 1);
+    }
+  }
+  return features;
+}
+
+/** What the last pass is told: see resolve.frag. */
+function look(state, { rotation: r, focal, width, height }) {
+  const show = { normal: 1, roughness: 2, visibility: 2 }[state.output] ?? 0, gain = 2 ** state.exposure;
+  if (state.background !== "hdr") {
+    const hex = /^#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})$/i.exec(state.background);
+    return { show, behind: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
+  }
+  if (shownSky !== lights[state.light]) {
+    shownSky = lights[state.light];
+    const { light } = shownSky;
+    splatter.setSky(light.height > LARGEST_SKY ? downsize(light, LARGEST_SKY, 2 * LARGEST_SKY) : light);
+  }
+  const turn = lightToWorld(state.yaw), pixelToLight = [];
+  for (let row = 0; row < 3; row++) {  // lightToWorldᵀ · rotationᵀ · K⁻¹
+    const [x, y, z] = [0, 1, 2].map((axis) => turn[row] * r[3 * axis] + turn[3 + row] * r[3 * axis + 1] + turn[6 + row] * r[3 * axis + 2]);
+    pixelToLight.push(x / focal, y / focal, z - (x * width + y * height) / 2 / focal);
+  }
+  return { show, behind: 1, gain, pixel_to_light: pixelToLight };
+}
+
+const linear = (srgb) => (srgb <= 0.04045 ? srgb / 12.92 : ((srgb + 0.055) / 1.055) ** 2.4);
+const rotate = (m, v) => [0, 1, 2].map((k) => m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2]);
+
+/** Turns the light about +Y, from +X towards +Z. */
+function lightToWorld(yaw) {
+  const c = Math.cos(yaw), s = Math.sin(yaw);
+  return [c, 0, -s, 0, 1, 0, s, 0, c];
+}
+
+function lap() {
+  let last = performance.now();
+  const clock = (name) => {
+    const now = performance.now();
+    clock.times[name] = now - last;
+    last = now;
+  };
+  clock.times = {};
+  return clock;
+}
+
+let queue = Promise.resolve();  // one at a time, in order
+onmessage = ({ data }) => {
+  queue = queue.then(() => (data.ask === "load" ? load(data.files) : render(data)))
+    .catch((error) => postMessage({ kind: "error", message: error.message ?? String(error) }));
+};
