@@ -15,6 +15,7 @@ from rnd_trainer.light_start import Sightings, start_light
 COUNT, PICTURES = 700, 24
 WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide
 ENERGY = 0.25  # of the sun's share of the light, relative: the albedo is unknown and may take some of it
+SHADOWS = 0.05  # the ball's own, as they are traced: those of 700 splats are a little too wide
 
 
 def _turning_ball(sun: np.ndarray, strength: float) -> Sightings:
@@ -42,12 +43,19 @@ def _turning_ball(sun: np.ndarray, strength: float) -> Sightings:
 def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
     sun /= np.linalg.norm(sun)
-    monkeypatch.setattr(light_start, "_sight", lambda *_: _turning_ball(sun, strength))
-    light = start_light(None, [], [])  # type: ignore[arg-type]  # the sightings are given
-    assert light is not None and light.shape == (32, 64, 3) and (light > 0).all()
+    ball = _turning_ball(sun, strength)
+    monkeypatch.setattr(light_start, "_sight", lambda *_: ball)
+    found = start_light(None, [], [])  # type: ignore[arg-type]  # the sightings are given
+    assert found is not None
+    light, exposure = found.radiance, found.exposure
+    assert light.shape == (32, 64, 3) and (light > 0).all() and (exposure >= 0).all()
     solid_angles = texel_solid_angles(32, 64)
     grey = light.mean(-1)
-    assert (grey * solid_angles).sum() / (4 * math.pi) == pytest.approx(1, abs=1e-3)
+    normals = np.concatenate([n[ball.who[ball.picture == k]] for k, (_, n) in enumerate(ball.posed)])
+    cosines = np.maximum(normals @ texel_directions(32, 64).reshape(-1, 3).T, 0)
+    arriving = (cosines @ (grey * solid_angles).reshape(-1) / math.pi).mean()
+    assert ball.colour.mean() / arriving == pytest.approx(light_start.REFLECTANCE, rel=SHADOWS)
+    assert (grey * exposure).sum() == pytest.approx(arriving, rel=SHADOWS)
     near = texel_directions(32, 64) @ sun > math.cos(math.radians(12))
     share = (grey * solid_angles)[near].sum() / (grey * solid_angles).sum()
     if strength:

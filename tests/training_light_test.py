@@ -31,6 +31,17 @@ def test_probe_starts_white_with_mean_luminance_one() -> None:
     assert abs(float(mean) - 1) < 1e-5
 
 
+def test_what_reaches_the_body_stays_as_it_started() -> None:
+    probe, radiance = LightProbe(), _sunny()
+    exposure = torch.rand(32, 64, generator=torch.Generator().manual_seed(1)) * probe.solid_angles
+    probe.start_from(radiance, exposure)
+    assert torch.allclose(probe.radiance(), radiance, rtol=1e-5)
+    with torch.no_grad():
+        probe.raw.add_(torch.randn_like(probe.raw))
+    reaches = [float((luminance(light.detach()) * exposure).sum()) for light in (probe.radiance(), radiance)]
+    assert abs(reaches[0] / reaches[1] - 1) < 1e-5
+
+
 def test_drawn_texels_are_unbiased_and_always_hold_the_sun() -> None:
     probe, radiance = LightProbe(), _sunny()
     generator = torch.Generator().manual_seed(0)

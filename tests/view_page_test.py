@@ -173,9 +173,8 @@ def test_ground_truth_stands_beside(page):
     page.run("document.getElementById('truth-on').click()")
     index = len(capture.frames) // 2
     _set(page, "truth-index", str(index))
-    page.wait("document.getElementById('truth').width > 300 || document.getElementById('truth').height > 200")
+    page.wait(f"document.getElementById('truth').dataset.index === '{index}'")
     image = read_image(capture.folder / capture.frames[index].image)
-    page.wait(f"document.getElementById('truth').width === {image.shape[1]}")
     picture = _picture(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
     assert picture.shape == image.shape
     assert (_pixels(page, "truth") == image).all()

@@ -17,10 +17,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from rnd_runtime.camera import Camera
-from rnd_runtime.raster_cpu import rasterize
 
 from .model import Posed
 from .perceptual import Perceptual
+from .sight import sight
 
 YAW, PITCH = math.radians(25), math.radians(8)
 """the virtual camera lies within these angles of the training camera, seen from the body"""
@@ -53,7 +53,10 @@ def virtual_camera(camera: Camera, centre: Tensor, generator: torch.Generator) -
 
 def covisible(posed: Posed, first: Camera, second: Camera, count: int) -> Tensor:
     """Indices of those of the first ``count`` Gaussians that both cameras see."""
-    return (_seen(posed, first, count) & _seen(posed, second, count)).nonzero()[:, 0]
+    seen = [
+        sight(posed, camera, count, facing=GRAZING, occlusion=OCCLUSION)[0] for camera in (first, second)
+    ]
+    return torch.from_numpy(np.flatnonzero(seen[0] & seen[1])).to(posed.means.device)
 
 
 def consistency_loss(
@@ -86,25 +89,6 @@ def project(points: Tensor, camera: Camera) -> Tensor:
     )
     homogeneous = (points @ turn.T + shift) @ K.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
-
-
-@torch.no_grad()
-def _seen(posed: Posed, camera: Camera, count: int) -> Tensor:
-    """Which of the first ``count`` Gaussians face the camera, lie inside its picture and behind nothing."""
-    arrays = (posed.means, posed.covariances, posed.attributes.opacity)
-    means, covariances, opacities = (x.detach().cpu().numpy() for x in arrays)
-    nothing = np.zeros((len(means), 1), np.float32)
-    raster = rasterize(means, covariances, opacities, nothing, camera, depth=True)
-    depth = torch.from_numpy(raster.depth / np.maximum(raster.alpha, 1e-6))
-    points, normals = posed.means[:count].cpu(), posed.normals[:count].cpu()
-    pixels = project(points, camera)
-    inside = ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(1)
-    column, row = torch.where(inside[:, None], pixels, 0).long().unbind(1)
-    eye = torch.as_tensor(camera.position, dtype=torch.float32)
-    facing = (normals * functional.normalize(eye - points, dim=-1)).sum(-1) > GRAZING
-    z = points @ torch.as_tensor(camera.world_to_camera[2, :3], dtype=torch.float32)
-    z = z + float(camera.world_to_camera[2, 3])
-    return (inside & facing & (z > 0) & (z < depth[row, column] + OCCLUSION)).to(posed.means.device)
 
 
 def _look_up(features: Tensor, pixels: Tensor, grid: tuple[int, float]) -> Tensor:

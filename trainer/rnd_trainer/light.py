@@ -28,15 +28,18 @@ class Texels:
 
 
 class LightProbe(nn.Module):
-    """L(ω): 32×64 texels of linear RGB, kept as logarithms, mean luminance over the sphere fixed at 1.
+    """L(ω): 32×64 texels of linear RGB, kept as logarithms, the luminance that reaches the body fixed.
 
     A logarithm lets a sun grow (its texel is a thousand times the sky's), which softplus does not in any
-    number of steps that we would wait for. Albedo and light are known up to a common factor only; the fixed
-    mean chooses it.
+    number of steps that we would wait for. Albedo and light are known up to a common factor only; what is
+    fixed chooses it: Σ exposure · luminance = level. Until :meth:`start_from` knows more, that is a mean of 1
+    over the sphere.
     """
 
     directions: Tensor
     solid_angles: Tensor
+    exposure: Tensor
+    level: Tensor
 
     def __init__(self, channels: int = 3) -> None:
         super().__init__()
@@ -47,17 +50,21 @@ class LightProbe(nn.Module):
         self.register_buffer(
             "solid_angles", torch.as_tensor(texel_solid_angles(*PROBE_SHAPE), dtype=torch.float32)
         )
+        self.register_buffer("exposure", self.solid_angles / (4 * math.pi))
+        self.register_buffer("level", torch.ones(()))
 
     def radiance(self) -> Tensor:
         """[32, 64, 3] linear."""
         light = torch.exp(self.raw).expand(*PROBE_SHAPE, 3)
-        return light / (luminance(light) * self.solid_angles).sum() * (4 * math.pi)
+        return light / (luminance(light) * self.exposure).sum() * self.level
 
     @torch.no_grad()
-    def start_from(self, radiance: Tensor) -> None:
-        """Take ``radiance`` [32, 64, 3] > 0, up to scale, as the map to go on from."""
+    def start_from(self, radiance: Tensor, exposure: Tensor) -> None:
+        """Go on from ``radiance`` [32, 64, 3] > 0, whose luminance under ``exposure`` [32, 64] is kept from now on."""
         grey = self.raw.shape[-1] == 1
         self.raw.copy_(torch.log(luminance(radiance)[..., None] if grey else radiance))
+        self.exposure.copy_(exposure)
+        self.level.copy_((luminance(radiance) * exposure).sum())
 
 
 def natural_sky(height: Tensor | NDArray[np.float64]) -> Any:

@@ -10,6 +10,11 @@ and the albedo drops out: whatever it is, a point's colours over the pictures ru
 a dictionary of broad lobes (the sky) and single directions (suns, with traced shadows) is fitted by non-negative
 least squares, and a direction joins where it explains most of what is left (orthogonal matching pursuit, Pati et
 al. 1993).
+
+Squares find where the suns are, but not how strong: a shadow's edge in the wrong place, or a fold that the shape
+does not have, looks like a brighter sky, and what errs in proportion to its light counts most where that is
+strong. The strengths are therefore found by least absolute error of the colours' logarithms (iteratively
+reweighted: Holland & Welsch 1977).
 """
 
 from __future__ import annotations
@@ -25,12 +30,12 @@ from scipy.optimize import nnls
 
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import texel_directions, texel_solid_angles
-from rnd_runtime.raster_cpu import rasterize
 
 from .data import View
 from .light import PROBE_SHAPE, natural_sky
 from .model import AvatarModel, PoseInput
 from .shading import traced_visibility
+from .sight import sight
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +57,10 @@ CANDIDATES = 24
 """directions that are tried in earnest before one is chosen: both ends of an axis, and their neighbours"""
 RIDGE = 1e-4
 """relative, on the normal equations: neighbouring lobes are nearly the same column"""
+REWEIGHTINGS = 10
+"""after which the strengths no longer move"""
+CLEAR = 0.1
+"""relative error of a colour below which it counts no more for being smaller"""
 EVEN = 1.0
 """relative weight of a natural sky: what no picture tells of, behind the person, is like the rest"""
 PENALTY = 30.0
@@ -64,7 +73,20 @@ FACING = 0.3
 """cosine between normal and view below which a point's colour is not trusted"""
 OCCLUSION = 0.03
 """metres by which a point may lie behind the first surface and still be the one that is seen"""
+REFLECTANCE = 0.22
+"""share of the light that people give back, on average: a photographer's grey card, 18 %, and 4 % at the surface"""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+@dataclass
+class FirstLight:
+    """A light to start from: radiance [32, 64, 3], and exposure [32, 64].
+
+    exposure: what unit radiance from each texel adds to what the pictures show of a white body, on average.
+    """
+
+    radiance: NDArray[np.float32]
+    exposure: NDArray[np.float32]
 
 
 @dataclass
@@ -80,8 +102,10 @@ class Sightings:
 
 def start_light(
     model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]
-) -> NDArray[np.float32] | None:
-    """Radiance [32, 64, 3] of mean luminance 1 that best explains the pictures; None where too little is seen.
+) -> FirstLight | None:
+    """The light that best explains the pictures; None where too little is seen.
+
+    Its scale is such that what is seen gives back :data:`REFLECTANCE` of what arrives.
 
     Args:
         model: with the geometry of the first stage.
@@ -97,14 +121,19 @@ def start_light(
     found = _search(_quadratic(seen, np.concatenate([sky, coarse], axis=1)))
     near = _texels_near(directions, wide[np.array(found, int) - SKY_LOBES])
     fine = _transport(seen, directions[near], solid_angles[near])
-    form = _quadratic(seen, np.concatenate([sky, fine], axis=1))
-    suns = _search(form)
-    _, strength = form.fit([*range(SKY_LOBES), *suns])
+    columns = np.concatenate([sky, fine], axis=1)
+    suns = _search(_quadratic(seen, columns))
+    strength = _strengths(seen, columns[:, [*range(SKY_LOBES), *suns]])
     radiance = _lobes(directions) @ strength[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
     radiance[near[np.array(suns, int) - SKY_LOBES]] += strength[SKY_LOBES:]
-    mean = (radiance @ _LUMINANCE) @ solid_angles / (4 * math.pi)
-    return (radiance / mean).reshape(*PROBE_SHAPE, 3).astype(np.float32)
+    exposure = _spread(coarse.mean(0) / wide_angles) * solid_angles
+    level = (seen.colour @ _LUMINANCE).mean() / REFLECTANCE
+    radiance *= level / ((radiance @ _LUMINANCE) @ exposure)
+    return FirstLight(
+        radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32),
+        exposure.reshape(PROBE_SHAPE).astype(np.float32),
+    )
 
 
 def _sight(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> Sightings:
@@ -117,26 +146,15 @@ def _sight(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]
         view, camera = views[index], views[index].camera
         with torch.no_grad():
             posed = model(poses[index])
-        points, covariances, directions = (x.cpu() for x in (posed.means, posed.covariances, posed.normals))
-        means, normals = points.numpy(), directions.numpy()
-        nothing = np.zeros((len(means), 1), np.float32)
-        opacity = posed.attributes.opacity.cpu().numpy()
-        raster = rasterize(means, covariances.numpy(), opacity, nothing, camera, depth=True)
-        local = means[:nodes] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            pixel = (local @ camera.K.T)[:, :2] / local[:, 2:]
-        inside = (local[:, 2] > 0) & (pixel >= 0).all(1) & (pixel < (camera.width, camera.height)).all(1)
-        column, row = np.where(inside[:, None], pixel, 0).astype(int).T
-        depth = raster.depth[row, column] / np.maximum(raster.alpha[row, column], 1e-6)
-        towards = camera.position - means[:nodes]
-        facing = (normals[:nodes] * towards).sum(1) > FACING * np.linalg.norm(towards, axis=1)
+        visible, pixel = sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
+        column, row = pixel.astype(int).T
         pixels = view.image[row, column]
         clear = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        good = np.nonzero(inside & facing & clear & (local[:, 2] < depth + OCCLUSION))[0]
+        good = np.nonzero(visible & clear)[0]
         who.append(good)
         colour.append(srgb_to_linear(pixels[good] / 255))
         picture.append(np.full(len(good), k))
-        posed_nodes.append((points[:nodes], directions[:nodes]))
+        posed_nodes.append((posed.means[:nodes].cpu(), posed.normals[:nodes].cpu()))
     return Sightings(
         np.concatenate(who), np.concatenate(colour), np.concatenate(picture), posed_nodes, spacing
     )
@@ -200,27 +218,49 @@ class Quadratic:
         return gain
 
 
-def _quadratic(seen: Sightings, transport: Floats) -> Quadratic:
+def _by_brightness(seen: Sightings) -> Floats:
+    """Weights [n] that are each point's mean luminance: an error of a dark point is a small one."""
+    count = np.maximum(np.bincount(seen.who), 1)
+    return (np.bincount(seen.who, seen.colour @ _LUMINANCE) / count)[seen.who]
+
+
+def _quadratic(seen: Sightings, transport: NDArray[np.float32], weight: Floats | None = None) -> Quadratic:
     """The quadratic form of ``transport`` [n, Q]: a point's irradiance must run parallel to its colours.
 
     With I_p the colours and T_p L the irradiance of point p in its pictures, the best albedo leaves
-    ‖(1 − Î_p Î_pᵀ) T_p L‖, weighted by the point's brightness: no albedo is left to solve for.
+    ‖(1 − Î_p Î_pᵀ) T_p L‖: no albedo is left to solve for. Sightings count by ``weight`` [n].
     """
     count, columns = int(seen.who.max()) + 1, transport.shape[1]
-    brightness = np.bincount(seen.who, seen.colour @ _LUMINANCE, count)
-    weight = np.sqrt(brightness / np.maximum(np.bincount(seen.who, minlength=count), 1))
-    rows = transport * weight[seen.who, None].astype(transport.dtype)
+    root = np.sqrt(_by_brightness(seen) if weight is None else weight)
+    rows = transport * root[:, None].astype(transport.dtype)
     whole = (rows.T @ rows).astype(np.float64)
     order = np.argsort(seen.who, kind="stable")
     starts = np.flatnonzero(np.diff(seen.who[order], prepend=-1))
     disagreement = np.empty((3, columns, columns))
     for channel in range(3):
-        colour = seen.colour[:, channel]
+        colour = seen.colour[:, channel] * (1 if weight is None else root)
         length = np.sqrt(np.bincount(seen.who, colour**2, count))
         unit = (colour / np.maximum(length[seen.who], 1e-9)).astype(rows.dtype)
         along = np.add.reduceat((rows * unit[:, None])[order], starts, axis=0).astype(np.float64)
         disagreement[channel] = whole - along.T @ along
     return Quadratic(disagreement, whole, rows.sum(0, dtype=np.float64))
+
+
+def _strengths(seen: Sightings, columns: NDArray[np.float32]) -> Floats:
+    """Strengths [Q, 3] of the sky's lobes and the suns that leave the least absolute error of log colours."""
+    everything = list(range(columns.shape[1]))
+    _, strength = _quadratic(seen, columns).fit(everything)
+    colour = np.log(np.maximum(seen.colour @ _LUMINANCE, 1e-4))
+    count, clear = int(seen.who.max()) + 1, np.ones(len(colour))
+    for _ in range(REWEIGHTINGS):
+        light = columns @ (strength @ _LUMINANCE)
+        light = np.maximum(light / light.mean(), 1e-3)
+        albedo = np.bincount(seen.who, clear * (colour - np.log(light)), count)
+        albedo /= np.maximum(np.bincount(seen.who, clear, count), 1e-12)
+        error = np.abs(colour - np.log(light) - albedo[seen.who])
+        clear = 1 / np.maximum(error, CLEAR)
+        _, strength = _quadratic(seen, columns, clear / light**2).fit(everything)
+    return strength
 
 
 def _search(form: Quadratic) -> list[int]:
@@ -247,6 +287,12 @@ def _search(form: Quadratic) -> list[int]:
 
 def _grid(shape: tuple[int, int]) -> tuple[Floats, Floats]:
     return texel_directions(*shape).reshape(-1, 3), texel_solid_angles(*shape).reshape(-1)
+
+
+def _spread(coarse: Floats) -> Floats:
+    """A map in the search's texels [K], repeated in the probe's."""
+    rows, columns = (fine // wide for fine, wide in zip(PROBE_SHAPE, SEARCH_SHAPE, strict=True))
+    return coarse.reshape(SEARCH_SHAPE).repeat(rows, 0).repeat(columns, 1).reshape(-1)
 
 
 def _lobe_centres() -> Floats:

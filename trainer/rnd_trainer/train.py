@@ -185,7 +185,7 @@ class Training:
             motion = self.motion()
             found = start_light(self.model, self.views, [self._pose(view, motion) for view in self.views])
             if found is not None:
-                self.probe.start_from(torch.from_numpy(found))
+                self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
 
     def _parameters(self) -> list[Tensor]:
         return [p for group in self.optimizer.param_groups for p in group["params"]]

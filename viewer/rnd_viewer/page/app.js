@@ -13,7 +13,7 @@ const state = {
   light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", gaussians: null, truth: null,
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
-let number = 0, wanted = false, flying = new Map();
+let number = 0, shown = 0, wanted = false, flying = new Map();
 let waiting = [];  // {number, done, failed} of those who want a picture for themselves
 let times = {}, rates = [];
 
@@ -40,6 +40,8 @@ function ask(exact) {
 }
 
 function show(picture) {
+  if (picture.number < shown) return;  // it took longer to decode than the one after it
+  shown = picture.number;
   const sent = flying.get(picture.number);
   for (const old of [...flying.keys()]) if (old <= picture.number) flying.delete(old);
   const canvas = $("picture"), context = canvas.getContext("2d");
@@ -170,7 +172,9 @@ async function setTruth() {
 }
 
 function showTruth(index, bitmap) {
+  if (index !== state.truth) return;  // another was asked for since
   const canvas = $("truth");
+  canvas.dataset.index = index;
   canvas.width = bitmap.width;
   canvas.height = bitmap.height;
   canvas.getContext("2d").drawImage(bitmap, 0, 0);
