@@ -14,7 +14,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
-from rnd_trainer import bench_frame, bench_grid, bench_peers
+from rnd_trainer import bench_frame, bench_grid, bench_peers, bench_shards
 from rnd_trainer.bench_avatars import Encoders, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
@@ -189,3 +189,14 @@ def test_peers_say_the_same_and_growth_is_measured(tiny_checkpoint, tiny_avatar,
     }  # fmt: skip
     for row in grown:
         assert len(row["ms"]) == len(row["amounts"]) and np.isfinite(row["exponent"]) and row["floor_ms"] > 0
+
+
+def test_a_clip_is_spread_over_processes(tiny_avatar, monkeypatch) -> None:
+    assert bench_shards.shards(10, 3) == [(0, 3), (3, 6), (6, 10)]
+    assert bench_shards.ways(1) == [(1, 1)]
+    monkeypatch.setattr(bench_shards, "REPEATS", 1)
+    rows = list(bench_shards.bench_shards(tiny_avatar, WALK, SKY, 4, 32, 2))
+    assert [(row["processes"], row["threads"]) for row in rows] == [(1, 1), (1, 2), (2, 1)]
+    assert rows[0]["speed_up"] == 1 and all(row["fps"] == 4 / row["seconds"] for row in rows)
+    with pytest.raises(InputError, match="rnd-play"):
+        list(bench_shards.bench_shards(tiny_avatar, WALK, WALK, 4, 32, 2))

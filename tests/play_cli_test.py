@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +19,7 @@ from rnd_runtime.images import read_image, write_image
 from rnd_runtime.motion import save_motion
 from rnd_viewer.cli import main
 from rnd_viewer.player import Player
+from tiny import ASSETS
 
 FRAMES = 6
 
@@ -127,6 +130,23 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     assert {name for name in parts if name.startswith("frames/")} == names | {"frames/mine.png"}
     assert all(parts[name] == whole[name] for name in names)
     assert {"play_000000-000002.json", "play_000002-000006.json"} <= parts.keys()
+
+
+@pytest.mark.skipif(shutil.which("parallel") is None, reason="needs GNU parallel")
+def test_the_readmes_line_for_a_queue_makes_the_whole(tmp_path):
+    readme = (ASSETS.parent / "README.md").read_text(encoding="utf-8")
+    line = re.search(r"^    (parallel rnd-play .+) 0:30 30:60$", readme, re.MULTILINE).group(1)
+    line = line.replace("rnd-play", str(Path(sys.executable).with_name("rnd-play")), 1).replace(
+        "assets/", f"{ASSETS}/"
+    )
+    small = line.replace("--frames", "--size 64 --format png --frames").replace("--out out", "--out {}")
+    whole = small.removeprefix("parallel ").partition(" :::")[0].format(tmp_path / "whole")
+    parts = small.format(tmp_path / "parts")
+    for command in (f"{whole} 0:4", f"{parts} 0:2 2:4"):
+        subprocess.run(command, shell=True, check=True, timeout=300, capture_output=True)
+    wholes, shared = _tree(tmp_path / "whole"), _tree(tmp_path / "parts")
+    names = {name for name in wholes if name.startswith("frames/")}
+    assert len(names) == 4 and all(shared[name] == wholes[name] for name in names)
 
 
 def test_a_floor_that_no_machine_holds_lowers_the_quality_and_drops_no_frame(files, tmp_path, capsys):

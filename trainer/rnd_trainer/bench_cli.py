@@ -102,6 +102,26 @@ class Peers:
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
 
 
+@dataclass(frozen=True)
+class Shards:
+    """One clip by one process, by several threads, and by several processes with a part each."""
+
+    json: Path | None = None
+    """write the rows here"""
+    avatar: Path = Path("assets/avatar.onnx")
+    """what is played"""
+    motion: Path = Path("assets/walk.npz")
+    """how it moves"""
+    hdr: Path = Path("assets/sky.exr")
+    """and what lights it"""
+    frames: int = 120
+    """of the clip, from its start"""
+    size: int = 512
+    """picture side in pixels"""
+    cores: int = 2
+    """processes, or threads, at most"""
+
+
 def main() -> None:
     """Entry point of ``rnd-bench``."""
     if sys.argv[1:2] == ["--stability"]:
@@ -113,6 +133,7 @@ def main() -> None:
         "frame": (Frame, _frame),
         "grid": (Grid, _grid),
         "peers": (Peers, _peers),
+        "shards": (Shards, _shards),
     }
     kinds = {name: kind for name, (kind, _) in commands.items()}
     options = tyro.extras.subcommand_cli_from_dict(kinds, prog="rnd-bench")
@@ -203,6 +224,23 @@ def _peers(options: Peers) -> None:
     console.print(table)
     console.print(grown)
     _write(options.json, {"peers": rows, "growth": slopes})
+
+
+def _shards(options: Shards) -> None:
+    _prepare(options, "frames", "size", "cores")
+    from rich.console import Console
+    from rich.table import Table
+
+    from .bench_shards import bench_shards
+
+    files = (options.avatar, options.motion, options.hdr)
+    rows = list(bench_shards(*files, options.frames, options.size, options.cores))
+    table = Table("processes", "threads", "seconds", "frames/s", "speed-up")
+    for row in rows:
+        cells = (f"{row['seconds']:.2f}", f"{row['fps']:.1f}", f"{row['speed_up']:.2f}")
+        table.add_row(str(row["processes"]), str(row["threads"]), *cells)
+    Console().print(table)
+    _write(options.json, rows)
 
 
 def _line(row: dict[str, Any]) -> str:

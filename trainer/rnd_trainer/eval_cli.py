@@ -16,6 +16,8 @@ from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from .perceptual import Perceptual
 
 COLUMNS = {
@@ -31,6 +33,8 @@ COLUMNS = {
     "psnr_albedo": ("albedo", "{:.2f}"),
 }
 """what the terminal's table shows of a row: heading and format"""
+WIDTH = 140
+"""characters of the widest table"""
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,6 @@ def need_extra() -> None:
 def evaluate_run(options: EvalOptions) -> None:
     """Score every held-out split that the capture has; print a table, write rows and pictures as asked."""
     need_extra()
-    from rich.console import Console
     from rich.table import Table
 
     from rnd_runtime.capture import load_capture
@@ -116,7 +119,7 @@ def evaluate_run(options: EvalOptions) -> None:
     for row in rows:
         cells = [COLUMNS[name][1].format(row[name]) if name in row else "" for name in names]
         table.add_row(row["split"], str(row["frames"]), *cells)
-    console = Console()
+    console = _wide_console()
     console.print(table)
     if rows[0].get("flicker") is not None:
         console.print(f"flicker on the held-out motion: {rows[0]['flicker']:.2f} of 255 levels")
@@ -187,11 +190,18 @@ def ablate_run(options: EvalOptions) -> None:
         cells = [_with_gain(line[split]) if split in line else "" for split in splits]
         cost = (f"{line['encoder_gflop']:.3f}", f"{line['encoder_ms']:.1f}")
         table.add_row(line["method"], *cells, line["beside"] or "", *cost)
-    Console().print(table)
+    _wide_console().print(table)
     if options.json is not None:
         with atomic_path(options.json) as temporary:
             text = json.dumps({"summary": summary, "rows": rows}, indent=1)
             temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _wide_console() -> Console:
+    """Where a terminal is too narrow, lines go on in the next: figures cut to two digits tell nothing."""
+    from rich.console import Console
+
+    return Console(width=max(Console().width, WIDTH), soft_wrap=True)
 
 
 def _with_gain(cell: dict[str, Any]) -> str:

@@ -100,9 +100,7 @@ class Sightings:
     spacing: float
 
 
-def start_light(
-    model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]
-) -> FirstLight | None:
+def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> FirstLight | None:
     """The light that best explains the pictures; None where too little is seen.
 
     Its scale is such that what is seen gives back :data:`REFLECTANCE` of what arrives.

@@ -1,0 +1,90 @@
+"""How playback of one clip spreads over processes: every frame stands alone, so shards need not talk."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
+
+REPEATS = 3
+"""of each way, which take turns; the median is reported"""
+PLAY = "import sys; from rnd_viewer.cli import main; sys.exit(main(sys.argv[1:]))"
+
+
+class Way(NamedTuple):
+    """So many processes, each with so many threads."""
+
+    processes: int
+    threads: int
+
+
+def ways(cores: int) -> list[Way]:
+    """One thread alone, all in one process, and a process for each core; the first is what the rest are beside."""
+    return list(dict.fromkeys([Way(1, 1), Way(1, cores), Way(cores, 1)]))
+
+
+def bench_shards(
+    avatar: Path, motion: Path, hdr: Path, frames: int, size: int, cores: int
+) -> Iterator[dict[str, Any]]:
+    """Rows of wall time from the first process' start to the last one's end, PNGs written, and the speed-up.
+
+    Args:
+        avatar, motion, hdr: of ``rnd-play``.
+        frames: of the clip, from its start; size: picture side in pixels.
+        cores: processes, or threads, at most.
+
+    Raises:
+        InputError: ``rnd-play`` failed; with its last line.
+    """
+    inputs = [str(avatar), "--motion", str(motion), "--hdr", str(hdr), "--size", str(size), "--format", "png"]
+    seconds: dict[Way, list[float]] = {way: [] for way in ways(cores)}
+    for _ in range(REPEATS):
+        for way, taken in seconds.items():
+            taken.append(_play(way, inputs, frames))
+    alone = statistics.median(seconds[Way(1, 1)])
+    for way, taken in seconds.items():
+        median = statistics.median(taken)
+        yield {
+            "processes": way.processes, "threads": way.threads, "seconds": median, "fps": frames / median,
+            "speed_up": alone / median, "frames": frames, "size": size, "avatar": avatar.name, "machine": machine(),
+        }  # fmt: skip
+
+
+def shards(frames: int, count: int) -> list[tuple[int, int]]:
+    """``count`` ranges START, END that cover ``frames`` and differ in length by one at most."""
+    edges = [frames * k // count for k in range(count + 1)]
+    return list(itertools.pairwise(edges))
+
+
+def _play(way: Way, inputs: list[str], frames: int) -> float:
+    """Seconds that the clip takes."""
+    environment = os.environ | {"OMP_NUM_THREADS": str(way.threads)}
+    with tempfile.TemporaryDirectory() as out:
+        started = time.perf_counter()
+        processes = [
+            subprocess.Popen(
+                [sys.executable, "-c", PLAY, *inputs, "--threads", str(way.threads),
+                 "--frames", f"{start}:{end}", "--out", out],
+                env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            )
+            for start, end in shards(frames, way.processes)
+        ]  # fmt: skip
+        said = [process.communicate()[1] for process in processes]
+        taken = time.perf_counter() - started
+        for process, text in zip(processes, said):
+            if process.returncode:
+                raise InputError("rnd-play", got=(text.strip().splitlines() or ["no answer"])[-1])
+        written = len(list(Path(out, "frames").glob("*.png")))
+        if written != frames:
+            raise InputError("--frames", expected=f"at most the clip's {written}", got=frames)
+    return taken
