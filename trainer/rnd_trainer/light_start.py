@@ -253,8 +253,8 @@ def _strengths(seen: Sightings, columns: NDArray[np.float32]) -> Floats:
     for _ in range(REWEIGHTINGS):
         light = columns @ (strength @ _LUMINANCE)
         light = np.maximum(light / light.mean(), 1e-3)
-        albedo = np.bincount(seen.who, clear * (colour - np.log(light)), count)
-        albedo /= np.maximum(np.bincount(seen.who, clear, count), 1e-12)
+        total = np.bincount(seen.who, clear * (colour - np.log(light)), count)
+        albedo = total / np.maximum(np.bincount(seen.who, clear, count), 1e-12)
         error = np.abs(colour - np.log(light) - albedo[seen.who])
         clear = 1 / np.maximum(error, CLEAR)
         _, strength = _quadratic(seen, columns, clear / light**2).fit(everything)
