@@ -1,8 +1,8 @@
 """Fills the tables of README.md and docs/performance.md from assets/bench/*.json: python scripts/doc_tables.py
 
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
-the file's rows, with the format of its numbers. ``<!-- chart: FILE.svg -->`` … ``<!-- end -->`` holds a picture. What
-was not measured yet leaves its place empty.
+the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY. ``<!-- chart: FILE.svg -->`` …
+``<!-- end -->`` holds a picture. What was not measured yet leaves its place empty.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
         return found[1] + (picture if (bench / found[2]).is_file() else "") + found[3]
 
     def table(found: re.Match[str]) -> str:
-        if not (bench / found[2]).is_file():
+        name, _, key = found[2].partition("#")
+        if not (bench / name).is_file():
             return found[1] + found[4]
-        rows = json.loads((bench / found[2]).read_text(encoding="utf-8"))
-        rows = rows["summary"] if isinstance(rows, dict) and "summary" in rows else rows
+        rows = json.loads((bench / name).read_text(encoding="utf-8"))
+        rows = rows[key] if key else rows
         columns = [column.strip().partition(" ")[::2] for column in found[3].split(",")]
         lines = [[name for name, _ in columns], ["---"] * len(columns)]
         lines += [[_cell(_value(row, name), form) for name, form in columns] for row in rows]
@@ -49,6 +50,8 @@ def _value(row: dict[str, Any], name: str) -> object:
 
 
 def _cell(value: object, form: str) -> str:
+    if isinstance(value, list):
+        return ", ".join(_cell(one, form) for one in value)
     return "" if value is None else format(value, form)
 
 
