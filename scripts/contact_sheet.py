@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from rnd_runtime.images import read_image, write_image
@@ -21,9 +22,10 @@ def main(run: Path, out: Path) -> None:
     chosen = [frames[k * len(frames) // COLUMNS] for k in range(COLUMNS)]
     played = np.concatenate([_on_grey(read_image(path)) for path in chosen], axis=1)
     preview = _on_grey(read_image(max((run / "previews").glob("*.png"))))
-    width = max(played.shape[1], preview.shape[1])
-    rows = [np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0))) for picture in (preview, played)]
-    write_image(out, np.concatenate(rows))
+    width = preview.shape[1]
+    height = round(played.shape[0] * width / played.shape[1])
+    shrunk = cv2.resize(played, (width, height), interpolation=cv2.INTER_AREA)
+    write_image(out, np.concatenate([preview, shrunk]))
 
 
 def _on_grey(picture: np.ndarray) -> np.ndarray:
