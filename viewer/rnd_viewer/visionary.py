@@ -73,7 +73,7 @@ def write_visionary(path: Path, frames: Sequence[Splats], fps: float) -> None:
 
 def _model(gaussians: Floats32, colours: Floats32, fps: float) -> bytes:
     count, points = gaussians.shape[:2]
-    constants = {
+    constants: dict[str, NDArray[Any]] = {
         "gaussian_frames": gaussians,
         "color_frames": colours,
         "fps": np.array([fps], np.float32),
