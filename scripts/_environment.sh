@@ -62,3 +62,15 @@ need_web_page() {
     [ -e "$stamp" ] || (cd viewer/web && npm ci --silent --no-audit --no-fund) && touch "$stamp"
     (cd viewer/web && npm run --silent build)
 }
+
+# splat-transform on the PATH, for the tests that read our splats with it (200 MB of node_modules)
+need_splat_transform() {
+    command -v splat-transform >/dev/null && return
+    command -v npm >/dev/null || need_system_packages npm
+    local version=2.7.1 # the last for Node.js 20
+    local folder=$PWD/.cache/splat-transform-$version
+    [ -x "$folder/node_modules/.bin/splat-transform" ] ||
+        npm install --silent --no-audit --no-fund --prefix "$folder" "@playcanvas/splat-transform@$version" ||
+        echo "splat-transform cannot be installed; its tests are skipped" >&2
+    export PATH=$folder/node_modules/.bin:$PATH
+}

@@ -43,7 +43,7 @@ STAGES = """(async () => {
   }
   const median = (values) => +values.sort((a, b) => a - b)[values.length >> 1].toFixed(2);
   const medians = Object.fromEntries(Object.entries(stages).map(([name, values]) => [name, median(values)]));
-  return { "median ms": medians, "whole ms": median(whole) };
+  return { ms_median: median(whole), stages_ms: medians };
 })()"""
 # Frames drawn while it plays, two of them in the making at any time.
 PLAYING = """(async () => {
@@ -91,7 +91,7 @@ def _measure(page: Page, url: str) -> dict[str, Any]:
     page.wait(f"location.href === {json.dumps(url)} && window.rnd && rnd.scene()")
     page.run(f"Object.assign(rnd.state, {{width: {SIZE}, height: {SIZE}}}); rnd.picture().then(() => 1)")
     result: dict[str, Any] = page.run(STAGES.replace("COUNT", str(ONE_BY_ONE)))
-    return result | {"frames/s": page.run(PLAYING.replace("SECONDS", str(PLAYED_S)))}
+    return result | {"fps": page.run(PLAYING.replace("SECONDS", str(PLAYED_S)))}
 
 
 def main() -> None:
@@ -104,20 +104,21 @@ def main() -> None:
     avatar: Path = arguments.avatar
     scene = Scene(ViewOptions(avatar, ASSETS / "walk.npz", (ASSETS / "sky.exr",), size=SIZE, raster="cpu"))
     scene.warm_up()
-    report: dict[str, Any] = {"gaussians": scene.avatar.gaussians, "size": SIZE, "cores": os.cpu_count()}
-    report["machine"] = platform.processor() or platform.machine()
+    common = {"gaussians": scene.avatar.gaussians, "size": SIZE, "cores": os.cpu_count()}
+    common["machine"] = platform.processor() or platform.machine()
+    rows = []
     with serve(scene, "127.0.0.1", 0, None) as (server, url), _browser(webgl=False) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        report["rnd-view, raw"] = _measure(page, url)
-        report["rnd-view, jpeg"] = _measure(page, f"{url}?encoding=jpeg")
+        rows.append({"page": "rnd-view, raw pixels", **_measure(page, url)})
+        rows.append({"page": "rnd-view, JPEG", **_measure(page, f"{url}?encoding=jpeg")})
         server.shutdown()
     with _static_host(avatar) as web, _browser(webgl=True) as page:
-        report["viewer/web"] = _measure(page, web)
-    files = {file.name: file.stat().st_size for file in DIST.rglob("*") if file.is_file()}
-    report["viewer/web bytes"] = sum(files.values())
-    print(json.dumps(report, indent=1))
+        size = sum(file.stat().st_size for file in DIST.rglob("*") if file.is_file())
+        rows.append({"page": "viewer/web", **_measure(page, web), "mb": round(size / 1e6, 1)})
+    text = json.dumps([row | common for row in rows], indent=1)
+    print(text)
     if arguments.json:
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
+        arguments.json.write_text(text + "\n")
 
 
 if __name__ == "__main__":

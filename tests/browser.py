@@ -85,13 +85,16 @@ class Page:
 
 
 @contextmanager
-def chromium(profile: Path, *, size: tuple[int, int] = (1100, 720), webgl: bool = False) -> Iterator[Page]:
-    """A fresh browser with one tab and no GPU; with ``webgl``, SwiftShader stands in for one."""
+def chromium(
+    profile: Path, *, size: tuple[int, int] = (1100, 720), webgl: bool = False, webgpu: bool = False
+) -> Iterator[Page]:
+    """A fresh browser with one tab and no GPU; with ``webgl`` and ``webgpu``, SwiftShader stands in for one."""
     assert CHROMIUM is not None
     options = [
         *("--headless=new", "--no-sandbox", "--no-first-run", "--disable-background-networking"),
         *("--disable-component-update", "--hide-scrollbars", "--disable-dev-shm-usage", "--mute-audio"),
         *(("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if webgl else ("--disable-gpu",)),
+        *(("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader") if webgpu else ()),
         *(f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "--remote-debugging-port=0"),
     ]
     process = subprocess.Popen(

@@ -10,12 +10,15 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import onnx
+import onnxruntime as ort
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
+from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
@@ -27,6 +30,7 @@ from rnd_viewer.convert_cli import main
 from rnd_viewer.mesh_files import posed_vertices
 from rnd_viewer.player import Player
 from rnd_viewer.splat_files import TRANSFORM
+from rnd_viewer.visionary import check_clip
 from tiny import ASSETS, body, motion
 
 AVATAR, WALK, SKY = ASSETS / "avatar.onnx", ASSETS / "walk.npz", ASSETS / "sky.exr"
@@ -37,6 +41,7 @@ INSIDE = 0.99  # alpha above which nothing behind the body shows
 CODED_PSNR = (
     33.0  # dB inside the body, where coded colours are blended; measured 33.9 (27.9 without correction)
 )
+PACKED_MEAN = 2.0  # of 255, inside the body: what SPZ, SOG and compressed PLY round
 FITTED_MEAN = 1.5  # of 255: a degree-3 fit over all views against the shading of one; measured 0.93
 
 
@@ -229,15 +234,51 @@ def test_spz_and_sog_name_the_program_they_need(tmp_path, monkeypatch, capsys):
     assert "splat-transform, which is not installed (npm install -g @playcanvas/splat-transform)" in error
 
 
+def test_a_clip_for_visionary_is_its_frames(tmp_path):
+    """The graph by itself, at times within, between and beyond the frames, against the PLY of each."""
+    line = ["splats", str(AVATAR), "--motion", str(WALK), "--hdr", str(SKY), "--out", str(tmp_path)]
+    assert main([*line, "--frames", "10:13", "--format", "ply,visionary"]) == 0
+    model = onnx.load(tmp_path / "visionary.onnx")
+    onnx.checker.check_model(model, full_check=True)
+    session = ort.InferenceSession(tmp_path / "visionary.onnx", providers=["CPUExecutionProvider"])
+    count, fps = Avatar.load(AVATAR, threads=1).gaussians, 30.0
+    assert [(i.name, i.type, i.shape) for i in session.get_inputs()] == [("time", "tensor(float)", [1])]
+    assert [(o.name, o.type, o.shape) for o in session.get_outputs()] == [
+        ("gaussian_f32", "tensor(float)", [count, 10]),
+        ("color_rgb", "tensor(float)", [count, 4]),
+        ("num_points", "tensor(int32)", [1]),
+    ]
+    for time, frame in (
+        (0.0, 10),
+        (1 / fps, 11),
+        (1.9 / fps, 11),
+        (2 / fps, 12),
+        (3 / fps, 10),
+        (3001 / fps, 11),
+    ):
+        gaussians, colours, points = session.run(None, {"time": np.array([time], np.float32)})
+        assert points == count and (colours[:, 3] == 1).all()
+        covariances = gaussians[:, 4:] * [1, 1, -1, 1, -1, 1]
+        picture = _drawn(gaussians[:, :3] * [-1, -1, 1], covariances, gaussians[:, 3], colours[:, :3])
+        wanted = _drawn_ply(tmp_path / f"{frame:06d}.ply", True)
+        assert np.abs(to_bytes(picture).astype(int) - to_bytes(wanted)).max() <= ONE_STEP, time
+
+
+def test_a_clip_that_no_webgpu_buffer_holds_is_refused():
+    check_clip(2**27 // (40 * 30_000), 30_000)
+    with pytest.raises(
+        InputError, match="--frames: expected at most 111 of this avatar for visionary, got 112"
+    ):
+        check_clip(112, 30_000)
+
+
 @pytest.mark.skipif(shutil.which(TRANSFORM) is None, reason="splat-transform is not installed")
 def test_splat_transform_understands_our_ply(tmp_path):
-    """Its glTF of our PLY, turned upright again with all harmonics, is our glTF; its SPZ holds the same cloud."""
-    ply = _splats(tmp_path, "--format", "ply,glb,spz", "--sh-degree", "3")
-    program = shutil.which(TRANSFORM)
-    for name in ("theirs.glb", "back.ply"):
-        source = ply if name == "theirs.glb" else ply.with_suffix(".spz")
-        subprocess.run([program, "--quiet", str(source), str(tmp_path / name)], check=True)
-    ours, theirs = (_glb(path) for path in (ply.with_suffix(".glb"), tmp_path / "theirs.glb"))
+    """Its glTF of our PLY, turned upright again with all harmonics, is our glTF."""
+    ply = _splats(tmp_path, "--format", "ply,glb", "--sh-degree", "3")
+    ours, theirs = (
+        _glb(path) for path in (ply.with_suffix(".glb"), _transformed(ply, tmp_path / "theirs.glb"))
+    )
     attributes = [document["meshes"][0]["primitives"][0]["attributes"] for document, _ in (ours, theirs)]
     assert attributes[0].keys() == attributes[1].keys()
     for name in attributes[0].keys() - {"COLOR_0"}:
@@ -245,9 +286,31 @@ def test_splat_transform_understands_our_ply(tmp_path):
         if name.endswith("ROTATION"):
             b = b * np.sign((a * b).sum(axis=1, keepdims=True))  # q and −q are one rotation
         np.testing.assert_allclose(a, b, atol=1e-5, err_msg=name)
-    cloud, back = _ply(ply), _ply(tmp_path / "back.ply")
-    for key in "xyz":  # SPZ quantises and reorders: compare the clouds, not the rows
-        assert abs(np.sort(cloud[key]) - np.sort(back[key])).max() < 1e-3
+
+
+@pytest.mark.skipif(shutil.which(TRANSFORM) is None, reason="splat-transform is not installed")
+def test_compressed_splats_show_the_same_picture(tmp_path):
+    """SPZ and SOG as we have them made, and its compressed PLY: read back by it, they are our picture."""
+    ply = _splats(tmp_path, "--format", "ply,spz,sog")
+    wanted = to_bytes(_drawn_ply(ply, True)).astype(int)
+    packed = [
+        ply.with_suffix(".spz"),
+        ply.with_suffix(".sog"),
+        _transformed(ply, tmp_path / "of.compressed.ply"),
+    ]
+    for path in packed:
+        assert path.stat().st_size < 0.3 * ply.stat().st_size, path.name
+        back = _transformed(path, tmp_path / f"from_{path.suffix[1:]}.ply")
+        again = to_bytes(_drawn_ply(back, True)).astype(int)
+        assert np.abs(again - wanted)[wanted.any(-1)].mean() < PACKED_MEAN, path.name
+
+
+def _transformed(source: Path, out: Path) -> Path:
+    """What splat-transform makes of ``source``."""
+    program = shutil.which(TRANSFORM)
+    assert program
+    subprocess.run([program, "--quiet", "--gpu", "cpu", str(source), str(out)], check=True)
+    return out
 
 
 def _evaluated(document, arrays, time_s: float) -> np.ndarray:
@@ -349,6 +412,10 @@ def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
             "--format: expected some of ply",
         ),
         (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--frames", "9:4"], "--frames"),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--format", "visionary", "--sh-degree", "1"],
+            "--sh-degree: expected 0 for visionary, got 1",
+        ),
         (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--camera", "above"], "--camera"),
         (["splats", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz: not a readable ONNX model"),
         (["mesh", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz"),

@@ -1,8 +1,9 @@
 """The documentation is true: its commands run, their options exist, its errors are raised, its figures are the files'.
 
 A fenced ``sh`` block is run line by line in a folder that has ``assets``; blocks of one page share it. Above a block
-that takes too long or needs what a test machine lacks stands ``<!-- not run: reason -->``. A ``python`` block that
-starts with ``# file: NAME`` is written to NAME.
+that takes too long or needs what a test machine lacks stands ``<!-- not run: reason -->``; above one that is run with
+fewer steps, ``<!-- tested with COMMAND OPTIONS -->``. A ``python`` block that starts with ``# file: NAME`` is written
+to NAME.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import runpy
 import shlex
 import sys
 import tomllib
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +24,20 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from tiny import ASSETS
+from view_process import running
 
 ROOT = ASSETS.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+FRONT_PAGES = [ROOT / name for name in ("README.md", "viewer/web/README.md", "assets/README.md")]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-BLOCK = re.compile(r"(?:<!-- not run: (?P<reason>.+?) -->\n)?```(?P<kind>\w+)\n(?P<body>.*?)```", re.DOTALL)
+BLOCK = re.compile(
+    r"(?:<!-- (?:not run: (?P<reason>.+?)|tested with (?P<command>\S+) (?P<added>.+?)) -->\n)?"
+    r"```(?P<kind>\w+)\n(?P<body>.*?)```",
+    re.DOTALL,
+)
+LOOKS_LIKE_A_COMMAND = re.compile(
+    r"^ +(?:rnd-\w+|python|pip|npm|\./scripts/\w+) .*|^ +\./scripts/\w+$", re.MULTILINE
+)
 FLOAT32_STEPS = 1e-5  # m: the example computes its bones in float64, the player in its own order
 
 
@@ -34,25 +45,32 @@ def _page(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def _run(line: str, monkeypatch) -> None:
+def _run(words: list[str], monkeypatch) -> None:
     """One command of a page, in this process: starting Python for each would take most of the time."""
-    words = shlex.split(line)
+    if words[0] == "rnd-view":
+        with running(*words[1:]) as address, urllib.request.urlopen(address) as answer:
+            assert answer.status == 200 and b"RnD-Avatar" in answer.read()
+        return
     monkeypatch.setattr(sys, "argv", words)
     if words[0] == "python":
         monkeypatch.setattr(sys, "argv", words[1:])
         runpy.run_path(words[1], run_name="__main__")
         return
-    assert words[0] in SCRIPTS, f"{line}: no command of ours; mark the block <!-- not run: reason -->"
+    assert words[0] in SCRIPTS, f"{words}: no command of ours; mark the block <!-- not run: reason -->"
     module, function = SCRIPTS[words[0]].split(":")
     try:
         code = getattr(importlib.import_module(module), function)()
     except SystemExit as leaving:
         code = leaving.code
-    assert not code, line
+    assert not code, words
 
 
 # own-video.md needs a video and poses: tests/own_video_test.py makes them and runs its commands
-@pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "own-video"], ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [p for p in (*PAGES, *FRONT_PAGES) if p.stem != "own-video"],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
 def test_commands_run(page, tmp_path, monkeypatch):
     (tmp_path / "assets").symlink_to(ASSETS)
     monkeypatch.chdir(tmp_path)
@@ -62,7 +80,17 @@ def test_commands_run(page, tmp_path, monkeypatch):
             Path(lines[0].removeprefix("# file: ")).write_text(block["body"], encoding="utf-8")
         elif block["kind"] == "sh" and block["reason"] is None:
             for line in lines:
-                _run(line, monkeypatch)
+                words = shlex.split(line, comments=True)
+                _run(
+                    [*words, *block["added"].split()] if words[0] == block["command"] else words, monkeypatch
+                )
+
+
+@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_stands_in_a_block_that_is_run(page):
+    """None is merely indented, where :func:`test_commands_run` would not see it."""
+    outside = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    assert not LOOKS_LIKE_A_COMMAND.findall(outside)
 
 
 def _help(command: str, capsys, monkeypatch) -> str:
@@ -78,7 +106,7 @@ def test_options_exist(capsys, monkeypatch):
     """Every option that a page or the README gives to a command of ours is in that command's help."""
     wanted: dict[str, set[str]] = {}
     for page in [*PAGES, ROOT / "README.md"]:
-        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ").replace("-->", "")
         for name, rest in re.findall(r"\b(rnd-[a-z]+)((?: +[^\s`|]+)*)", text):
             if name not in SCRIPTS:
                 continue

@@ -18,7 +18,11 @@ from rnd_trainer import data_cli
 
 PAGE = Path(__file__).parent.parent / "docs" / "own-video.md"
 COMMANDS = [
-    line for block in re.findall(r"```sh\n(.*?)```", PAGE.read_text(), re.S) for line in block.splitlines()
+    line
+    for block in re.findall(
+        r"(?<!-->\n)```sh\n(.*?)```", PAGE.read_text(), re.S
+    )  # but for those marked "not run"
+    for line in block.splitlines()
 ]
 
 

@@ -135,7 +135,7 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
 @pytest.mark.skipif(shutil.which("parallel") is None, reason="needs GNU parallel")
 def test_the_readmes_line_for_a_queue_makes_the_whole(tmp_path):
     readme = (ASSETS.parent / "README.md").read_text(encoding="utf-8")
-    line = re.search(r"^    (parallel rnd-play .+) 0:30 30:60$", readme, re.MULTILINE).group(1)
+    line = re.search(r"^(parallel rnd-play .+) 0:30 30:60$", readme, re.MULTILINE).group(1)
     line = line.replace("rnd-play", str(Path(sys.executable).with_name("rnd-play")), 1).replace(
         "assets/", f"{ASSETS}/"
     )

@@ -7,6 +7,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,11 @@ from websockets.sync.client import connect
 
 import rnd_viewer.view_scene
 from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
+from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_viewer.background import Background
@@ -33,6 +36,8 @@ from rnd_viewer.view_cli import main
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene
 from rnd_viewer.view_server import serve
+from tiny import ASSETS
+from view_process import running
 
 SIZE = 64
 FRAMES = 6
@@ -235,6 +240,27 @@ def test_a_token_is_asked_for_everywhere(options):
             assert visitor.picture().any()
         with pytest.raises(InvalidStatus, match="403"):
             _knock(port, additional_headers=given, origin="http://evil.example")
+
+
+def test_any_other_address_asks_for_the_token_that_is_printed():
+    with running(str(ASSETS / "avatar.onnx"), "--host", "0.0.0.0", "--size", "64") as address:
+        port, token = address.removeprefix("http://0.0.0.0:").split("/?token=")
+        assert len(token) > 20
+        for path in ("/", "/app.js", "/socket", f"/?token={token[:-1]}"):
+            assert _get(int(port), path)[0] == 401, path
+        assert _get(int(port), f"/?token={token}")[0] == 200
+
+
+def test_the_motion_is_edited_as_rnd_play_does(options):
+    edits = MotionEdits(speed=2.0, in_place=True)
+    scene = Scene(replace(options, speed=edits.speed, in_place=edits.in_place))
+    untouched = load_motion(options.motion, scene.avatar.skeleton)
+    expected = edit_motion(untouched, edits)
+    assert scene.motion.duration == expected.duration < untouched.duration
+    assert (scene.motion.translations == expected.translations).all()
+    scene.close()
+    with pytest.raises(InputError, match=r"--smooth: expected 0\.01 to 1000, got 0"):
+        replace(options, smooth=0)
 
 
 def test_options_and_refusals(options, capsys, tmp_path, monkeypatch):

@@ -114,8 +114,8 @@ class OnnxFile:
                 if name in wanted:
                     graph += data
         for name in outputs:
-            graph += _field(_GRAPH_OUTPUT, _field(1, name.encode()))
-        return bytes(self._head + _field(_MODEL_GRAPH, graph))
+            graph += bytes_field(_GRAPH_OUTPUT, bytes_field(1, name.encode()))
+        return bytes(self._head + bytes_field(_MODEL_GRAPH, graph))
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
@@ -152,9 +152,14 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
             return number, at
 
 
-def _field(number: int, value: bytes | bytearray) -> bytes:
-    """A field of bytes."""
+def bytes_field(number: int, value: bytes | bytearray) -> bytes:
+    """A field of bytes: a text, a message, raw data."""
     return _coded(number << 3 | _LENGTH) + _coded(len(value)) + value
+
+
+def number_field(number: int, value: int) -> bytes:
+    """A field that holds the number ``value``, not negative."""
+    return _coded(number << 3 | _VARINT) + _coded(value)
 
 
 def _coded(number: int) -> bytes:

@@ -28,9 +28,10 @@ from .mesh_files import posed_vertices, write_obj, write_rigged_glb
 from .options import parse_frames
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
 from .splats import Splats, fixed_colour, make_splats, stored_colours, turned_over, view_dependent_colour
+from .visionary import check_clip, write_visionary
 
 Floats = NDArray[np.float64]
-SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog"), ("glb", "obj")
+SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog", "visionary"), ("glb", "obj")
 # The front camera of rnd-play; only where it stands matters here.
 FRONT = View(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
 
@@ -50,13 +51,18 @@ def convert(options: Options) -> Iterator[str]:
 
 def _splats(options: SplatOptions) -> Iterator[str]:
     formats = _formats(options.format, SPLAT_FORMATS)
+    if "visionary" in formats and options.sh_degree > 0:
+        raise InputError("--sh-degree", expected="0 for visionary", got=options.sh_degree)
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
     motion = load_motion(options.motion, avatar.skeleton)
     frames = parse_frames(options.frames, motion.frame_count)
+    if "visionary" in formats:
+        check_clip(len(frames), avatar.gaussians)
     shader = Shader(_light(options, avatar), mode=options.shade)
     camera_at = _camera_path(options.camera, avatar.skeleton, motion)
     out = output_folder(options.out)
+    clip: list[Splats] = []
     for number in frames:
         gaussians = avatar.pose(motion, number / motion.fps)
         eye = camera_at(number, number / motion.fps).position
@@ -68,8 +74,12 @@ def _splats(options: SplatOptions) -> Iterator[str]:
             write_splat_glb(out / f"{number:06d}.glb", splats, options.coding)
         if program is not None:
             _transformed(program, out / f"{number:06d}", stored, formats)
-    sizes = [(suffix, (out / f"{number:06d}.{suffix}").stat().st_size / 1e6) for suffix in formats]
-    listed = ", ".join(f"{suffix} ({size:.2f} MB)" for suffix, size in sizes)
+        if "visionary" in formats:
+            clip.append(stored)
+    if clip:
+        write_visionary(out / "visionary.onnx", clip, motion.fps)
+    files = {suffix: f"{number:06d}.{suffix}" for suffix in formats} | {"visionary": "visionary.onnx"}
+    listed = ", ".join(f"{name} ({(out / files[name]).stat().st_size / 1e6:.2f} MB)" for name in formats)
     yield f"{len(frames)} frames of {avatar.gaussians} Gaussians in {out}: {listed}"
 
 

@@ -25,7 +25,7 @@ class SplatOptions:
     out: Path
     """folder for 000000.ply and so on"""
     format: str = "ply"
-    """some of ply,glb,spz,sog"""
+    """some of ply,glb,spz,sog and visionary (all frames in one visionary.onnx)"""
     frames: str = "0:1"
     """frames of the motion, START:END, END excluded, either may be missing"""
     colour: Literal["lit", "albedo"] = "lit"

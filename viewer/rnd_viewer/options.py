@@ -1,4 +1,4 @@
-"""The options of ``rnd-play``; each comment is the option's help."""
+"""The options of ``rnd-play``, and those that it shares; each comment is the option's help."""
 
 from __future__ import annotations
 
@@ -11,48 +11,95 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.motion_edit import MotionEdits
+from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.motion_edit import MotionEdits, edit_motion
+from rnd_runtime.skeleton import Skeleton
 
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
 
 # Help without "{None}|PATH" and "(default: None)": the text says what happens when an option is left out.
-def _option(metavar: str) -> Any:
+def option(metavar: str) -> Any:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
+@dataclass(frozen=True, kw_only=True)
+class MotionOptions:
+    """How a motion's file is read, and what is done to the motion before it is played."""
+
+    motion_up: Literal["auto", "y", "z"] = "auto"
+    """Which axis points up in the motion's file."""
+    motion_fps: Annotated[float | None, option("FLOAT")] = None
+    """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
+    joint_map: Annotated[Path | None, option("FILE")] = None
+    """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
+    smooth: Annotated[float | None, option("HZ")] = None
+    """Take jitter out of the motion: a One-Euro filter of this cutoff, 1 to 5; lower is smoother."""
+    speed: float = 1.0
+    """How many times as fast the motion is played."""
+    in_place: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Hold the motion's root over the place where it begins."""
+    loop: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Blend the motion's end into its beginning, so that the clip can be repeated."""
+
+    @property
+    def edits(self) -> MotionEdits:
+        """What is done to the motion once it is read."""
+        return MotionEdits(self.smooth, self.speed, self.in_place, self.loop)
+
+    def read_motion(self, path: Path, skeleton: Skeleton) -> Motion:
+        """The motion in ``path`` for ``skeleton``, edited.
+
+        Raises:
+            InputError: for whatever cannot be used.
+        """
+        motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
+        return edit_motion(motion, self.edits)
+
+    def __post_init__(self) -> None:
+        refuse_outside(self, {"smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
+
+
+def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:
+    """Refuse numbers that no later step could explain: ``limits`` by field."""
+    for name, (low, high) in limits.items():
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:  # false for NaN
+            raise InputError(f"--{name.replace('_', '-')}", expected=f"{low:g} to {high:g}", got=value)
+
+
 @dataclass(frozen=True)
-class PlayOptions:
+class PlayOptions(MotionOptions):
     """Animate, relight and splat an avatar, with no GPU and no display needed.
 
     rnd-play avatar.onnx --motion walk.npz --hdr sky.exr --out out/
     """
 
-    avatar: Annotated[tyro.conf.Positional[Path | None], _option("AVATAR.onnx")] = None
+    avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
     """The avatar, a file that rnd-export wrote."""
-    motion: Annotated[Path | None, _option("FILE")] = None
+    motion: Annotated[Path | None, option("FILE")] = None
     """Body poses over time: .npz of AMASS, SMPL or EasyMocap, .pkl of AIST++ or WHAM, .pt of GVHMR, .npy of MDM,
     .bvh, or .amc with its .asf beside it."""
-    hdr: Annotated[Path | None, _option("FILE")] = None
+    hdr: Annotated[Path | None, option("FILE")] = None
     """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
-    out: Annotated[Path | None, _option("FOLDER")] = None
+    out: Annotated[Path | None, option("FOLDER")] = None
     """Folder for frames/, frames_exr/, aov/, play.mp4 and play.json."""
 
-    size: Annotated[str | None, _option("N|WxH")] = None
+    size: Annotated[str | None, option("N|WxH")] = None
     """Picture size: N or WIDTHxHEIGHT pixels. Default: 512, or the camera file's own size."""
-    fps: Annotated[float | None, _option("FLOAT")] = None
+    fps: Annotated[float | None, option("FLOAT")] = None
     """Frames per second. Default: the motion's."""
-    frames: Annotated[str | None, _option("START:END")] = None
+    frames: Annotated[str | None, option("START:END")] = None
     """Frames to render, END excluded, either may be missing; same pixels as in the whole run, and processes with
     different parts may share a folder. Default: all."""
-    format: Annotated[str | None, _option("LIST")] = None
+    format: Annotated[str | None, option("LIST")] = None
     """Some of png,exr,mp4. Default: png, and mp4 where PyAV is installed."""
 
     camera: str = "front"
     """front, orbit, FILE.json or FILE.json:NAME. The first two frame the whole motion."""
     orbit_seconds: float = 8.0
     """Time of one turn of --camera orbit, in seconds; negative turns the other way."""
-    distance: Annotated[float | None, _option("FLOAT")] = None
+    distance: Annotated[float | None, option("FLOAT")] = None
     """Metres from the middle of the motion to the camera. Default: the least that shows all."""
     elevation: float = 5.0
     """Degrees by which the camera stands above the horizon."""
@@ -71,28 +118,14 @@ class PlayOptions:
     """Shading: ao (fastest), table, table+sun (the only one with hard sun shadows), lights:K of 1 to 8192
     lights, brute (every texel of the map, shadows as soft as the avatar learned them)."""
 
-    aov: Annotated[str, _option("LIST")] = ""
+    aov: Annotated[str, option("LIST")] = ""
     """Also write some of albedo,normal,roughness,visibility,depth. Normals in the camera's OpenCV axes."""
     raster: Literal["auto", "gl", "cpu"] = "auto"
     """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
-    motion_up: Literal["auto", "y", "z"] = "auto"
-    """Which axis points up in the motion's file."""
-    motion_fps: Annotated[float | None, _option("FLOAT")] = None
-    """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
-    joint_map: Annotated[Path | None, _option("FILE")] = None
-    """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
-    smooth: Annotated[float | None, _option("HZ")] = None
-    """Take jitter out of the motion: a One-Euro filter of this cutoff, 1 to 5; lower is smoother."""
-    speed: float = 1.0
-    """How many times as fast the motion is played."""
-    in_place: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Hold the motion's root over the place where it begins."""
-    loop: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Blend the motion's end into its beginning, so that the clip can be repeated."""
 
-    threads: Annotated[int | None, _option("INT")] = None
+    threads: Annotated[int | None, option("INT")] = None
     """CPU threads. Default: all."""
-    fps_floor: Annotated[float | None, _option("FLOAT")] = None
+    fps_floor: Annotated[float | None, option("FLOAT")] = None
     """Frames per second to hold by shading less often, then at a lower resolution, rather than by dropping frames:
     what is given up depends on the machine, so two runs may differ."""
     pipeline: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
@@ -100,13 +133,8 @@ class PlayOptions:
     doctor: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")] = False
     """Print renderer, providers, threads, versions and what to install for what is missing."""
 
-    @property
-    def edits(self) -> MotionEdits:
-        """What is done to the motion before it is played."""
-        return MotionEdits(self.smooth, self.speed, self.in_place, self.loop)
-
     def __post_init__(self) -> None:
-        """Refuse numbers that no later step could explain."""
+        super().__post_init__()
         limits = {
             "fps": (1e-3, 1000),
             "fps_floor": (1e-3, 1000),
@@ -116,13 +144,8 @@ class PlayOptions:
             "fov": (1, 170),
             "hdr_yaw": (-1e6, 1e6),
             "exposure": (-30, 30),
-            "smooth": (1e-2, 1e3),
-            "speed": (1e-2, 100),
         }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:  # false for NaN
-                raise InputError(f"--{name.replace('_', '-')}", expected=f"{low:g} to {high:g}", got=value)
+        refuse_outside(self, limits)
         if self.orbit_seconds == 0:
             raise InputError("--orbit-seconds", expected="not 0", got=0)
 

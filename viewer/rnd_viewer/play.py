@@ -16,8 +16,6 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import output_folder
 from rnd_runtime.light import Light, load_light
-from rnd_runtime.motion import load_motion
-from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 
@@ -57,16 +55,7 @@ def play(options: PlayOptions) -> int:
     times = StageTimes()
     with times.stage("load"):
         avatar = Avatar.load(avatar_file, threads=options.threads)
-        motion = edit_motion(
-            load_motion(
-                motion_file,
-                avatar.skeleton,
-                up=options.motion_up,
-                fps=options.motion_fps,
-                joint_map=options.joint_map,
-            ),
-            options.edits,
-        )
+        motion = options.read_motion(motion_file, avatar.skeleton)
         light = _light(options, avatar)
         shader = Shader(light, mode=options.shade)
         rasterizer = make_rasterizer(options.raster)

@@ -5,31 +5,29 @@ from __future__ import annotations
 import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from rnd_runtime.errors import InputError
 
-
-def _option(metavar: str) -> Any:
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+from .options import MotionOptions, option
 
 
 @dataclass(frozen=True)
-class ViewOptions:
+class ViewOptions(MotionOptions):
     """Look at an avatar in the browser: turn it, play it, move the light. No GPU needed.
 
     rnd-view avatar.onnx --motion walk.npz --hdr sky.exr
     """
 
-    avatar: Annotated[tyro.conf.Positional[Path], _option("AVATAR.onnx")]
+    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx")]
     """The avatar, a file that rnd-export wrote."""
-    motion: Annotated[Path | None, _option("FILE")] = None
-    """Body poses over time: an .npz as rnd-play takes it. Default: the capture's, else the pose at rest."""
-    hdr: Annotated[tuple[Path, ...], _option("FILE|FOLDER ...")] = field(default_factory=tuple)
+    motion: Annotated[Path | None, option("FILE")] = None
+    """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the pose at rest."""
+    hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = field(default_factory=tuple)
     """Light probes to choose from, .exr or .hdr, or folders of them. The avatar's own light is always there."""
-    capture: Annotated[Path | None, _option("FOLDER")] = None
+    capture: Annotated[Path | None, option("FOLDER")] = None
     """A capture: its pictures can be shown beside the avatar, from their cameras and under their lights."""
 
     host: str = "127.0.0.1"
@@ -40,16 +38,13 @@ class ViewOptions:
     """Picture size in pixels to begin with."""
     raster: Literal["auto", "gl", "cpu"] = "auto"
     """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
-    motion_up: Literal["auto", "y", "z"] = "auto"
-    """Which axis points up in the motion's file."""
-    motion_fps: Annotated[float | None, _option("FLOAT")] = None
-    """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
-    threads: Annotated[int | None, _option("INT")] = None
+    threads: Annotated[int | None, option("INT")] = None
     """CPU threads. Default: all."""
     browser: bool = True
     """Open the page in this machine's browser."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         if not 64 <= self.size <= 2048:

@@ -20,6 +20,7 @@ from rnd_runtime.frame import draw
 from rnd_runtime.gaussians import Gaussians, Raster
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.tone import tone_map
@@ -135,11 +136,9 @@ class Scene:
 
     def _motion(self, options: ViewOptions) -> Motion:
         if options.motion:
-            return load_motion(
-                options.motion, self.avatar.skeleton, up=options.motion_up, fps=options.motion_fps
-            )
+            return options.read_motion(options.motion, self.avatar.skeleton)
         if self.capture:
-            return self._captured_motion
+            return edit_motion(self._captured_motion, options.edits)
         joints = len(self.avatar.skeleton)
         rest = np.broadcast_to(np.eye(3), (1, joints, 3, 3))
         return Motion(rest, np.zeros((1, 3)), 30.0, self.avatar.skeleton.names, "at rest")

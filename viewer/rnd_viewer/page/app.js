@@ -141,7 +141,7 @@ function setScene(description) {
   $("title").textContent = scene.avatar;
   $("subtitle").textContent = `${scene.gaussians} Gaussians · ${scene.motion.name} · ${scene.raster}`;
   options($("light"), scene.lights.map((name, index) => [index, name]));
-  options($("shade"), (scene.shades ?? SHADES).map((name) => [name, name]));
+  options($("shade"), SHADES.map((name) => [name, name]));
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
   $("time").max = scene.motion.duration || 1;
@@ -150,10 +150,7 @@ function setScene(description) {
   $("clip").disabled = $("play").disabled = scene.motion.duration === 0;
   state.time = Math.min(state.time, scene.motion.duration);
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
-  if (first) {
-    Object.assign(state, { width: scene.size, height: scene.size });
-    state.shade = scene.shade ?? state.shade;
-  }
+  if (first) Object.assign(state, { width: scene.size, height: scene.size });
   if (moved) home();
   $("notes").textContent = scene.notes.join(" · ");
   redraw();

@@ -5,6 +5,9 @@ import parseExr from "parse-exr";
 const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
 const LARGEST_FLOAT = 3.4028234663852886e38;
 
+/** Rec.709. */
+export const luminance = (r, g, b) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
+
 /** {height, width, radiance: Float32Array [H·W·3]} of an .exr or .hdr file. */
 export function readLight(bytes, name) {
   const image = name.toLowerCase().endsWith(".exr") ? readExr(bytes) : readHdr(bytes);

@@ -1,15 +1,21 @@
-// Gaussians → records for the splatting shader, back to front (rnd_runtime/_raster_project.py, raster_gl.py).
+// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/_raster_project.py, _raster_tiles.py).
 
-export const ROW_GAUSSIANS = 1024, TEXELS = 3;  // centre, reach, peak; shape; three attributes
+export const ROW_GAUSSIANS = 512, ROW_PAIRS = 2048, TILE = 4;
+export const TEXELS = 3;  // whole and broken part of the centre less ½; shear, fall_y, fall_x, peak; three attributes
 
 const NEAR = 0.1, DILATION = 0.3, MARGIN = 0.3, HALF_LOG2_E = 0.5 * Math.LOG2E, LOG2_255 = Math.log2(255);
+const HALF = 0.5 * (TILE - 1), LEAST = -LOG2_255 - 1e-3;  // no tile is lost to rounding
 const RADIX = 11, DIGITS = 1 << RADIX;
 
-/** Records as the shaders read them: {data: Float32Array, count, rows}. `features` [N·3]; `grown` scales covariances. */
+/**
+ * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
+ * front to back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
+ */
 export function project({ means, covariances, opacities }, count, features, camera, grown) {
   const { rotation: r, translation: t, focal, width, height } = camera;
   const limitX = (0.5 + MARGIN * 0.5) * width / focal, limitY = (0.5 + MARGIN * 0.5) * height / focal;
-  const splats = new Float32Array(7 * count), depths = new Float64Array(count), drawn = new Int32Array(count);
+  const records = new Float32Array(wholeRows(count, ROW_GAUSSIANS) * TEXELS * 4);
+  const boxes = new Int32Array(4 * count), depths = new Float64Array(count), drawn = new Int32Array(count);
   let visible = 0;
   for (let i = 0; i < count; i++) {
     const mx = means[3 * i], my = means[3 * i + 1], mz = means[3 * i + 2], opacity = opacities[i];
@@ -28,21 +34,60 @@ export function project({ means, covariances, opacities }, count, features, came
     const pyy = b0 * sb0 + b1 * sb1 + b2 * sb2 + DILATION, shear = pxy / pyy, conditional = pxx - pxy * shear;
     if (!(pyy > 0 && conditional > 0 && pxx < Infinity && pyy < Infinity)) continue;
     const centerX = focal * x / z + width / 2, centerY = focal * y / z + height / 2, peak = Math.log2(opacity);
-    const reach = Math.sqrt(Math.max(peak + LOG2_255, 0));
-    const reachX = reach * Math.sqrt(pxx / HALF_LOG2_E), reachY = reach * Math.sqrt(pyy / HALF_LOG2_E);
-    if (!(centerX + reachX > 0 && centerX - reachX < width && centerY + reachY > 0 && centerY - reachY < height)) continue;
-    splats.set([centerX, centerY, reach, peak, Math.sqrt(HALF_LOG2_E / conditional), Math.sqrt(HALF_LOG2_E / pyy), shear], 7 * i);
+    const reach = Math.max(peak + LOG2_255, 0) / HALF_LOG2_E;  // 2·ln(255·opacity)
+    const reachX = Math.sqrt(reach * pxx) - 0.499, reachY = Math.sqrt(reach * pyy) - 0.499;  // to the last pixel centre
+    const left = Math.max(centerX - reachX, 0), right = Math.min(centerX + reachX, width - 1);
+    const top = Math.max(centerY - reachY, 0), bottom = Math.min(centerY + reachY, height - 1);
+    if (!(left < width && top < height && right >= 0 && bottom >= 0)) continue;
+    if (Math.floor(left) > Math.floor(right) || Math.floor(top) > Math.floor(bottom)) continue;
+    boxes.set([left / TILE, top / TILE, right / TILE, bottom / TILE], 4 * i);  // whole tiles: what is stored is cut off
+    const column = Math.floor(centerX - 0.5), row = Math.floor(centerY - 0.5);
+    records.set([column, row, centerX - 0.5 - column, centerY - 0.5 - row, shear, HALF_LOG2_E / pyy, HALF_LOG2_E / conditional,
+      peak, features[3 * i], features[3 * i + 1], features[3 * i + 2]], 4 * TEXELS * i);
     depths[i] = z;
     drawn[visible++] = i;
   }
-  const rows = Math.ceil(visible / ROW_GAUSSIANS), data = new Float32Array(rows * ROW_GAUSSIANS * TEXELS * 4);
-  frontToBack(depths, drawn.subarray(0, visible)).forEach((i, place) => {
-    const at = (visible - 1 - place) * TEXELS * 4;
-    for (let c = 0; c < 7; c++) data[at + c] = splats[7 * i + c];
-    for (let c = 0; c < 3; c++) data[at + 8 + c] = features[3 * i + c];
-  });
-  return { data, count: visible, rows };
+  return { records, ...sortIntoTiles(frontToBack(depths, drawn.subarray(0, visible)), boxes, records, width, height) };
 }
+
+/** Counting sort of the (Gaussian, tile) pairs into tiles, in the order of `order` within each. */
+function sortIntoTiles(order, boxes, records, width, height) {
+  const columns = Math.ceil(width / TILE), rows = Math.ceil(height / TILE), tiles = new Uint32Array(2 * columns * rows);
+  let total = 0, most = 0;
+  for (const i of order) most += (boxes[4 * i + 2] - boxes[4 * i] + 1) * (boxes[4 * i + 3] - boxes[4 * i + 1] + 1);
+  const reached = new Uint32Array(most), counts = new Uint32Array(order.length);
+  order.forEach((i, place) => {
+    const before = total;
+    for (let row = boxes[4 * i + 1]; row <= boxes[4 * i + 3]; row++)
+      for (let column = boxes[4 * i]; column <= boxes[4 * i + 2]; column++)
+        if (reaches(records, 4 * TEXELS * i, TILE * column, TILE * row)) {
+          reached[total++] = row * columns + column;
+          tiles[2 * (row * columns + column) + 1]++;
+        }
+    counts[place] = total - before;
+  });
+  for (let tile = 0, start = 0; tile < tiles.length; tile += 2) {
+    const count = tiles[tile + 1];
+    tiles[tile] = tiles[tile + 1] = start;
+    start += count;
+  }
+  const pairs = new Uint32Array(wholeRows(total, ROW_PAIRS));
+  let pair = 0;
+  order.forEach((i, place) => {
+    for (const last = pair + counts[place]; pair < last; pair++) pairs[tiles[2 * reached[pair] + 1]++] = i;
+  });
+  return { pairs, tiles, columns };
+}
+
+/** Whether α may come to 1/255 in the tile that starts at pixel (x, y): pixels are within HALF of its middle. */
+function reaches(records, at, x, y) {
+  const shear = records[at + 4], dy = y + HALF - records[at + 1] - records[at + 3];
+  const across = Math.abs(x + HALF - records[at] - records[at + 2] - shear * dy) - HALF * (1 + Math.abs(shear));
+  const v = Math.max(Math.abs(dy) - HALF, 0), u = Math.max(across, 0);
+  return records[at + 7] - records[at + 5] * v * v - records[at + 6] * u * u >= LEAST;
+}
+
+const wholeRows = (count, row) => Math.max(Math.ceil(count / row), 1) * row;
 
 /** `drawn` by depth: a stable radix sort of 32-bit keys that span just the visible range. */
 function frontToBack(depths, drawn) {

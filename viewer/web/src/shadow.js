@@ -3,18 +3,23 @@
 import { clampRoughness, ggx } from "./brdf.js";
 
 const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
-const CLEARANCE = 1, CLEARANCE_TEXELS = 0.35, COSINE_FLOOR = 0.1;
+const CLEARANCE_TEXELS = Math.fround(0.35), COSINE_FLOOR = Math.fround(0.1);  // and of a disc's radius, once
 
 /** Add to `radiance` [count·3] what `suns` ({direction in the world, irradiance, spread}) lay on the Gaussians. */
 export function addSuns(suns, gaussians, count, eye, grown, radiance) {
-  const radii = discRadii(gaussians, count, grown);
+  const radii = suns.length ? discRadii(gaussians, count, grown) : null;
   for (const sun of suns) shadeSun(sun, gaussians, count, eye, sunVisibility(sun.direction, gaussians, count, radii), radiance);
 }
 
+// Whether a texel lies inside a disc, and whether something rises above a plane, are yes or no: every step that leads to
+// such an answer is rounded to 32 bits where rnd_runtime rounds it, else some answers differ, and a pixel with them.
+const f = Math.fround, sum3 = (a, b, c) => f(f(a + b) + c);
+
 /** Disc radius [count] m of each Gaussian in a depth map; `grown`: by how much its covariance is multiplied. */
 function discRadii({ covariances, opacities }, count, grown) {
+  const factor = f(grown), variance = (k) => f(factor * covariances[k]);
   return Float32Array.from({ length: count }, (_, i) => opacities[i] > CASTING_OPACITY
-    ? DISC_SIGMAS * Math.sqrt(grown * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5]) / 2) : 0);
+    ? DISC_SIGMAS * Math.sqrt(sum3(variance(6 * i), variance(6 * i + 3), variance(6 * i + 5)) / 2) : 0);
 }
 
 function sunVisibility(direction, { means, normals }, count, radii) {
@@ -23,21 +28,20 @@ function sunVisibility(direction, { means, normals }, count, radii) {
   for (let i = 0; i < count; i++)
     for (let axis = 0; axis < 3; axis++) {
       const [fx, fy, fz] = frame[axis], k = 3 * i + axis;
-      position[k] = fx * means[3 * i] + fy * means[3 * i + 1] + fz * means[3 * i + 2];
-      normal[k] = fx * normals[3 * i] + fy * normals[3 * i + 1] + fz * normals[3 * i + 2];
+      position[k] = sum3(f(fx * means[3 * i]), f(fy * means[3 * i + 1]), f(fz * means[3 * i + 2]));
+      normal[k] = sum3(f(fx * normals[3 * i]), f(fy * normals[3 * i + 1]), f(fz * normals[3 * i + 2]));
       if (axis < 2) {
         lower[axis] = Math.min(lower[axis], position[k]);
         upper[axis] = Math.max(upper[axis], position[k]);
       }
     }
-  const extent = Math.max(upper[0] - lower[0], upper[1] - lower[1]);
-  const texel = (extent > 0 ? extent : 1) / (RESOLUTION - 3);  // centres at integers, one empty row all around
-  const width = Math.floor((upper[0] - lower[0]) / texel) + 3, height = Math.floor((upper[1] - lower[1]) / texel) + 3;
+  const spans = [f(upper[0] - lower[0]), f(upper[1] - lower[1])], extent = Math.max(...spans);
+  const texel = f((extent > 0 ? extent : 1) / (RESOLUTION - 3));  // centres at integers, one empty row all around
+  const [width, height] = spans.map((span) => Math.floor(f(span / texel)) + 3);
   const map = { depth: new Float32Array(width * height).fill(-Infinity), width, height, texel };
   for (let i = 0; i < count; i++) {
     if (!(normal[3 * i + 2] > 0)) continue;
-    position[3 * i] = (position[3 * i] - lower[0]) / texel + 1;
-    position[3 * i + 1] = (position[3 * i + 1] - lower[1]) / texel + 1;
+    for (let axis = 0; axis < 2; axis++) position[3 * i + axis] = f(f(position[3 * i + axis] - lower[axis]) / texel) + 1;
     if (radii[i] > 0) drawDisc(map, position, normal, 3 * i, radii[i]);
   }
   for (let i = 0; i < count; i++) if (normal[3 * i + 2] > 0) visibility[i] = lookUp(map, position, normal, 3 * i, radii[i]);
@@ -46,38 +50,50 @@ function sunVisibility(direction, { means, normals }, count, radii) {
 
 /** Two axes across `direction` and the direction itself. */
 function frameOf(direction) {
-  const z = direction, sizes = z.map(Math.abs);
-  const helper = [0, 0, 0];
+  const z = unit(direction.map(f)), sizes = z.map(Math.abs), helper = [0, 0, 0];
   helper[sizes.indexOf(Math.min(...sizes))] = 1;
-  const x = cross(helper, z), length = Math.hypot(...x), unit = x.map((value) => value / length);
-  return [unit, cross(z, unit), z];
+  const x = unit(cross(helper, z));
+  return [x, cross(z, x), z];
+}
+
+function unit(v) {
+  const length = f(Math.sqrt(sum3(f(v[0] * v[0]), f(v[1] * v[1]), f(v[2] * v[2]))));
+  return v.map((value) => f(value / length));
 }
 
 function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+  const minor = (i, j) => f(f(a[i] * b[j]) - f(a[j] * b[i]));
+  return [minor(1, 2), minor(2, 0), minor(0, 1)];
+}
+
+/** Rise of a point's tangent plane towards the light, in metres a texel, along x and y. */
+function slopes(normal, k, texel) {
+  const scale = f(-texel / Math.max(normal[k + 2], COSINE_FLOOR));
+  return [f(normal[k] * scale), f(normal[k + 1] * scale)];
 }
 
 function drawDisc({ depth, width, height, texel }, position, normal, k, radius) {
-  const x = position[k], y = position[k + 1], z = position[k + 2], reach = radius / texel;
-  const scale = -texel / Math.max(normal[k + 2], COSINE_FLOOR), slopeX = normal[k] * scale, slopeY = normal[k + 1] * scale;
-  const right = Math.min(Math.floor(x + reach) + 1, width), bottom = Math.min(Math.floor(y + reach) + 1, height);
-  for (let row = Math.max(Math.ceil(y - reach), 0); row < bottom; row++)
-    for (let column = Math.max(Math.ceil(x - reach), 0); column < right; column++) {
-      const dx = column - x, dy = row - y, rise = slopeX * dx + slopeY * dy, at = row * width + column;
-      if ((dx * dx + dy * dy) * texel * texel + rise * rise <= radius * radius && z + rise > depth[at]) depth[at] = z + rise;
+  const x = position[k], y = position[k + 1], z = position[k + 2], reach = f(radius / texel), square = f(radius * radius);
+  const [slopeX, slopeY] = slopes(normal, k, texel);
+  const right = Math.min(Math.floor(f(x + reach)) + 1, width), bottom = Math.min(Math.floor(f(y + reach)) + 1, height);
+  for (let row = Math.max(Math.ceil(f(y - reach)), 0); row < bottom; row++)
+    for (let column = Math.max(Math.ceil(f(x - reach)), 0); column < right; column++) {
+      const dx = f(column - x), dy = f(row - y), rise = f(f(slopeX * dx) + f(slopeY * dy)), at = row * width + column;
+      const across = f(f(f(f(dx * dx) + f(dy * dy)) * texel) * texel);
+      if (f(across + f(rise * rise)) <= square && f(z + rise) > depth[at]) depth[at] = z + rise;
     }
 }
 
 /** Bilinear share of the four texels around a point in which nothing rises above its plane. */
 function lookUp({ depth, width, texel }, position, normal, k, radius) {
-  const x = position[k], y = position[k + 1], z = position[k + 2], steep = Math.max(normal[k + 2], COSINE_FLOOR);
-  const slopeX = -texel * normal[k] / steep, slopeY = -texel * normal[k + 1] / steep;
-  const clearance = Math.max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / steep;
+  const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
+  const clearance = f(Math.max(radius, f(CLEARANCE_TEXELS * texel)) / Math.max(normal[k + 2], COSINE_FLOOR));
   const column = Math.floor(x), row = Math.floor(y);
   let lit = 0;
   for (let corner = 0; corner < 4; corner++) {
-    const c = column + (corner & 1), r = row + (corner >> 1), dx = c - x, dy = r - y;
-    if (!(depth[r * width + c] > z + slopeX * dx + slopeY * dy + clearance)) lit += (1 - Math.abs(dx)) * (1 - Math.abs(dy));
+    const c = column + (corner & 1), r = row + (corner >> 1), dx = f(c - x), dy = f(r - y);
+    const plane = f(sum3(z, f(slopeX * dx), f(slopeY * dy)) + clearance);
+    if (!(depth[r * width + c] > plane)) lit += (1 - Math.abs(dx)) * (1 - Math.abs(dy));
   }
   return Math.min(lit, 1);
 }

@@ -1,11 +1,8 @@
 // Taking the sun out of a light probe (rnd_runtime/sun.py): sky + suns = map.
 
-import { downsize, texelDirections, texelSolidAngles } from "./light.js";
+import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 
-const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const CAP = 6 * Math.PI / 180, RING = 10 * Math.PI / 180, LEAST_SHARE = 0.05, LARGEST = 512, LIMIT = 2;
-
-const luminance = (r, g, b) => LUMINANCE[0] * r + LUMINANCE[1] * g + LUMINANCE[2] * b;
 
 /** {sky: light, suns: [{direction, irradiance, spread}]}, strongest first. */
 export function extractSuns(light) {

@@ -6,10 +6,8 @@ import { downsize, readLight } from "./light.js";
 import { readMotion, restMotion } from "./motion.js";
 import { project } from "./project.js";
 import { shBasis } from "./sh.js";
-import { addSuns } from "./shadow.js";
-import { buildSky, shadeSky } from "./sky.js";
+import { makeShader } from "./shading.js";
 import { Splatter } from "./splat.js";
-import { extractSuns } from "./sun.js";
 
 const CLAY = 0.8;  // albedo of a body that shows the light alone
 const LARGEST_SKY = 1024;  // rows behind the avatar
@@ -17,7 +15,7 @@ const SIZE = 512;
 const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
 
 const splatter = new Splatter();
-const lights = [];  // {name, light, tables: Map of shade → {sky, suns}}
+const lights = [];  // {name, light, shaders: Map of shade → function}
 let avatar = null, motion = null, motionFile = null, posed = null, shownSky = null;
 
 /** Take in files [{name, bytes}]; the page learns of the new scene. */
@@ -27,12 +25,12 @@ async function load(files) {
     if (kind === "onnx") {
       avatar = await Avatar.load(bytes, name);
       const own = { height: 32, width: 64, radiance: avatar.trainedLight };
-      lights.splice(0, lights.length && lights[0].own ? 1 : 0, { name: "the avatar's own", own: true, light: own, tables: new Map() });
+      lights.splice(0, lights.length && lights[0].own ? 1 : 0, { name: "the avatar's own", own: true, light: own, shaders: new Map() });
       motion = motionFile ? readMotion(motionFile.bytes, motionFile.name, avatar.skeleton) : restMotion(avatar.skeleton);
     } else if (kind === "npz") {
       if (avatar) motion = readMotion(bytes, name, avatar.skeleton);
       motionFile = { name, bytes };
-    } else if (kind === "hdr" || kind === "exr") lights.push({ name, light: readLight(bytes, name), tables: new Map() });
+    } else if (kind === "hdr" || kind === "exr") lights.push({ name, light: readLight(bytes, name), shaders: new Map() });
     else throw new Error(`${name}: expected .onnx, .npz, .hdr or .exr`);
   }
   posed = null;
@@ -47,7 +45,7 @@ function description(files) {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light: lit ? lights.length - 1 : undefined,
-    shades: ["table", "table+sun"], size: SIZE, raster: splatter.name, view: homeView(avatar.skeleton, motion),
+    size: SIZE, raster: splatter.name, view: homeView(avatar.skeleton, motion),
     truths: [], notes: [...motion.notes, ...repaired],
   };
 }
@@ -73,16 +71,10 @@ async function render({ number, state }) {
 
 function radianceOf(state, gaussians, count, camera, grown) {
   const entry = lights[state.light];
-  if (!entry.tables.has(state.shade)) {
-    const { sky, suns } = state.shade === "table+sun" ? extractSuns(entry.light) : { sky: entry.light, suns: [] };
-    entry.tables.set(state.shade, { sky: buildSky(sky), suns });
-  }
-  const { sky, suns } = entry.tables.get(state.shade), turn = lightToWorld(state.yaw);
+  if (!entry.shaders.has(state.shade)) entry.shaders.set(state.shade, makeShader(entry.light, state.shade));
   const shown = state.output === "light" ? { ...gaussians, albedo: new Float32Array(3 * count).fill(CLAY) } : gaussians;
-  const radiance = new Float32Array(3 * count), gain = 2 ** state.exposure;
-  shadeSky(sky, shown, count, camera.position, turn, radiance);
-  const turned = suns.map((sun) => ({ ...sun, direction: rotate(turn, sun.direction) }));
-  addSuns(turned, shown, count, camera.position, grown, radiance);
+  const radiance = entry.shaders.get(state.shade)(shown, count, camera.position, lightToWorld(state.yaw), grown);
+  const gain = 2 ** state.exposure;
   return gain === 1 ? radiance : radiance.map((value) => value * gain);
 }
 
@@ -105,7 +97,7 @@ function material(output, { albedo, normals, roughness, visibility, root }, coun
   return features;
 }
 
-/** What the last pass is told: see resolve.frag. */
+/** What the last pass is told: see picture.frag. */
 function look(state, { rotation: r, focal, width, height }) {
   const show = { normal: 1, roughness: 2, visibility: 2 }[state.output] ?? 0, gain = 2 ** state.exposure;
   if (state.background !== "hdr") {
@@ -126,7 +118,6 @@ function look(state, { rotation: r, focal, width, height }) {
 }
 
 const linear = (srgb) => (srgb <= 0.04045 ? srgb / 12.92 : ((srgb + 0.055) / 1.055) ** 2.4);
-const rotate = (m, v) => [0, 1, 2].map((k) => m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2]);
 
 /** Turns the light about +Y, from +X towards +Z. */
 function lightToWorld(yaw) {

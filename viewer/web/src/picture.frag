@@ -1,7 +1,12 @@
-// The splatted picture over its background, coded as sRGB; or what a material map shows (rnd_viewer/aov.py).
+// The Gaussians of a pixel's tile, blended front to back by the rule of rnd_runtime/raster_oracle.py: a pixel stops before
+// the one that would leave less than 1e-4 of its light, which no blending unit can do. Then the background, and sRGB; or
+// what a material map shows (rnd_viewer/aov.py).
 
-uniform sampler2D splatted;  // premultiplied; the first row is the picture's top
+uniform sampler2D records;   // TEXELS for each Gaussian; see project.js
+uniform usampler2D pairs;    // Gaussians, tile by tile, front to back
+uniform usampler2D tiles;    // first and last + 1 of a tile's pairs
 uniform sampler2D sky;       // lat-long radiance
+uniform ivec2 size;          // px
 uniform int show;            // 0 radiance, 1 normals, 2 a number
 uniform int behind;          // 0 one colour, 1 the sky
 uniform vec3 colour;         // linear
@@ -9,8 +14,32 @@ uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's fr
 uniform float gain;
 out vec4 picture;
 
+const float LOG2_ALPHA_MIN = -7.9943534368588578;  // log2(1/255)
+const float ALPHA_MAX = 0.99;
+const float TRANSMITTANCE_MIN = 0.9999e-4;
 const float MIN_COVERAGE = 0.05;
 const float PI = 3.14159265358979;
+
+/** Premultiplied attributes and alpha. */
+vec4 blend(ivec2 pixel) {
+    uvec2 range = texelFetch(tiles, pixel / TILE, 0).xy;
+    vec4 sum = vec4(0.0);
+    float left = 1.0;
+    for (uint pair = range.x; pair < range.y; pair++) {
+        int gaussian = int(texelFetch(pairs, ivec2(pair % ROW_PAIRS, pair / ROW_PAIRS), 0).x);
+        ivec2 texel = ivec2(gaussian % ROW_GAUSSIANS * TEXELS, gaussian / ROW_GAUSSIANS);
+        vec4 place = texelFetch(records, texel, 0), shape = texelFetch(records, texel + ivec2(1, 0), 0);
+        vec2 d = vec2(pixel) - place.xy - place.zw;
+        float across = d.x - shape.x * d.y;
+        float exponent = shape.w - shape.y * d.y * d.y - shape.z * across * across;
+        if (!(exponent >= LOG2_ALPHA_MIN)) continue;
+        float weight = left * min(exp2(exponent), ALPHA_MAX);
+        if (left - weight < TRANSMITTANCE_MIN) break;
+        left -= weight;
+        sum += weight * vec4(texelFetch(records, texel + ivec2(2, 0), 0).rgb, 1.0);
+    }
+    return sum;
+}
 
 vec3 texel(ivec2 at, ivec2 size) {
     return texelFetch(sky, ivec2((at.x + size.x) % size.x, clamp(at.y, 0, size.y - 1)), 0).rgb;
@@ -33,9 +62,8 @@ vec3 srgb(vec3 linear) {
 }
 
 void main() {
-    ivec2 size = textureSize(splatted, 0);
     ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
-    vec4 value = texelFetch(splatted, at, 0);
+    vec4 value = blend(at);
     vec3 result;
     if (show == 0) {
         vec3 far = behind == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;

@@ -1,0 +1,27 @@
+"""rnd-view as a process of its own, as its user starts it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+INTERRUPTED = 130
+START = "import sys; from rnd_viewer.view_cli import main; sys.exit(main())"
+
+
+@contextmanager
+def running(*arguments: str) -> Iterator[str]:
+    """Start rnd-view on a free port, yield the address that it prints, and end it as Ctrl-C does."""
+    command = [sys.executable, "-c", START, *arguments, "--port", "0", "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as viewer:
+        assert viewer.stdout and viewer.stderr
+        line = viewer.stdout.readline()
+        assert line.startswith("rnd-view: http://"), (line, viewer.stderr.read())
+        try:
+            yield line.removeprefix("rnd-view: ").strip()
+        finally:
+            viewer.send_signal(signal.SIGINT)
+        assert viewer.wait() == INTERRUPTED

@@ -1,0 +1,63 @@
+// A light of sixteen harmonics times each Gaussian's occlusion (rnd_runtime/shading_ambient.py).
+
+import { downsize, texelDirections, texelSolidAngles } from "./light.js";
+import { lobeAt, lobeTable } from "./lobe.js";
+import { shBasis, shRotation } from "./sh.js";
+
+const TEXELS = [32, 64];
+const COSINE = [1, 2 / 3, 1 / 4];  // max(cos, 0)/π, by degree
+
+/** Harmonics [16·3] of a light's radiance. */
+export function buildAmbient(light) {
+  const [height, width] = TEXELS, { radiance } = downsize(light, height, width);
+  const directions = texelDirections(height, width), angles = texelSolidAngles(height, width);
+  const coefficients = new Float64Array(48), basis = new Float64Array(16);
+  for (let k = 0; k < height * width; k++) {
+    shBasis(directions[3 * k], directions[3 * k + 1], directions[3 * k + 2], basis);
+    for (let j = 0; j < 16; j++)
+      for (let c = 0; c < 3; c++) coefficients[3 * j + c] += radiance[3 * k + c] * angles[Math.floor(k / width)] * basis[j];
+  }
+  return coefficients;
+}
+
+/** Radiance [count·3] towards `eye` under the harmonics, turned by the 3×3 `lightToWorld`. */
+export function shadeAmbient(coefficients, { means, normals, albedo, roughness, visibility, root: q }, count, eye, r, radiance) {
+  const rootToLight = new Float64Array(9);  // as the harmonics are turned: rootᵀ · lightToWorld
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j < 3; j++) rootToLight[3 * i + j] = q[i] * r[j] + q[3 + i] * r[3 + j] + q[6 + i] * r[6 + j];
+  const light = times(shRotation(rootToLight), coefficients), lobes = lobeTable(), lobe = new Float64Array(8);
+  const atNormal = new Float64Array(16), atLobe = new Float64Array(16), n = [0, 0, 0], v = [0, 0, 0];
+  for (let i = 0; i < count; i++) {
+    const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
+    const distance = Math.max(Math.hypot(dx, dy, dz), 1e-12);
+    for (let k = 0; k < 3; k++) {
+      n[k] = q[k] * normals[3 * i] + q[3 + k] * normals[3 * i + 1] + q[6 + k] * normals[3 * i + 2];
+      v[k] = (q[k] * dx + q[3 + k] * dy + q[6 + k] * dz) / distance;
+    }
+    lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
+    shBasis(...n, atNormal);
+    shBasis(lobe[1], lobe[2], lobe[3], atLobe);
+    let occlusion = 0;
+    for (let j = 0; j < 9; j++) {
+      atNormal[j] *= COSINE[j < 1 ? 0 : j < 4 ? 1 : 2];
+      occlusion += atNormal[j] * visibility[16 * i + j];
+    }
+    for (let c = 0; c < 3; c++) {
+      let diffuse = 0, shine = 0;
+      for (let j = 0; j < 16; j++) {
+        shine += (j < 1 ? 1 : lobe[j < 4 ? 5 : j < 9 ? 6 : 7]) * atLobe[j] * light[3 * j + c];
+        if (j < 9) diffuse += atNormal[j] * light[3 * j + c];
+      }
+      radiance[3 * i + c] = Math.max(occlusion, 0) * (albedo[3 * i + c] * Math.max(diffuse, 0) + lobe[0] * Math.max(shine, 0));
+    }
+  }
+}
+
+/** Coefficients [16·3] turned by M [16·16]. */
+function times(matrix, coefficients) {
+  const result = new Float64Array(48);
+  for (let i = 0; i < 16; i++)
+    for (let j = 0; j < 16; j++)
+      for (let c = 0; c < 3; c++) result[3 * i + c] += matrix[16 * i + j] * coefficients[3 * j + c];
+  return result;
+}

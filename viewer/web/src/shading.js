@@ -1,0 +1,31 @@
+// Relighting posed Gaussians: the modes of rnd_runtime/shading.py.
+
+import { buildAmbient, shadeAmbient } from "./ambient.js";
+import { allTexels, medianCut, shadeLights } from "./lights.js";
+import { addSuns } from "./shadow.js";
+import { buildSky, shadeSky } from "./sky.js";
+import { extractSuns } from "./sun.js";
+
+/**
+ * A light made ready for the mode `shade`: a function (gaussians, count, eye, lightToWorld, grown) → radiance [count·3].
+ * `grown`: by how much covariances are multiplied.
+ */
+export function makeShader(light, shade) {
+  const { sky, suns } = shade === "table+sun" ? extractSuns(light) : { sky: light, suns: [] };
+  const [prepared, shadeUnder] = prepare(sky, shade);
+  return (gaussians, count, eye, lightToWorld, grown) => {
+    const radiance = new Float32Array(3 * count);
+    shadeUnder(prepared, gaussians, count, eye, lightToWorld, radiance);
+    const turned = suns.map((sun) => ({ ...sun, direction: rotate(lightToWorld, sun.direction) }));
+    addSuns(turned, gaussians, count, eye, grown, radiance);
+    return radiance;
+  };
+}
+
+function prepare(light, shade) {
+  if (shade === "ao") return [buildAmbient(light), shadeAmbient];
+  if (shade.startsWith("table")) return [buildSky(light), shadeSky];
+  return [shade === "brute" ? allTexels(light) : medianCut(light, Number(shade.split(":")[1])), shadeLights];
+}
+
+const rotate = (m, v) => [0, 1, 2].map((k) => m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2]);
