@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from motion_formats_test import FRAMES, MATRICES, _easymocap_json, _phalp
 from rnd_runtime.body import Body
 from rnd_runtime.motion import load_motion
 from rnd_trainer.data_cli import main
@@ -41,6 +42,17 @@ def test_edits_and_rates(tmp_path, monkeypatch, capsys):
         assert archive["mocap_framerate"] == 60
         assert np.ptp(archive["trans"][:, :2], axis=0).max() < 1e-9  # Z up: the floor's axes
         assert 60 < len(archive["poses"]) < 120  # half of 4.4 s, less the seam, at 60
+
+
+@pytest.mark.parametrize("write", [_easymocap_json, _phalp])
+def test_fits_of_a_video_go_out_as_amass(tmp_path, monkeypatch, capsys, write):
+    """EasyMocap's folder and PHALP's pickle: the command says whom it took and what it assumed."""
+    source, out = write(tmp_path), tmp_path / "out.npz"
+    assert _run(monkeypatch, source, out, "--source-fps", 25) == 0
+    printed = capsys.readouterr().out
+    assert "left out:" in printed and f"{FRAMES} frames, 25 per second" in printed
+    skeleton = Body.load(ASSETS / "body.npz").skeleton
+    assert_allclose(load_motion(out, skeleton).rotations, MATRICES, atol=2e-6)
 
 
 def test_bad_use_is_one_line_and_exit_2(tmp_path, monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """One known motion, written in everybody's layout: all of them import to the same rotations and the same path."""
 
+import json
 import pickle  # noqa: TID251  # to write what others write
 from pathlib import Path
 
@@ -98,6 +99,63 @@ def _easymocap(folder, suffix="", shape=(FRAMES, 3)):
     return _npz(folder / "motion.npz", **members, **{f"Th{suffix}": place.reshape(shape)}, fps=30.0)
 
 
+def _easymocap_json(folder, frames=range(7, 7 + FRAMES), columns=72, root=SMPL_REST_ROOT):
+    """EasyMocap's own: a file a frame, Z up, somebody else in the first half; ``columns`` by body model."""
+    turn = Rotation.from_matrix(Z_UP) * Rotation.from_rotvec(POSES[:, 0])
+    place = PELVIS @ Z_UP.T - turn.apply(root)
+    poses = np.zeros((FRAMES, columns))
+    poses[:, 3:66] = _flat(POSES[:, 1:22])
+    poses[:, 72:] = 0.3  # coefficients of hands and face, which are no angles
+    (folder / "smpl").mkdir()
+    for k, frame in enumerate(frames):
+        ours = {"id": 1, "Rh": [turn.as_rotvec()[k].tolist()], "Th": [place[k].tolist()],
+                "poses": [poses[k].tolist()], "shapes": [[0.0] * 10]}  # fmt: skip
+        people = [ours | {"id": 0}, ours] if k < FRAMES // 2 else [ours]
+        (folder / "smpl" / f"{frame:06d}.json").write_text(json.dumps(people))
+    return folder / "smpl"
+
+
+def _rootless(folder):
+    """The 69 columns that its older versions leave."""
+    files = _easymocap_json(folder)
+    for file in files.iterdir():
+        people = json.loads(file.read_text())
+        file.write_text(json.dumps([one | {"poses": [one["poses"][0][3:]]} for one in people]))
+    return files
+
+
+def _before_a_camera() -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [F, 24, 3, 3] and SMPL's trans in the axes of a level camera: right, down, forward."""
+    level = np.diag([1.0, -1, -1])
+    matrices = MATRICES.copy()
+    matrices[:, 0] = level @ matrices[:, 0]
+    places = PELVIS - PELVIS[0] * [1, 0, 1] + np.array([0.4, 0, -6.0])
+    return matrices, places @ level - SMPL_REST_ROOT
+
+
+def _phalp(folder, frames=range(FRAMES)):
+    """PHALP's and 4D-Humans': matrices by picture, another person first in every other one."""
+    matrices, trans = _before_a_camera()
+    content = {}
+    for k, frame in enumerate(frames):
+        smpl = {"global_orient": matrices[k, :1].astype(np.float32), "betas": np.zeros(10, np.float32),
+                "body_pose": matrices[k, 1:].astype(np.float32)}  # fmt: skip
+        tracks, people, places = [4], [smpl], [trans[k]]
+        if k % 2:
+            tracks, people, places = [2, 4], [smpl, smpl], [np.ones(3), trans[k]]
+        content[f"img/{frame:06d}.jpg"] = {"time": frame, "tid": tracks, "smpl": people, "camera": places}
+    return _pickle(folder / "phalp_me.pkl", content)
+
+
+def _wham_in_camera(folder):
+    """WHAM without its estimate of the world."""
+    matrices, trans = _before_a_camera()
+    pose = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec().reshape(FRAMES, 72)
+    return _pickle(
+        folder / "wham_output.pkl", {0: {"pose": pose, "trans": trans, "frame_ids": np.arange(FRAMES)}}
+    )
+
+
 def _aist(folder):
     scaling = 93.7
     content = {
@@ -153,6 +211,10 @@ LAYOUTS = {
     "AMASS, split, body only": (lambda f: _stageii(f, fingers=False), 30, DOUBLE),
     "EasyVolcap": (_easymocap, 30, DOUBLE),
     "pose_seq": (lambda f: _easymocap(f, "_all", (FRAMES, 1, 3)), 30, DOUBLE),
+    "EasyMocap, SMPL": (_easymocap_json, 30, DOUBLE),
+    "EasyMocap, SMPL-H": (lambda f: _easymocap_json(f, columns=78), 30, DOUBLE),
+    "EasyMocap, SMPL-X": (lambda f: _easymocap_json(f, columns=87, root=SMPLX_REST_ROOT), 30, DOUBLE),
+    "EasyMocap without its root": (_rootless, 30, DOUBLE),
     "AIST++": (_aist, 60, SINGLE),
     "WHAM": (_wham, 30, DOUBLE),
     "GVHMR": (_gvhmr, 30, SINGLE),
@@ -196,6 +258,46 @@ def test_wham_takes_the_longest_track_and_fills_its_gaps(tmp_path):
     assert (
         "person 5" in notes and "left out: 0, 3, 9" in notes and "5 frames" in notes and "frame rate" in notes
     )
+
+
+@pytest.mark.parametrize("write", [_phalp, _wham_in_camera])
+def test_what_a_camera_saw_is_turned_upright_over_the_origin(tmp_path, write):
+    motion = load_motion(write(tmp_path), SKELETON)
+    assert motion.fps == 30 and any("taken to stand level" in note for note in motion.notes)
+    assert_allclose(motion.rotations, MATRICES, atol=SINGLE)
+    path = motion.translations + SKELETON.rest_joints[0]
+    assert_allclose(path, PELVIS - PELVIS[0] * [1, 0, 1], atol=SINGLE)
+
+
+@pytest.mark.parametrize("write", [_phalp, _easymocap_json])
+def test_gaps_are_filled_and_others_named(tmp_path, write):
+    frames = [0, 1, *range(4, FRAMES + 2)]
+    motion = load_motion(write(tmp_path, frames), SKELETON)
+    assert motion.frame_count == FRAMES + 2
+    assert_allclose(motion.rotations[4:], MATRICES[2:], atol=SINGLE)
+    steps = np.diff(motion.translations[1:5], axis=0)
+    assert_allclose(steps, np.broadcast_to(steps[0], steps.shape), atol=SINGLE)
+    notes = " ".join(motion.notes)
+    assert "2 frames without the person" in notes and "left out: " in notes and "frame rate" in notes
+
+
+def test_a_folder_that_is_no_motion_is_refused_in_one_line(tmp_path):
+    def refusal(text=None) -> str:
+        if text is not None:
+            (tmp_path / "000000.json").write_text(text)
+        with pytest.raises(InputError) as caught:
+            load_motion(tmp_path, SKELETON)
+        return str(caught.value)
+
+    assert "expected .json files, got none" in refusal()
+    assert "000000.json" in refusal("{") and "000000.json" in refusal("3") and "000000.json" in refusal("[3]")
+    assert "at least one" in refusal("[]")
+    assert "Rh, Th, poses, shapes" in refusal('[{"id": 0, "Rh": [[0, 0, 0]]}]')
+    assert "000000.json" in refusal('[{"id": "me"}]')
+    person = {"id": 0, "Rh": [0, 0, 0], "Th": [0, 0, 0], "poses": [0] * 30, "shapes": [0]}
+    assert "joints of the motion" in refusal(json.dumps([person]))
+    assert "finite" in refusal(json.dumps([person | {"poses": [float("nan")] * 72}]))
+    assert "expected 3 numbers" in refusal(json.dumps([person | {"Th": [0]}]))
 
 
 @pytest.mark.parametrize(

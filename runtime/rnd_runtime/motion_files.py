@@ -51,7 +51,7 @@ class MotionRecord:
 
 
 def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = None) -> MotionRecord:
-    """Read a motion from arrays of a known layout: an .npz, or a pickle (:func:`motion_pickles.read_track`).
+    """Read a motion from arrays of a known layout: an .npz, or a pickle or folder (:func:`motion_pickles.read_track`).
 
     ======================================================  ==========================================  ====
     members                                                 joints                                      up
@@ -77,7 +77,7 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
-    if Path(path).suffix.lower() in PICKLE_SUFFIXES:
+    if Path(path).is_dir() or Path(path).suffix.lower() in PICKLE_SUFFIXES:
         track = read_track(path)
         return _read(track.members, joint_names, track.rest_root, list(track.notes))
     with Npz(path, what="motion") as archive:

@@ -1,4 +1,4 @@
-"""Motions that come as pickles: AIST++, WHAM, GVHMR, MDM, or the members of an .npz in a dict."""
+"""Motions that come as pickles or folders: AIST++, WHAM, GVHMR, PHALP, MDM, EasyMocap, a dict of arrays."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from .motion_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .npz import Members
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 from .unpickle import read_pickle
+from .video_fits import VideoFits, is_phalp, read_easymocap_folder, read_phalp
 
 Floats = NDArray[np.float64]
 
 PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
+_LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
 
@@ -40,7 +42,9 @@ class Track:
 
 
 def read_track(path: str | Path) -> Track:
-    """Read the motion in a .pkl, .joblib, .pt or .npy. All of them are Y up, in a world of their own.
+    """Read the motion in a .pkl, .joblib, .pt or .npy, or in a folder of EasyMocap's JSON files.
+
+    All pickles are Y up, in a world of their own; what is known before a camera only is turned upright about it.
 
     ===========  ============================================================================================
     AIST++       ``smpl_poses`` (F,72), ``smpl_trans`` (F,3), ``smpl_scaling``: metres are trans / scaling;
@@ -48,6 +52,8 @@ def read_track(path: str | Path) -> Track:
     GVHMR        ``smpl_params_global`` {``body_pose`` (F,63), ``global_orient``, ``transl``}, SMPL-X
     WHAM         {person: {``pose_world`` (F,72), ``trans_world`` (F,3), ``frame_ids``}}: the person seen
                  longest; frames between the parts of a track are filled in
+    PHALP        picture → {``tid``, ``smpl`` of rotation matrices, ``camera``}, also 4D-Humans'
+    EasyMocap    a folder of 000000.json, …: {``id``, ``Rh``, ``Th``, ``poses``, ``shapes``}, Z up
     MDM          ``thetas`` (24,6,F) the first two rows of each rotation, or ``thetas_ori`` (24,3,F)
                  axis-angle, and ``root_translation`` (3,F), the pelvis' place; 20 frames per second
     others       a dict with the members of an .npz, or an object array of it
@@ -56,6 +62,8 @@ def read_track(path: str | Path) -> Track:
     Raises:
         InputError: when it is none of them.
     """
+    if Path(path).is_dir():
+        return _easymocap(read_easymocap_folder(Path(path)), path)
     content = read_pickle(path, what="motion")
     if not isinstance(content, Mapping) or not content:
         kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
@@ -80,6 +88,8 @@ def _track(content: Mapping[Any, Any], path: str | Path) -> Track:
         return Track(Members(_with_fps(content["smpl_params_global"]), path), SMPLX_REST_ROOT, (_VIDEO_NOTE,))
     if "root_translation" in content and ("thetas" in content or "thetas_ori" in content):
         return _mdm(content, path)
+    if is_phalp(content):
+        return _phalp(read_phalp(content, Path(path)), path)
     people = {who: track for who, track in content.items() if isinstance(track, Mapping) and "pose" in track}
     if people:
         return _wham(people, path)
@@ -104,28 +114,71 @@ def _mdm(content: Mapping[Any, Any], path: str | Path) -> Track:
 
 
 def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
-    notes = [_VIDEO_NOTE]
     longest = max(people, key=lambda who: len(people[who]["pose"]))
-    if len(people) > 1:
-        others = ", ".join(str(who) for who in people if who != longest)
-        notes.append(f"person {longest} is taken, who is seen longest; left out: {others}")
+    notes = [_VIDEO_NOTE, *_left_out(longest, tuple(who for who in people if who != longest))]
     person = people[longest]
     world = "pose_world" in person and "trans_world" in person
-    if not world:
-        notes.append("no world coordinates in the file: the camera's are used, whose Y points down")
     poses = np.asarray(person["pose_world" if world else "pose"], np.float64)
     trans = np.asarray(person["trans_world" if world else "trans"], np.float64)
     frames = np.asarray(person.get("frame_ids", np.arange(len(poses)))).reshape(-1)
     if len(frames) != len(poses) or (np.diff(frames) <= 0).any():
         raise InputError("frame_ids", expected=f"{len(poses)} that ascend", got=f"{len(frames)}", file=path)
-    missing = int(frames[-1] - frames[0] + 1 - len(frames))
-    if missing:
-        notes.append(f"{missing} frames without the person are filled in between their neighbours")
-        wanted = np.arange(frames[0], frames[-1] + 1)
-        after = np.clip(np.searchsorted(frames, wanted), 1, len(frames) - 1)
-        t = (wanted - frames[after - 1]) / (frames[after] - frames[after - 1])
-        turns = axis_angle_to_matrix(poses.reshape(len(poses), -1, 3))
-        filled = slerp_matrices(turns[after - 1], turns[after], t[:, None])
-        poses = matrix_to_axis_angle(filled)
-        trans = (1 - t[:, None]) * trans[after - 1] + t[:, None] * trans[after]
-    return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, tuple(notes))
+    poses, trans, filled = _without_gaps(frames, poses.reshape(len(poses), -1), trans)
+    if not world:
+        poses, trans, turned = _before_the_camera(poses, trans)
+        filled += turned
+    return Track(
+        Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, (*notes, *filled)
+    )
+
+
+def _phalp(fits: VideoFits, path: str | Path) -> Track:
+    poses, trans, filled = _without_gaps(fits.frames, fits.axis_angles, fits.translations)
+    poses, trans, turned = _before_the_camera(poses, trans)
+    notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled, *turned)
+    return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, notes)
+
+
+def _easymocap(fits: VideoFits, path: str | Path) -> Track:
+    """As SMPL's, about the pelvis: what lies between two frames lies between their pelvises, not their Th."""
+    assert fits.turns is not None
+    rest_root = SMPLX_REST_ROOT if fits.family == "SMPL-X" else SMPL_REST_ROOT
+    turns, poses = axis_angle_to_matrix(fits.turns), fits.axis_angles.copy()
+    poses[:, :3] = matrix_to_axis_angle(turns @ axis_angle_to_matrix(poses[:, :3]))
+    poses, places, filled = _without_gaps(fits.frames, poses, turns @ rest_root + fits.translations)
+    arrays = _with_fps({"poses": poses, "trans": places - rest_root, "up_axis": "z"})
+    notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled)
+    return Track(Members(arrays, path), rest_root, notes)
+
+
+def _left_out(person: Any, others: tuple[Any, ...]) -> tuple[str, ...]:
+    if not others:
+        return ()
+    return (f"person {person} is taken, who is seen longest; left out: {', '.join(map(str, others))}",)
+
+
+def _without_gaps(
+    frames: NDArray[np.int64], turns: Floats, places: Floats
+) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """Axis-angles ``turns`` [F, 3J] and ``places`` [F, 3] of ascending ``frames`` at every frame between the ends."""
+    wanted = np.arange(frames[0], frames[-1] + 1)
+    missing = len(wanted) - len(frames)
+    if missing == 0:
+        return turns, places, ()
+    after = np.clip(np.searchsorted(frames, wanted), 1, len(frames) - 1)
+    t = (wanted - frames[after - 1]) / (frames[after] - frames[after - 1])
+    matrices = axis_angle_to_matrix(turns.reshape(len(turns), -1, 3))
+    filled = matrix_to_axis_angle(slerp_matrices(matrices[after - 1], matrices[after], t[:, None]))
+    between = (1 - t[:, None]) * places[after - 1] + t[:, None] * places[after]
+    note = f"{missing} frames without the person are filled in between their neighbours"
+    return filled.reshape(len(wanted), -1), between, (note,)
+
+
+def _before_the_camera(poses: Floats, trans: Floats) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """``poses`` [F, 3J] and ``trans`` [F, 3] of SMPL in a camera's axes, turned Y up, beginning over the origin."""
+    poses = poses.copy()
+    poses[:, :3] = matrix_to_axis_angle(np.diag(_LEVEL) @ axis_angle_to_matrix(poses[:, :3]))
+    places = (SMPL_REST_ROOT + trans) * _LEVEL
+    places -= places[0] * [1, 0, 1]
+    note = "no world coordinates in the file: the camera is taken to stand level; --in-place holds a root that drifts"
+    return poses, places - SMPL_REST_ROOT, (note,)
