@@ -11,7 +11,14 @@ from onnx import TensorProto, helper
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
-from rnd_trainer.importing.normals import find_axes, make_normals, read_normals, smoothed, to_opencv
+from rnd_trainer.importing.normals import (
+    find_axes,
+    normal_map,
+    normal_network,
+    read_normals,
+    smoothed,
+    to_opencv,
+)
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 EIGHT_BIT = 0.01  # half a step of (n + 1)/2, twice over
@@ -98,7 +105,7 @@ def test_a_network_sees_the_person_on_grey(tmp_path, as_picture):
         helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10),
         tmp_path / "n.onnx",
     )
-    (found,) = make_normals([picture], [mask], net=tmp_path / "n.onnx")
+    found = normal_map(normal_network(tmp_path / "n.onnx"), picture, mask)
     axes = find_axes([found], [normals])
     assert axes.signs == (1, -1, -1)
     turned = to_opencv(found, axes)

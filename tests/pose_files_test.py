@@ -20,7 +20,7 @@ from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
 from rnd_trainer.importing.pose_files import read_poses
-from rnd_trainer.importing.recording import easymocap_poses, smpl_poses
+from rnd_trainer.importing.recording import easymocap_poses, read_as, smpl_poses
 from rnd_trainer.silhouette import overlap, posed_vertices
 
 PLACE = 2e-5  # m: float32 in the files and in bone transforms
@@ -186,7 +186,7 @@ def test_an_npz_is_read_by_its_keys_or_as_told(tmp_path) -> None:
         tmp_path / "em.npz", poses=world.thetas, trans=world.Th, betas=BETAS
     )  # Rh, Th under SMPL's names
     assert_allclose(read_poses(tmp_path / "smpl.npz").poses.root(rest), world.places, atol=1e-9)
-    told = read_poses(tmp_path / "em.npz", convention="easymocap").poses
+    told = read_as(read_poses(tmp_path / "em.npz").poses, "easymocap")
     assert_allclose(told.root(rest), world.places, atol=1e-9)
     assert_allclose(told.rotations[:, 0], world.roots, atol=1e-9)
     assert np.abs(read_poses(tmp_path / "em.npz").poses.root(rest) - world.places).max() > 0.1

@@ -289,7 +289,8 @@ def _normals(capture: Capture, pairs: list[tuple[Floats, Floats]], count: int) -
     pairs = [pair for pair in pairs if len(pair[0])]
     if not pairs:
         return [Finding("note", "normals", "none" if not count else "none where the template is")]
-    axes = judge(pairs)
+    turned = _imported(capture).get("normal_axes")
+    axes = judge(pairs, None if turned is None else np.array(turned, np.float64).reshape(3, 3))
     degrees = np.degrees(np.arccos(np.clip(axes.cosine, -1, 1)))
     if axes.wrong:
         return [Finding("wrong", "normals", f"mean cosine {axes.cosine:.2f} to the template; with --normal-axes="

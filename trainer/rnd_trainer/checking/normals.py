@@ -33,7 +33,7 @@ class NormalAxes(NamedTuple):
 
     @property
     def wrong(self) -> bool:
-        return self.best_axes != "x,y,z" and self.best_cosine > self.cosine + GAIN
+        return self.best_cosine > self.cosine + GAIN
 
 
 def parse_axes(text: str) -> Floats:
@@ -49,19 +49,29 @@ def parse_axes(text: str) -> Floats:
     return matrix
 
 
-def judge(pairs: list[tuple[Floats, Floats]]) -> NormalAxes:
-    """Judge (map's normals [n, 3], template's normals [n, 3]) at the same pixels, both in OpenCV camera axes."""
+def axes_in_words(matrix: Floats) -> str:
+    """What :func:`parse_axes` turns into the signed permutation ``matrix`` [3, 3]."""
+    columns = np.abs(matrix).argmax(1)
+    return ",".join(("" if row[column] > 0 else "-") + _AXES[column] for row, column in zip(matrix, columns))
+
+
+def judge(pairs: list[tuple[Floats, Floats]], turned: Floats | None = None) -> NormalAxes:
+    """Judge (map's normals [n, 3], template's normals [n, 3]) at the same pixels, both in OpenCV camera axes.
+
+    ``turned`` [3, 3] is how an import turned the maps; what is best is told of the maps as they were before.
+    """
     ours = np.concatenate([a for a, _ in pairs])
     template = np.concatenate([b for _, b in pairs])
     products = template.T @ ours / len(ours)  # [3, 3]: mean of template_i · map_j
-    best, axes = -2.0, ""
-    for order in permutations(range(3)):
-        for signs in product((1, -1), repeat=3):
-            score = sum(sign * products[i, j] for i, (j, sign) in enumerate(zip(order, signs)))
-            if score > best + 1e-9:
-                best = float(score)
-                axes = ",".join(("" if s > 0 else "-") + _AXES[j] for j, s in zip(order, signs))
-    return NormalAxes(float(np.trace(products)), float((ours[:, 2] < 0).mean()), best, axes)
+    readings = [
+        np.array(signs)[:, None] * np.eye(3)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    best = max(readings, key=lambda reading: round(float((reading * products).sum()), 9))
+    cosines = float(np.trace(products)), float((best * products).sum())
+    axes = axes_in_words(best @ (np.eye(3) if turned is None else turned))
+    return NormalAxes(cosines[0], float((ours[:, 2] < 0).mean()), cosines[1], axes)
 
 
 def pixels(normals: NDArray[np.float32], view: View) -> tuple[Floats, Floats]:

@@ -34,16 +34,16 @@ def detect(source: Path) -> str | None:
     )
 
 
-def read(source: Path, *, poses: Path | None = None) -> Recording:
+def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> Recording:
     """Read OpenCV's calibration (pixel centres at whole numbers, metres), pictures and the fits of one person.
 
-    ``poses``: a folder of one JSON file a frame, or a motion.npz (poses, Rh, Th, shapes); looked for where EasyMocap
-    and EasyVolcap write it when not given.
+    ``poses``: any file of :func:`pose_files.read_poses`; looked for where EasyMocap (a folder of one JSON file a frame)
+    and EasyVolcap (motion.npz) write it when not given.
     """
     fits = poses or next((source / name for name in _FITS if _is_fit(source / name)), None)
     if fits is None:
         raise InputError("SMPL fits", expected=" or ".join(_FITS) + ", or --poses", got="none", file=source)
-    found = read_poses(fits, convention="easymocap")
+    found = read_poses(fits, person=person)
     names = _names(source / "intri.yml")
     intrinsics, extrinsics = (
         cv2.FileStorage(str(source / f"{k}tri.yml"), cv2.FILE_STORAGE_READ) for k in ("in", "ex")

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from rnd_runtime.errors import InputError
-from rnd_trainer.checking.normals import parse_axes
-from rnd_trainer.silhouette import draw, posed_vertices
 
 from . import (
     arah,
@@ -29,11 +23,9 @@ from . import (
     zju,
 )
 from .body_models import BodyModel, load_body_model
-from .masks import make_masks
-from .normals import find_axes, make_normals, read_normals, smoothed, to_opencv
-from .pictures import Bytes, listed, read_mask
 from .pose_files import read_poses
-from .recording import Recording, Shot, straightened
+from .recording import Recording, RootConvention, read_as, straightened
+from .surfaces import attached, with_masks, with_normals
 from .write import Choice, Scene, chosen_shots, placed, write_capture
 
 LAYOUTS: dict[str, Any] = {
@@ -50,7 +42,8 @@ LAYOUTS: dict[str, Any] = {
     "video": video,
 }
 """modules with ``detect`` and ``read``, the particular before the general: a folder of pictures may be anything"""
-_AXIS_FRAMES = 8
+_CONVENTIONS: dict[str, RootConvention] = {"smpl": "smpl", "easymocap": "easymocap"}
+_POSES_FROM_ELSEWHERE = ("video", "nerfstudio", "easymocap")
 
 
 @dataclass(frozen=True)
@@ -58,12 +51,12 @@ class ImportOptions:
     """What the user says about a source.
 
     Attributes:
-        layout: a name of :data:`LAYOUTS`; "easymocap" or "smpl" also says how a pose file's root is meant.
+        layout: a name of :data:`LAYOUTS`; "easymocap" or "smpl" also says how the poses' root is meant.
         body: a file of :func:`load_body_model`.
         poses, person: body poses for sources without, and whose.
-        masks, normals: folders, by picture name or frame number, in a folder a camera where there are several.
+        masks, normals: folders, by frame number, in a folder a camera where there are several.
         mask_net, normal_net: ONNX networks in their place.
-        normal_axes: "x,-y,-z" …; found by the template when None.
+        normal_axes: "x,-y,-z" …; None: found by the template, or what the layout says of its own normals.
         intrinsics, distortion: of a plain video.
         count: most training pictures of a plain video.
         up: the source's axis that points up; found when None.
@@ -96,7 +89,7 @@ def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
         raise InputError("source not found", file=source)
     if name in LAYOUTS:
         found = _detect(name, source)
-        if found is None and name == "easymocap":  # then it says how a pose file is meant
+        if found is None and name == "easymocap":  # then it says how the poses' root is meant
             return find_layout(source)
         if found is None:
             raise InputError("layout", expected=f"{name}: {_needs(name)}", got="none of it", file=source)
@@ -136,7 +129,7 @@ def import_source(
 
     Args:
         on_shot: called with (pictures written, pictures in all).
-        on_found: called with one sentence on what the source was found to be.
+        on_found: called with what the source was found to be, then with what it holds.
 
     Raises:
         InputError: with the file and, where there is one, the frame.
@@ -149,152 +142,72 @@ def import_source(
         raise InputError(
             "--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none"
         )
+    _refuse_unused(layout, options)
     model = load_body_model(options.body)
-    recording = straightened(_attached(_read(layout, source, model, options), options))
+    recording = _read(layout, source, model, options)
+    convention = _CONVENTIONS.get(options.layout or "")
+    if convention is not None:
+        recording = replace(recording, poses=read_as(recording.poses, convention))
+    on_found(_contents(recording))
+    recording = straightened(attached(recording, options.masks, options.normals))
     if options.fps is not None:
         recording = replace(recording, fps=options.fps)
     scene = placed(recording, model, options.up)
     shots = chosen_shots(recording, options.choice)
-    shots = _with_masks(shots, scene, recording, options)
-    shots = _with_normals(shots, scene, recording, options)
-    write_capture(out, recording, scene, shots, on_shot)
+    shots = with_masks(shots, scene, recording, options.mask_net)
+    shots, axes = with_normals(
+        shots, scene, recording,
+        net=options.normal_net, axes=options.normal_axes, found=options.normals is not None,
+    )  # fmt: skip
+    write_capture(out, recording, scene, shots, on_shot, normal_axes=axes)
     return scene
 
 
+def _refuse_unused(layout: str, options: ImportOptions) -> None:
+    """What is given and would change nothing is a misunderstanding."""
+    if options.masks and options.mask_net:
+        raise InputError("--masks and --mask-net", expected="one of them", got="both")
+    if options.normals and options.normal_net:
+        raise InputError("--normals and --normal-net", expected="one of them", got="both")
+    for name, used in (
+        ("poses", layout in _POSES_FROM_ELSEWHERE),
+        ("person", layout in _POSES_FROM_ELSEWHERE),
+        ("intrinsics", layout == "video"),
+        ("distortion", layout == "video"),
+    ):
+        given = getattr(options, name)
+        if not used and given is not None and given != ():
+            raise InputError(f"--{name}", expected=f"none, as {layout} has its own", got=given)
+
+
+def _contents(recording: Recording) -> str:
+    """What a source was found to hold, in a sentence."""
+    lens = next(iter(recording.lenses.values()))
+    bent = any(any(lens.distortion) for lens in recording.lenses.values())
+    size = f"{lens.camera.width} x {lens.camera.height}" + (", lenses bend" if bent else "")
+    convention = {"smpl": "SMPL's root", "easymocap": "EasyMocap's root", "placed": "the pelvis's place"}
+    poses = recording.poses
+    count = len(recording.lenses)
+    return (
+        f"{recording.kind}: {len(recording.shots)} pictures of {count} camera{'s' * (count > 1)}, {size}; "
+        f"{len(poses.frames)} poses ({len(poses.joint_names)} joints, {convention[poses.convention]})"
+    )
+
+
 def _read(layout: str, source: Path, model: BodyModel, options: ImportOptions) -> Recording:
-    convention = options.layout if options.layout in ("easymocap", "smpl") else None
     if layout == "video":
         if options.poses is None:
             raise InputError(
                 "--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none"
             )
-        poses = read_poses(options.poses, person=options.person, convention=convention)
+        poses = read_poses(options.poses, person=options.person)
         return video.read(
             source, model, poses, intrinsics=options.intrinsics, distortion=options.distortion,
             count=options.count, fps=options.fps,
         )  # fmt: skip
     if layout == "nerfstudio":
-        return nerfstudio.read(source, poses=options.poses, convention=convention)
+        return nerfstudio.read(source, poses=options.poses, person=options.person)
     if layout == "easymocap":
-        return easymocap.read(source, poses=options.poses)
+        return easymocap.read(source, poses=options.poses, person=options.person)
     recording: Recording = LAYOUTS[layout].read(source)
     return recording
-
-
-def _attached(recording: Recording, options: ImportOptions) -> Recording:
-    """``recording`` with masks and normals from the folders that the user names."""
-
-    def replaced(shot: Shot) -> Shot:
-        if options.masks is not None:
-            shot = replace(
-                shot,
-                mask=partial(read_mask, _file_of(options.masks, shot, recording, (".png", ".npy", ".jpg"))),
-            )
-        if options.normals is not None:
-            shot = replace(
-                shot,
-                normals=partial(
-                    read_normals, _file_of(options.normals, shot, recording, (".npy", ".png", ".exr"))
-                ),
-            )
-        return shot
-
-    if options.masks is None and options.normals is None:
-        return recording
-    return replace(recording, shots=[replaced(shot) for shot in recording.shots])
-
-
-def _file_of(folder: Path, shot: Shot, recording: Recording, suffixes: tuple[str, ...]) -> Path:
-    """The file of ``shot``: by its number at the end of the name, in the camera's folder where there is one."""
-    inner = folder / shot.camera if (folder / shot.camera).is_dir() else folder
-    files = listed(inner, suffixes)
-    numbered = {}
-    for k, file in enumerate(files):
-        digits = file.stem[len(file.stem.rstrip("0123456789")) :]
-        numbered[int(digits) if digits else k] = file
-    if shot.frame not in numbered:
-        raise InputError(
-            "file",
-            expected=f"one numbered {shot.frame}",
-            got=f"{files[0].name} … {files[-1].name}",
-            file=inner,
-        )
-    return numbered[shot.frame]
-
-
-class _Lazy(Sequence[Any]):
-    """A sequence computed entry by entry when asked for."""
-
-    def __init__(self, entries: Sequence[Any], compute: Callable[[Any], Any]) -> None:
-        self.entries, self.compute = entries, compute
-
-    def __len__(self) -> int:
-        return len(self.entries)
-
-    def __getitem__(self, index: Any) -> Any:
-        return self.compute(self.entries[index])
-
-
-def _template(shot: Shot, scene: Scene, recording: Recording):
-    k = shot.frame - int(recording.poses.frames[0])
-    vertices = posed_vertices(scene.body, scene.motion.rotations[k], scene.motion.translations[k])
-    return draw(vertices, scene.body.faces, scene.cameras[shot.camera])
-
-
-def _with_masks(shots: list[Shot], scene: Scene, recording: Recording, options: ImportOptions) -> list[Shot]:
-    """``shots`` with rough masks for those that have none, made camera by camera."""
-    made: dict[int, Bytes] = {}
-    for camera in dict.fromkeys(shot.camera for shot in shots if shot.mask is None):
-        numbers = [k for k, shot in enumerate(shots) if shot.camera == camera and shot.mask is None]
-        pictures = _Lazy([shots[k] for k in numbers], lambda shot: shot.image())
-        silhouettes = _Lazy([shots[k] for k in numbers], lambda shot: _template(shot, scene, recording).mask)
-        made |= dict(zip(numbers, make_masks(pictures, silhouettes, net=options.mask_net)))
-    if made:
-        how = "by a network" if options.mask_net else "from the template and the pictures' colours"
-        scene.notes.append(f"{len(made)} masks made {how}: rough; better ones come from SAM 2 with --masks")
-    return [
-        replace(shot, mask=partial(made.__getitem__, k)) if k in made else shot
-        for k, shot in enumerate(shots)
-    ]
-
-
-def _with_normals(
-    shots: list[Shot], scene: Scene, recording: Recording, options: ImportOptions
-) -> list[Shot]:
-    """``shots`` with normals of a network or of the user's folder brought to our axes; others stay as they are."""
-    if options.normal_net is not None:
-        shots = [replace(shot, normals=partial(_one_normal_map, shot, options.normal_net)) for shot in shots]
-    elif options.normals is None:
-        return shots
-    if options.normal_axes is not None:
-        try:
-            matrix = parse_axes(options.normal_axes)
-        except ValueError:
-            raise InputError("--normal-axes", expected="such as x,-y,-z", got=options.normal_axes) from None
-
-        def turned(normals: NDArray[np.float32]) -> NDArray[np.float32]:
-            return (normals @ matrix.T).astype(np.float32)
-    else:
-        few = [shots[round(k)] for k in np.linspace(0, len(shots) - 1, min(_AXIS_FRAMES, len(shots)))]
-        axes = find_axes(_maps(few), (_template(shot, scene, recording).normals for shot in few))
-        scene.notes.append(f"normals point {axes.name}: mean cosine {axes.agreement:.2f} to the template")
-
-        def turned(normals: NDArray[np.float32]) -> NDArray[np.float32]:
-            return to_opencv(normals, axes)
-
-    def finished(shot: Shot) -> NDArray[np.float32]:
-        assert shot.normals is not None and shot.mask is not None
-        return smoothed(turned(shot.normals()), shot.mask())
-
-    return [replace(shot, normals=partial(finished, shot)) for shot in shots]
-
-
-def _maps(shots: list[Shot]) -> Iterator[NDArray[np.float32]]:
-    for shot in shots:
-        assert shot.normals is not None
-        yield shot.normals()
-
-
-def _one_normal_map(shot: Shot, net: Path) -> NDArray[np.float32]:
-    assert shot.mask is not None
-    return next(make_normals([shot.image()], [shot.mask()], net=net))

@@ -30,7 +30,7 @@ def detect(source: Path) -> str | None:
     return "transforms.json" if "frames" in read_json(file) else None
 
 
-def read(source: Path, *, poses: Path | None = None, convention: str | None = None) -> Recording:
+def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> Recording:
     """Read cameras (OpenGL's camera-to-world, pixel centres at +0.5) and pictures.
 
     Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given, else
@@ -67,7 +67,7 @@ def read(source: Path, *, poses: Path | None = None, convention: str | None = No
         raise InputError(
             "body poses", expected="--poses FILE, as transforms.json has none", got="none", file=file
         )
-    found = read_poses(pose_file, convention=convention)
+    found = read_poses(pose_file, person=person)
     return Recording("nerfstudio transforms.json", lenses, shots, found.poses, found.fps or FPS, found.notes)
 
 

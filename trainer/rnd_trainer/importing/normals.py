@@ -7,7 +7,7 @@ signs are those that agree with it best, and maps that agree with nothing are re
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,34 +113,33 @@ def read_normals(path: str | Path) -> Normals:
     return _unit(np.nan_to_num(normals))  # Sapiens leaves NaN outside the person
 
 
-def make_normals(
-    pictures: Sequence[NDArray[np.uint8]], masks: Sequence[NDArray[np.uint8]], *, net: Path
-) -> Iterator[Normals]:
-    """Normal maps [H, W, 3] of a network, in its own axes, zero outside the masks.
+def normal_network(path: Path) -> ImageNetwork:
+    """The ONNX file ``path`` as a network that gives three channels (layouts: :class:`networks.ImageNetwork`)."""
+    return ImageNetwork(path, outputs=(3,))
+
+
+def normal_map(network: ImageNetwork, picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> Normals:
+    """The map [H, W, 3] that ``network`` gives, in its own axes, zero outside the mask.
 
     The network sees the person's surroundings on grey, the way such predictors are trained.
 
     Args:
-        pictures: [H, W, 3] uint8 sRGB; may be lazy.
-        masks: [H, W] uint8 coverage.
-        net: an ONNX file that gives three channels (layouts: :class:`networks.ImageNetwork`).
+        picture: [H, W, 3] uint8 sRGB.
+        mask: [H, W] uint8 coverage.
     """
-    network = ImageNetwork(net, outputs=(3,))
-    for picture, mask in zip(pictures, masks):
-        normals = np.zeros(picture.shape, np.float32)
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        if len(rows):
-            margin = (rows[-1] - rows[0]) // 10 + 2
-            box = tuple(
-                slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns)
-            )
-            alpha = mask[box][..., None] / np.float32(255)
-            seen = np.round(picture[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
-            output = network(seen)
-            if output.min() >= 0:  # a network that gives pictures of normals
-                output = 2 * output - 1
-            normals[box] = _unit(output) * (mask[box] > 0)[..., None]
-        yield normals
+    normals = np.zeros(picture.shape, np.float32)
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return normals
+    margin = (rows[-1] - rows[0]) // 10 + 2
+    box = tuple(slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns))
+    alpha = mask[box][..., None] / np.float32(255)
+    seen = np.round(picture[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
+    output = network(seen)
+    if output.min() >= 0:  # a network that gives pictures of normals
+        output = 2 * output - 1
+    normals[box] = _unit(output) * (mask[box] > 0)[..., None]
+    return normals
 
 
 def smoothed(normals: Normals, mask: NDArray[np.uint8]) -> Normals:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,18 @@ import numpy as np
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.npz import Npz
-from rnd_runtime.rotations import matrix_to_axis_angle
 from rnd_runtime.unpickle import read_pickle
+from rnd_runtime.video_fits import (
+    VideoFits,
+    is_phalp,
+    one_of,
+    read_easymocap_folder,
+    read_phalp,
+    trailing_number,
+    with_root,
+)
 
-from .pictures import listed, read_json
+from .pictures import listed
 from .recording import Floats, Poses, easymocap_poses, smpl_poses
 
 Focal = Callable[[int, int], float]
@@ -46,7 +54,7 @@ class FoundPoses:
     notes: tuple[str, ...] = ()
 
 
-def read_poses(path: Path, *, person: int | None = None, convention: str | None = None) -> FoundPoses:
+def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     """Read the body poses of one person.
 
     ==============================================  =============================  ============================
@@ -64,15 +72,16 @@ def read_poses(path: Path, *, person: int | None = None, convention: str | None 
 
     Args:
         person: track or person number; the one with most frames when None.
-        convention: "easymocap" or "smpl" to read an .npz's root so, whatever its keys suggest.
     """
     if path.is_dir():
         files = listed(path, (".json", ".npz"))
-        return _easymocap_folder(files, person) if files[0].suffix == ".json" else _romp(files)
+        if files[0].suffix == ".json":
+            return _fitted("EasyMocap", read_easymocap_folder(path, person))
+        return _romp(files)
     if path.suffix.lower() == ".npz":
         with Npz(path, what="body poses") as archive:
             names = archive.names
-        return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path, convention)
+        return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
     content = read_pickle(path, what="body poses")
     if isinstance(content, dict):
         try:
@@ -80,9 +89,11 @@ def read_poses(path: Path, *, person: int | None = None, convention: str | None 
                 return _gvhmr(content)
             values = [value for value in content.values() if isinstance(value, dict)]
             if values and all("frame_ids" in value and "pose" in value for value in values):
-                return _wham(content, person)
-            if values and all("smpl" in value and "camera" in value for value in values):
-                return _phalp(content, person)
+                return _wham(content, person, path)
+            if is_phalp(content):
+                found = _fitted("4D-Humans / PHALP", read_phalp(content, path, person))
+                notes = ("frames are those of PHALP's picture list", *found.notes)
+                return replace(found, focal=lambda w, h: _PHALP_FOCAL, notes=notes)
         except InputError as error:
             raise error.at(file=path) from error
         except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -95,14 +106,26 @@ def read_poses(path: Path, *, person: int | None = None, convention: str | None 
     )
 
 
-def _wham(content: dict[Any, Any], person: int | None) -> FoundPoses:
-    chosen = _one_of({key: len(value["frame_ids"]) for key, value in content.items()}, person)
-    entry = content[chosen]
+def _fitted(kind: str, fits: VideoFits) -> FoundPoses:
+    if fits.turns is None:
+        poses = smpl_poses(fits.frames, fits.axis_angles, fits.translations, fits.betas, family=fits.family)
+    else:
+        poses = easymocap_poses(
+            fits.frames, fits.axis_angles, fits.turns, fits.translations, fits.betas, family=fits.family
+        )
+    return FoundPoses(kind, poses, notes=_several(fits.person, fits.others))
+
+
+def _wham(content: dict[Any, Any], person: int | None, path: Path) -> FoundPoses:
+    tracks = {int(key): entry for key, entry in content.items()}
+    chosen, others = one_of([key for key, entry in tracks.items() for _ in entry["frame_ids"]], person, path)
+    entry = tracks[chosen]
     frames = np.asarray(entry["frame_ids"], np.int64)
     order = np.unique(frames, return_index=True)[1]
     pose, trans, betas = (np.asarray(entry[key], np.float64)[order] for key in ("pose", "trans", "betas"))
     poses = smpl_poses(frames[order], pose, trans, betas)
-    return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=_others(content, chosen))
+    notes = _several(chosen, others)
+    return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=notes)
 
 
 def _gvhmr(content: dict[str, Any]) -> FoundPoses:
@@ -116,38 +139,12 @@ def _gvhmr(content: dict[str, Any]) -> FoundPoses:
     return FoundPoses("GVHMR", poses, K=K)
 
 
-def _phalp(content: dict[str, Any], person: int | None) -> FoundPoses:
-    moments = sorted(content.values(), key=lambda value: int(value.get("time", 0)))
-    counts: dict[Any, int] = {}
-    for moment in moments:
-        for track in moment["tid"]:
-            counts[int(track)] = counts.get(int(track), 0) + 1
-    chosen = _one_of(counts, person)
-    frames, angles, trans, betas = [], [], [], []
-    for number, moment in enumerate(moments):
-        tracks = [int(track) for track in moment["tid"]]
-        if chosen not in tracks or tracks.index(chosen) >= len(moment["smpl"]):
-            continue
-        place = tracks.index(chosen)
-        smpl = moment["smpl"][place]
-        matrices = np.concatenate(
-            [np.asarray(smpl[key], np.float64).reshape(-1, 3, 3) for key in ("global_orient", "body_pose")]
-        )
-        frames.append(int(moment.get("time", number)))
-        angles.append(matrix_to_axis_angle(matrices))
-        trans.append(np.asarray(moment["camera"][place], np.float64).reshape(3))
-        betas.append(np.asarray(smpl["betas"], np.float64).reshape(-1))
-    poses = smpl_poses(frames, np.stack(angles), np.stack(trans), np.stack(betas))
-    notes = ("frames are those of PHALP's picture list", *_others(counts, chosen))
-    return FoundPoses("4D-Humans / PHALP", poses, focal=lambda w, h: _PHALP_FOCAL, notes=notes)
-
-
 def _romp(files: Sequence[Path]) -> FoundPoses:
     rows: list[tuple[int, dict[str, Any]]] = []
     for number, file in enumerate(files):
         content = _romp_content(file)
         if "smpl_thetas" in content:
-            rows.append((_trailing_number(file.stem, number), content))
+            rows.append((trailing_number(file.stem, number), content))
         else:  # a video's results: picture name → result
             rows += [(k, content[name]) for k, name in enumerate(sorted(content)) if content[name]]
     kept = [(k, row) for k, row in rows if len(np.atleast_2d(row["smpl_thetas"]))]
@@ -179,32 +176,7 @@ def _romp_content(file: Path) -> dict[str, Any]:
     return content
 
 
-def _easymocap_folder(files: Sequence[Path], person: int | None) -> FoundPoses:
-    records = {}
-    for number, file in enumerate(files):
-        content = read_json(file)
-        people = content.get("annots", []) if isinstance(content, dict) else content
-        records[_trailing_number(file.stem, number)] = {int(entry.get("id", 0)): entry for entry in people}
-    counts: dict[int, int] = {}
-    for people in records.values():
-        for key in people:
-            counts[key] = counts.get(key, 0) + 1
-    chosen = _one_of(counts, person)
-    kept = {frame: people[chosen] for frame, people in sorted(records.items()) if chosen in people}
-    try:
-        poses, Rh, Th, shapes = (
-            np.stack([np.asarray(entry[key], np.float64).reshape(-1) for entry in kept.values()])
-            for key in ("poses", "Rh", "Th", "shapes")
-        )
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            "EasyMocap fits", expected="Rh, Th, poses, shapes", got=repr(error), file=files[0].parent
-        ) from error
-    found = easymocap_poses(list(kept), _with_root(poses), Rh, Th, shapes)
-    return FoundPoses("EasyMocap", found, notes=_others(counts, chosen))
-
-
-def _npz(path: Path, convention: str | None) -> FoundPoses:
+def _npz(path: Path) -> FoundPoses:
     with Npz(path, what="body poses") as archive:
         member = archive.first_of("poses", "thetas", "poses_all", "pose", "body_pose", "pose_body")
         if member is None:
@@ -216,7 +188,7 @@ def _npz(path: Path, convention: str | None) -> FoundPoses:
         root = archive.first_of("global_orient", "root_orient")
         if member in ("body_pose", "pose_body") and root is not None:
             poses = np.concatenate([archive.numbers(root).reshape(-1, 3), poses], 1)
-        poses = _with_root(poses)
+        poses = with_root(poses)
         betas_name = archive.first_of("shapes", "betas")
         betas = None if betas_name is None else archive.numbers(betas_name)
         rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
@@ -227,41 +199,13 @@ def _npz(path: Path, convention: str | None) -> FoundPoses:
     notes = () if shift is not None else ("no trans in the file: the root stays at its rest place",)
     frames = range(len(poses))
     family = "SMPL-X" if poses.shape[1] == 165 else "SMPL"
-    if convention == "easymocap" or (convention is None and Rh is not None):
-        if Rh is None:
-            Rh = poses[:, :3].copy()
-            poses[:, :3] = 0
+    if Rh is not None:
         found = easymocap_poses(frames, poses, Rh, trans, betas, family=family)
         return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
-    if Rh is not None:
-        poses[:, :3] = Rh
     return FoundPoses("SMPL", smpl_poses(frames, poses, trans, betas, family=family), fps=fps, notes=notes)
 
 
-def _with_root(poses: Floats) -> Floats:
-    """Poses [F, 3J] with a zero root before those that leave it out (69, 63 columns)."""
-    if poses.shape[1] in (63, 69):
-        return np.concatenate([np.zeros((len(poses), 3)), poses], 1)
-    return poses
-
-
-def _one_of(counts: dict[Any, int], person: int | None) -> Any:
-    if not counts:
-        raise InputError("people", expected="at least one", got="none")
-    if person is None:
-        return max(counts, key=lambda key: counts[key])
-    found = next((key for key in counts if int(key) == person), None)
-    if found is None:
-        raise InputError("--person", expected=" or ".join(str(key) for key in counts), got=person)
-    return found
-
-
-def _others(counts: dict[Any, Any], chosen: Any) -> tuple[str, ...]:
-    if len(counts) < 2:
+def _several(chosen: int, others: tuple[int, ...]) -> tuple[str, ...]:
+    if not others:
         return ()
-    return (f"{len(counts)} people in the file: number {chosen} taken, --person chooses another",)
-
-
-def _trailing_number(stem: str, otherwise: int) -> int:
-    digits = stem[len(stem.rstrip("0123456789")) :]
-    return int(digits) if digits else otherwise
+    return (f"{len(others) + 1} people in the file: number {chosen} taken, --person chooses another",)

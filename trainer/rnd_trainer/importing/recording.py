@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,8 @@ from .pictures import undistorted
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
+
+RootConvention = Literal["smpl", "easymocap", "placed"]
 
 _NAMES = {22: SMPL_NAMES[:22], 24: SMPL_NAMES, 52: SMPLH_NAMES, 55: SMPLX_NAMES}
 
@@ -69,6 +72,8 @@ class Poses:
         joint_names: J.
         family: "SMPL" or "SMPL-X": whose rest pelvis ``root`` wants.
         betas: shape, or None.
+        convention: how ``root`` was meant: "smpl" (rest + trans), "easymocap" (R rest + Th), or "placed" where the
+            layout says where the root is.
     """
 
     frames: NDArray[np.int64]
@@ -77,6 +82,7 @@ class Poses:
     joint_names: tuple[str, ...] = SMPL_NAMES
     family: str = "SMPL"
     betas: Floats | None = None
+    convention: RootConvention = "placed"
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -150,8 +156,8 @@ def smpl_poses(
     rotations, names = _rotations(axis_angles)
     offsets = np.asarray(trans, np.float64).reshape(-1, 3)
     return Poses(
-        np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas)
-    )
+        np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
+    )  # fmt: skip
 
 
 def easymocap_poses(
@@ -172,8 +178,29 @@ def easymocap_poses(
     offsets = np.asarray(Th, np.float64).reshape(-1, 3)
     rotations[:, 0] = turn @ rotations[:, 0]
     return Poses(
-        np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas)
+        np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas),
+        "easymocap",
     )  # fmt: skip
+
+
+def read_as(poses: Poses, convention: RootConvention) -> Poses:
+    """``poses`` whose file holds the numbers of another root convention than its layout promises.
+
+    Raises:
+        InputError: where the layout says where the root is, so that there is nothing to misread.
+    """
+    if convention == poses.convention:
+        return poses
+    if poses.convention == "placed":
+        raise InputError(
+            "--as", expected="no root convention: this layout says where the pelvis is", got=convention
+        )
+    offsets, turn = poses.root(np.zeros(3)), poses.rotations[:, 0]
+
+    def root(rest: Floats) -> Floats:
+        return offsets + (turn @ rest if convention == "easymocap" else rest)
+
+    return replace(poses, root=root, convention=convention)
 
 
 def mean_betas(betas: ArrayLike | None) -> Floats | None:

@@ -144,8 +144,13 @@ def write_capture(
     scene: Scene,
     shots: Sequence[Shot],
     on_shot: Callable[[int, int], None] = lambda done, total: None,
+    *,
+    normal_axes: Floats | None = None,
 ) -> None:
-    """Write ``shots`` of a straightened ``recording``, placed as ``scene``, as a capture into ``folder``."""
+    """Write ``shots`` of a straightened ``recording``, placed as ``scene``, as a capture into ``folder``.
+
+    ``normal_axes`` [3, 3] is how the user's normals were turned; :func:`check.check_capture` reasons from there.
+    """
     output_folder(folder)
     first = int(recording.poses.frames[0])
     frames = []
@@ -160,6 +165,8 @@ def write_capture(
         "distortion": undone,
         "turn": scene.turn.tolist(),
     }
+    if normal_axes is not None:
+        information["normal_axes"] = normal_axes.tolist()
     capture = Capture(folder, used, {}, scene.body, scene.motion, tuple(frames))
     save_capture(capture, **{"import": information})
 
