@@ -14,17 +14,22 @@ import layouts
 from known_scene import FRAMES, HEIGHT, WIDTH, cameras, motion, see, shaped_body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
+from rnd_runtime.errors import InputError
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
 from rnd_trainer.importing.write import Choice
 from rnd_trainer.silhouette import overlap, posed_vertices
 
-PLACE = 2e-5  # m: some layouts store float32, transforms are float32
+# Measured over all layouts: 3e-7 m, nothing, nothing, cosine 0.99997
+PLACE = 1e-6  # m: some layouts store float32, transforms are float32
 PIXEL = 1e-9  # of K: nothing but half a pixel is added
-EXACT_COLOUR = 1.01 / 255  # PNG: one rounding
-JPEG_COLOUR = 6 / 255  # quality 100, no chroma subsampling; also a lossless YUV video
-BENT_COLOUR = 0.03  # mean, of pictures resampled once when the lens is undone
-BENT_MASK = 0.95  # IoU of a mask resampled softly with one resampled to the nearest pixel
+COLOUR = 0.5 / 255  # where no lens is undone: as it was
+NORMAL = 0.9999  # cosine: 8 bits
+
+# Pictures whose lens is undone, against the definition of k1. Measured: IoU 0.951 (half a pixel off: 0.944, one fifth
+# of the bend left: 0.926, all of it: 0.861), mean colour 0.015 (all of the bend left: 0.023)
+BENT_MASK = 0.95
+BENT_COLOUR = 0.018
 
 EVERYTHING = Choice(held_out_every=1)
 
@@ -39,7 +44,7 @@ def _imported(write: Callable[[Path], None], tmp_path: Path, **options: object) 
 
 
 def assert_the_scene(
-    capture: Capture, camera_of: Callable[[str, int], str], *, colour: float, bent: bool, fps: float
+    capture: Capture, camera_of: Callable[[str, int], str], *, bent: bool, fps: float
 ) -> None:
     """``capture`` is the known scene up to a choice of world; ``camera_of`` (camera, frame) is the scene's camera."""
     assert capture.fps == fps and capture.motion.frame_count == FRAMES
@@ -64,12 +69,12 @@ def assert_the_scene(
             assert np.abs(images.image_srgb - straight / 255)[inside].mean() < BENT_COLOUR
         else:
             assert ((images.mask > 0.5) == seen.mask).all()
-            assert np.abs(images.image_srgb - seen.image / 255)[seen.mask].max() < colour
+            assert np.abs(images.image_srgb - seen.image / 255)[seen.mask].max() < COLOUR
         assert images.image_srgb[images.mask == 0].max() == 0
         if images.normal is not None:
             known = seen.mask & (np.abs(images.normal).max(-1) > 0)
-            assert known.sum() > 0.95 * seen.mask.sum()
-            assert (images.normal * seen.normals).sum(-1)[known].min() > 0.999
+            assert (known == seen.mask).all()
+            assert (images.normal * seen.normals).sum(-1)[known].min() > NORMAL
 
 
 def _before(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -106,34 +111,89 @@ def _moving(camera: str, frame: int) -> str:
 
 
 _prepared, _neuman, _easymocap = layouts.write_intrinsic_avatar, layouts.write_neuman, layouts.write_easymocap
-LAYOUTS: dict[str, tuple[str, Callable[[Path], None], Callable[[str, int], str], float, bool, float]] = {
-    # layout, writer, the scene's camera, colour tolerance, whether a lens is undone, fps
-    "ZJU-MoCap": ("zju", layouts.write_zju, _either, JPEG_COLOUR, True, 50),
-    "ZJU-MoCap refined": ("zju", partial(layouts.write_zju, refined=True), _either, JPEG_COLOUR, True, 50),
-    "ARAH": ("arah", layouts.write_arah, _counted_from_one, JPEG_COLOUR, True, 50),
-    "HumanNeRF": ("humannerf", layouts.write_humannerf, _only, EXACT_COLOUR, True, 30),
-    "PeopleSnapshot": ("snapshot", layouts.write_snapshot, _only, JPEG_COLOUR, True, 30),
-    "InstantAvatar": ("instant-avatar", layouts.write_instant_avatar, _only, EXACT_COLOUR, False, 30),
-    "RANA prepared": ("intrinsic-avatar", partial(_prepared, many=False), _only, EXACT_COLOUR, False, 30),
-    "SyntheticHuman": ("intrinsic-avatar", partial(_prepared, many=True), _either, EXACT_COLOUR, False, 30),
-    "RANA": ("rana", layouts.write_rana, _only, EXACT_COLOUR, False, 30),
-    "NeuMan": ("neuman", _neuman, _moving, EXACT_COLOUR, False, 30),
-    "NeuMan, HUGS": ("neuman", partial(_neuman, hugs=True), _moving, EXACT_COLOUR, False, 30),
-    "nerfstudio": ("nerfstudio", layouts.write_nerfstudio, _either, EXACT_COLOUR, True, 30),
-    "EasyMocap": ("easymocap", _easymocap, _counted_from_one, JPEG_COLOUR, True, 30),
-    "EasyVolcap": ("easymocap", partial(_easymocap, volcap=True), _counted_from_one, JPEG_COLOUR, True, 30),
+LAYOUTS: dict[str, tuple[str, Callable[[Path], None], Callable[[str, int], str], bool, float]] = {
+    # layout, writer, the scene's camera, whether a lens is undone, fps
+    "ZJU-MoCap": ("zju", layouts.write_zju, _either, True, 50),
+    "ZJU-MoCap refined": ("zju", partial(layouts.write_zju, refined=True), _either, True, 50),
+    "ARAH": ("arah", layouts.write_arah, _counted_from_one, True, 50),
+    "HumanNeRF": ("humannerf", layouts.write_humannerf, _only, True, 30),
+    "PeopleSnapshot": ("snapshot", layouts.write_snapshot, _only, True, 30),
+    "InstantAvatar": ("instant-avatar", layouts.write_instant_avatar, _only, False, 30),
+    "RANA prepared": ("intrinsic-avatar", partial(_prepared, many=False), _only, False, 30),
+    "SyntheticHuman": ("intrinsic-avatar", partial(_prepared, many=True), _either, False, 30),
+    "RANA": ("rana", layouts.write_rana, _only, False, 30),
+    "NeuMan": ("neuman", _neuman, _moving, False, 30),
+    "NeuMan, HUGS": ("neuman", partial(_neuman, hugs=True), _moving, False, 30),
+    "nerfstudio": ("nerfstudio", layouts.write_nerfstudio, _either, True, 30),
+    "EasyMocap": ("easymocap", _easymocap, _counted_from_one, True, 30),
+    "EasyVolcap": ("easymocap", partial(_easymocap, volcap=True), _counted_from_one, True, 30),
 }
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_every_layout_is_the_same_scene(tmp_path, name) -> None:
-    layout, write, camera_of, colour, bent, fps = LAYOUTS[name]
+    layout, write, camera_of, bent, fps = LAYOUTS[name]
     if "NeuMan" in name:
         pytest.importorskip("joblib")
     if name == "PeopleSnapshot":
         pytest.importorskip("h5py")
     capture = _imported(write, tmp_path)
     assert find_layout(tmp_path / "source")[0] == layout
-    assert_the_scene(capture, camera_of, colour=colour, bent=bent, fps=fps)
+    assert_the_scene(capture, camera_of, bent=bent, fps=fps)
     report = check_capture(tmp_path / "capture")
     assert not [f for f in report.findings if f.level == "wrong"], report.findings
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_layout_can_be_named_and_not_another(tmp_path, name) -> None:
+    layout, write, *_ = LAYOUTS[name]
+    if "NeuMan" in name:
+        pytest.importorskip("joblib")
+    if name == "PeopleSnapshot":
+        pytest.importorskip("h5py")
+    write(tmp_path)
+    assert find_layout(tmp_path, layout) == find_layout(tmp_path)
+    other = "arah" if layout != "arah" else "zju"
+    with pytest.raises(InputError, match=f"layout: expected {other}"):
+        find_layout(tmp_path, other)
+
+
+# InstantAvatar's own split of PeopleSnapshot: first and last frame and the step, as its configurations have them
+SPLITS = {
+    "male-3-casual": ((0, 455, 4), (456, 675, 4)),
+    "male-4-casual": ((0, 659, 6), (660, 872, 6)),
+    "female-3-casual": ((0, 445, 4), (446, 647, 4)),
+    "female-4-casual": ((0, 335, 4), (335, 523, 4)),
+}
+
+
+@pytest.mark.parametrize("subject", SPLITS)
+def test_instant_avatars_split_is_kept(tmp_path, subject) -> None:
+    """Optimised poses hold one row for each of a split's frames; poses.npz, wrong here, is not used for those."""
+    source = tmp_path / subject
+    source.mkdir()
+    parts = [range(first, last + 1, step) for first, last, step in SPLITS[subject]]
+    layouts.write_snapshot_split(source, *parts)
+    options = ImportOptions(body=str(layouts.body_file(tmp_path)))
+    scene = import_source(source, tmp_path / "capture", options)
+    assert any("InstantAvatar's own frames" in note for note in scene.notes)
+    capture = load_capture(tmp_path / "capture")
+    for split, part in zip(("train", "novel_pose"), parts):
+        assert [frame.frame for frame in capture.split(split)] == list(part)
+    assert len(capture.frames) == sum(map(len, parts))
+    for frame in capture.frames[:: len(capture.frames) // 9]:
+        k = frame.frame % FRAMES
+        posed = posed_vertices(
+            capture.body, capture.motion.rotations[frame.frame], capture.motion.translations[frame.frame]
+        )
+        truth = posed_vertices(shaped_body(), motion().rotations[k], motion().translations[k])
+        assert_allclose(_before(capture.cameras["0"], posed), _before(cameras()["0"], truth), atol=PLACE)
+        assert ((capture.load_frame(frame).mask > 0.5) == see("0", k).mask).all()
+
+
+def test_poses_that_do_not_fill_a_split_are_refused(tmp_path) -> None:
+    source = tmp_path / "female-3-casual"
+    source.mkdir()
+    layouts.write_snapshot_split(source, range(0, 446, 4), range(446, 640, 4))
+    with pytest.raises(InputError, match=r"expected 51 in the test split .*, got 49"):
+        import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))

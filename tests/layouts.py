@@ -251,6 +251,26 @@ def write_instant_avatar(folder: Path) -> None:
     )
 
 
+def write_snapshot_split(folder: Path, train: range, test: range) -> None:
+    """A subject of InstantAvatar's: every picture of the video, frame k in the scene's pose k % 4, and poses that were
+    optimised for the frames of its splits alone; the first poses beside them are worthless."""
+    write_instant_avatar(folder)
+    count = test.stop
+    for k in range(FRAMES, count):
+        for part, name in (("images", "image_{:04d}.png"), ("masks", "mask_{:04d}.npy")):
+            (folder / part / name.format(k)).hardlink_to(folder / part / name.format(k % FRAMES))
+    np.savez(folder / "poses.npz", betas=BETAS, thetas=np.ones((count, 72)), transl=np.ones((count, 3)))
+    world = camera_world()
+    (folder / "poses").mkdir()
+    for name, part in (("train", train), ("test", test)):
+        rows = np.array(part) % FRAMES
+        np.savez(
+            folder / "poses" / f"anim_nerf_{name}.npz", betas=BETAS[None].astype(np.float32),
+            global_orient=world.thetas[rows, :3].astype(np.float32),
+            body_pose=world.thetas[rows, 3:].astype(np.float32), transl=world.trans[rows].astype(np.float32),
+        )  # fmt: skip
+
+
 def write_intrinsic_avatar(folder: Path, *, many: bool) -> None:
     """RANA (one camera) or SyntheticHuman (several) as IntrinsicAvatar prepares them."""
     world = World(np.eye(3)) if many else camera_world()

@@ -53,7 +53,7 @@ def test_a_root_of_the_other_convention_is_named_and_mended(tmp_path, monkeypatc
     monkeypatch.setattr(layouts.World, ours, getattr(layouts.World, other))
     source = tmp_path / "source"
     source.mkdir()
-    _, write, camera_of, colour, bent, fps = LAYOUTS[name]
+    _, write, camera_of, bent, fps = LAYOUTS[name]
     write(source)
     code, printed, _ = import_it(source)
     assert code == 1
@@ -65,7 +65,7 @@ def test_a_root_of_the_other_convention_is_named_and_mended(tmp_path, monkeypatc
     assert float(found[1]) < GOOD_OVERLAP
     code, printed, out = import_it(source, "--as", told.split()[-1])
     assert code == 0, printed
-    assert_the_scene(load_capture(out), camera_of, colour=colour, bent=bent, fps=fps)
+    assert_the_scene(load_capture(out), camera_of, bent=bent, fps=fps)
 
 
 def test_a_layout_that_places_the_pelvis_has_no_root_to_misread(tmp_path, import_it) -> None:
