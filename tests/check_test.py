@@ -16,6 +16,7 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.checking.normals import judge, parse_axes
+from rnd_trainer.checking.overlay import CAPTION, TILE
 from rnd_trainer.checking.report import check_and_report
 
 SOUND = 0.97  # IoU of the silhouette with a mask that the same mesh made: pixels on the edge when scaled
@@ -208,6 +209,16 @@ def test_the_command_prints_writes_and_exits(folder, capsys) -> None:
     (folder / "capture.json").unlink()
     with pytest.raises(InputError, match="capture not found"):
         check_and_report(folder, folder / "out")
+
+
+def test_the_overlay_looks_at_the_person(folder) -> None:
+    """A person of 42 pixels in 64 fills the height of a tile, but for the margin on both sides."""
+    check_and_report(folder, folder / "out")
+    picture = read_image(folder / "out" / "check.png")
+    for left in range(0, 4 * TILE, TILE):
+        tile = picture[CAPTION : CAPTION + TILE, left : left + TILE]
+        rows = np.flatnonzero((tile == 255).all(-1).any(1))
+        assert 0.8 * TILE < np.ptp(rows) < 0.95 * TILE
 
 
 def test_the_overlay_shows_what_differs(folder) -> None:

@@ -53,11 +53,19 @@ def test_maps_that_agree_with_nothing_are_refused():
     rng = np.random.default_rng(0)
     noise = rng.normal(size=normals.shape).astype(np.float32)
     noise /= np.linalg.norm(noise, axis=-1, keepdims=True)
-    for wrong in (noise, np.roll(normals, 1, -1), np.broadcast_to(np.float32([0, 0, -1]), normals.shape)):
-        with pytest.raises(InputError, match="cosine"):
+    for wrong in (noise, np.broadcast_to(np.float32([0, 0, -1]), normals.shape)):
+        with pytest.raises(InputError, match=r"cosine.*do they belong"):
             find_axes([wrong], [normals])
     with pytest.raises(InputError, match="both cover"):
         find_axes([np.where(inside[..., None], 0, 1).astype(np.float32)], [normals])
+
+
+def test_swapped_axes_are_named():
+    """Red and blue the other way round, or turned about: no sign mends that, the flag does."""
+    normals, _ = _sphere()
+    for wrong, flag in ((normals[..., ::-1], "z,y,x"), (-np.roll(normals, 1, -1), "-y,-z,-x")):
+        with pytest.raises(InputError, match=rf"with --normal-axes={flag} it would be 1\.00"):
+            find_axes([wrong], [normals])
 
 
 def test_files(tmp_path):

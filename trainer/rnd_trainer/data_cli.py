@@ -29,7 +29,7 @@ class ImportCommand:
     body: str | None = None
     """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny"""
     layout: Annotated[str | None, tyro.conf.arg(name="as")] = None
-    """what SOURCE is, where it is not found out rightly; smpl or easymocap: how the root of --poses is meant"""
+    """what SOURCE is, where it is not found out rightly; smpl or easymocap: how the root of the poses is meant"""
     poses: Path | None = None
     """body poses from WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap or an SMPL .npz"""
     person: int | None = None
@@ -37,13 +37,14 @@ class ImportCommand:
     masks: Path | None = None
     """folder of masks (.png, .npy), numbered like the frames; without one, rough masks are made"""
     mask_net: Path | None = None
-    """segmentation network (.onnx) to make masks with"""
+    """segmentation network (.onnx) to make masks with, instead of the source's"""
     normals: Path | None = None
     """folder of normal maps (.npy, .png), numbered like the frames"""
     normal_net: Path | None = None
-    """normal network (.onnx) to make normals with"""
+    """normal network (.onnx) to make normals with, instead of the source's"""
     normal_axes: str | None = None
-    """such as x,-y,-z: which of the maps' axes are our right, down, forward; found by the template when not given"""
+    """such as x,-y,-z: which of the maps' axes are our right, down, forward; found by the template when not given. A
+    data set's own normals are read as it promises, and turned by this"""
     intrinsics: tuple[float, ...] = ()
     """fx fy cx cy of a video, in pixels"""
     distortion: tuple[float, ...] = ()

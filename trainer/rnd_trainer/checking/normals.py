@@ -62,16 +62,24 @@ def judge(pairs: list[tuple[Floats, Floats]], turned: Floats | None = None) -> N
     """
     ours = np.concatenate([a for a, _ in pairs])
     template = np.concatenate([b for _, b in pairs])
-    products = template.T @ ours / len(ours)  # [3, 3]: mean of template_i · map_j
+    products = template.T @ ours / len(ours)
+    best, cosine = best_reading(products)
+    axes = axes_in_words(best @ (np.eye(3) if turned is None else turned))
+    return NormalAxes(float(np.trace(products)), float((ours[:, 2] < 0).mean()), cosine, axes)
+
+
+def best_reading(products: Floats) -> tuple[Floats, float]:
+    """The signed permutation [3, 3] of a map's axes that agrees best with the template, and its mean cosine.
+
+    ``products`` [3, 3] is the mean of template_i · map_j over the pixels; equals go to the least changed.
+    """
     readings = [
         np.array(signs)[:, None] * np.eye(3)[list(order)]
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
     best = max(readings, key=lambda reading: round(float((reading * products).sum()), 9))
-    cosines = float(np.trace(products)), float((best * products).sum())
-    axes = axes_in_words(best @ (np.eye(3) if turned is None else turned))
-    return NormalAxes(cosines[0], float((ours[:, 2] < 0).mean()), cosines[1], axes)
+    return best, float((best * products).sum())
 
 
 def pixels(normals: NDArray[np.float32], view: View) -> tuple[Floats, Floats]:

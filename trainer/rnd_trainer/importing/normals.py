@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
 from rnd_runtime.images import read_image
+from rnd_trainer.checking.normals import axes_in_words, best_reading
 
 from .networks import ImageNetwork
 
@@ -60,24 +61,28 @@ def find_axes(maps: Iterable[Normals], template: Iterable[NDArray[np.float64]]) 
     Raises:
         InputError: when no signs make them agree, or two do equally well.
     """
-    products, pixels = np.zeros(3), 0
+    products, pixels = np.zeros((3, 3)), 0
     for one, wanted in zip(maps, template):
         known = wanted.any(-1) & one.any(-1)
-        products += (one[known] * wanted[known]).sum(0, dtype=np.float64)
+        products += wanted[known].T.astype(np.float64) @ one[known].astype(np.float64)
         pixels += int(known.sum())
     if pixels < _ENOUGH_PIXELS:
         raise InputError("normals", expected="some on the template", got=f"{pixels} pixels that both cover")
-    scores = _SIGNS @ (products / pixels)
+    products /= pixels
+    scores = _SIGNS @ np.diag(products)
     order = np.argsort(-scores)
     best, lead = scores[order[0]], scores[order[0]] - scores[order[1]]
     x, y, z = (int(sign) for sign in _SIGNS[order[0]])
     axes = NormalAxes((x, y, z), float(best), float(lead))
     if best < _LEAST_AGREEMENT or lead < _CLEAR_LEAD:
+        reading, cosine = best_reading(products)
+        swapped = cosine > max(best + _CLEAR_LEAD, _LEAST_AGREEMENT)
+        hint = f"with --normal-axes={axes_in_words(reading)} it would be {cosine:.2f}"
         raise InputError(
             "normals",
             expected=f"a mean cosine above {_LEAST_AGREEMENT:g} with the template's in one choice of axes",
             got=f"{best:.2f} at best ({axes.name}), {best - lead:.2f} at second best",
-            hint="do they belong to these frames and poses?",
+            hint=hint if swapped else "do they belong to these frames and poses?",
         )
     return axes
 
