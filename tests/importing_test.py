@@ -95,7 +95,8 @@ def _straight(name: str, k: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _either(camera: str, frame: int) -> str:
     """The scene's name of a camera called 00, 01, 1, 2, Camera_B1, …"""
-    return {"00": "0", "01": "1", "0000": "0", "0001": "1", "Camera_B1": "0", "Camera_B2": "1"}[camera]
+    return {"00": "0", "01": "1", "0000": "0", "0001": "1", "Camera_B1": "0", "Camera_B2": "1",
+            "Camera (1)": "0", "Camera (2)": "1"}[camera]  # fmt: skip
 
 
 def _only(camera: str, frame: int) -> str:
@@ -115,6 +116,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], None], Callable[[str, int], str],
     # layout, writer, the scene's camera, whether a lens is undone, fps
     "ZJU-MoCap": ("zju", layouts.write_zju, _either, True, 50),
     "ZJU-MoCap refined": ("zju", partial(layouts.write_zju, refined=True), _either, True, 50),
+    "ZJU-MoCap, 313": ("zju", partial(layouts.write_zju, early=True), _either, True, 50),
     "ARAH": ("arah", layouts.write_arah, _counted_from_one, True, 50),
     "HumanNeRF": ("humannerf", layouts.write_humannerf, _only, True, 30),
     "PeopleSnapshot": ("snapshot", layouts.write_snapshot, _only, True, 30),

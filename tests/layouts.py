@@ -36,6 +36,22 @@ def body_file(folder: Path) -> Path:
     return folder / "SMPL_SCENE.npz"
 
 
+def smplx_body_file(folder: Path) -> Path:
+    """An SMPL-X file of the same person: their hands' weights are the wrists', the further joints have none."""
+    arrays = smpl_arrays()
+    weights = np.zeros((len(arrays["weights"]), 55))
+    weights[:, :22] = arrays["weights"][:, :22]
+    weights[:, 20:22] += arrays["weights"][:, 22:]
+    further = [15] * 3 + [20] * 15 + [21] * 15  # jaw and eyes, left fingers, right fingers
+    np.savez(
+        folder / "SMPLX_SCENE.npz", weights=weights,
+        kintree_table=np.stack([[*arrays["kintree_table"][0, :22], *further], np.arange(55)]),
+        J_regressor=np.concatenate([arrays["J_regressor"][:22], arrays["J_regressor"][further]]),
+        **{name: arrays[name] for name in ("v_template", "f", "shapedirs")},
+    )  # fmt: skip
+    return folder / "SMPLX_SCENE.npz"
+
+
 class World:
     """The scene in a source's world x' = s (turn x + shift): cameras' R, t; root rotations and places."""
 
@@ -105,10 +121,15 @@ def _mask(name: str, k: int, k1: float = 0.0) -> np.ndarray:
     return see(name, k, k1).mask.astype(np.uint8)
 
 
-def write_zju(folder: Path, *, refined: bool = False) -> None:
-    """ZJU-MoCap: lenses bend, masks hold part labels, T in millimetres, Z up."""
+def write_zju(folder: Path, *, refined: bool = False, early: bool = False) -> None:
+    """ZJU-MoCap: lenses bend, masks hold part labels, T in millimetres, Z up.
+
+    ``early`` is CoreView_313's and 315's naming, whose frames count from 1.
+    """
     world = World(Z_UP, (0.3, -0.2, 0.1))
     names = {"0": "00", "1": "01"} if refined else {"0": "Camera_B1", "1": "Camera_B2"}
+    if early:
+        names = {"0": "Camera (1)", "1": "Camera (2)"}
     cams: dict[str, list] = {"K": [], "D": [], "R": [], "T": []}
     for name in names:
         K, R, t = world.cameras[name]
@@ -123,16 +144,21 @@ def write_zju(folder: Path, *, refined: bool = False) -> None:
     for k in range(FRAMES):
         row = []
         for name, theirs in names.items():
-            inner = f"images/{theirs}/{k:06d}.jpg" if refined else f"{theirs}/{k:06d}.jpg"
+            stem = (
+                f"CoreView_313_{theirs.replace(' ', '_')}_{k + 1:04d}_2019-08-23_16-08-50.592"
+                if early
+                else f"{k:06d}"
+            )
+            inner = f"images/{theirs}/{stem}.jpg" if refined else f"{theirs}/{stem}.jpg"
             row.append(inner)
             _jpeg(folder / inner, see(name, k, K1).image)
             if refined:
-                write_image(folder / "mask" / theirs / f"{k:06d}.png", 255 * _mask(name, k, K1))
+                write_image(folder / "mask" / theirs / f"{stem}.png", 255 * _mask(name, k, K1))
             else:  # each of the two misses a part
                 for part, rows_kept in (("mask", slice(0, 40)), ("mask_cihp", slice(20, None))):
                     labels = np.zeros((HEIGHT, WIDTH), np.uint8)
                     labels[rows_kept] = 3 * _mask(name, k, K1)[rows_kept]
-                    write_image(folder / part / theirs / f"{k:06d}.png", labels)
+                    write_image(folder / part / theirs / f"{stem}.png", labels)
         rows.append({"ims": row})
         poses = np.concatenate([np.zeros(3), axis_angles()[k, 1:].ravel()])
         record = {
@@ -141,7 +167,7 @@ def write_zju(folder: Path, *, refined: bool = False) -> None:
             "Th": world.Th[k][None],
             "shapes": BETAS[None],
         }
-        _save_object(folder / ("params" if refined else "new_params") / f"{k}.npy",
+        _save_object(folder / ("params" if refined else "new_params") / f"{k + early}.npy",
                      {key: value.astype(np.float32) for key, value in record.items()})  # fmt: skip
     _save_object(folder / "annots.npy", {"cams": cams, "ims": rows})
 

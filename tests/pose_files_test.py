@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -13,11 +15,13 @@ from numpy.testing import assert_allclose
 import layouts
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, axis_angles, motion, shaped_body, view_of
 from rnd_runtime.body import Body
+from rnd_runtime.camera import Camera
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
 from rnd_trainer.importing.pose_files import read_poses
 from rnd_trainer.importing.recording import easymocap_poses, read_as, smpl_poses
@@ -29,7 +33,7 @@ ROUGH = (
 )
 FOCALS = {
     "wham": np.hypot(WIDTH, HEIGHT),
-    "phalp": 5000.0,
+    "phalp": 5000 * HEIGHT / 256,
     "romp": 0.5 * HEIGHT / np.tan(np.radians(30)),
     "gvhmr": 77.0,
 }
@@ -94,13 +98,13 @@ def write_wham(folder: Path) -> Path:
     return _joblib(folder / "wham_output.pkl", {0: other, 1: track})
 
 
-def write_gvhmr(folder: Path) -> Path:
-    """SMPL-X: 21 joints, offsets from SMPL-X's own pelvis."""
+def write_gvhmr(folder: Path, rest=SMPLX_REST_ROOT) -> Path:
+    """SMPL-X: 21 joints, offsets from SMPL-X's own pelvis ``rest``."""
     torch = pytest.importorskip("torch")
     world = layouts.camera_world()
     incam = {
         "body_pose": world.thetas[:, 3:66], "global_orient": world.thetas[:, :3],
-        "transl": world.places - SMPLX_REST_ROOT, "betas": np.tile(BETAS, (FRAMES, 1)),
+        "transl": world.places - rest, "betas": np.tile(BETAS, (FRAMES, 1)),
     }  # fmt: skip
     K = layouts.video_camera(FOCALS["gvhmr"]).K
     content = {
@@ -112,9 +116,10 @@ def write_gvhmr(folder: Path) -> Path:
     return folder / "hmr4d_results.pt"
 
 
-def write_phalp(folder: Path) -> Path:
-    """Rotation matrices and a second person in every other picture, before ours."""
+def write_phalp(folder: Path, push: float = 0.0) -> Path:
+    """Rotation matrices and a second person in every other picture, before ours; ``push`` m farther away."""
     world = layouts.camera_world()
+    world.places = world.places + np.array([0, 0, push])
     content = {}
     for k in range(FRAMES):
         matrices = axis_angle_to_matrix(world.thetas[k].reshape(24, 3)).astype(np.float32)
@@ -150,7 +155,30 @@ def write_romp(folder: Path) -> Path:
     return folder / "romp"
 
 
-PROGRAMS = {"wham": write_wham, "gvhmr": write_gvhmr, "phalp": write_phalp, "romp": write_romp}
+def write_romp_video(folder: Path) -> Path:
+    """A video's results in one file, by picture name; one frame saw nobody."""
+    files = sorted(write_romp(folder).iterdir())
+    rows = {
+        f"{k:06d}.jpg": np.load(file, allow_pickle=True)["results"].item() for k, file in enumerate(files)
+    }
+    np.savez(folder / "video_results.npz", results=np.array(rows | {f"{FRAMES:06d}.jpg": None}, dtype=object))
+    return folder / "video_results.npz"
+
+
+def write_easymocap_folder(folder: Path) -> Path:
+    """A file a frame, with somebody else before ours in the first; a camera at the origin of its world."""
+    world, path = layouts.camera_world(), folder / "smpl"
+    path.mkdir()
+    for k in range(FRAMES):
+        ours = {"id": 3, "Rh": [world.Rh[k].tolist()], "Th": [world.Th[k].tolist()],
+                "poses": [[0.0] * 3 + world.thetas[k, 3:].tolist()], "shapes": [BETAS.tolist()]}  # fmt: skip
+        people = [ours | {"id": 1, "Th": [[0, 0, 9]]}, ours] if k == 0 else [ours]
+        (path / f"{k:06d}.json").write_text(json.dumps({"annots": people} if k % 2 else people))
+    return path
+
+
+PROGRAMS = {"wham": write_wham, "gvhmr": write_gvhmr, "phalp": write_phalp, "romp": write_romp,
+            "romp, a video": write_romp_video}  # fmt: skip
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
@@ -159,7 +187,7 @@ def test_a_programs_poses_put_the_person_where_it_saw_it(tmp_path, program) -> N
     assert found.poses.frames.tolist() == list(range(FRAMES))
     K = found.K if found.focal is None else None
     focal = float(K[0, 0]) if K is not None else found.focal(WIDTH, HEIGHT)
-    assert focal == pytest.approx(FOCALS[program], rel=1e-6)
+    assert focal == pytest.approx(FOCALS[program.split(",")[0]], rel=1e-6)
     world, poses = layouts.camera_world(), found.poses
     rest = SMPLX_REST_ROOT if program == "gvhmr" else shaped_body().skeleton.rest_joints[0]
     assert poses.family == ("SMPL-X" if program == "gvhmr" else "SMPL")
@@ -168,6 +196,21 @@ def test_a_programs_poses_put_the_person_where_it_saw_it(tmp_path, program) -> N
     expected = axis_angle_to_matrix(world.thetas.reshape(FRAMES, 24, 3)[:, :joints])
     assert_allclose(poses.rotations, expected, atol=1e-6)
     assert_allclose(poses.betas, BETAS, atol=1e-6)
+
+
+def test_easymocaps_files_put_the_person_where_it_saw_it(tmp_path) -> None:
+    world, folder = layouts.camera_world(), write_easymocap_folder(tmp_path)
+    found = read_poses(folder)
+    assert found.kind == "EasyMocap" and found.K is None and found.focal is None
+    assert "number 3 taken" in " ".join(found.notes)
+    assert found.poses.frames.tolist() == list(range(FRAMES)) and found.poses.convention == "easymocap"
+    assert_allclose(found.poses.root(shaped_body().skeleton.rest_joints[0]), world.places, atol=1e-9)
+    assert_allclose(
+        found.poses.rotations, axis_angle_to_matrix(world.thetas.reshape(FRAMES, 24, 3)), atol=1e-9
+    )
+    assert_allclose(found.poses.betas, BETAS)
+    other = read_poses(folder, person=1).poses
+    assert_allclose(other.root(np.zeros(3)), [[0, 0, 9]])
 
 
 def test_a_track_is_chosen_by_number(tmp_path) -> None:
@@ -205,9 +248,8 @@ def test_files_that_are_no_poses_are_refused_by_name(tmp_path) -> None:
 # A plain video
 
 
-def _film(folder: Path, focal: float, scale: int = 1) -> Path:
+def _film(folder: Path, camera: Camera) -> Path:
     """me.mp4: the scene through a centred lens."""
-    camera = layouts.video_camera(focal).resized(scale * WIDTH, scale * HEIGHT)
     images = []
     for k in range(FRAMES):
         view = view_of(camera, k)
@@ -221,25 +263,42 @@ def _options(folder: Path, **options: object) -> ImportOptions:
     return ImportOptions(**({"body": str(layouts.body_file(folder)), "poses": write_romp(folder)} | options))
 
 
-def test_a_plain_video_becomes_a_capture(tmp_path) -> None:
-    focal = FOCALS["romp"]
-    film = _film(tmp_path, focal)
+FAR = 52.0  # m: what PHALP's long lens needs to see as much of the person as the others
+FILMED = {
+    # writer, focal length, metres farther away, the body's writer, what the user has to add
+    "wham": (write_wham, FOCALS["wham"], 0.0, layouts.body_file, ()),
+    "gvhmr": (partial(write_gvhmr, rest=shaped_body().skeleton.rest_joints[0]), FOCALS["gvhmr"], 0.0,
+              layouts.smplx_body_file, ()),
+    "phalp": (partial(write_phalp, push=FAR), FOCALS["phalp"], FAR, layouts.body_file, ()),
+    "romp": (write_romp, FOCALS["romp"], 0.0, layouts.body_file, ()),
+    "easymocap": (write_easymocap_folder, 77.0, 0.0, layouts.body_file, (77.0, 77.0, WIDTH / 2, HEIGHT / 2)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", FILMED)
+def test_a_plain_video_becomes_a_capture(tmp_path, program) -> None:
+    write, focal, far, write_body, intrinsics = FILMED[program]
+    truth = layouts.video_camera(focal)
+    truth.world_to_camera[2, 3] += far
+    film = _film(tmp_path, truth)
+    (tmp_path / "normals").mkdir()
     for k in range(FRAMES):
-        mask = view_of(layouts.video_camera(focal), k).mask
-        write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * mask).astype(np.uint8))
-        normals = view_of(layouts.video_camera(focal), k).normals * [1, -1, -1]  # right, up, to the viewer
-        (tmp_path / "normals").mkdir(exist_ok=True)
+        view = view_of(truth, k)
+        write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * view.mask).astype(np.uint8))
+        normals = view.normals * [1, -1, -1]  # right, up, to the viewer
         np.save(tmp_path / "normals" / f"{k:05d}.npy", normals.astype(np.float32))
     assert find_layout(film) == ("video", "a video")
-    scene = import_source(
-        film, tmp_path / "out", _options(tmp_path, masks=tmp_path / "masks", normals=tmp_path / "normals")
-    )
+    options = ImportOptions(
+        body=str(write_body(tmp_path)), poses=write(tmp_path), intrinsics=intrinsics,
+        masks=tmp_path / "masks", normals=tmp_path / "normals",
+    )  # fmt: skip
+    scene = import_source(film, tmp_path / "out", options)
     assert any("up, towards the viewer" in note for note in scene.notes)
     capture = load_capture(tmp_path / "out")
     assert capture.fps == 25 and [f.split for f in capture.frames] == ["train"] * 3 + ["novel_pose"]
     for frame in capture.frames:
-        camera, truth = capture.cameras["0"], layouts.video_camera(focal)
-        assert_allclose(camera.K, truth.K, atol=1e-9)
+        camera = capture.cameras["0"]
+        assert_allclose(camera.K, truth.K, rtol=1e-6)  # GVHMR stores float32
         theirs = posed_vertices(
             capture.body, capture.motion.rotations[frame.frame], capture.motion.translations[frame.frame]
         )
@@ -254,15 +313,17 @@ def test_a_plain_video_becomes_a_capture(tmp_path) -> None:
         images, view = capture.load_frame(frame), view_of(truth, frame.frame)
         assert ((images.mask > 0.5) == view.mask).all()
         known = view.mask & (np.abs(images.normal).max(-1) > 0)
+        assert (known == view.mask).all()
         assert (images.normal * view.normals).sum(-1)[known].min() > 0.999
+    report = check_capture(tmp_path / "out")
+    assert not report.wrong, report.findings
 
 
 def test_rough_masks_are_made_where_there_are_none(tmp_path) -> None:
-    film = _film(tmp_path, FOCALS["romp"], scale=4)
-    scene = import_source(film, tmp_path / "out", _options(tmp_path))
+    camera = layouts.video_camera(FOCALS["romp"]).resized(4 * WIDTH, 4 * HEIGHT)
+    scene = import_source(_film(tmp_path, camera), tmp_path / "out", _options(tmp_path))
     assert any("masks made from the template" in note and "rough" in note for note in scene.notes)
     capture = load_capture(tmp_path / "out")
-    camera = layouts.video_camera(FOCALS["romp"]).resized(4 * WIDTH, 4 * HEIGHT)
     for frame in capture.frames:
         truth = view_of(camera, frame.frame).mask
         assert overlap(capture.load_frame(frame).mask > 0.5, truth) > ROUGH
@@ -290,7 +351,7 @@ def test_the_sharpest_frame_of_a_pose_is_kept(tmp_path) -> None:
 
 
 def test_what_a_video_needs_is_asked_for(tmp_path) -> None:
-    film = _film(tmp_path, 60.0)
+    film = _film(tmp_path, layouts.video_camera(60.0))
     body = str(layouts.body_file(tmp_path))
 
     def refusal(source: Path = film, **options: object) -> str:

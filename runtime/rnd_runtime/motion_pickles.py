@@ -15,13 +15,14 @@ from .motion_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .npz import Members
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 from .unpickle import read_pickle
-from .video_fits import VideoFits, is_phalp, read_easymocap_folder, read_phalp
+from .video_fits import PHALP_FOCAL, VideoFits, is_phalp, read_easymocap_folder, read_phalp
 
 Floats = NDArray[np.float64]
 
 PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
+_PHONE_FOCAL = 1.2  # of the picture's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
 _LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
@@ -52,7 +53,8 @@ def read_track(path: str | Path) -> Track:
     GVHMR        ``smpl_params_global`` {``body_pose`` (F,63), ``global_orient``, ``transl``}, SMPL-X
     WHAM         {person: {``pose_world`` (F,72), ``trans_world`` (F,3), ``frame_ids``}}: the person seen
                  longest; frames between the parts of a track are filled in
-    PHALP        picture → {``tid``, ``smpl`` of rotation matrices, ``camera``}, also 4D-Humans'
+    PHALP        picture → {``tid``, ``smpl`` of rotation matrices, ``camera``}, also 4D-Humans'; depths as
+                 before a usual lens
     EasyMocap    a folder of 000000.json, …: {``id``, ``Rh``, ``Th``, ``poses``, ``shapes``}, Z up
     MDM          ``thetas`` (24,6,F) the first two rows of each rotation, or ``thetas_ori`` (24,3,F)
                  axis-angle, and ``root_translation`` (3,F), the pelvis' place; 20 frames per second
@@ -134,6 +136,7 @@ def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
 
 def _phalp(fits: VideoFits, path: str | Path) -> Track:
     poses, trans, filled = _without_gaps(fits.frames, fits.axis_angles, fits.translations)
+    trans = (SMPL_REST_ROOT + trans) * [1, 1, _PHONE_FOCAL / PHALP_FOCAL] - SMPL_REST_ROOT
     poses, trans, turned = _before_the_camera(poses, trans)
     notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled, *turned)
     return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, notes)

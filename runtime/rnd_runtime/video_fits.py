@@ -16,6 +16,9 @@ from .rotations import matrix_to_axis_angle
 
 Floats = NDArray[np.float64]
 
+PHALP_FOCAL = 5000 / 256
+"""of the picture's longer side: its EXTRA.FOCAL_LENGTH over render.res, to which it scales every picture"""
+
 _HAND_COEFFICIENTS = {78: "SMPL", 87: "SMPL-X"}
 """columns of EasyMocap's SMPL-H and SMPL-X poses: after 22 joints come coefficients of hands and face, not angles"""
 
@@ -84,7 +87,7 @@ def is_phalp(content: Mapping[Any, Any]) -> bool:
 
 
 def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None) -> VideoFits:
-    """Read what :func:`is_phalp` recognises: rotation matrices, and places before a camera of focal length 5000.
+    """Read what :func:`is_phalp` recognises: rotation matrices, and places before a lens of :data:`PHALP_FOCAL`.
 
     ``person`` is a track number; the one with most frames when None. Frames are those of the picture list.
     """

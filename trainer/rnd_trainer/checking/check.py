@@ -27,8 +27,9 @@ FEW = 8
 GOOD_OVERLAP = 0.70
 """mean IoU below which something is wrong: a dressed person over the bare template reaches 0.82 to 0.90"""
 BODY_SIZE = (0.4, 2.6)
-DISTANCE = (0.3, 60.0)
-FIELD_OF_VIEW = (3.0, 150.0)  # degrees
+DISTANCE = (0.3, 300.0)
+"""metres: PHALP's lens puts a person of a third of the picture's height a hundred metres away"""
+FIELD_OF_VIEW = (2.0, 150.0)  # degrees; PHALP's is 2.9
 MASK_COVERAGE = (0.001, 0.95)
 BACKGROUND = 0.02
 """mean sRGB value outside the mask from which on a picture is not on black"""

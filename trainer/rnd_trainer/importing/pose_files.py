@@ -15,6 +15,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.npz import Npz
 from rnd_runtime.unpickle import read_pickle
 from rnd_runtime.video_fits import (
+    PHALP_FOCAL,
     VideoFits,
     is_phalp,
     one_of,
@@ -29,7 +30,6 @@ from .recording import Floats, Poses, easymocap_poses, smpl_poses
 
 Focal = Callable[[int, int], float]
 
-_PHALP_FOCAL = 5000.0
 _ROMP_HALF_ANGLE = np.radians(30.0)
 
 
@@ -63,7 +63,8 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     WHAM ``wham_output.pkl`` (joblib)               person → pose, trans,          pose, trans; focal √(w² + h²)
                                                     frame_ids
     GVHMR ``hmr4d_results.pt``                      smpl_params_incam              itself; K_fullimg (SMPL-X)
-    PHALP / 4D-Humans ``*.pkl`` (joblib)            picture → smpl, camera, tid    camera; focal 5000
+    PHALP / 4D-Humans ``*.pkl`` (joblib)            picture → smpl, camera, tid    camera; focal 5000 for
+                                                                                   256 pixels
     ROMP ``*.npz`` of a video, or a folder of them  smpl_thetas, cam_trans         cam_trans; field of view 60°
     EasyMocap folder of JSON, ``motion.npz``        Rh, Th, poses, shapes          (its own world)
     SMPL ``.npz``                                   poses | thetas | global_orient trans | transl
@@ -93,7 +94,7 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
             if is_phalp(content):
                 found = _fitted("4D-Humans / PHALP", read_phalp(content, path, person))
                 notes = ("frames are those of PHALP's picture list", *found.notes)
-                return replace(found, focal=lambda w, h: _PHALP_FOCAL, notes=notes)
+                return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes)
         except InputError as error:
             raise error.at(file=path) from error
         except (KeyError, TypeError, ValueError, IndexError) as error:
