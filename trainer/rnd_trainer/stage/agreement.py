@@ -146,7 +146,7 @@ def compare(name: str, surface: Surface, camera: Camera, options: AgreementOptio
     processor time of the light's pictures, all cores together.
 
     Raises:
-        InputError: a light that the stage does not have.
+        InputError: a light that the stage does not have, or pictures too small.
     """
     lights = {light.name: light for light in stage_lights()}
     unknown = sorted(set(options.lights) - set(lights))
@@ -156,6 +156,8 @@ def compare(name: str, surface: Surface, camera: Camera, options: AgreementOptio
     direct, full = Set(surface, max_depth=DIRECT), Set(surface, max_depth=FULL)
     coverage = full.truth(camera, samples=16, seed=0).coverage
     inside = binary_erosion(coverage > 0.99, iterations=RIM)
+    if not inside.any():
+        raise InputError("--size", expected=f"pixels inside the {name}", got=options.size)
     for light in lights.values():
         if options.lights and light.name not in options.lights:
             continue

@@ -6,10 +6,11 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path, output_folder
@@ -179,7 +180,8 @@ def _agreement(options: Agreement) -> None:
     table = Table(
         "body", "light", *settings.modes, "noise", "interreflection", "its energy", title="PSNR inside, dB"
     )
-    rows, strips = [], []
+    rows: list[dict[str, Any]] = []
+    strips: list[NDArray[np.float64]] = []
     with Console(stderr=True).status("dressing") as status:
         dressed = dress(chosen, options.step)
         motion = dance(dressed.body.skeleton)
