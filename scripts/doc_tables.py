@@ -1,4 +1,4 @@
-"""Fills the tables of README.md and docs/performance.md from assets/bench/*.json: python scripts/doc_tables.py
+"""Fills the tables of README.md and docs from assets/bench/*.json: python scripts/doc_tables.py
 
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
 the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY. ``<!-- chart: FILE.svg -->`` …
@@ -17,7 +17,11 @@ CHART = re.compile(r"(<!-- chart: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 TABLE = re.compile(r"(<!-- table: (\S+) \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-PAGES = {ROOT / "README.md": "assets/bench", ROOT / "docs" / "performance.md": "../assets/bench"}
+PAGES = {
+    ROOT / "README.md": "assets/bench",
+    ROOT / "docs" / "performance.md": "../assets/bench",
+    ROOT / "docs" / "light-stage.md": "../assets/bench",
+}
 """the pages with tables, and where their pictures lie as seen from them"""
 
 

@@ -151,6 +151,30 @@ def test_the_project_layout_is_read_with_its_textures(body: Body, tmp_path: Path
     assert set(np.round(dressed.roughness, 2)) == {0.45, 0.8}
 
 
+def test_skin_under_clothes_is_tucked_in(body: Body) -> None:
+    """A shirt 5 mm over the trunk: the skin below it sinks, what is bare stays, and so does the shirt."""
+    from rnd_trainer.stage.remesh import vertex_normals
+
+    normals = vertex_normals(body.vertices, body.faces)
+    height = body.vertices[body.faces][:, :, 1]
+    trunk = body.faces[(height > 0.95).all(1) & (height < 1.35).all(1)]
+    worn, shirt = np.unique(trunk, return_inverse=True)
+    count = len(body.vertices)
+    vertices = np.concatenate([body.vertices, body.vertices[worn] + 0.005 * normals[worn]])
+    faces = np.concatenate([body.faces, shirt.reshape(-1, 3) + count])
+    weights = np.concatenate([body.skinning_weights, body.skinning_weights[worn]])
+    of_vertex = np.repeat([0, 1], [count, len(worn)])
+    tucked = characters._tucked_in(vertices, faces, weights, of_vertex, ("skin", "shirt"))
+    moved = np.linalg.norm(tucked - vertices, axis=1)
+    y, x = body.vertices[:, 1], np.abs(body.vertices[:, 0])
+    belly = (y > 1.05) & (y < 1.2) & (x < 0.2)
+    np.testing.assert_allclose(
+        (vertices - tucked)[:count][belly], characters.SUNK * normals[belly], atol=1e-9
+    )
+    assert moved[:count][(y < 0.9) | (y > 1.5) | (x > 0.4)].max() == 0
+    assert moved[count:].max() == 0
+
+
 @pytest.mark.parametrize("name", ["person.obj", "person.glb", "missing.npz"])
 def test_other_files_are_refused(name: str, tmp_path: Path) -> None:
     if name == "person.glb":

@@ -23,9 +23,6 @@ from .film import film, keep_recipe, prepare
 from .manifest import finish
 from .plan import BenchmarkOptions, missing, picture_count
 
-SUBJECTS = (0, 1, 2, 3)
-SEEDS = (0, 1, 2)
-"""of the subject that is trained with more than one"""
 METHODS = ("ours", "static skinning", "LBS, plain colour")
 COST_FILE = "cost.json"
 
@@ -35,26 +32,28 @@ def film_subjects(
 ) -> None:
     """Film what is missing of every subject; ``on_picture`` is told how many pictures there are and will be."""
     done, total = 0, None
-    for subject in SUBJECTS:
+    for subject in range(options.subjects):
         place = folder / f"subject{subject}"
         keep_recipe(options.recipe(subject), place)
         if (place / "capture.json").exists():
             continue
         production = prepare(options.recipe(subject), place)
         fresh = [shot for shot in production.shots if missing(place, shot, False)]
-        total = len(SUBJECTS) * picture_count(production.shots) if total is None else total
+        total = options.subjects * picture_count(production.shots) if total is None else total
 
         def count(name: str, expected: int = total) -> None:
             nonlocal done
             done += 1
             on_picture(done, expected)
 
-        seconds = film(production, place, on_picture=count)
+        spent = film(production, place, on_picture=count)
         pictures = picture_count(fresh)
-        cost = {"pictures": pictures, "seconds": seconds, "variant": variant, "machine": machine()}
+        cost = {
+            "pictures": pictures, **dataclasses.asdict(spent), "variant": variant, "machine": machine(),
+        }  # fmt: skip
         with atomic_path(place / COST_FILE) as temporary:
             temporary.write_text(json.dumps(cost, indent=1) + "\n", encoding="utf-8")
-        finish(production, place, variant, seconds / max(pictures, 1))
+        finish(production, place, variant, spent.cpu_seconds / max(pictures, 1))
 
 
 def run_benchmark(
@@ -71,13 +70,13 @@ def run_benchmark(
     started = time.perf_counter()
     base = resized(preset("quick"), options.gaussians, options.steps)
     variants = [variant for variant in VARIANTS if variant.name in METHODS]
-    total = (len(SUBJECTS) - 1 + len(SEEDS)) * len(variants)
+    total = (options.subjects - 1 + options.seeds) * len(variants)
     rows: list[dict[str, Any]] = []
     summaries: dict[str, list[dict[str, Any]]] = {}
     done = 0
-    for subject in SUBJECTS:
+    for subject in range(options.subjects):
         capture = load_capture(folder / f"subject{subject}")
-        seeds = SEEDS if subject == SUBJECTS[0] else SEEDS[:1]
+        seeds = tuple(range(options.seeds if subject == 0 else 1))
 
         def tell(
             name: str, seed: int, of_subject: int, _: int, subject: int = subject, before: int = done
@@ -99,7 +98,7 @@ def run_benchmark(
     return {
         "options": dataclasses.asdict(options),
         "summary": summaries,
-        "cost": _cost(folder, rows, time.perf_counter() - started),
+        "cost": _cost(folder, options, rows, time.perf_counter() - started),
         "rows": rows,
     }
 
@@ -121,13 +120,17 @@ def means(rows: list[dict[str, Any]], figure: str) -> list[tuple[str, dict[str, 
     return table
 
 
-def _cost(folder: Path, rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
-    """Seconds a picture and hours of filming and training, as they were measured when it was done."""
-    filmed = [json.loads((folder / f"subject{s}" / COST_FILE).read_text(encoding="utf-8")) for s in SUBJECTS]
-    pictures, filming = sum(f["pictures"] for f in filmed), sum(f["seconds"] for f in filmed)
+def _cost(
+    folder: Path, options: BenchmarkOptions, rows: list[dict[str, Any]], seconds: float
+) -> dict[str, Any]:
+    """Seconds a picture with its truth, and hours of filming and training, as measured when it was done."""
+    files = [folder / f"subject{subject}" / COST_FILE for subject in range(options.subjects)]
+    filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    pictures, filming, cpu = (sum(f[key] for f in filmed) for key in ("pictures", "seconds", "cpu_seconds"))
     trainings = {(row["subject"], row["method"], row["seed"]): row["minutes"] for row in rows}
     return {
         "seconds_per_picture": filming / max(pictures, 1),
+        "cpu_seconds_per_picture": cpu / max(pictures, 1),
         "pictures": pictures,
         "hours_filming": filming / 3600,
         "hours_training": sum(minutes or 0 for minutes in trainings.values()) / 60,

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
@@ -23,6 +24,8 @@ from rnd_runtime.skeleton import SMPL_NAMES, bone_transforms, smpl_skeleton
 
 from .cloth import Capsules, Drape
 from .dressing import Dressed
+from .garments import ramp
+from .remesh import vertex_normals
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -33,13 +36,20 @@ CLOTH = re.compile(
 UNWORN = re.compile(
     r"eye|brow|lash|hair|braid|short0|long0|bob0|pony|afro|teeth|tongue|high-poly|low-poly", re.I
 )
+SKIN = re.compile(r"skin|body", re.I)
+SHOES = re.compile(r"shoe|boot", re.I)
+HAIR = re.compile(r"hair|braid|short0|long0|bob0|pony|afro", re.I)
 ROUGHNESS = (
-    (re.compile(r"skin|body", re.I), 0.45),
-    (re.compile(r"shoe|boot", re.I), 0.40),
+    (SKIN, 0.45),
+    (SHOES, 0.40),
     (re.compile(r"eye", re.I), 0.35),
     (UNWORN, 0.52),
     (CLOTH, 0.80),
 )
+OVER, UNDER = 0.03, 0.01  # m that a cover may lie above, or below where it comes through
+ASIDE = 0.012  # m from a point's normal to the covering vertex: the usual distance of these
+SUNK = 0.012  # m that what is covered is sunk: cloth may move 7 mm inwards
+RIM = (0.012, 0.03)  # m from what is bare over which it sinks
 CLEAR = 0.5  # opacity below which a triangle of a hair card is left out
 RADIUS, SLACK, GAP = 0.015, 0.035, 0.010  # of the cloth: m, share, m
 MOST_VERTICES = 60_000  # before triangles are halved for the sake of their textures
@@ -140,6 +150,7 @@ def dress_character(character: Character, path: Path) -> Dressed:
     faces, material = faces[proper], material[proper]
     vertices, weights, of_vertex = vertices[chosen], weights[chosen], of_vertex[chosen]
     colour = np.clip(character.albedo[chosen], 0.03, 0.80)
+    vertices = _tucked_in(vertices, faces, weights, of_vertex, character.materials)
 
     worn = np.array([not UNWORN.search(name) for name in character.materials])
     body_faces = faces[worn[material]] if worn[material].any() else faces
@@ -163,6 +174,39 @@ def dress_character(character: Character, path: Path) -> Dressed:
     return Dressed(
         body, vertices, faces, weights, colour, _roughness(character, of_vertex, colour), drape, none
     )
+
+
+def _tucked_in(
+    vertices: Floats, faces: Ints, weights: Floats, of_vertex: Ints, materials: tuple[str, ...]
+) -> Floats:
+    """The vertices with skin below clothes and shoes, shoes below trousers, and the scalp below hair sunk a little.
+
+    Makers cut clothes for the rest pose only; in others the skin would come through them.
+    """
+
+    def named(pattern: re.Pattern[str]) -> NDArray[np.bool_]:
+        return np.array([bool(pattern.search(name)) for name in materials])[of_vertex]
+
+    skin, shoes, hair = named(SKIN), named(SHOES), named(HAIR)
+    worn = ~skin & ~named(UNWORN)
+    head = weights[:, SMPL_NAMES.index("head")] > 0.5
+    normals = vertex_normals(vertices, faces)
+    covered = np.zeros(len(vertices), bool)
+    for below, cover in ((skin, worn), (shoes, worn & ~shoes), (skin & head, hair)):
+        if not (below.any() and cover.any()):
+            continue
+        _, nearest = cKDTree(vertices[cover]).query(vertices[below])
+        apart = vertices[cover][nearest] - vertices[below]
+        height = np.sum(apart * normals[below], axis=1)
+        aside = np.linalg.norm(apart - height[:, None] * normals[below], axis=1)
+        covered[below] |= (height > -UNDER) & (height < OVER) & (aside < ASIDE)
+    bare = (skin | shoes) & ~covered
+    if not (covered.any() and bare.any()):
+        return vertices
+    inside, _ = cKDTree(vertices[bare]).query(vertices[covered])
+    sunk = vertices.copy()
+    sunk[covered] -= SUNK * ramp(inside, *RIM)[:, None] * normals[covered]
+    return sunk
 
 
 def _read_npz(path: Path) -> Character:

@@ -6,12 +6,15 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.images import to_bytes, write_image
 
 from .plan import BenchmarkOptions, Recipe
 from .variants import Variant, need_extra, use_variant
@@ -46,8 +49,12 @@ class Agreement:
     """of the dance"""
     size: int = 256
     """pixels, square"""
-    samples: int = 256
-    """Mitsuba's paths a pixel"""
+    samples: int = 128
+    """Mitsuba's paths a pixel; what noise they leave stands in every row"""
+    lights: tuple[str, ...] = ()
+    """names of the lights; none named: white and all eight coloured ones"""
+    picture: Path | None = None
+    """write ours, Mitsuba's direct light, four times their difference and interreflection, a row for each light"""
     step: float = 0.006
     """metres between the person's vertices, and Gaussians"""
     variant: Variant = "auto"
@@ -107,7 +114,7 @@ def _stage(options: StageOptions) -> None:
 
 
 def _film_with_progress(production, options: StageOptions, shard: tuple[int, int], console) -> float | None:
-    """Film a shard with a progress bar; seconds per picture, None where all was there."""
+    """Film a shard with a progress bar; processor seconds per picture, None where all was there."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -129,8 +136,8 @@ def _film_with_progress(production, options: StageOptions, shard: tuple[int, int
     )  # fmt: skip
     with Progress(*columns, console=console, speed_estimate_period=120) as progress:
         task = progress.add_task("filming", total=picture_count(shots))
-        seconds = film(production, options.out, shard=shard, on_picture=lambda name: progress.advance(task))
-    return seconds / fresh if fresh else None
+        spent = film(production, options.out, shard=shard, on_picture=lambda name: progress.advance(task))
+    return spent.cpu_seconds / fresh if fresh else None
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -151,9 +158,15 @@ def _agreement(options: Agreement) -> None:
         raise InputError(
             "--size, --samples", expected="at least 16, 2", got=f"{options.size}, {options.samples}"
         )
-    use_variant(options.variant)
+    if options.picture is not None and options.picture.suffix.lower() != ".png":
+        raise InputError("--picture", expected="a .png", got=options.picture.name)
+    for file in filter(None, (options.json, options.picture)):
+        output_folder(file.parent)
+    variant = use_variant(options.variant)
     from rich.console import Console
     from rich.table import Table
+
+    from rnd_runtime.doctor import machine
 
     from .agreement import AgreementOptions, ball, compare
     from .cameras import ring_cameras
@@ -161,21 +174,24 @@ def _agreement(options: Agreement) -> None:
     from .dressing import Wearer, dress
     from .subjects import subject
 
-    settings = AgreementOptions(options.size, options.samples)
+    settings = AgreementOptions(options.size, options.samples, lights=options.lights)
     camera = ring_cameras(1, options.size)["cam00"]
-    dressed = dress(subject(options.subject), options.step)
-    motion = dance(dressed.body.skeleton)
-    if not 0 <= options.frame < motion.frame_count:
-        raise InputError("--frame", expected=f"below {motion.frame_count}", got=options.frame)
-    person = Wearer(dressed, motion, [options.frame]).surface(options.frame)
+    chosen = subject(options.subject)
     table = Table(
         "body", "light", *settings.modes, "noise", "interreflection", "its energy", title="PSNR inside, dB"
     )
-    rows = []
-    console = Console(stderr=True)
-    with console.status("comparing"):
+    rows: list[dict[str, Any]] = []
+    strips: list[NDArray[np.float64]] = []
+    with Console(stderr=True).status("dressing") as status:
+        dressed = dress(chosen, options.step)
+        motion = dance(dressed.body.skeleton)
+        if not 0 <= options.frame < motion.frame_count:
+            raise InputError("--frame", expected=f"below {motion.frame_count}", got=options.frame)
+        person = Wearer(dressed, motion, [options.frame]).surface(options.frame)
         for name, surface in (("ball", ball()), ("person", person)):
-            for row in compare(name, surface, camera, settings, lambda row: None):
+            status.update(f"{name}: fitting visibility")
+            for result in compare(name, surface, camera, settings):
+                row = {**result.row, "variant": variant, "machine": machine()}
                 ours = [
                     f"{row[mode]['psnr_inside']:.1f} ({row[mode]['energy'] - 1:+.1%})"
                     for mode in settings.modes
@@ -185,12 +201,20 @@ def _agreement(options: Agreement) -> None:
                     f"{row['interreflection_energy']:+.1%}",
                 )  # fmt: skip
                 rows.append(row)
+                strips.append(result.strip())
+                status.update(f"{name}: {row['light']} is done")
     Console().print(table)
     _write_json(options.json, rows)
+    if options.picture is not None:
+        half = len(strips) // 2
+        sheet = np.concatenate([np.concatenate(part) for part in (strips[:half], strips[half:])], axis=1)
+        write_image(options.picture, to_bytes(sheet))
 
 
 def _benchmark(options: Benchmark) -> None:
     need_extra()
+    settings = options.sizes
+    settings.check()
     variant = use_variant(options.variant)
     from rich.console import Console
     from rich.progress import Progress
@@ -200,10 +224,6 @@ def _benchmark(options: Benchmark) -> None:
 
     from .benchmark import film_subjects, means, run_benchmark
 
-    settings = options.sizes
-    if settings.steps < 1 or settings.gaussians < 64:
-        got = f"{settings.steps}, {settings.gaussians}"
-        raise InputError("--steps, --gaussians", expected="at least 1, 64", got=got)
     perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
     output_folder(options.out)
     with Progress(console=Console(stderr=True)) as progress:

@@ -275,12 +275,17 @@ def _advance(
                 share = (qx * bx + qy * by + qz * bz) / (bx * bx + by * by + bz * bz)
                 share = min(max(share, 0.0), 1.0)
                 ex, ey, ez = qx - share * bx, qy - share * by, qz - share * bz
-                away = np.sqrt(ex * ex + ey * ey + ez * ez) + 1e-12
-                if away < radii[c] and hangs[i]:  # sleeves and legs have their planes
-                    push = (radii[c] - away) / away
-                    dx += push * ex
-                    dy += push * ey
-                    dz += push * ez
+                inside = radii[c] * radii[c] - (ex * ex + ey * ey + ez * ez)
+                if inside > 0.0 and hangs[i]:  # sleeves and legs have their planes
+                    # out of the leg and away from the body: straight out of the axis would tear a skirt at a knee
+                    mx, my, mz = ex + 2 * radii[c] * nx, ey + 2 * radii[c] * ny, ez + 2 * radii[c] * nz
+                    norm = np.sqrt(mx * mx + my * my + mz * mz)
+                    mx, my, mz = mx / norm, my / norm, mz / norm
+                    along = ex * mx + ey * my + ez * mz
+                    push = np.sqrt(along * along + inside) - along
+                    dx += push * mx
+                    dy += push * my
+                    dz += push * mz
             stray = np.sqrt(dx * dx + dy * dy + dz * dz)
             if stray > radius[i]:
                 shrink = radius[i] / stray

@@ -35,6 +35,14 @@ VISIBILITY_SAMPLES = 16
 FINEST, COARSEST = 0.003, 0.007  # m between a dressed surface's vertices
 
 
+@dataclass(frozen=True)
+class Cost:
+    """What filming took: by the clock, and on the processor, all its cores together, which no other load lengthens."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+
 @dataclass
 class Production:
     """A recipe with everything it names loaded: what is filmed, by which cameras, under which lights."""
@@ -80,8 +88,8 @@ def film(
     *,
     shard: tuple[int, int] = (0, 1),
     on_picture: Callable[[str], None],
-) -> float:
-    """Film what is missing of one shard (k, n): the instants whose number is k modulo n. Returns seconds of filming.
+) -> Cost:
+    """Film what is missing of one shard (k, n): the instants whose number is k modulo n.
 
     ``on_picture`` is called with the name of each picture that is there, filmed or found.
     """
@@ -97,9 +105,9 @@ def film(
             for _, name in shot.uses:
                 on_picture(shot.image(name))
     if not missing:
-        return 0.0
+        return Cost()
+    started, started_cpu = time.perf_counter(), time.process_time()
     wearer = Wearer(production.dressed, production.motion, sorted({shot.frame for shot in missing}))
-    started = time.perf_counter()
     for frame in sorted({shot.frame for shot in missing}):
         stage = Set(wearer.surface(frame), max_depth=production.recipe.max_depth)
         save_npz(folder / f"surface/{frame:06d}.npz", {"vertices": stage.surface.vertices.astype(np.float32)})
@@ -108,7 +116,7 @@ def film(
                 _shoot(production, stage, shot, folder)
                 for _, name in shot.uses:
                     on_picture(shot.image(name))
-    return time.perf_counter() - started
+    return Cost(time.perf_counter() - started, time.process_time() - started_cpu)
 
 
 def _shoot(production: Production, stage: Set, shot: Shot, folder: Path) -> None:

@@ -27,7 +27,7 @@ ESTIMATED = "capture_estimated.json"
 _TILE, _COLUMNS = 128, 10  # pixels, pictures in a row
 
 
-def finish(production: Production, folder: Path, variant: str, seconds_per_picture: float | None) -> bool:
+def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_picture: float | None) -> bool:
     """Write the manifest when every picture of every shard is there; False when some are still missing."""
     if any(missing(folder, shot, production.recipe.visibility) for shot in production.shots):
         return False
@@ -52,7 +52,7 @@ def finish(production: Production, folder: Path, variant: str, seconds_per_pictu
         },
     )
     with atomic_path(folder / "README.md") as temporary:
-        temporary.write_text(_readme(production, variant, seconds_per_picture), encoding="utf-8")
+        temporary.write_text(_readme(production, variant, cpu_seconds_per_picture), encoding="utf-8")
     contact_sheet(folder)
     return True
 
@@ -112,7 +112,11 @@ def _readme(production: Production, variant: str, seconds: float | None) -> str:
         if value not in (None, ()) and not isinstance(value, bool)
     )
     options += "" if recipe.visibility else " --no-visibility"
-    cost = "" if seconds is None else f" {seconds:.2f} s a picture with its truth, here."
+    cost = (
+        ""
+        if seconds is None
+        else f" {seconds:.2f} s of processor time a picture with its truth, cloth included."
+    )
     counts = {s: sum(use[0] == s for shot in production.shots for use in shot.uses) for s in _SPLITS}
     splits = ", ".join(f"{name} {count}" for name, count in counts.items())
     return f"""# {production.title}

@@ -49,7 +49,12 @@ def _top(p: Floats, garments: Garments, palette: Palette) -> Look:
     x, y, z = p.T
     reach = np.abs(x)
     sleeve = (reach > ARM_STARTS) & (y > 1.2)
-    along = np.where(sleeve, 1.42 - reach + ARM_STARTS, y)  # a pattern runs on from the shoulder down the arm
+    shoulder = ramp(y, 1.30, 1.46) * (
+        ARM_STARTS - 0.04 - reach
+    )  # level there: height alone would smear the pattern
+    along = np.where(
+        sleeve, 1.42 - reach + ARM_STARTS, y + shoulder
+    )  # it runs on from the shoulder down the arm
     around = np.where(sleeve, 0.058 * np.arctan2(z + 0.02, y - 1.416), 0.150 * np.arctan2(x, z))
     colour, roughness, relief = weave(palette.top, around, along, palette.seed)
     ground = np.array(palette.top.ground)

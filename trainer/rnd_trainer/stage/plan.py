@@ -73,6 +73,10 @@ class Recipe:
 class BenchmarkOptions:
     """Sizes of the benchmark: by default two cores take some forty minutes for all of it, the half of it trainings."""
 
+    subjects: int = 4
+    """people, by their seeds from 0 on"""
+    seeds: int = 3
+    """trainings of the first of them with every method; of the others one"""
     size: int = 256
     """pixels, square"""
     samples: int = 64
@@ -89,6 +93,13 @@ class BenchmarkOptions:
     """of every training"""
     gaussians: int = 6_000
     """of every avatar"""
+
+    def check(self) -> None:
+        """Refuse what cannot be filmed or trained."""
+        for name, least in (("subjects", 1), ("seeds", 1), ("steps", 1), ("gaussians", 64)):
+            if getattr(self, name) < least:
+                raise InputError(f"--{name}", expected=f"at least {least}", got=getattr(self, name))
+        self.recipe(0).check()
 
     def recipe(self, subject: int) -> Recipe:
         """What is filmed of one subject."""

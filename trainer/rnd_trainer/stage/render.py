@@ -51,7 +51,7 @@ class Truth:
     Attributes:
         coverage: [H, W].
         albedo: [H, W, 3] linear, premultiplied.
-        normals: [H, W, 3] unit, camera's OpenCV axes; zero where coverage is below 5 %.
+        normals: [H, W, 3] unit, of the side that is seen, camera's OpenCV axes; zero where coverage is below 5 %.
         roughness: [H, W] and depth: [H, W] m along the camera's z, both of the covered part; zero elsewhere.
     """
 
@@ -95,9 +95,10 @@ class Set:
         roughness, coverage = extra[..., 0], extra[..., 1]
         share = np.maximum(coverage, 1e-6)
         covered = coverage >= MASK_FLOOR
-        turned = seen[..., 3:6] @ camera.world_to_camera[:3, :3].T
-        turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
         places = seen[..., 6:9] / share[..., None]
+        away = np.sum(seen[..., 9:12] * (places - camera.position), axis=-1) > 0  # cloth seen from its inside
+        turned = np.where(away, -1, 1)[..., None] * seen[..., 3:6] @ camera.world_to_camera[:3, :3].T
+        turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
         depth = places @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         return Truth(
             coverage, seen[..., :3], turned * covered[..., None], roughness / share * covered, depth * covered
@@ -113,7 +114,7 @@ class Set:
         surface's horizon.
         """
         white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
-        copy = mesh(self.surface, white, {})
+        copy = mesh(self.surface, {"type": "twosided", "sides": white}, {})
         world = normals @ camera.world_to_camera[:3, :3]
         result = np.zeros((len(directions), *normals.shape[:2]))
         for start in range(0, len(directions), 3):
@@ -139,7 +140,7 @@ class Set:
         one = np.ones_like(surface.roughness)
         plain = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
         passes = (
-            (surface.colour, "albedo:albedo,normal:sh_normal,place:position"),
+            (surface.colour, "albedo:albedo,normal:sh_normal,place:position,side:geo_normal"),
             (np.stack([surface.roughness, one, 0 * one], axis=1), "albedo:albedo"),
         )
         return [
@@ -155,7 +156,7 @@ class Set:
 
 
 def layered() -> dict[str, Any]:
-    """The material: its mesh attributes are those of :func:`_layers`."""
+    """The material, on both sides of the mesh; its attributes are those of :func:`_layers`."""
 
     def attribute(name: str) -> dict[str, Any]:
         return {"type": "mesh_attribute", "name": f"vertex_{name}"}
@@ -164,12 +165,13 @@ def layered() -> dict[str, Any]:
         "type": "roughconductor", "distribution": "ggx", "alpha": attribute("alpha"), "eta": 1.5, "k": 0.0,
         "specular_reflectance": attribute("gain"),
     }  # fmt: skip
-    return {
+    blend = {
         "type": "blendbsdf",
         "weight": GLOSS_SHARE,
         "first": {"type": "diffuse", "reflectance": attribute("color")},
         "second": gloss,
     }
+    return {"type": "twosided", "sides": blend}
 
 
 def _layers(surface: Surface) -> dict[str, Floats]:
