@@ -13,10 +13,8 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("skimage")
 
 from rnd_runtime.body import Body  # noqa: E402
-from rnd_runtime.camera import Camera  # noqa: E402
 from rnd_runtime.errors import InputError  # noqa: E402
 from rnd_runtime.images import read_image  # noqa: E402
-from rnd_runtime.light import downsize, texel_directions, texel_solid_angles  # noqa: E402
 from rnd_runtime.sh import sh_basis, sphere_quadrature  # noqa: E402
 from rnd_runtime.shadow import directional_visibility  # noqa: E402
 
@@ -31,8 +29,6 @@ from rnd_trainer.stage.agreement import (  # noqa: E402
     true_gaussians,
 )
 from rnd_trainer.stage.cameras import ring_cameras  # noqa: E402
-from rnd_trainer.stage.lights import stage_lights  # noqa: E402
-from rnd_trainer.stage.render import Set  # noqa: E402
 
 ASSETS = Path(__file__).parent.parent / "assets"
 SIZE = 64  # pixels
@@ -79,69 +75,6 @@ def test_a_picture_too_small_for_the_body_is_refused() -> None:
     thin = ball(radius=0.05, rings=8)
     with pytest.raises(InputError, match="--size"):
         next(compare("ball", thin, ring_cameras(1, 16)["cam00"], AgreementOptions(size=16, samples=2)))
-
-
-def test_rim_light_differs_by_the_formula_for_fresnel_and_masking() -> None:
-    """Where light grazes, Schlick's term and joint masking keep less; summed with Mitsuba's, the gap is gone."""
-    light = next(light for light in stage_lights() if light.name == "rim")
-    colour, roughness = np.array([0.5, 0.4, 0.3]), 0.4
-    surface = ball(rings=96)
-    count = len(surface.vertices)
-    surface = replace(
-        surface,
-        vertices=surface.normals,
-        colour=np.tile(colour, (count, 1)),
-        roughness=np.full(count, roughness),
-    )
-    eye = np.array([0.0, 0, 40])  # far: a pixel's place is its point's
-    camera = Camera.look_at(eye.tolist(), [0.0, 0, 0], width=SIZE, height=SIZE, fov_y=2 * np.arctan(1 / 40))
-    theirs = Set(surface, max_depth=2).radiance(camera, light.radiance, samples=64, seed=0)
-    line = (np.arange(SIZE) + 0.5) / (SIZE / 2) - 1
-    x, y = np.meshgrid(line, -line)
-    inside = x**2 + y**2 < 0.9
-    inside[::2] = False  # half the rows will do
-    points = np.stack([x, y, np.sqrt(np.where(inside, 1 - x**2 - y**2, 0))], -1)[inside]
-    texels = downsize(light.radiance.astype(np.float32), 32, 64)
-    flux = (texels * texel_solid_angles(32, 64)[..., None]).reshape(-1, 3)
-    towards = texel_directions(32, 64).reshape(-1, 3)
-    schlick, exact = (
-        _shaded(points, eye, towards, flux, colour, roughness**2, term) for term in (_schlick, _exact)
-    )
-    truth = theirs[inside].sum()
-    assert exact.sum() == pytest.approx(truth, rel=0.01)
-    assert schlick.sum() < 0.97 * truth
-
-
-def _shaded(points, eye, towards, flux, colour, alpha, gloss):
-    view = eye - points
-    view /= np.linalg.norm(view, axis=1, keepdims=True)
-    n_l = np.maximum(points @ towards.T, 0)
-    n_v = np.maximum(np.sum(points * view, axis=1), 1e-4)[:, None]
-    half = towards + view[:, None]
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    n_h, v_h = np.einsum("ijk,ik->ij", half, points), np.einsum("ijk,ik->ij", half, view)
-    d = alpha**2 / (np.pi * (1 - n_h**2 * (1 - alpha**2)) ** 2)
-    safe = np.maximum(n_l, 1e-4)
-    shine = d * gloss(safe, n_v, v_h, alpha) / (4 * safe * n_v)
-    return (n_l * shine) @ flux + colour / np.pi * (n_l @ flux)
-
-
-def _lambda(cosine, alpha):
-    return (np.sqrt(1 + alpha**2 * (1 / cosine**2 - 1)) - 1) / 2
-
-
-def _schlick(n_l, n_v, v_h, alpha):
-    """Ours: :mod:`rnd_runtime.brdf`."""
-    return (0.04 + 0.96 * (1 - v_h) ** 5) / (1 + _lambda(n_l, alpha) + _lambda(n_v, alpha))
-
-
-def _exact(n_l, n_v, v_h, alpha):
-    """Mitsuba's: Fresnel's equations for an index of 1.5, separable masking."""
-    inner = np.sqrt(1.5**2 - 1 + v_h**2)
-    across = (v_h - inner) / (v_h + inner)
-    along = (1.5**2 * v_h - inner) / (1.5**2 * v_h + inner)
-    fresnel = 0.5 * (across**2 + along**2)
-    return fresnel / ((1 + _lambda(n_l, alpha)) * (1 + _lambda(n_v, alpha)))
 
 
 def test_fitted_visibility_keeps_the_light_that_arrives() -> None:

@@ -133,7 +133,7 @@ def _learn_background(pictures: Sequence[Picture], silhouettes: Sequence[Mask] |
 def _seeds(
     person: Mask, silhouette: Mask | None, picture: Picture, background: _Background | None, reach: float
 ) -> Picture:
-    """GrabCut's labels [H, W]: ``person`` is probable, and the template and the background make some places sure."""
+    """GrabCut's labels [H, W]: ``person`` is probable; well inside it and the template, and by the background, sure."""
     seeds = np.full(person.shape, cv2.GC_BGD, np.uint8)
     template = person if silhouette is None else silhouette
     if not template.any():
@@ -146,7 +146,7 @@ def _seeds(
         seeds[near & background.seen & differs] = cv2.GC_FGD
         seeds[near & background.seen & ~differs] = cv2.GC_PR_BGD
         seeds[near & ~template & background.seen & ~differs] = cv2.GC_BGD
-    inside = cv2.distanceTransform(template.astype(np.uint8), cv2.DIST_L2, 3)
+    inside = cv2.distanceTransform((template & person).astype(np.uint8), cv2.DIST_L2, 3)
     seeds[inside > _SURE_INSIDE * _height(template)] = cv2.GC_FGD
     return seeds
 
