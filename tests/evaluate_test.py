@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
-from rnd_trainer.ablate import CAUSES, VARIANTS, ablate, encoder_cost, summarise
+from rnd_trainer.ablate import CAUSES, VARIANTS, ablate, chosen, encoder_cost, summarise
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
@@ -138,6 +139,13 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     ]
     assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
     assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
+
+
+def test_rows_of_a_study_are_chosen_by_name() -> None:
+    assert chosen(VARIANTS, ()) == VARIANTS
+    assert [one.name for one in chosen(VARIANTS, ("static skinning", "ours"))] == ["ours", "static skinning"]
+    with pytest.raises(InputError, match="--variants"):
+        chosen(VARIANTS, ("ours", "theirs"))
 
 
 def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_capture, tiny_config) -> None:

@@ -19,6 +19,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from rnd_runtime.capture import Capture, load_capture
+from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
 
 from .checkpoint import load_checkpoint
@@ -96,6 +97,15 @@ CAUSES = (
     *(_gaussians(count) for count in (7_500, 15_000, 60_000, 120_000)),
 )
 STUDIES = {"ablations": VARIANTS, "causes": CAUSES}
+
+
+def chosen(variants: Sequence[Variant], names: Sequence[str]) -> tuple[Variant, ...]:
+    """Those of ``names``, in the study's order; all where none is named. Raises :class:`InputError` for others."""
+    known = [variant.name for variant in variants]
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InputError("--variants", expected="some of " + ", ".join(known), got=", ".join(unknown))
+    return tuple(variant for variant in variants if not names or variant.name in names)
 
 
 def ablate(

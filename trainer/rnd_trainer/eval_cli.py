@@ -61,6 +61,8 @@ class EvalOptions:
     """train and score a study's variants in the folder RUN instead; done runs are not done again"""
     study: Literal["ablations", "causes"] = "ablations"
     """the paper's ablations, or what holds the figures back: light, normals, poses, number of Gaussians"""
+    variants: tuple[str, ...] = ()
+    """names of the study's rows to train, such as "static skinning"; none named: all"""
     preset: Literal["quick", "standard", "full"] = "quick"
     """of the ablations' trainings"""
     steps: int | None = None
@@ -155,10 +157,10 @@ def ablate_run(options: EvalOptions) -> None:
 
     from rnd_runtime.capture import load_capture
 
-    from .ablate import STUDIES, ablate, summarise
+    from .ablate import STUDIES, ablate, chosen, summarise
     from .config import preset, resized
 
-    variants = STUDIES[options.study]
+    variants = chosen(STUDIES[options.study], options.variants)
     config = resized(preset(options.preset), options.gaussians, options.steps)
     config = dataclasses.replace(config, image_scale=options.image_scale)
     capture = load_capture(options.capture, motion_file=options.motion)
