@@ -38,6 +38,7 @@ def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
             return found[1] + found[4]
         rows = json.loads((bench / name).read_text(encoding="utf-8"))
         rows = rows[key] if key else rows
+        rows = rows if isinstance(rows, list) else [rows]
         columns = [column.strip().partition(" ")[::2] for column in found[3].split(",")]
         lines = [[name for name, _ in columns], ["---"] * len(columns)]
         lines += [[_cell(_value(row, name), form) for name, form in columns] for row in rows]
