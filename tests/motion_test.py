@@ -275,14 +275,14 @@ def test_sampling_interpolates_on_the_shortest_path_and_clamps():
         np.pi + 0.6,
     ]  # steady, but written across the wrap
     motion = Motion(
-        axis_angle_to_matrix(angles), np.array([[0.0, 0, 0], [1, 0, 0], [1, 4, 0]]), 10.0, ("a", "b")
+        axis_angle_to_matrix(angles), np.array([[0.0, 0, 0], [2, 0, 0], [2, 4, 0]]), 10.0, ("a", "b")
     )
     times = [-5.0, 0.0, 0.05, 0.1, 0.125, 0.2, 99.0]
     sampled = motion.at(times)
     expected = np.pi + np.array([-0.2, -0.2, 0.0, 0.2, 0.3, 0.6, 0.6])
     expected_rotations = axis_angle_to_matrix(np.outer(expected, [0, 0, 1]))
     assert_allclose(sampled.rotations[:, 1], expected_rotations, atol=ROUND_OFF)
-    moves = [[0, 0, 0], [0, 0, 0], [0.5, 0, 0], [1, 0, 0], [1, 1, 0], [1, 4, 0], [1, 4, 0]]
+    moves = [[0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0], [2, 4, 0], [2, 4, 0]]
     assert_allclose(sampled.translations, moves, atol=ROUND_OFF)
     assert sampled.joint_names == motion.joint_names
 

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import JointTable, load_joint_map, match_joints
 from .mocap import read_acclaim, read_bvh
 from .motion_files import SMPL_REST_ROOT, read_motion_file
 from .npz import save_npz
 from .retarget import retarget
-from .rotations import matrix_to_axis_angle, slerp_matrices
+from .rotations import matrix_to_axis_angle
 from .skeleton import Skeleton
 
 Floats = NDArray[np.float64]
@@ -65,16 +66,13 @@ class Motion:
         return (self.frame_count - 1) / self.fps
 
     def at(self, times_s: ArrayLike) -> Motion:
-        """The poses at ``times_s`` [T] seconds: slerp between frames, the end poses beyond the ends.
+        """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames, the end poses beyond the ends.
 
         ``fps`` of the result is still that of the recording and says nothing about ``times_s``.
         """
         place = np.clip(np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps, 0, self.frame_count - 1)
-        before = np.floor(place).astype(np.int64)
-        after = np.minimum(before + 1, self.frame_count - 1)
-        t = (place - before)[:, None]
-        rotations = slerp_matrices(self.rotations[before], self.rotations[after], t)
-        translations = (1 - t) * self.translations[before] + t * self.translations[after]
+        rotations = interpolate_rotations(np.ascontiguousarray(self.rotations, np.float64), place)
+        translations = interpolate_points(np.ascontiguousarray(self.translations, np.float64), place)
         return Motion(rotations, translations, self.fps, self.joint_names, self.source, self.notes)
 
 

@@ -76,7 +76,7 @@ def sped_up(motion: Motion, speed: float) -> Motion:
 
 
 def resampled(motion: Motion, fps: float) -> Motion:
-    """``motion`` at ``fps`` frames per second, by slerp."""
+    """``motion`` at ``fps`` frames per second."""
     _check("fps", fps, "frames per second")
     frames = int(motion.duration * fps + 1e-6) + 1
     return replace(motion.at(np.arange(frames) / fps), fps=fps)

@@ -1,7 +1,8 @@
 // Motion files, as rnd_runtime/motion_files.py and motion.py read them, and the window an avatar's skinning looks at.
 
 import { readNpz } from "./npz.js";
-import { axisAngleToMatrix, matrixToAxisAngle, multiply, slerp, transposedTimes } from "./rotations.js";
+import { pointAt, rotationsAt } from "./interpolation.js";
+import { axisAngleToMatrix, matrixToAxisAngle, multiply, transposedTimes } from "./rotations.js";
 
 const SMPL = [
   "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",
@@ -129,14 +130,7 @@ function match(rotations, frames, names, skeleton, notes, file) {
 /** Local rotations [J·9] and the root's translation [3] at `time` seconds; the end poses beyond the ends. */
 export function poseAt(motion, time) {
   const place = Math.min(Math.max(time * motion.fps, 0), motion.frames - 1);
-  const before = Math.floor(place), after = Math.min(before + 1, motion.frames - 1), t = place - before;
-  const rotations = new Float64Array(9 * motion.joints);
-  for (let joint = 0; joint < motion.joints; joint++)
-    slerp(motion.rotations, 9 * (before * motion.joints + joint), motion.rotations, 9 * (after * motion.joints + joint),
-      t, rotations, 9 * joint);
-  const translation = [0, 1, 2].map((k) =>
-    (1 - t) * motion.translations[3 * before + k] + t * motion.translations[3 * after + k]);
-  return { rotations, translation };
+  return { rotations: rotationsAt(motion, place), translation: pointAt(motion.translations, motion.frames, place) };
 }
 
 /** The last `poses` poses up to `time` over `seconds`, without the root: 6D rotations and joint velocities (window.py). */

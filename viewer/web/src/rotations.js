@@ -46,13 +46,3 @@ export function transposedTimes(a, atA, b, atB, out, at) {
     for (let j = 0; j < 3; j++)
       out[at + 3 * i + j] = a[atA + i] * b[atB + j] + a[atA + 3 + i] * b[atB + 3 + j] + a[atA + 6 + i] * b[atB + 6 + j];
 }
-
-const step = new Float64Array(9);
-
-/** The rotation `t` of the way from `a` to `b`, on the shortest path. */
-export function slerp(a, atA, b, atB, t, out, at) {
-  transposedTimes(a, atA, b, atB, step, 0);
-  const [x, y, z] = matrixToAxisAngle(step, 0);
-  axisAngleToMatrix(t * x, t * y, t * z, step, 0);
-  multiply(a, atA, step, 0, out, at);
-}
