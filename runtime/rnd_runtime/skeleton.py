@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
@@ -89,14 +90,11 @@ class Skeleton:
         batch = np.broadcast_shapes(rotations.shape[:-3], translation.shape[:-1])
         posed = np.zeros((*batch, count, 4, 4))
         posed[..., 3, 3] = 1
-        posed[..., 0, :3, :3] = rotations[..., 0, :, :]
         posed[..., 0, :3, 3] = self.rest_joints[0] + translation
-        for joint in range(1, count):
-            parent = int(self.parents[joint])
-            turn = posed[..., parent, :3, :3]
-            offset = self.rest_joints[joint] - self.rest_joints[parent]
-            posed[..., joint, :3, :3] = turn @ rotations[..., joint, :, :]
-            posed[..., joint, :3, 3] = turn @ offset + posed[..., parent, :3, 3]
+        _chain(
+            np.ascontiguousarray(np.broadcast_to(rotations, (*batch, count, 3, 3))).reshape(-1, count, 3, 3),
+            np.asarray(self.parents, np.int64), np.asarray(self.rest_joints, np.float64), posed.reshape(-1, count, 4, 4),
+        )  # fmt: skip
         return posed
 
 
@@ -120,10 +118,28 @@ def bone_transforms(
         canonical_rotations: [J, 3, 3] local rotations of the canonical pose, whose translation is 0;
             None for the rest pose.
     """
-    if canonical_rotations is None:
-        canonical_rotations = np.broadcast_to(np.eye(3), (len(skeleton), 3, 3))
     posed = skeleton.joint_transforms(rotations, translation)
-    canonical = skeleton.joint_transforms(canonical_rotations, np.zeros(3))
-    turn = posed[..., :3, :3] @ np.swapaxes(canonical[..., :3, :3], -1, -2)
-    shift = posed[..., :3, 3] - (turn @ canonical[..., :3, 3:])[..., 0]
+    turn, places = posed[..., :3, :3], skeleton.rest_joints
+    if canonical_rotations is not None:
+        canonical = skeleton.joint_transforms(canonical_rotations, np.zeros(3))
+        turn, places = turn @ np.swapaxes(canonical[..., :3, :3], -1, -2), canonical[..., :3, 3]
+    shift = posed[..., :3, 3] - (turn @ places[..., None])[..., 0]
     return np.concatenate([turn, shift[..., None]], -1).astype(np.float32)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
+    """Fill ``posed`` [B, J, 4, 4], whose roots' places and last rows are there, from the root outwards."""
+    for pose in range(rotations.shape[0]):
+        posed[pose, 0, :3, :3] = rotations[pose, 0]
+        for joint in range(1, rotations.shape[1]):
+            parent = posed[pose, parents[joint]]
+            for row in range(3):
+                place = parent[row, 3]
+                for k in range(3):
+                    place += parent[row, k] * (rest_joints[joint, k] - rest_joints[parents[joint], k])
+                    total = 0.0
+                    for inner in range(3):
+                        total += parent[row, inner] * rotations[pose, joint, inner, k]
+                    posed[pose, joint, row, k] = total
+                posed[pose, joint, row, 3] = place
