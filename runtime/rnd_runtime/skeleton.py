@@ -93,7 +93,7 @@ class Skeleton:
         posed[..., 0, :3, 3] = self.rest_joints[0] + translation
         _chain(
             np.ascontiguousarray(np.broadcast_to(rotations, (*batch, count, 3, 3))).reshape(-1, count, 3, 3),
-            np.asarray(self.parents, np.int64), np.asarray(self.rest_joints, np.float64), posed.reshape(-1, count, 4, 4),
+            self.parents, self.rest_joints, posed.reshape(-1, count, 4, 4),
         )  # fmt: skip
         return posed
 
