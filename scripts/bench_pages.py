@@ -12,7 +12,6 @@ import functools
 import http.server
 import json
 import os
-import platform
 import sys
 import tempfile
 import threading
@@ -26,6 +25,7 @@ ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
 sys.path.insert(0, str(ROOT / "tests"))
 
 from browser import Page, chromium  # noqa: E402
+from rnd_runtime.doctor import machine  # noqa: E402
 from rnd_viewer.view_options import ViewOptions  # noqa: E402
 from rnd_viewer.view_scene import Scene  # noqa: E402
 from rnd_viewer.view_server import serve  # noqa: E402
@@ -105,7 +105,7 @@ def main() -> None:
     scene = Scene(ViewOptions(avatar, ASSETS / "walk.npz", (ASSETS / "sky.exr",), size=SIZE, raster="cpu"))
     scene.warm_up()
     common = {"gaussians": scene.avatar.gaussians, "size": SIZE, "cores": os.cpu_count()}
-    common["machine"] = platform.processor() or platform.machine()
+    common["machine"] = machine()
     rows = []
     with serve(scene, "127.0.0.1", 0, None) as (server, url), _browser(webgl=False) as page:
         threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -116,11 +116,11 @@ def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseI
     wide, wide_angles = _grid(SEARCH_SHAPE)
     coarse = _transport(seen, wide, wide_angles)
     sky = coarse @ _lobes(wide).astype(np.float32)
-    found = _search(_quadratic(seen, np.concatenate([sky, coarse], axis=1)))
+    found = _search(_quadratic(seen, np.concatenate([sky, coarse], axis=1), _by_brightness(seen)))
     near = _texels_near(directions, wide[np.array(found, int) - SKY_LOBES])
     fine = _transport(seen, directions[near], solid_angles[near])
     columns = np.concatenate([sky, fine], axis=1)
-    suns = _search(_quadratic(seen, columns))
+    suns = _search(_quadratic(seen, columns, _by_brightness(seen)))
     strength = _strengths(seen, columns[:, [*range(SKY_LOBES), *suns]])
     radiance = _lobes(directions) @ strength[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
@@ -222,21 +222,21 @@ def _by_brightness(seen: Sightings) -> Floats:
     return (np.bincount(seen.who, seen.colour @ _LUMINANCE) / count)[seen.who]
 
 
-def _quadratic(seen: Sightings, transport: NDArray[np.float32], weight: Floats | None = None) -> Quadratic:
+def _quadratic(seen: Sightings, transport: NDArray[np.float32], weight: Floats) -> Quadratic:
     """The quadratic form of ``transport`` [n, Q]: a point's irradiance must run parallel to its colours.
 
     With I_p the colours and T_p L the irradiance of point p in its pictures, the best albedo leaves
     ‖(1 − Î_p Î_pᵀ) T_p L‖: no albedo is left to solve for. Sightings count by ``weight`` [n].
     """
     count, columns = int(seen.who.max()) + 1, transport.shape[1]
-    root = np.sqrt(_by_brightness(seen) if weight is None else weight)
+    root = np.sqrt(weight)
     rows = transport * root[:, None].astype(transport.dtype)
     whole = (rows.T @ rows).astype(np.float64)
     order = np.argsort(seen.who, kind="stable")
     starts = np.flatnonzero(np.diff(seen.who[order], prepend=-1))
     disagreement = np.empty((3, columns, columns))
     for channel in range(3):
-        colour = seen.colour[:, channel] * (1 if weight is None else root)
+        colour = seen.colour[:, channel] * root
         length = np.sqrt(np.bincount(seen.who, colour**2, count))
         unit = (colour / np.maximum(length[seen.who], 1e-9)).astype(rows.dtype)
         along = np.add.reduceat((rows * unit[:, None])[order], starts, axis=0).astype(np.float64)
@@ -247,7 +247,7 @@ def _quadratic(seen: Sightings, transport: NDArray[np.float32], weight: Floats |
 def _strengths(seen: Sightings, columns: NDArray[np.float32]) -> Floats:
     """Strengths [Q, 3] of the sky's lobes and the suns that leave the least absolute error of log colours."""
     everything = list(range(columns.shape[1]))
-    _, strength = _quadratic(seen, columns).fit(everything)
+    _, strength = _quadratic(seen, columns, _by_brightness(seen)).fit(everything)
     colour = np.log(np.maximum(seen.colour @ _LUMINANCE, 1e-4))
     count, clear = int(seen.who.max()) + 1, np.ones(len(colour))
     for _ in range(REWEIGHTINGS):
