@@ -18,7 +18,8 @@ from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPL_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_trainer import data_cli
-from rnd_trainer.importing.importer import ImportOptions, import_source
+from rnd_trainer.importing.importer import import_source
+from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.silhouette import overlap
 
 SCALE = 4

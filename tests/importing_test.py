@@ -16,8 +16,8 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
 from rnd_trainer.checking.check import check_capture
-from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
-from rnd_trainer.importing.write import Choice
+from rnd_trainer.importing.importer import find_layout, import_source
+from rnd_trainer.importing.options import Choice, ImportOptions
 from rnd_trainer.silhouette import overlap, posed_vertices
 
 # Measured over all layouts: 3e-7 m, nothing, nothing, cosine 0.99997

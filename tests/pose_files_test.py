@@ -22,7 +22,8 @@ from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.checking.check import check_capture
-from rnd_trainer.importing.importer import ImportOptions, find_layout, import_source
+from rnd_trainer.importing.importer import find_layout, import_source
+from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pose_files import read_poses
 from rnd_trainer.importing.recording import easymocap_poses, read_as, smpl_poses
 from rnd_trainer.silhouette import overlap, posed_vertices

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +23,11 @@ from . import (
     zju,
 )
 from .body_models import BodyModel, load_body_model
+from .options import ImportOptions
 from .pose_files import read_poses
 from .recording import Recording, RootConvention, read_as, straightened
 from .surfaces import attached, with_masks, with_normals
-from .write import Choice, Scene, chosen_shots, placed, write_capture
+from .write import Scene, chosen_shots, placed, write_capture
 
 LAYOUTS: dict[str, Any] = {
     "zju": zju,
@@ -44,39 +45,6 @@ LAYOUTS: dict[str, Any] = {
 """modules with ``detect`` and ``read``, the particular before the general: a folder of pictures may be anything"""
 _CONVENTIONS: dict[str, RootConvention] = {"smpl": "smpl", "easymocap": "easymocap"}
 _POSES_FROM_ELSEWHERE = ("video", "nerfstudio", "easymocap")
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """What the user says about a source.
-
-    Attributes:
-        layout: a name of :data:`LAYOUTS`; "easymocap" or "smpl" also says how the poses' root is meant.
-        body: a file of :func:`load_body_model`.
-        poses, person: body poses for sources without, and whose.
-        masks, normals: folders, by frame number, in a folder a camera where there are several.
-        mask_net, normal_net: ONNX networks in their place.
-        normal_axes: "x,-y,-z" …; None: found by the template, or what the layout says of its own normals.
-        intrinsics, distortion: of a plain video.
-        count: most training pictures of a plain video.
-        up: the source's axis that points up; found when None.
-    """
-
-    layout: str | None = None
-    body: str | None = None
-    poses: Path | None = None
-    person: int | None = None
-    masks: Path | None = None
-    mask_net: Path | None = None
-    normals: Path | None = None
-    normal_net: Path | None = None
-    normal_axes: str | None = None
-    intrinsics: tuple[float, ...] = ()
-    distortion: tuple[float, ...] = ()
-    fps: float | None = None
-    count: int = 100
-    up: str | None = None
-    choice: Choice = field(default_factory=Choice)
 
 
 def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:

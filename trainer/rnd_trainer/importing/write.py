@@ -20,6 +20,7 @@ from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from rnd_runtime.rotations import slerp_matrices
 
 from .body_models import BodyModel
+from .options import Choice
 from .recording import Poses, Recording, Shot
 
 Floats = NDArray[np.float64]
@@ -32,23 +33,6 @@ SNAP = np.cos(np.radians(30))
 TRAIN_SHARE = 0.8
 """of the training camera's frames: the paper's split"""
 _TO_LINEAR = srgb_to_linear(np.arange(256) / 255)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Which pictures become part of the capture.
-
-    Attributes:
-        camera: whose first 4/5 are trained on; the first one when None.
-        held_out_every: every how many frames the other cameras are kept as novel views.
-        every: keep one frame in so many, and none below ``start`` or from ``stop`` on.
-    """
-
-    camera: str | None = None
-    held_out_every: int = 30
-    every: int = 1
-    start: int = 0
-    stop: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
