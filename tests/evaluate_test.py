@@ -13,7 +13,8 @@ import torch
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
-from rnd_trainer.ablate import CAUSES, VARIANTS, ablate, chosen, encoder_cost, summarise
+from rnd_trainer.ablate import CAUSES, LENGTHS, VARIANTS, ablate, chosen, encoder_cost, summarise
+from rnd_trainer.charts import draw_lengths
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
@@ -139,6 +140,21 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     ]
     assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
     assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
+
+
+def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, steps=8)
+    shorter = [variant for variant in LENGTHS if variant.name in ("ours", "1/4", "1/2")]
+    rows = ablate(
+        tiny_capture, config, tmp_path, shorter, seeds=(0,), perceptual=None, on_run=lambda *call: None
+    )
+    assert {(row["method"], row["steps"]) for row in rows} == {("ours", 8), ("1/4", 2), ("1/2", 4)}
+    draw_lengths(rows, [tmp_path / "lengths.svg"])
+    drawn = (tmp_path / "lengths.svg").read_text(encoding="utf-8")
+    for said in ("minutes of training", *{row["split"] for row in rows}):
+        assert said in drawn
+    draw_lengths(rows, [tmp_path / "again.svg"])
+    assert (tmp_path / "again.svg").read_text(encoding="utf-8") == drawn
 
 
 def test_rows_of_a_study_are_chosen_by_name() -> None:

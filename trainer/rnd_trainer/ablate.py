@@ -1,7 +1,7 @@
 """Studies on one capture: same steps, same seeds, and the spread of the seeds beside every gain.
 
 ``VARIANTS`` are the paper's ablations; ``CAUSES`` tell what holds the figures back: each takes one doubt away (true
-light, true normals) or adds one (noisy poses, fewer Gaussians).
+light, true normals) or adds one (noisy poses, fewer Gaussians); ``LENGTHS`` what more steps would bring.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Variant:
     """One row of the table: what is switched, beside which row it is to be read, and on which split it should show.
 
     ``model`` and ``train`` are the fields of the configuration that differ from ours; ``noisy`` trains on the
-    capture's ``motion_noisy.npz`` and scores with the exact poses.
+    capture's ``motion_noisy.npz`` and scores with the exact poses; ``length`` times as many steps are trained.
     """
 
     name: str
@@ -52,6 +52,7 @@ class Variant:
     model: dict[str, Any] = dataclasses.field(default_factory=dict)
     train: dict[str, Any] = dataclasses.field(default_factory=dict)
     noisy: bool = False
+    length: float = 1.0
 
 
 def _window(d: int) -> Variant:
@@ -96,7 +97,14 @@ CAUSES = (
     Variant("noisy poses, refined", "and corrected", "noisy poses", {}, {"refine_poses": True}, noisy=True),
     *(_gaussians(count) for count in (7_500, 15_000, 60_000, 120_000)),
 )
-STUDIES = {"ablations": VARIANTS, "causes": CAUSES}
+LENGTHS = (
+    Variant("ours", "the steps of the preset", None),
+    *(
+        Variant(name, f"{name} times the steps", "ours", length=length)
+        for name, length in (("1/8", 1 / 8), ("1/4", 1 / 4), ("1/2", 1 / 2), ("5", 5.0))
+    ),
+)
+STUDIES = {"ablations": VARIANTS, "causes": CAUSES, "lengths": LENGTHS}
 
 
 def chosen(variants: Sequence[Variant], names: Sequence[str]) -> tuple[Variant, ...]:
@@ -131,7 +139,8 @@ def ablate(
         place = folder / f"{_slug(variant.name)}-{seed}"
         if not (place / "rows.json").exists():
             model = dataclasses.replace(base.model, **variant.model)
-            config = dataclasses.replace(base, model=model, seed=seed, **variant.train)
+            steps = round(base.steps * variant.length)
+            config = dataclasses.replace(base, model=model, seed=seed, **{"steps": steps, **variant.train})
             seen = load_capture(capture.folder, motion_file=NOISY_MOTION) if variant.noisy else capture
             extra = _train(seen, config, place, perceptual, capture)
             checkpoint = load_checkpoint(place / "avatar.ckpt")

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path
 
 from .bench_grid import Row, pareto
+from .charts import chart
 
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
 USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
@@ -21,33 +21,17 @@ def draw_chart(rows: list[Row], files: list[Path]) -> None:
 
     Raises :class:`InputError` where matplotlib is missing.
     """
-    try:
-        import matplotlib
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "matplotlib is not installed",
-            hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
-        ) from error
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
     rows = [row for row in rows if "psnr_db" in row]
     if not rows:
         raise InputError("chart", expected="at least one measured point", got="none")
     stages = list(dict.fromkeys(name for row in rows for name in row["stages"]))
     columns = 3
     below = -(-len(stages) // columns)
-    with matplotlib.rc_context({"svg.hashsalt": "rnd-bench", "font.size": 9, "svg.fonttype": "none"}):
-        figure = plt.figure(figsize=(11, 5.2 + 2.5 * below), layout="constrained")
+    with chart(files, (11, 5.2 + 2.5 * below)) as figure:
         grid = figure.add_gridspec(1 + below, columns, height_ratios=[2.2, *[1] * below])
         _overview(figure.add_subplot(grid[0, :]), rows)
         for k, stage in enumerate(stages):
             _stage(figure.add_subplot(grid[1 + k // columns, k % columns]), rows, stage)
-        for file in files:
-            with atomic_path(file) as temporary:
-                metadata: dict[str, Any] = {"Date": None} if file.suffix == ".svg" else {}
-                figure.savefig(temporary, dpi=110, metadata=metadata)
-        plt.close(figure)
 
 
 def _overview(axes: Any, rows: list[Row]) -> None:

@@ -59,8 +59,9 @@ class EvalOptions:
     """name of the rows in the JSON; the run folder's unless given"""
     ablate: bool = False
     """train and score a study's variants in the folder RUN instead; done runs are not done again"""
-    study: Literal["ablations", "causes"] = "ablations"
-    """the paper's ablations, or what holds the figures back: light, normals, poses, number of Gaussians"""
+    study: Literal["ablations", "causes", "lengths"] = "ablations"
+    """the paper's ablations; what holds the figures back (light, normals, poses, number of Gaussians); or an eighth
+    to five times the steps"""
     variants: tuple[str, ...] = ()
     """names of the study's rows to train, such as "static skinning"; none named: all"""
     preset: Literal["quick", "standard", "full"] = "quick"
@@ -71,6 +72,8 @@ class EvalOptions:
     """of the ablations' trainings, instead of the preset's"""
     image_scale: float = 1.0
     """of the ablations' training pictures"""
+    chart: Path | None = None
+    """draw the PSNR against the minutes of a study's trainings here (.svg or .png)"""
     seeds: int = 3
     """of the ablations' trainings: 0 to SEEDS − 1"""
 
@@ -158,6 +161,7 @@ def ablate_run(options: EvalOptions) -> None:
     from rnd_runtime.capture import load_capture
 
     from .ablate import STUDIES, ablate, chosen, summarise
+    from .charts import draw_lengths
     from .config import preset, resized
 
     variants = chosen(STUDIES[options.study], options.variants)
@@ -186,6 +190,8 @@ def ablate_run(options: EvalOptions) -> None:
             on_run=on_run,
         )
     summary = summarise(rows, variants)
+    if options.chart is not None:
+        draw_lengths(rows, [options.chart])
     splits = [key for key, cell in summary[0].items() if isinstance(cell, dict)]
     table = Table("method", *splits, "read beside", "GFLOP", "ms", title=f"{options.study}, PSNR")
     for line in summary:

@@ -1,0 +1,67 @@
+"""Charts as SVG and PNG: the same bytes for the same rows; and that of the held-out PSNR against training time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path
+
+Row = dict[str, Any]
+
+
+@contextmanager
+def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
+    """A matplotlib figure of ``size`` inches, written to every file, SVG or PNG by its suffix, when the block ends.
+
+    Raises :class:`InputError` where matplotlib is missing.
+    """
+    try:
+        import matplotlib
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "matplotlib is not installed",
+            hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
+        ) from error
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    with matplotlib.rc_context({"svg.hashsalt": "rnd-bench", "font.size": 9, "svg.fonttype": "none"}):
+        figure = plt.figure(figsize=size, layout="constrained")
+        yield figure
+        for file in files:
+            with atomic_path(file) as temporary:
+                metadata: Row = {"Date": None} if file.suffix == ".svg" else {}
+                figure.savefig(temporary, dpi=110, metadata=metadata)
+        plt.close(figure)
+
+
+def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
+    """PSNR of every split against minutes of training, of ``rnd-eval --ablate --study lengths``.
+
+    A point is a training of its own, with its own schedule; the mean over seeds, with their range.
+    """
+    with chart(files, (7.5, 4.2)) as figure:
+        axes = figure.add_subplot()
+        for split in dict.fromkeys(row["split"] for row in rows):
+            points = []
+            for steps in sorted({row["steps"] for row in rows}):
+                of = [row for row in rows if row["split"] == split and row["steps"] == steps]
+                figures = [row["psnr"] for row in of]
+                points.append((sum(row["minutes"] for row in of) / len(of), sum(figures) / len(of), figures))
+            minutes, means, spreads = zip(*points)
+            low = [mean - min(figures) for mean, figures in zip(means, spreads)]
+            high = [max(figures) - mean for mean, figures in zip(means, spreads)]
+            axes.errorbar(minutes, means, yerr=(low, high), marker="o", ms=4, lw=1, capsize=2, label=split)
+        first = rows[0]
+        what = f"{first['gaussians']:,} Gaussians".replace(",", " ")
+        axes.set_title(f"Held-out PSNR against training time: {what}, {first['machine']}", loc="left")
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.set_xlabel("minutes of training")
+        axes.set_ylabel("dB")
+        axes.grid(True, color="#eee", lw=0.6)
+        axes.legend(frameon=False, fontsize=8)
