@@ -5,121 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import atomic_path
 
-
-@dataclass(frozen=True)
-class Files:
-    """What is drawn; the defaults are those of a clone."""
-
-    checkpoint: Path | None = None
-    """a trained avatar.ckpt, used where N is its own; elsewhere a seeded, untrained avatar on the body stands in"""
-    body: Path = Path("assets/body.npz")
-    """of the seeded avatar"""
-    motion: Path = Path("assets/walk.npz")
-    """how it moves"""
-    hdr: Path = Path("assets/sky.exr")
-    """and what lights it"""
-    work: Path = Path(".cache/bench")
-    """folder in which avatars and references are kept between runs"""
-
-
-@dataclass(frozen=True)
-class Raster:
-    """The CPU and GL rasterisers against a plain-torch tile rasteriser, with their errors to the oracle."""
-
-    json: Path | None = None
-    """write the rows here"""
-    n: int = 30_000
-    """Gaussians"""
-    size: int = 512
-    """picture side in pixels"""
-    repeats: int = 40
-    """timed calls of each kernel; the slow reference gets a tenth of them"""
-    threads: int | None = None
-    """of numba and torch; by default one per core"""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One point: a frame from pose to pixels, all stages, with its error against the full reference."""
-
-    json: Path | None = None
-    """write the row here"""
-    n: int = 30_000
-    """Gaussians"""
-    size: int = 512
-    """picture side in pixels"""
-    shade: str = "table+sun"
-    """ao, table, table+sun, lights:K or brute"""
-    encoder: Literal["full", "coarse", "static"] = "full"
-    """as of rnd-export"""
-    precision: Literal["f32", "f16", "int8"] = "f32"
-    """as of rnd-export"""
-    window: int | None = None
-    """poses in the motion window; by default the checkpoint's"""
-    raster: Literal["cpu", "gl-egl", "gl-osmesa"] = "cpu"
-    """what splats"""
-    threads: int = 2
-    """of onnxruntime and of the kernels"""
-    compare: bool = True
-    """measure the error too: the reference takes half a minute the first time"""
-    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Every point of the speed–accuracy chart, each in a process of its own; resumes; draws the chart."""
-
-    quick: bool = False
-    """the small grid, in two minutes"""
-    json: Path = Path("assets/bench/grid.json")
-    """rows; those measured on this machine are not measured again"""
-    chart: tuple[Path, ...] = (Path("assets/bench/grid.svg"), Path("assets/bench/grid.png"))
-    """the chart, SVG or PNG by suffix"""
-    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
-
-
-@dataclass(frozen=True)
-class Peers:
-    """The same work done by others, side by side, and how each stage's time grows, with the floor beside it."""
-
-    json: Path | None = None
-    """write the rows here"""
-    n: int = 30_000
-    """Gaussians"""
-    size: int = 512
-    """picture side in pixels"""
-    threads: int = 2
-    """of everybody"""
-    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
-
-
-@dataclass(frozen=True)
-class Shards:
-    """One clip by one process, by several threads, and by several processes with a part each."""
-
-    json: Path | None = None
-    """write the rows here"""
-    avatar: Path = Path("assets/avatar.onnx")
-    """what is played"""
-    motion: Path = Path("assets/walk.npz")
-    """how it moves"""
-    hdr: Path = Path("assets/sky.exr")
-    """and what lights it"""
-    frames: int = 120
-    """of the clip, from its start"""
-    size: int = 512
-    """picture side in pixels"""
-    cores: int = 2
-    """processes, or threads, at most"""
+from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
 
 
 def main() -> None:
@@ -134,6 +28,7 @@ def main() -> None:
         "grid": (Grid, _grid),
         "peers": (Peers, _peers),
         "shards": (Shards, _shards),
+        "step": (Step, _step),
     }
     kinds = {name: kind for name, (kind, _) in commands.items()}
     options = tyro.extras.subcommand_cli_from_dict(kinds, prog="rnd-bench")
@@ -239,6 +134,32 @@ def _shards(options: Shards) -> None:
     for row in rows:
         cells = (f"{row['seconds']:.2f}", f"{row['fps']:.1f}", f"{row['speed_up']:.2f}")
         table.add_row(str(row["processes"]), str(row["threads"]), *cells)
+    Console().print(table)
+    _write(options.json, rows)
+
+
+def _step(options: Step) -> None:
+    _prepare(options, "repeats")
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from rnd_runtime.capture import load_capture
+
+    from .bench_step import bench_step
+    from .config import preset
+    from .perceptual import load_perceptual
+
+    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("training")
+        rows = bench_step(
+            load_capture(options.capture), preset(options.preset), perceptual, repeats=options.repeats,
+            on_step=lambda done, total: progress.update(task, completed=done, total=total),
+        )  # fmt: skip
+    table = Table("what", "ms", "share", title=f"{rows[0]['gaussians']} Gaussians")
+    for row in rows:
+        table.add_row(row["what"], f"{row['ms']:.1f}", f"{row['share']:.0%}")
     Console().print(table)
     _write(options.json, rows)
 

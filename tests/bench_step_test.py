@@ -1,0 +1,34 @@
+"""Where a training step's time goes: operations are told apart, and their times add up."""
+
+import pytest
+
+from rnd_trainer.bench_step import KINDS, OUTSIDE, REST, bench_step, kind_of
+
+
+@pytest.mark.parametrize(
+    ("operation", "kind"),
+    [
+        ("aten::mm", "matrix products"),
+        ("aten::mul", REST),
+        ("_CpuRasterizerBackward", "our splatting"),
+        ("autograd::engine::evaluate_function: PoseGaussiansBackward", "our posing"),
+        ("aten::convolution_backward", "perceptual network"),
+        ("Optimizer.step#Adam.step", "optimiser"),
+    ],
+)
+def test_operations_are_told_apart_by_name(operation, kind):
+    assert kind_of(operation) == kind
+
+
+def test_the_parts_add_up_to_the_step_and_ours_are_among_them(tiny_capture, tiny_config):
+    seen = []
+    rows = bench_step(
+        tiny_capture, tiny_config, None, repeats=3, on_step=lambda done, total: seen.append((done, total))
+    )
+    assert rows[0]["what"] == "a step" and seen[-1][0] == seen[-1][1] - 1
+    assert {row["what"] for row in rows[1:]} == {*KINDS, REST, OUTSIDE}
+    assert sum(row["ms"] for row in rows[1:]) == pytest.approx(rows[0]["ms"])
+    spent = {row["what"]: row["ms"] for row in rows}
+    assert min(spent[kind] for kind in ("our posing", "our shading", "our splatting", "our SSIM")) > 0
+    assert spent["perceptual network"] == 0  # none was given
+    assert rows[0]["gaussians"] == tiny_config.model.gaussians

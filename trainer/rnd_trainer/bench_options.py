@@ -1,0 +1,132 @@
+"""The options of rnd-bench's commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Files:
+    """What is drawn; the defaults are those of a clone."""
+
+    checkpoint: Path | None = None
+    """a trained avatar.ckpt, used where N is its own; elsewhere a seeded, untrained avatar on the body stands in"""
+    body: Path = Path("assets/body.npz")
+    """of the seeded avatar"""
+    motion: Path = Path("assets/walk.npz")
+    """how it moves"""
+    hdr: Path = Path("assets/sky.exr")
+    """and what lights it"""
+    work: Path = Path(".cache/bench")
+    """folder in which avatars and references are kept between runs"""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """The CPU and GL rasterisers against a plain-torch tile rasteriser, with their errors to the oracle."""
+
+    json: Path | None = None
+    """write the rows here"""
+    n: int = 30_000
+    """Gaussians"""
+    size: int = 512
+    """picture side in pixels"""
+    repeats: int = 40
+    """timed calls of each kernel; the slow reference gets a tenth of them"""
+    threads: int | None = None
+    """of numba and torch; by default one per core"""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One point: a frame from pose to pixels, all stages, with its error against the full reference."""
+
+    json: Path | None = None
+    """write the row here"""
+    n: int = 30_000
+    """Gaussians"""
+    size: int = 512
+    """picture side in pixels"""
+    shade: str = "table+sun"
+    """ao, table, table+sun, lights:K or brute"""
+    encoder: Literal["full", "coarse", "static"] = "full"
+    """as of rnd-export"""
+    precision: Literal["f32", "f16", "int8"] = "f32"
+    """as of rnd-export"""
+    window: int | None = None
+    """poses in the motion window; by default the checkpoint's"""
+    raster: Literal["cpu", "gl-egl", "gl-osmesa"] = "cpu"
+    """what splats"""
+    threads: int = 2
+    """of onnxruntime and of the kernels"""
+    compare: bool = True
+    """measure the error too: the reference takes half a minute the first time"""
+    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Every point of the speed–accuracy chart, each in a process of its own; resumes; draws the chart."""
+
+    quick: bool = False
+    """the small grid, in two minutes"""
+    json: Path = Path("assets/bench/grid.json")
+    """rows; those measured on this machine are not measured again"""
+    chart: tuple[Path, ...] = (Path("assets/bench/grid.svg"), Path("assets/bench/grid.png"))
+    """the chart, SVG or PNG by suffix"""
+    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
+
+
+@dataclass(frozen=True)
+class Peers:
+    """The same work done by others, side by side, and how each stage's time grows, with the floor beside it."""
+
+    json: Path | None = None
+    """write the rows here"""
+    n: int = 30_000
+    """Gaussians"""
+    size: int = 512
+    """picture side in pixels"""
+    threads: int = 2
+    """of everybody"""
+    files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
+
+
+@dataclass(frozen=True)
+class Shards:
+    """One clip by one process, by several threads, and by several processes with a part each."""
+
+    json: Path | None = None
+    """write the rows here"""
+    avatar: Path = Path("assets/avatar.onnx")
+    """what is played"""
+    motion: Path = Path("assets/walk.npz")
+    """how it moves"""
+    hdr: Path = Path("assets/sky.exr")
+    """and what lights it"""
+    frames: int = 120
+    """of the clip, from its start"""
+    size: int = 512
+    """picture side in pixels"""
+    cores: int = 2
+    """processes, or threads, at most"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """Where the time of a training step goes."""
+
+    capture: Annotated[Path, tyro.conf.Positional]
+    """folder with capture.json"""
+    json: Path | None = None
+    """write the rows here"""
+    preset: Literal["quick", "standard", "full"] = "standard"
+    """as of rnd-train"""
+    perceptual_weights: Path | None = None
+    """as of rnd-train"""
+    repeats: int = 24
+    """steps that are timed"""
