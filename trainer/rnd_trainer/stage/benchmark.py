@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ from .plan import BenchmarkOptions, missing, picture_count
 
 METHODS = ("ours", "static skinning", "LBS, plain colour")
 COST_FILE = "cost.json"
+FIGURES = ("psnr", "ssim", "lpips", "psnr_box", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
+"""of rnd-eval, averaged over the subjects"""
 
 
 def film_subjects(
@@ -97,26 +100,32 @@ def run_benchmark(
         summaries[f"subject{subject}"] = summarise(own, variants)
     return {
         "options": dataclasses.asdict(options),
+        "means": means(rows),
         "summary": summaries,
         "cost": _cost(folder, options, rows, time.perf_counter() - started),
         "rows": rows,
     }
 
 
-def means(rows: list[dict[str, Any]], figure: str) -> list[tuple[str, dict[str, float]]]:
-    """For every method the mean of ``figure`` over the subjects, by split; seeds of one subject count as one."""
+def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for every method and split: FIGURES as means over the subjects, the seeds of one counting as one.
+
+    ``psnr_spread`` is the standard deviation over the first subject's seeds; a figure that no row has is None.
+    """
     table = []
-    for method in dict.fromkeys(row["method"] for row in rows):
-        cells = {}
-        for split in dict.fromkeys(row["split"] for row in rows):
-            by_subject: dict[int, list[float]] = {}
-            for row in rows:
-                if row["method"] == method and row["split"] == split and row.get(figure) is not None:
-                    by_subject.setdefault(row["subject"], []).append(row[figure])
-            if by_subject:
-                each = [sum(values) / len(values) for values in by_subject.values()]
-                cells[split] = sum(each) / len(each)
-        table.append((method, cells))
+    for method, split in dict.fromkeys((row["method"], row["split"]) for row in rows):
+        by_subject: dict[int, list[dict[str, Any]]] = {}
+        for row in rows:
+            if (row["method"], row["split"]) == (method, split):
+                by_subject.setdefault(row["subject"], []).append(row)
+        line: dict[str, Any] = {"method": method, "split": split, "subjects": len(by_subject)}
+        for figure in FIGURES:
+            each = [[row[figure] for row in of if row.get(figure) is not None] for of in by_subject.values()]
+            each = [values for values in each if values]
+            line[figure] = statistics.fmean(map(statistics.fmean, each)) if each else None
+        first = [row["psnr"] for row in by_subject[min(by_subject)]]
+        line["psnr_spread"] = statistics.stdev(first) if len(first) > 1 else None
+        table.append(line)
     return table
 
 

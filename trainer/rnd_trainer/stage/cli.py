@@ -222,7 +222,7 @@ def _benchmark(options: Benchmark) -> None:
 
     from rnd_trainer.perceptual import load_perceptual
 
-    from .benchmark import film_subjects, means, run_benchmark
+    from .benchmark import FIGURES, film_subjects, run_benchmark
 
     perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
     output_folder(options.out)
@@ -245,10 +245,10 @@ def _benchmark(options: Benchmark) -> None:
                 training, description=what, completed=done, total=total
             ),
         )
-    splits = list(dict.fromkeys(row["split"] for row in result["rows"]))
-    table = Table("method", *splits, title=f"PSNR, mean of {len(result['summary'])} subjects")
-    for method, cells in means(result["rows"], "psnr"):
-        table.add_row(method, *(f"{cells[split]:.2f}" if split in cells else "" for split in splits))
+    table = Table("method", "split", *FIGURES, title=f"means of {settings.subjects} subjects")
+    for line in result["means"]:
+        cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)
+        table.add_row(line["method"], line["split"], *cells)
     Console().print(table)
     if options.json is not None:
         _write_json(options.json, result)
