@@ -11,6 +11,7 @@ from rnd_runtime.shading import Shader
 from rnd_runtime.shading_reference import shade_reference
 from rnd_runtime.shading_sum import DistantLights
 from rnd_runtime.shading_tables import octahedral_nodes
+from rnd_runtime.sun import extract_suns
 
 CAMERA = np.array([0.5, 0.4, 4.0])
 COUNT = 1500
@@ -124,7 +125,27 @@ def test_a_sun_is_shaded_by_itself_with_the_whole_brdf():
     assert len(shader.suns) == 1
     fine = DistantLights.all_texels(light, (64, 128)).shade(gaussians, CAMERA, light.rotation)
     # a convex body under an open sky shadows nothing beyond its own horizon, so the sum is the truth
-    assert psnr(shader.shade(gaussians, CAMERA), fine) > 45
+    seen = _facing(gaussians) > -0.1
+    assert psnr(shader.shade(gaussians, CAMERA)[seen], fine[seen]) > 45
+
+
+def test_suns_fade_out_on_what_faces_away_from_the_camera():
+    """What gaps in a front in shade would show of its back is sky alone."""
+    gaussians, light = ball(open_sky=True), probe(height=64, sun=4000)
+    sun, sky = Shader(light, "table+sun"), extract_suns(light)[0]
+    added = sun.shade(gaussians, CAMERA) - Shader(sky, "table").shade(gaussians, CAMERA)
+    facing, lit = _facing(gaussians), gaussians.normals @ np.float32(sun.suns[0].direction) > 0.05
+    away, between, front = facing < -0.3, (facing > -0.3) & (facing < -0.1), facing > -0.1
+    assert (lit & away).sum() > 20 and (lit & between).sum() > 5 and (lit & front).sum() > 20
+    assert np.abs(added[away]).max() < 1e-6
+    assert added[lit & front].min() > 0
+    assert 0 < added[lit & between].mean() < added[lit & front].mean()
+
+
+def _facing(gaussians: Gaussians) -> np.ndarray:
+    """n·v [N]."""
+    towards = CAMERA - gaussians.means
+    return (gaussians.normals * towards).sum(1) / np.linalg.norm(towards, axis=1)
 
 
 def test_a_mirror_shows_a_lamp_and_no_pinpoint():

@@ -124,7 +124,7 @@ def evaluate_run(options: EvalOptions) -> None:
     for row in rows:
         cells = [COLUMNS[name][1].format(row[name]) if name in row else "" for name in names]
         table.add_row(row["split"], str(row["frames"]), *cells)
-    console = _wide_console()
+    console = wide_console()
     console.print(table)
     if rows[0].get("flicker") is not None:
         console.print(f"flicker on the held-out motion: {rows[0]['flicker']:.2f} of 255 levels")
@@ -198,14 +198,14 @@ def ablate_run(options: EvalOptions) -> None:
         cells = [_with_gain(line[split]) if split in line else "" for split in splits]
         cost = (f"{line['encoder_gflop']:.3f}", f"{line['encoder_ms']:.1f}")
         table.add_row(line["method"], *cells, line["beside"] or "", *cost)
-    _wide_console().print(table)
+    wide_console().print(table)
     if options.json is not None:
         with atomic_path(options.json) as temporary:
             text = json.dumps({"summary": summary, "rows": rows}, indent=1)
             temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _wide_console() -> Console:
+def wide_console() -> Console:
     """Where a terminal is too narrow, lines go on in the next: figures cut to two digits tell nothing."""
     from rich.console import Console
 

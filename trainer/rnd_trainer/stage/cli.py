@@ -220,6 +220,7 @@ def _benchmark(options: Benchmark) -> None:
     from rich.progress import Progress
     from rich.table import Table
 
+    from rnd_trainer.eval_cli import wide_console
     from rnd_trainer.perceptual import load_perceptual
 
     from .benchmark import FIGURES, film_subjects, run_benchmark
@@ -249,7 +250,7 @@ def _benchmark(options: Benchmark) -> None:
     for line in result["means"]:
         cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)
         table.add_row(line["method"], line["split"], *cells)
-    Console().print(table)
+    wide_console().print(table)
     if options.json is not None:
         _write_json(options.json, result)
 

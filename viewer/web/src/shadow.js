@@ -3,6 +3,7 @@
 import { clampRoughness, ggx } from "./brdf.js";
 
 const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
+const TURNED_AWAY = -0.3, AT_SILHOUETTE = -0.1;  // n·v over which suns fade out on what faces away (shading.py)
 const CLEARANCE_TEXELS = Math.fround(0.35), COSINE_FLOOR = Math.fround(0.1);  // and of a disc's radius, once
 
 /** Add to `radiance` [count·3] what `suns` ({direction in the world, irradiance, spread}) lay on the Gaussians. */
@@ -111,11 +112,13 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
     vy /= distance;
     vz /= distance;
     const hx = lx + vx, hy = ly + vy, hz = lz + vz, halfSquared = Math.max(hx * hx + hy * hy + hz * hz, 1e-12);
+    const nDotV = nx * vx + ny * vy + nz * vz;
+    const facing = Math.min((nDotV - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), 1);
+    if (!(facing > 0)) continue;
     const cx = ny * hz - nz * hy, cy = nz * hx - nx * hz, cz = nx * hy - ny * hx;
     const sineSquared = (cx * cx + cy * cy + cz * cz) / halfSquared;
     const alpha = clampRoughness(roughness[i]) ** 2;
-    const shine = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nx * vx + ny * vy + nz * vz,
-      sineSquared, halfSquared);
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] += arriving * (albedo[3 * i + c] / Math.PI + shine) * sun.irradiance[c];
+    const shine = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * arriving * (albedo[3 * i + c] / Math.PI + shine) * sun.irradiance[c];
   }
 }
