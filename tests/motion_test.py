@@ -420,3 +420,5 @@ def test_whole_turns_written_into_a_file_are_the_same_pose(tmp_path):
     for motion in motions[1:]:
         step = matrix_to_axis_angle(motions[0].rotations.swapaxes(-1, -2) @ motion.rotations)
         assert np.abs(step).max() < 1e-13
+    assert not any("degrees" in note for note in motions[0].notes)
+    assert any("100% of the rotations" in note and "degrees" in note for note in motions[1].notes)

@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 # What AMASS' SMPL-X files hold beside the split poses, and nobody else's
 _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
 _MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and garbage are beyond
+# In degrees half of all rotations are; a root that goes round and round is one of 22 at least.
+_MANY_BEYOND_A_TURN = 0.2
 _MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
 _DEFAULT_FPS = 60.0
 
@@ -90,7 +92,7 @@ def _read(
     easymocap = members.first_of("Rh", "Rh_all") is not None
     axis_angles = _axis_angles(members, notes, joint_names)
     names = _names(members, axis_angles, joint_names)
-    _check_angles(axis_angles, names, members.path)
+    _check_angles(axis_angles, names, members.path, notes)
     rotations = axis_angle_to_matrix(axis_angles)
     named = joint_names is not None or "joint_names" in members.names
     split = "pose_body" in members.names and "poses" not in members.names
@@ -198,7 +200,7 @@ def _per_frame(archive: Members, *members: str, frames: int) -> Floats:
     return array
 
 
-def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path) -> None:
+def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path, notes: list[str]) -> None:
     angles = np.linalg.norm(axis_angles, axis=-1)
     if angles.max() > _MAX_ANGLE:
         frame, joint = np.argwhere(angles > _MAX_ANGLE)[0]
@@ -209,6 +211,11 @@ def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path)
             file=path,
             frame=int(frame),
             hint="are these degrees?",
+        )
+    beyond = float((angles > 2 * np.pi).mean())
+    if beyond > _MANY_BEYOND_A_TURN:
+        notes.append(
+            f"{beyond:.0%} of the rotations are beyond a whole turn: are these degrees instead of radians?"
         )
 
 

@@ -191,9 +191,8 @@ def _score_after_training(training: Training, folder: Path, options: TrainOption
     from .evaluate import HELD_OUT
 
     if any(training.capture.split(split) for split in HELD_OUT):
-        evaluate_run(
-            EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
-        )
+        scoring = EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
+        evaluate_run(dataclasses.replace(scoring, perceptual_weights=options.perceptual_weights))
 
 
 def _check(good: bool, what: str, expected: str, got: object) -> None:

@@ -59,9 +59,9 @@ RIDGE = 1e-4
 """relative, on the normal equations: neighbouring lobes are nearly the same column"""
 REWEIGHTINGS = 10
 """after which the strengths no longer move"""
-CLEAR = 0.1
+ERROR_FLOOR = 0.1
 """relative error of a colour below which it counts no more for being smaller"""
-EVEN = 1.0
+SKY_PRIOR = 1.0
 """relative weight of a natural sky: what no picture tells of, behind the person, is like the rest"""
 PENALTY = 30.0
 """of the constraint that fixes the light's scale, relative to the error: large enough to hold it"""
@@ -147,8 +147,8 @@ def _sight(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]
         visible, pixel = sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
         column, row = pixel.astype(int).T
         pixels = view.image[row, column]
-        clear = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        good = np.nonzero(visible & clear)[0]
+        unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
+        good = np.nonzero(visible & unclipped)[0]
         who.append(good)
         colour.append(srgb_to_linear(pixels[good] / 255))
         picture.append(np.full(len(good), k))
@@ -189,7 +189,7 @@ class Quadratic:
             gram = self.disagreement[channel][np.ix_(pick, pick)]
             gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12)
             sky = slice(0, SKY_LOBES)  # the dictionary's first columns, always picked
-            level = EVEN * float(np.diag(gram)[sky].mean())
+            level = SKY_PRIOR * float(np.diag(gram)[sky].mean())
             expected = natural_sky(_lobe_centres()[:, 1])
             gram[sky, sky] += level * (
                 np.eye(SKY_LOBES) - np.outer(expected, expected) / (expected @ expected)
@@ -249,15 +249,15 @@ def _strengths(seen: Sightings, columns: NDArray[np.float32]) -> Floats:
     everything = list(range(columns.shape[1]))
     _, strength = _quadratic(seen, columns, _by_brightness(seen)).fit(everything)
     colour = np.log(np.maximum(seen.colour @ _LUMINANCE, 1e-4))
-    count, clear = int(seen.who.max()) + 1, np.ones(len(colour))
+    count, weight = int(seen.who.max()) + 1, np.ones(len(colour))
     for _ in range(REWEIGHTINGS):
         light = columns @ (strength @ _LUMINANCE)
         light = np.maximum(light / light.mean(), 1e-3)
-        total = np.bincount(seen.who, clear * (colour - np.log(light)), count)
-        albedo = total / np.maximum(np.bincount(seen.who, clear, count), 1e-12)
+        total = np.bincount(seen.who, weight * (colour - np.log(light)), count)
+        albedo = total / np.maximum(np.bincount(seen.who, weight, count), 1e-12)
         error = np.abs(colour - np.log(light) - albedo[seen.who])
-        clear = 1 / np.maximum(error, CLEAR)
-        _, strength = _quadratic(seen, columns, clear / light**2).fit(everything)
+        weight = 1 / np.maximum(error, ERROR_FLOOR)
+        _, strength = _quadratic(seen, columns, weight / light**2).fit(everything)
     return strength
 
 

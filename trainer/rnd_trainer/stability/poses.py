@@ -1,4 +1,4 @@
-"""Rows P1–P11: poses nobody filmed, twists, wraps, noise, frame rates."""
+"""Rows P1–P6: poses nobody filmed, twists, wraps, turns."""
 
 from __future__ import annotations
 

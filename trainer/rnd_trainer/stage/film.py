@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.files import atomic_path, existing_file, output_folder
 from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.npz import save_npz
@@ -67,6 +67,10 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
         InputError: a part that cannot be had, or a folder that holds another recipe's pictures.
     """
     recipe.check()
+    lights = _chosen(recipe)
+    for what, file in (("motion", recipe.motion), ("character", recipe.character)):
+        if file is not None:
+            existing_file(Path(file), what=what)
     keep_recipe(recipe, folder)
     dressed, title = _cast(recipe, template)
     motion = dance(dressed.body.skeleton)
@@ -76,7 +80,6 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
     frames = plans.instants(recipe, motion.frame_count)
     if len(frames) < 5:
         raise InputError("motion", expected="at least 5 frames", got=motion.frame_count, file=motion.source)
-    lights = _chosen(recipe)
     names = [light.name for light in lights]
     shots = plans.plan(recipe, frames, list(ring_cameras(recipe.cameras, recipe.size)), names)
     return Production(recipe, dressed, title, motion, frames, lights, shots)
