@@ -31,7 +31,11 @@ def main() -> None:
         "step": (Step, _step),
     }
     kinds = {name: kind for name, (kind, _) in commands.items()}
-    options = tyro.extras.subcommand_cli_from_dict(kinds, prog="rnd-bench")
+    options = tyro.extras.subcommand_cli_from_dict(
+        kinds,
+        prog="rnd-bench",
+        description="Time and error of the same calls. --stability runs the stability list.",
+    )
     run = next(run for kind, run in commands.values() if isinstance(options, kind))
     sys.exit(run_command("rnd-bench", lambda: run(options)))
 

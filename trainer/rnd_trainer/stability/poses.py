@@ -1,4 +1,4 @@
-"""Rows P1–P6: poses nobody filmed, twists, wraps, turns."""
+"""Rows P1–P4: poses nobody filmed, twists, wraps, turns."""
 
 from __future__ import annotations
 
