@@ -43,8 +43,8 @@ _SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 _DISC_SIGMAS = 1.4
 _CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
 # What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
-# shade. Suns fade out over these n·v, below the silhouette's own.
-_TURNED_AWAY, _AT_SILHOUETTE = np.float32(-0.3), np.float32(-0.1)
+# shade. Suns fade out over these n·v, chosen on training pictures of the dancer (36.19 dB without, 36.27 with).
+_TURNED_AWAY, _AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
 
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-12)
 _ONE_OVER_PI = np.float32(1 / np.pi)
