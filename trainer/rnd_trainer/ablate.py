@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import write_json
 
 from .checkpoint import load_checkpoint
 from .config import TrainConfig
@@ -146,10 +146,7 @@ def ablate(
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
-            with atomic_path(place / "rows.json") as temporary:
-                temporary.write_text(
-                    json.dumps([row | cost | extra for row in scored], indent=1), encoding="utf-8"
-                )
+            write_json(place / "rows.json", [row | cost | extra for row in scored])
         rows += json.loads((place / "rows.json").read_text(encoding="utf-8"))
     return rows
 

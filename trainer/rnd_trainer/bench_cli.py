@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
 
@@ -201,5 +200,4 @@ def _inputs(files: Files) -> Any:
 
 def _write(file: Path | None, value: Any) -> None:
     if file is not None:
-        with atomic_path(file) as temporary:
-            temporary.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+        write_json(file, value)

@@ -16,7 +16,7 @@ from typing import Any
 from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, existing_file, output_folder
+from rnd_runtime.files import existing_file, output_folder, write_json
 
 from .bench_avatars import Encoders, exported, seeded_checkpoint
 from .bench_frame import Point, measure
@@ -143,9 +143,7 @@ def grid(inputs: Inputs, out: Path, *, quick: bool = False, on_row: Callable[[Ro
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
         done.append(row)
         on_row(row, new)
-        with atomic_path(out) as temporary:
-            kept = {_key(r): r for r in (*rows, *done)}
-            temporary.write_text(json.dumps([*kept.values()], indent=1) + "\n", encoding="utf-8")
+        write_json(out, [*{_key(r): r for r in (*rows, *done)}.values()])
     return done
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import atomic_path, write_json
 
 from .eval_cli import need_extra
 
@@ -132,8 +132,7 @@ def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[st
         run_commands(folder, [(EXPORT, [str(small), "--out", str(folder / "small.onnx")])])
         prepare(folder / "files", folder / "small.onnx", small, capture.folder)
         figures, record = fuzz(folder / "files", options.fuzz)
-        with atomic_path(options.json.with_name("stability_fuzz.json")) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        write_json(options.json.with_name("stability_fuzz.json"), record)
         yield "F", "hostile files", figures
     if options.soak:
         from .stability.soak import soak_playback, soak_training
@@ -170,8 +169,7 @@ def _keep(
         for figure in figures
     ]  # fmt: skip
     rows.sort(key=lambda row: _place(row["id"]))
-    with atomic_path(options.json) as temporary:
-        temporary.write_text(json.dumps(rows, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(options.json, rows)
     with atomic_path(options.json.with_suffix(".md")) as temporary:
         temporary.write_text(markdown(rows), encoding="utf-8")
     if result is not None and result.pictures is not None:

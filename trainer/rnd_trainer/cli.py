@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.files import output_folder, write_json
 
 from .eval_cli import EvalOptions, evaluate_run, need_extra
 
@@ -116,8 +115,7 @@ def _train(options: TrainOptions) -> None:
     training = Training(capture, config, perceptual, _device(options.device))
     if options.resume:
         training.resume(state)
-    with atomic_path(folder / "config.json") as temporary:
-        temporary.write_text(json.dumps(to_dict(config), indent=1) + "\n", encoding="utf-8")
+    write_json(folder / "config.json", to_dict(config))
     for frame in training.bad_masks:
         print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
     with live_view(folder, config.steps) if options.view else nullcontext() as page:

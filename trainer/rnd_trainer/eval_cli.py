@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -131,8 +130,7 @@ def evaluate_run(options: EvalOptions) -> None:
     if "fps" in rows[0]:
         console.print(f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second")
     if options.json is not None:
-        with atomic_path(options.json) as temporary:
-            temporary.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        write_json(options.json, rows)
 
 
 def _perceptual(path: Path | None) -> Perceptual | None:
@@ -200,9 +198,7 @@ def ablate_run(options: EvalOptions) -> None:
         table.add_row(line["method"], *cells, line["beside"] or "", *cost)
     wide_console().print(table)
     if options.json is not None:
-        with atomic_path(options.json) as temporary:
-            text = json.dumps({"summary": summary, "rows": rows}, indent=1)
-            temporary.write_text(text + "\n", encoding="utf-8")
+        write_json(options.json, {"summary": summary, "rows": rows})
 
 
 def wide_console() -> Console:

@@ -13,7 +13,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.files import output_folder, write_json
 from rnd_runtime.images import write_image
 
 from .aov import CHANNELS, aov_picture
@@ -98,5 +97,4 @@ def _write_exr(path: Path, frame: Frame) -> None:
 
 def write_report(file: Path, report: dict[str, Any]) -> None:
     """Write ``play.json``, under the name of its part of a run."""
-    with atomic_path(file) as temporary:
-        temporary.write_text(json.dumps(report, indent=1) + "\n")
+    write_json(file, report)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import write_json
 
 from .check import Report, check_capture
 from .overlay import save_overlay
@@ -43,5 +42,4 @@ def save_report(report: Report, out: Path) -> None:
         "findings": [dataclasses.asdict(finding) for finding in report.findings],
         "frames": [dataclasses.asdict(entry) for entry in report.overlaps],
     }
-    with atomic_path(out / "check.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(out / "check.json", record)

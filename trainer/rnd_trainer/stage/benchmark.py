@@ -15,7 +15,7 @@ from typing import Any
 
 from rnd_runtime.capture import load_capture
 from rnd_runtime.doctor import machine
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import write_json
 from rnd_trainer.ablate import VARIANTS, ablate, summarise
 from rnd_trainer.config import preset, resized
 from rnd_trainer.perceptual import Perceptual
@@ -54,8 +54,7 @@ def film_subjects(
         cost = {
             "pictures": pictures, **dataclasses.asdict(spent), "variant": variant, "machine": machine(),
         }  # fmt: skip
-        with atomic_path(place / COST_FILE) as temporary:
-            temporary.write_text(json.dumps(cost, indent=1) + "\n", encoding="utf-8")
+        write_json(place / COST_FILE, cost)
         finish(production, place, variant, spent.cpu_seconds / max(pictures, 1))
 
 

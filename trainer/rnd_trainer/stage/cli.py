@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import tyro
 from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import atomic_path, output_folder
+from rnd_runtime.files import output_folder, write_json
 from rnd_runtime.images import to_bytes, write_image
 
 from .plan import BenchmarkOptions, Recipe
@@ -204,7 +203,7 @@ def _agreement(options: Agreement) -> None:
                 strips.append(result.strip())
                 status.update(f"{name}: {row['light']} is done")
     Console().print(table)
-    _write_json(options.json, rows)
+    write_json(options.json, rows)
     if options.picture is not None:
         half = len(strips) // 2
         sheet = np.concatenate([np.concatenate(part) for part in (strips[:half], strips[half:])], axis=1)
@@ -252,9 +251,4 @@ def _benchmark(options: Benchmark) -> None:
         table.add_row(line["method"], line["split"], *cells)
     wide_console().print(table)
     if options.json is not None:
-        _write_json(options.json, result)
-
-
-def _write_json(path: Path, content: object) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_json(options.json, result)

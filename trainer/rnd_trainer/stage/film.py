@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, existing_file, output_folder
+from rnd_runtime.files import existing_file, output_folder, write_json
 from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.npz import save_npz
@@ -175,8 +175,7 @@ def keep_recipe(recipe: Recipe, folder: Path) -> None:
                 hint="or another OUT",
             )
         return
-    with atomic_path(file) as temporary:
-        temporary.write_text(json.dumps(mine, indent=1) + "\n", encoding="utf-8")
+    write_json(file, mine)
 
 
 def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:

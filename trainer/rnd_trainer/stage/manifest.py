@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rnd_runtime.capture import Capture, CaptureLight, load_capture, save_capture
 from rnd_runtime.capture_format import Frame
 from rnd_runtime.doctor import machine
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import atomic_path, write_json
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion import save_motion
 from rnd_runtime.npz import save_npz
@@ -96,8 +96,7 @@ def _estimated_record(production: Production, folder: Path) -> None:
     for kept, row in zip(record["frames"], rows):
         kept["mask"] = row.mask
     record["motion"] = "motion_noisy.npz"
-    with atomic_path(folder / ESTIMATED) as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_json(folder / ESTIMATED, record)
 
 
 def _engine(variant: str) -> dict[str, str]:
