@@ -115,6 +115,10 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     rows = grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
     assert seen == [True] * 3 + [False] * 3 + [True] * (len(settings(True)) - 3)
     assert [row for row in rows if "failed" in row] == [next(r for r in rows if r["raster"] == "gl-egl")]
+    seen.clear()
+    (tmp_path / "work" / "old_lit.npz").touch()
+    grid(inputs, out, quick=True, fresh=True, on_row=lambda row, new: seen.append(new))
+    assert all(seen) and len(seen) == len(settings(True)) and not [*(tmp_path / "work").glob("*.npz")]
     assert {json.dumps(row, sort_keys=True) for row in read_rows(out)} == {
         json.dumps(row, sort_keys=True) for row in rows
     }

@@ -91,7 +91,7 @@ def _grid(options: Grid) -> None:
     def show(row: dict[str, Any], new: bool) -> None:
         console.print(_line(row) + ("" if new else "  (kept)"), highlight=False)
 
-    rows = grid(_inputs(options.files), options.json, quick=options.quick, on_row=show)
+    rows = grid(_inputs(options.files), options.json, quick=options.quick, fresh=options.fresh, on_row=show)
     draw_chart(rows, list(options.chart))
     console.print(f"{options.json}, {', '.join(map(str, options.chart))}")
 

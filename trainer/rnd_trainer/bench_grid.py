@@ -127,10 +127,23 @@ def measured(
     return row
 
 
-def grid(inputs: Inputs, out: Path, *, quick: bool = False, on_row: Callable[[Row, bool], None]) -> list[Row]:
-    """Measure what ``out`` does not hold yet; calls ``on_row(row, new)`` for every point, writes after each."""
+def grid(
+    inputs: Inputs,
+    out: Path,
+    *,
+    quick: bool = False,
+    fresh: bool = False,
+    on_row: Callable[[Row, bool], None],
+) -> list[Row]:
+    """Measure what ``out`` does not hold yet, or with ``fresh`` everything; writes after each point.
+
+    ``on_row(row, new)`` is called for every point.
+    """
     inputs.checked()
-    wanted, rows = settings(quick), read_rows(out) if out.exists() else []
+    if fresh:
+        for kept in inputs.work.glob("*.npz"):  # references
+            kept.unlink()
+    wanted, rows = settings(quick), read_rows(out) if out.exists() and not fresh else []
     here = {_key(row): row for row in rows if row["machine"] == machine()}
     done: list[Row] = []
     for setting in wanted:
