@@ -10,7 +10,7 @@ threads give the same bits.
 
 from __future__ import annotations
 
-from importlib import resources
+from collections.abc import Mapping
 from time import perf_counter
 from types import TracebackType
 from typing import NamedTuple
@@ -27,9 +27,9 @@ from .camera import Camera
 from .errors import InputError
 from .gaussians import Floats32, Raster
 from .gl_context import Backend, create_context
+from .gl_passes import ROW_GAUSSIANS, Pass
 
 LOG2_255 = float(np.log2(255.0))
-ROW_GAUSSIANS = 1024  # Gaussians in a row of the record texture
 GEOMETRY_TEXELS = 2  # centre, reach, peak; √fall_x, √fall_y, shear, –
 PER_TARGET = 3  # attributes of a target; its fourth component is α
 FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
@@ -61,7 +61,7 @@ class GlRasterizer:
 
     def __init__(self, backend: Backend = "auto", *, context: moderngl.Context | None = None) -> None:
         self.context = create_context(backend) if context is None else context
-        self._programs: dict[int, tuple[moderngl.Program, moderngl.VertexArray]] = {}
+        self._programs: dict[int, Pass] = {}
         self._targets: dict[tuple[int, int, int], _Targets] = {}
         self._records: moderngl.Texture | None = None
         info = self.context.info
@@ -83,10 +83,10 @@ class GlRasterizer:
         Up to three channels without ``depth`` need one target; each three more attributes need another.
         """
         means, covariances, opacities, features = checked(means, covariances, opacities, features)
-        self._check_limits(len(means), camera)
+        self.check_limits(len(means), camera)
         channels = features.shape[1]
         started = perf_counter()
-        splats = _sorted_splats(means, covariances, opacities, features, view_of(camera))
+        splats = sorted_ellipses(means, covariances, opacities, features, view_of(camera))
         seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
         pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
@@ -97,7 +97,7 @@ class GlRasterizer:
                 self._draw(splats, first, attributes, camera)
                 self.context.finish()  # else the read-back would be charged with the drawing
                 drawn = perf_counter()
-                pictures += self._read(attributes, camera)
+                pictures += self.read(attributes, camera)
                 seconds["raster"] += drawn - started
                 seconds["read-back"] += perf_counter() - drawn
         return _assembled(pictures, channels, depth, seconds)
@@ -107,8 +107,7 @@ class GlRasterizer:
         with self.context:
             for targets in self._targets.values():
                 targets.release()
-            for program, vertices in self._programs.values():
-                vertices.release()
+            for program in self._programs.values():
                 program.release()
             if self._records is not None:
                 self._records.release()
@@ -123,7 +122,8 @@ class GlRasterizer:
     ) -> None:
         self.close()
 
-    def _check_limits(self, count: int, camera: Camera) -> None:
+    def check_limits(self, count: int, camera: Camera) -> None:
+        """Raise an :class:`InputError` where the picture or the number of Gaussians is above GL's limits."""
         size = f"{camera.width} x {camera.height}"
         if max(camera.width, camera.height) > self._max_size:
             raise InputError(
@@ -132,26 +132,39 @@ class GlRasterizer:
         if count > self._max_size * ROW_GAUSSIANS:
             raise InputError("Gaussians", expected=f"at most {self._max_size * ROW_GAUSSIANS}", got=count)
 
-    def _draw(self, splats: _Splats, first: int, attributes: int, camera: Camera) -> None:
+    def _draw(self, splats: Ellipses, first: int, attributes: int, camera: Camera) -> None:
         """Draw attributes ``first`` … ``first + attributes`` of all splats into this pass's targets."""
-        context = self.context
         count = len(splats.order)
-        targets = self._targets_for(attributes, camera)
+        records = self._upload(_records(splats, first, attributes)) if count else None
+        if attributes not in self._programs:
+            self._programs[attributes] = splat_pass(self.context, attributes)
+        self.blend(
+            self._programs[attributes], {"records": records} if records else {}, count, attributes, camera
+        )
+
+    def blend(
+        self,
+        splat: Pass,
+        textures: Mapping[str, moderngl.Texture],
+        count: int,
+        attributes: int,
+        camera: Camera,
+    ) -> None:
+        """Clear the targets of ``attributes`` and draw ``count`` triangles of :func:`splat_pass`, first to last."""
+        targets = self.targets_for(attributes, camera)
         targets.framebuffer.use()
         targets.framebuffer.clear()
         if count == 0:
             return
-        program, vertices = self._program_for(attributes)
-        program["size"] = (camera.width, camera.height)
-        self._upload(_records(splats, first, attributes))
-        context.enable_only(moderngl.BLEND)
-        context.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        splat.bind(textures, size=(camera.width, camera.height))
+        self.context.enable_only(moderngl.BLEND)
+        self.context.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
         part = -(-count // FLUSHES)
         for start in range(0, count, part):
-            vertices.render(moderngl.TRIANGLES, 3 * min(part, count - start), first=3 * start)
-            context.extra.flush()
+            splat.render(moderngl.TRIANGLES, 3 * min(part, count - start), first=3 * start)
+            self.context.extra.flush()
 
-    def _upload(self, records: Floats32) -> None:
+    def _upload(self, records: Floats32) -> moderngl.Texture:
         rows, texels = records.shape[0], records.shape[1]
         texture = self._records
         if texture is None or texture.width != texels or texture.height < rows:
@@ -160,10 +173,11 @@ class GlRasterizer:
             texture = self._records = self.context.texture((texels, rows), 4, dtype="f4")
             texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         texture.write(records, viewport=(0, 0, texels, rows))
-        texture.use(0)
+        return texture
 
-    def _read(self, attributes: int, camera: Camera) -> list[Floats32]:
-        targets = self._targets_for(attributes, camera)
+    def read(self, attributes: int, camera: Camera) -> list[Floats32]:
+        """What was drawn: a picture [H, W, ≤ 4] for each target; the first one's fourth channel is alpha."""
+        targets = self.targets_for(attributes, camera)
         pictures = []
         for index, texture in enumerate(targets.textures):
             picture = np.empty((camera.height, camera.width, texture.components), np.float32)
@@ -173,7 +187,8 @@ class GlRasterizer:
             pictures.append(picture)
         return pictures
 
-    def _targets_for(self, attributes: int, camera: Camera) -> _Targets:
+    def targets_for(self, attributes: int, camera: Camera) -> _Targets:
+        """Float32 targets for ``attributes`` at the camera's size; those of other sizes are released."""
         key = (attributes, camera.width, camera.height)
         if key not in self._targets:
             textures = []
@@ -187,37 +202,28 @@ class GlRasterizer:
                 self._targets.pop(other).release()
         return self._targets[key]
 
-    def _program_for(self, attributes: int) -> tuple[moderngl.Program, moderngl.VertexArray]:
-        if attributes not in self._programs:
-            head = _shader_head(attributes)
-            shaders = resources.files(__package__) / "shaders"
-            program = self.context.program(
-                vertex_shader=head + (shaders / "splat.vert").read_text("utf-8"),
-                fragment_shader=head + (shaders / "splat.frag").read_text("utf-8"),
-            )
-            self._programs[attributes] = program, self.context.vertex_array(program, [])
-        return self._programs[attributes]
 
+def splat_pass(context: moderngl.Context, attributes: int, *, lit: bool = False) -> Pass:
+    """The program that draws a triangle for each Gaussian, back to front.
 
-def _shader_head(attributes: int) -> str:
-    """GLSL's version and the macros that the shaders ask for."""
+    With ``lit`` the three attributes are the ``radiance`` texture's, and what else it reads stands in splat.vert.
+    """
     values = [f"attributes[{i // 4}].{'xyzw'[i % 4]}" for i in range(attributes)]
     values += ["0.0"] * (-attributes % PER_TARGET)
     targets = range(len(values) // PER_TARGET)
     macros = {
         "ATTRIBUTES": attributes,
-        "TEXELS": GEOMETRY_TEXELS + -(-attributes // 4),
-        "ROW_GAUSSIANS": ROW_GAUSSIANS,
         "OUTPUTS": " ".join(f"layout(location = {t}) out vec4 target_{t};" for t in targets),
         "WRITES": " ".join(
             f"target_{t} = alpha * vec4({', '.join(values[PER_TARGET * t : PER_TARGET * (t + 1)])}, 1.0);"
             for t in targets
         ),
+        **({"LIT": 1} if lit else {"TEXELS": GEOMETRY_TEXELS + -(-attributes // 4)}),
     }
-    return "#version 330 core\n" + "".join(f"#define {name} {value}\n" for name, value in macros.items())
+    return Pass(context, ("splat.vert",), ("splat.frag",), macros)
 
 
-class _Splats(NamedTuple):
+class Ellipses(NamedTuple):
     """Projected Gaussians; see :class:`rnd_runtime._raster_project.Splats` for the rows."""
 
     order: NDArray[np.int32]  # [V] of those drawn, front to back
@@ -226,10 +232,10 @@ class _Splats(NamedTuple):
     attributes: Floats32  # [N, C + 1] features, depth
 
 
-def _sorted_splats(
+def sorted_ellipses(
     means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, view: View
-) -> _Splats:
-    return _Splats(*_project_and_sort(means, covariances, opacities, features, view))
+) -> Ellipses:
+    return Ellipses(*_project_and_sort(means, covariances, opacities, features, view))
 
 
 # One thread: numba's others would still spin, waiting for more, when llvmpipe's want the cores (14 of 62 ms).
@@ -247,7 +253,7 @@ def _project_and_sort(means, covariances, opacities, features, view):  # type: i
     return _front_to_back(depths, starts), centers, shapes, attributes
 
 
-def _records(splats: _Splats, first: int, attributes: int) -> Floats32:
+def _records(splats: Ellipses, first: int, attributes: int) -> Floats32:
     """The texture the shaders read, back to front: [rows, ROW_GAUSSIANS · texels, 4]."""
     texels = GEOMETRY_TEXELS + -(-attributes // 4)
     rows = -(-len(splats.order) // ROW_GAUSSIANS)

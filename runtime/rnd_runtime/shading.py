@@ -37,7 +37,7 @@ Floats32 = NDArray[np.float32]
 
 SHADE_MODES = ("ao", "table", "table+sun", "lights:K", "brute")
 _MOST_LIGHTS = 8192
-_SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
+SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 # A Gaussian's disc in the depth map, in standard deviations: neighbours of a trained avatar stand 1.4 σ apart. Discs
 # of 2 σ hide nothing more, but rise above their neighbours where normals disagree: speckled thighs.
 _DISC_SIGMAS = 1.4
@@ -60,6 +60,7 @@ class Shader:
             and was trained on 32 × 64; more changes highlights below roughness 0.4 only.
 
     Attributes:
+        sky: all the light but the suns, as the mode has it.
         suns: what ``table+sun`` took out of the map; empty when nothing in it is bright and compact enough.
 
     Raises:
@@ -69,18 +70,18 @@ class Shader:
     def __init__(self, light: Light, mode: str = "table+sun", *, texels: tuple[int, int] = (32, 64)) -> None:
         self.light, self.mode = light, mode
         self.suns: tuple[Sun, ...] = ()
-        self._sky: AmbientLight | SkyTables | DistantLights
+        self.sky: AmbientLight | SkyTables | DistantLights
         if mode == "ao":
-            self._sky = AmbientLight.project(light, texels)
+            self.sky = AmbientLight.project(light, texels)
         elif mode == "table":
-            self._sky = SkyTables.build(light, texels)
+            self.sky = SkyTables.build(light, texels)
         elif mode == "table+sun":
             sky, self.suns = extract_suns(light)
-            self._sky = SkyTables.build(sky, texels)
+            self.sky = SkyTables.build(sky, texels)
         elif mode == "brute":
-            self._sky = DistantLights.all_texels(light, texels)
+            self.sky = DistantLights.all_texels(light, texels)
         else:
-            self._sky = DistantLights.median_cut(light, _light_count(mode))
+            self.sky = DistantLights.median_cut(light, _light_count(mode))
 
     def turned(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
@@ -98,15 +99,15 @@ class Shader:
         """
         light_to_world = self.light.rotation
         seen = mask(seen, len(gaussians.means))
-        radiance = self._sky.shade(gaussians, camera_position, light_to_world, seen)
+        radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
         if self.suns and len(radiance):
             directions = np.array([sun.direction for sun in self.suns]) @ light_to_world.T
             visibility = directional_visibility(
                 gaussians.means,
                 gaussians.normals,
                 directions,
-                radii=_shadow_radii(gaussians),
-                resolution=_SHADOW_RESOLUTION,
+                radii=shadow_radii(gaussians),
+                resolution=SHADOW_RESOLUTION,
                 receivers=seen,
             )
             _add_suns(
@@ -136,7 +137,7 @@ def _light_count(mode: str) -> int:
     return int(count)
 
 
-def _shadow_radii(gaussians: Gaussians) -> Floats32:
+def shadow_radii(gaussians: Gaussians) -> Floats32:
     """Disc radius [N] m of each Gaussian in a depth map; flat ones have σ² twice in the trace."""
     radii = np.empty(len(gaussians.means), np.float32)
     _radii(floats(gaussians.covariances), floats(gaussians.opacities), radii)

@@ -30,8 +30,8 @@ from .specular_lobe import LOBE_WIDTHS, lobe_table
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-_DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
-_SPECULAR_SIZE = 49
+DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
+SPECULAR_SIZE = 49
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _ONE_OVER_PI = np.float32(1 / np.pi)
 _TINY = np.float32(1e-12)
@@ -58,9 +58,9 @@ class SkyTables:
         solid_angles = texel_solid_angles(*texels).reshape(-1, 1).astype(np.float32)
         radiance = light.resized(*texels).radiance.reshape(-1, 3)
         weighted = (radiance * solid_angles)[:, :, None] * sh_basis(directions)[:, None, :]  # [K, 3, 16]
-        cosines = np.maximum(octahedral_nodes(_DIFFUSE_SIZE) @ directions.T, 0)
+        cosines = np.maximum(octahedral_nodes(DIFFUSE_SIZE) @ directions.T, 0)
         diffuse = cosines @ weighted.reshape(len(directions), 3 * SH_COUNT)
-        nodes = octahedral_nodes(_SPECULAR_SIZE)
+        nodes = octahedral_nodes(SPECULAR_SIZE)
         specular = np.empty((len(LOBE_WIDTHS), len(nodes), 3), np.float32)
         texel_rows = np.concatenate([directions, solid_angles, radiance * solid_angles], axis=1)
         _prefilter(nodes, np.ascontiguousarray(texel_rows.T), LOBE_WIDTHS.astype(np.float32), specular)
@@ -177,19 +177,19 @@ def _look_up(  # type: ignore[no-untyped-def]
 
         low = min(int(place), len(specular) - 2)
         up = place - np.float32(low)
-        cell, s, t = octahedral_cell(mx, my, mz, _SPECULAR_SIZE)
-        node, ns, nt = octahedral_cell(nx, ny, nz, _DIFFUSE_SIZE)
+        cell, s, t = octahedral_cell(mx, my, mz, SPECULAR_SIZE)
+        node, ns, nt = octahedral_cell(nx, ny, nz, DIFFUSE_SIZE)
         w00, w01, w10, w11 = (_ONE - ns) * (_ONE - nt), ns * (_ONE - nt), (_ONE - ns) * nt, ns * nt
         coefficients = load(visibility, i * WIDTH)
         row = 3 * WIDTH  # of one node
         node *= row
         for channel in range(3):
-            lower = _bilinear(specular[low], cell, _SPECULAR_SIZE, s, t, channel)
-            upper = _bilinear(specular[low + 1], cell, _SPECULAR_SIZE, s, t, channel)
+            lower = _bilinear(specular[low], cell, SPECULAR_SIZE, s, t, channel)
+            upper = _bilinear(specular[low + 1], cell, SPECULAR_SIZE, s, t, channel)
             shine = energy * max(open_share, _ZERO) * (lower + up * (upper - lower))
             at = node + channel * WIDTH
             upper_nodes = w00 * load(diffuse, at) + w01 * load(diffuse, at + row)
-            at += _DIFFUSE_SIZE * row
+            at += DIFFUSE_SIZE * row
             lower_nodes = w10 * load(diffuse, at) + w11 * load(diffuse, at + row)
             irradiance = total(coefficients * (upper_nodes + lower_nodes))
             radiance[i, channel] = max(albedo[i, channel] * _ONE_OVER_PI * irradiance + shine, _ZERO)

@@ -71,7 +71,7 @@ def directional_visibility(
     wanted = mask(receivers, len(points))
     for direction, row in zip(directions, visibility):
         arrays = (points, normals, disc_radii, wanted)
-        _one_direction(arrays, _frame(direction), resolution, numba.get_num_threads(), row)
+        _one_direction(arrays, axes_towards(direction), resolution, numba.get_num_threads(), row)
     return visibility.T
 
 
@@ -155,7 +155,7 @@ def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _frame(direction):  # type: ignore[no-untyped-def]
+def axes_towards(direction):  # type: ignore[no-untyped-def]
     """Rows: two axes across ``direction`` and the direction itself, a right-handed orthonormal frame."""
     frame = np.empty((3, 3), np.float32)
     z = direction / np.sqrt((direction * direction).sum())

@@ -1,8 +1,15 @@
 // One triangle around the ellipse α = 1/255 of each Gaussian, from gl_VertexID alone.
-// Before these lines the program states GLSL's version, TEXELS, ATTRIBUTES and ROW_GAUSSIANS.
+// Before these lines the program states GLSL's version, ATTRIBUTES, ROW_GAUSSIANS and either TEXELS or LIT.
 
-uniform sampler2D records;  // TEXELS texels for each Gaussian, back to front; see raster_gl.py
-uniform vec2 size;          // px
+#ifdef LIT
+uniform isampler2D order;    // the Gaussian of each rank, back to front
+uniform sampler2D places;    // by Gaussian: as below
+uniform sampler2D shapes;
+uniform sampler2D radiance;  // by rank
+#else
+uniform sampler2D records;   // TEXELS texels for each Gaussian, back to front; see raster_gl.py
+#endif
+uniform vec2 size;           // px
 
 // u, v with log2 α = peak − u² − v²; peak. Not `noperspective`, though w is 1: Mesa 22 clips such varyings wrongly when an
 // edge lies on the border (α 0.01 instead of 0.9).
@@ -13,12 +20,22 @@ const vec2 CORNERS[3] = vec2[3](vec2(0.0, 2.0), vec2(-1.7320508, -1.0), vec2(1.7
 const float MARGIN = 1.001;  // the rasteriser snaps corners to 1/256 px
 
 void main() {
-    int gaussian = gl_VertexID / 3, corner = gl_VertexID % 3;
-    ivec2 texel = ivec2(gaussian % ROW_GAUSSIANS * TEXELS, gaussian / ROW_GAUSSIANS);
+    int rank = gl_VertexID / 3, corner = gl_VertexID % 3;
+#ifdef LIT
+    ivec2 texel = ivec2(rank % ROW_GAUSSIANS, rank / ROW_GAUSSIANS);
+    int gaussian = texelFetch(order, texel, 0).r;
+    attributes[0] = texelFetch(radiance, texel, 0);
+    texel = ivec2(gaussian % ROW_GAUSSIANS, gaussian / ROW_GAUSSIANS);
+    vec4 place = texelFetch(places, texel, 0);
+    vec3 shape = texelFetch(shapes, texel, 0).xyz;
+    if (any(isnan(attributes[0])) || any(isinf(attributes[0]))) place.z = 0.0;  // radiance that is no number is not drawn
+#else
+    ivec2 texel = ivec2(rank % ROW_GAUSSIANS * TEXELS, rank / ROW_GAUSSIANS);
     vec4 place = texelFetch(records, texel, 0);                // centre x, y px; reach in u, v; peak
     vec3 shape = texelFetch(records, texel + ivec2(1, 0), 0).xyz;  // u = shape.x (dx − shape.z dy), v = shape.y dy
     for (int k = 0; k < (ATTRIBUTES + 3) / 4; k++)
         attributes[k] = texelFetch(records, texel + ivec2(2 + k, 0), 0);
+#endif
 
     vec2 uv = place.z * MARGIN * CORNERS[corner];
     float dy = uv.y / shape.y;

@@ -1,0 +1,17 @@
+// The radiance that the Gaussian of this rank sends to the camera.
+
+uniform isampler2D order;  // the Gaussian of each rank
+uniform int count;         // ranks
+
+out vec4 radiance;
+
+void main() {
+    ivec2 texel = ivec2(gl_FragCoord.xy);
+    if (texel.y * ROW_GAUSSIANS + texel.x >= count) discard;
+    load_surface(texelFetch(order, texel, 0).r);
+    vec3 linear = sky();
+#ifdef SUNS
+    linear += suns();
+#endif
+    radiance = vec4(linear, 1.0);
+}

@@ -1,0 +1,29 @@
+// shading_sum.py: the sum over distant lights, each with the whole BRDF and the visibility towards it.
+
+uniform sampler2D distant;  // six texels a light, ROW_LIGHTS lights a row: direction, flux.r; flux.g, flux.b; harmonics
+uniform int lights;
+
+const float HALF_FLOOR = 1e-8;  // of |l + v|², where light and camera are opposite
+
+vec3 sky() {
+    vec3 scattered = vec3(0.0), reflected = vec3(0.0);
+    float alpha2 = alpha_squared();
+    for (int k = 0; k < lights; k++) {
+        ivec2 texel = ivec2(6 * (k % ROW_LIGHTS), k / ROW_LIGHTS);
+        vec4 first = texelFetch(distant, texel, 0);
+        vec3 flux = vec3(first.w, texelFetch(distant, texel + ivec2(1, 0), 0).xy);
+        float seen = dot(coefficients[0], texelFetch(distant, texel + ivec2(2, 0), 0));
+        seen += dot(coefficients[1], texelFetch(distant, texel + ivec2(3, 0), 0));
+        seen += dot(coefficients[2], texelFetch(distant, texel + ivec2(4, 0), 0));
+        seen += dot(coefficients[3], texelFetch(distant, texel + ivec2(5, 0), 0));
+        vec3 h = first.xyz + view;
+        float half_squared = max(dot(h, h), HALF_FLOOR);
+        // sin²θ_h by the cross product: 1 − (n·h)² would lose the highlights of α ≈ 0.01 to rounding
+        vec3 across = cross(normal, h);
+        float n_dot_l = dot(normal, first.xyz);
+        vec3 arriving = seen * max(n_dot_l, 0.0) * flux;
+        scattered += arriving;
+        reflected += arriving * ggx(alpha2, n_dot_l, n_dot_v, dot(across, across) / half_squared, half_squared);
+    }
+    return max(ONE_OVER_PI * albedo * scattered + reflected, 0.0);
+}
