@@ -78,6 +78,16 @@ def test_a_point_is_measured_in_a_process_of_its_own(tiny_avatar) -> None:
         bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table", "optix", 1, 1))
 
 
+@pytest.mark.parametrize("raster", ["gl-egl", "gl-osmesa"])
+def test_a_point_in_gl_has_the_cpus_pictures(tiny_avatar, raster) -> None:
+    cpu, gl = (
+        bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table+sun", kind, 1, 2))
+        for kind in ("cpu", raster)
+    )
+    assert {"encoders", "shading", "raster", "read-back"} <= set(gl.row["stages"])
+    assert errors(gl, Reference(cpu.radiance, cpu.means))["psnr_db"] > 50
+
+
 def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
     points = settings()
     assert len(points) == len(set(points)) and points[0] == Setting()

@@ -57,6 +57,18 @@ def _tree(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
+def test_gl_draws_what_the_cpu_draws(files, tmp_path):
+    pictures = {}
+    for raster in ("cpu", "gl"):
+        out = tmp_path / raster
+        assert main(_arguments(files, out, raster=raster, shade="table", frames="0:2")) == 0
+        pictures[raster] = [read_image(out / f"frames/{k:06d}.png").astype(int) for k in range(2)]
+    report = json.loads(next((tmp_path / "gl").glob("play*.json")).read_text())
+    assert report["raster"].startswith("gl (") and {"shading", "read-back"} <= set(report["times"])
+    for cpu, gl in zip(pictures["cpu"], pictures["gl"]):
+        assert cpu.max() > 100 and np.abs(cpu - gl).max() <= 2
+
+
 def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
     arguments = _arguments(files, tmp_path / "out", format="png,exr,mp4", aov="normal,depth")
     assert main(arguments) == 0

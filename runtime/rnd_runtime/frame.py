@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Literal
 
 import numpy as np
 from numba import njit
@@ -24,7 +23,7 @@ from .camera import Camera
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
 from .light import Light
 from .motion import Motion
-from .raster import make_rasterizer
+from .raster import ChosenRasterizer, Kind, make_rasterizer
 from .shading import Shader
 from .tone import tone_map
 
@@ -58,7 +57,7 @@ class FrameRenderer:
         light: the probe; :meth:`turn` and :meth:`relight` change it between frames.
         camera: the view; assign ``renderer.camera`` to move it between frames.
         shade: one of :data:`rnd_runtime.shading.SHADE_MODES`.
-        raster: "cpu", "gl" or "auto", see :func:`rnd_runtime.raster.make_rasterizer`.
+        raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see :func:`rnd_runtime.raster.make_rasterizer`.
         cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5. What that costs
             stands in :func:`facing`; by default all are drawn.
     """
@@ -70,7 +69,7 @@ class FrameRenderer:
         camera: Camera,
         *,
         shade: str = "table+sun",
-        raster: Literal["auto", "gl", "cpu"] = "cpu",
+        raster: Kind = "cpu",
         cull: float | None = None,
     ) -> None:
         self.avatar, self.camera, self.cull = avatar, camera, cull
@@ -114,12 +113,17 @@ def draw(
     """Shade what can be seen and splat it: the raster's picture is linear radiance [H, W, 3], without depth.
 
     ``cull`` as of :class:`FrameRenderer`. With ``kept``, only Gaussians are shaded that were not seen since it was
-    made. The raster's ``seconds`` have "shading" beside its own stages.
+    made. The raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept``
+    radiance, which is the CPU's.
     """
     started = perf_counter()
     opacities = gaussians.opacities
     if cull is not None:
         opacities = facing(gaussians, camera.position, cull)
+    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
+        seconds = {} if cull is None else {"culling": perf_counter() - started}
+        raster = rasterizer.renderer.draw(gaussians, opacities, shader, camera)
+        return replace(raster, seconds={**seconds, **raster.seconds})
     if getattr(rasterizer, "name", "") != "cpu":
         radiance = _shade(gaussians, shader, camera, opacities >= _LEAST_OPACITY, kept)
         shaded = perf_counter()

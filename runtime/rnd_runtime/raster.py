@@ -8,6 +8,7 @@ from typing import Literal, get_args
 from . import raster_cpu
 from .camera import Camera
 from .errors import InputError
+from .frame_gl import GlRenderer
 from .gaussians import Floats32, Raster
 from .gl_context import Backend, create_context, is_software, renderer
 from .raster_gl import GlRasterizer
@@ -20,12 +21,14 @@ class ChosenRasterizer:
 
     Attributes:
         name: such as ``gl (egl, llvmpipe (LLVM 15.0.6, 256 bits))`` or ``cpu``.
+        renderer: shades on the device too; None where the CPU draws.
     """
 
     def __init__(self, name: str, gl: GlRasterizer | None = None) -> None:
         self.name = name
         self._gl = gl
         self._rasterize = raster_cpu.rasterize if gl is None else gl
+        self.renderer = None if gl is None else GlRenderer(gl)
 
     def __call__(
         self,
@@ -40,6 +43,8 @@ class ChosenRasterizer:
         return self._rasterize(means, covariances, opacities, features, camera, depth=depth)
 
     def close(self) -> None:
+        if self.renderer is not None:
+            self.renderer.close()
         if self._gl is not None:
             self._gl.close()
 

@@ -1,0 +1,132 @@
+"""Frames whose shading and splatting stay on an OpenGL device, against the CPU's, on EGL and on OSMesa."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.errors import InputError
+from rnd_runtime.frame import FrameRenderer, KeptRadiance, draw
+from rnd_runtime.light import load_light
+from rnd_runtime.motion import load_motion
+from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.shading import Shader
+
+ASSETS = Path(__file__).parent.parent / "assets"
+BACKENDS = ("gl-egl", "gl-osmesa")
+MODES = ("ao", "table", "table+sun", "lights:32", "brute")
+CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
+AGREEMENT_DB = 50.0  # of 8-bit pictures, as every pair of our rasterisers
+MAX_CODES = 2  # of 255: FAILURES G10
+
+
+@pytest.fixture(scope="module")
+def avatar():
+    return Avatar.load(ASSETS / "avatar.onnx")
+
+
+@pytest.fixture(scope="module")
+def motion(avatar):
+    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return load_light(ASSETS / "sky.exr")
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def rasterizer(request):
+    with make_rasterizer(request.param) as made:
+        yield made
+
+
+def _assert_same_picture(got, expected):
+    assert expected.max() > 100
+    difference = np.abs(got.astype(int) - expected)
+    assert difference.max() <= MAX_CODES
+    assert difference.any() == 0 or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("mode", MODES)
+def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
+    frames = []
+    for raster in ("cpu", backend):
+        renderer = FrameRenderer(avatar, sky, CAMERA, shade=mode, raster=raster)
+        renderer.turn(0.8)
+        frames.append(renderer.render(motion, 0.3))
+        renderer.close()
+    cpu, gl = frames
+    _assert_same_picture(gl.image, cpu.image)
+    np.testing.assert_allclose(gl.alpha, cpu.alpha, atol=0.01)  # GL's blending does not stop at T < 1e-4
+    assert {"upload", "shading", "raster", "read-back"} <= gl.stage_seconds.keys()
+    assert min(gl.stage_seconds.values()) > 0
+
+
+def test_the_cpu_does_not_shade(avatar, motion, sky, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("shaded on the CPU")
+
+    monkeypatch.setattr(Shader, "shade", refuse)
+    renderer = FrameRenderer(avatar, sky, CAMERA, raster="gl")
+    assert renderer.render(motion, 0.3).alpha.max() > 0.9
+    renderer.close()
+
+
+def test_other_views_lights_and_sizes_leave_nothing_behind(avatar, motion, sky, rasterizer):
+    gaussians = avatar.pose(motion, 0.3)
+    shaders = [Shader(sky), Shader(sky).turned(2.0), Shader(sky, "brute")]
+    away = Camera.look_at([0, 1, 5], [0, 1, 10], width=96, height=128, fov_y=0.6)
+    close = Camera.look_at([0.2, 1.6, 1.2], [0, 1.5, 0], width=40, height=30, fov_y=0.4)
+    calls = [(shader, camera) for shader in shaders for camera in (CAMERA, away, close)]
+    first = [draw(gaussians, shader, camera, rasterizer).image for shader, camera in calls]
+    assert [bool(image.any()) for image in first] == 3 * [True, False, True]
+    for k in (8, 0, 4, 2, 3, 6, 1, 5, 7, 0):
+        shader, camera = calls[k]
+        np.testing.assert_array_equal(draw(gaussians, shader, camera, rasterizer).image, first[k])
+
+
+def test_culling_is_the_cpus(avatar, motion, sky, rasterizer):
+    gaussians, shader = avatar.pose(motion, 0.3), Shader(sky)
+    with make_rasterizer("cpu") as cpu:
+        culled, whole = (draw(gaussians, shader, CAMERA, cpu, cull=cull).image for cull in (0.2, None))
+    ours = draw(gaussians, shader, CAMERA, rasterizer, cull=0.2)
+    assert np.abs(culled - whole).max() > 0.05
+    assert np.abs(ours.image - culled).max() < 0.01 < np.abs(ours.image - whole).max()
+    assert ours.seconds["culling"] > 0
+
+
+def test_broken_gaussians_leave_no_trace(avatar, motion, sky, rasterizer):
+    gaussians, shader = avatar.pose(motion, 0.3), Shader(sky)
+    broken = {name: getattr(gaussians, name).copy() for name in ("means", "covariances", "albedo", "normals")}
+    broken["means"][5, 1], broken["covariances"][6, 2], broken["albedo"][7, 0] = np.nan, np.inf, np.inf
+    opacities = gaussians.opacities.copy()
+    opacities[8] = np.nan
+    clean = gaussians.opacities.copy()
+    clean[5:9] = 0
+    got = draw(replace(gaussians, **broken, opacities=opacities), shader, CAMERA, rasterizer)
+    expected = draw(replace(gaussians, opacities=clean), shader, CAMERA, rasterizer)
+    assert np.isfinite(got.image).all()
+    # without these four as casters of shadows, their neighbours' may differ by a texel
+    assert np.quantile(np.abs(got.image - expected.image), 0.999) < 1e-4
+
+
+def test_kept_radiance_is_the_cpus(avatar, motion, sky, rasterizer):
+    gaussians, shader = avatar.pose(motion, 0.3), Shader(sky)
+    kept = KeptRadiance(len(gaussians.means))
+    image = draw(gaussians, shader, CAMERA, rasterizer, kept=kept).image
+    assert kept.known.any()
+    black = Shader(replace(sky, radiance=0 * sky.radiance))
+    np.testing.assert_array_equal(draw(gaussians, black, CAMERA, rasterizer, kept=kept).image, image)
+
+
+def test_wrong_shapes_are_refused(avatar, motion, sky, rasterizer):
+    gaussians = avatar.pose(motion, 0.3)
+    with pytest.raises(InputError, match="covariances: expected shape"):
+        draw(replace(gaussians, covariances=gaussians.covariances[:, :5]), Shader(sky), CAMERA, rasterizer)
