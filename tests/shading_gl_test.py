@@ -17,7 +17,8 @@ from rnd_runtime.gl_passes import GaussianTexture
 from rnd_runtime.light import Light, load_light, texel_directions
 from rnd_runtime.motion import load_motion
 from rnd_runtime.shading import Shader
-from rnd_runtime.shading_gl import GlShading, SurfaceUpload
+from rnd_runtime.shading_gl import GlShading
+from rnd_runtime.surfaces_gl import SurfaceUpload
 from shading_test import ball, probe, rotation
 
 ASSETS = Path(__file__).parent.parent / "assets"

@@ -42,7 +42,7 @@ from .files import existing_file
 from .gaussians import Gaussians
 from .motion import Motion
 from .onnx_parts import OnnxFile
-from .posing import RestPose
+from .posing import RestPose, Unposed
 from .skeleton import Skeleton, bone_transforms
 from .window import motion_window
 
@@ -189,6 +189,16 @@ class Avatar:
         return Gaussians(
             means, covariances, self._opacities, normals, self._albedo, self._roughness, visibility,
             np.ascontiguousarray(bones[0, :, :3], np.float32),
+        )  # fmt: skip
+
+    def unposed(self, encoded: Encoded) -> Unposed | None:
+        """What :meth:`posed` is made of, for those who pose elsewhere; None where the graph has posed already."""
+        if self._rest is None:
+            return None
+        offsets, visibility, *logits = encoded.values
+        return Unposed(
+            self._rest, logits[0] if logits else None, offsets, visibility, encoded.bones,
+            self._opacities, self._albedo, self._roughness,
         )  # fmt: skip
 
     def run(

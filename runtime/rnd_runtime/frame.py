@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import raster_cpu
 from ._raster_input import floats
-from .avatar import Avatar
+from .avatar import Avatar, Encoded
 from .camera import Camera
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
 from .light import Light
@@ -87,18 +87,41 @@ class FrameRenderer:
     def render(self, motion: Motion, time: float) -> Frame:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton)."""
         encoded = self.avatar.encode(motion, time)
-        started = perf_counter()
-        gaussians = self.avatar.posed(encoded)
-        seconds = {**encoded.seconds, "posing": perf_counter() - started}
-        raster = draw(gaussians, self._shader, self.camera, self._rasterizer, cull=self.cull)
+        raster = draw_encoded(
+            self.avatar, encoded, self._shader, self.camera, self._rasterizer, cull=self.cull
+        )
         started = perf_counter()
         image = tone_map(raster.image, raster.alpha)
-        seconds |= {**raster.seconds, "tone map": perf_counter() - started}
+        seconds = {**encoded.seconds, **raster.seconds, "tone map": perf_counter() - started}
         return Frame(image, raster.image, raster.alpha, seconds)
 
     def close(self) -> None:
         """Release the rasteriser."""
         self._rasterizer.close()
+
+
+def draw_encoded(
+    avatar: Avatar,
+    encoded: Encoded,
+    shader: Shader,
+    camera: Camera,
+    rasterizer: Rasterizer,
+    *,
+    cull: float | None = None,
+) -> Raster:
+    """Pose and :func:`draw`: on the device where ``rasterizer`` draws with OpenGL and the avatar's file allows it.
+
+    The raster's ``seconds`` have "posing" too.
+    """
+    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
+        unposed = avatar.unposed(encoded)
+        if unposed is not None:
+            return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
+    started = perf_counter()
+    gaussians = avatar.posed(encoded)
+    posing = perf_counter() - started
+    raster = draw(gaussians, shader, camera, rasterizer, cull=cull)
+    return replace(raster, seconds={"posing": posing, **raster.seconds})
 
 
 def draw(
@@ -116,14 +139,12 @@ def draw(
     made. The raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept``
     radiance, which is the CPU's.
     """
+    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
+        return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
     opacities = gaussians.opacities
     if cull is not None:
         opacities = facing(gaussians, camera.position, cull)
-    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
-        seconds = {} if cull is None else {"culling": perf_counter() - started}
-        raster = rasterizer.renderer.draw(gaussians, opacities, shader, camera)
-        return replace(raster, seconds={**seconds, **raster.seconds})
     if getattr(rasterizer, "name", "") != "cpu":
         radiance = _shade(gaussians, shader, camera, opacities >= _LEAST_OPACITY, kept)
         shaded = perf_counter()

@@ -1,7 +1,7 @@
 """What passes over Gaussians share: textures with some texels for each of them, and programs put together from parts.
 
 A fragment stands for a Gaussian: Gaussian i is texel (i % ROW_GAUSSIANS, i // ROW_GAUSSIANS), and where it has several
-texels they lie side by side.
+texels they lie side by side. Where it has many, ROW_WIDE make a row.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROW_GAUSSIANS = 1024  # Gaussians in a row of a texture
+ROW_WIDE = 256  # Gaussians, or nodes, of many texels in a row: GL promises no more than 1024 and gives 16384
 
 
 class GaussianTexture:
@@ -25,20 +26,28 @@ class GaussianTexture:
         components: numbers in a texel.
         texels: for each Gaussian.
         dtype: "f4" or "i4".
+        row: Gaussians in a row.
     """
 
     def __init__(
-        self, context: moderngl.Context, components: int, *, texels: int = 1, dtype: str = "f4"
+        self,
+        context: moderngl.Context,
+        components: int,
+        *,
+        texels: int = 1,
+        dtype: str = "f4",
+        row: int = ROW_GAUSSIANS,
     ) -> None:
         self._context, self._components, self._texels, self._dtype = context, components, texels, dtype
+        self._row = row
         self._texture: moderngl.Texture | None = None
 
     def reserve(self, count: int) -> moderngl.Texture:
         """The texture, with room for ``count`` Gaussians; what it held is lost when it grows."""
-        rows = max(-(-count // ROW_GAUSSIANS), 1)
+        rows = max(-(-count // self._row), 1)
         if self._texture is None or self._texture.height < rows:
             self.release()
-            size = (ROW_GAUSSIANS * self._texels, rows)
+            size = (self._row * self._texels, rows)
             self._texture = self._context.texture(size, self._components, dtype=self._dtype)
             self._texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         return self._texture
@@ -46,13 +55,11 @@ class GaussianTexture:
     def write(self, values: NDArray[Any]) -> moderngl.Texture:
         """Upload ``values`` [N, texels · components], contiguous and of the texture's type."""
         texture = self.reserve(len(values))
-        whole, rest = divmod(len(values), ROW_GAUSSIANS)
+        whole, rest = divmod(len(values), self._row)
         if whole:
-            texture.write(
-                values[: whole * ROW_GAUSSIANS], viewport=(0, 0, ROW_GAUSSIANS * self._texels, whole)
-            )
+            texture.write(values[: whole * self._row], viewport=(0, 0, self._row * self._texels, whole))
         if rest:
-            texture.write(values[whole * ROW_GAUSSIANS :], viewport=(0, whole, rest * self._texels, 1))
+            texture.write(values[whole * self._row :], viewport=(0, whole, rest * self._texels, 1))
         return texture
 
     def release(self) -> None:
@@ -61,13 +68,42 @@ class GaussianTexture:
             self._texture = None
 
 
+class GaussianTargets:
+    """Float32 textures with the same texels for each Gaussian, of ``components`` each, that one pass draws into."""
+
+    def __init__(self, context: moderngl.Context, components: tuple[int, ...], *, texels: int = 1) -> None:
+        self._context, self._texels = context, texels
+        self._textures = [GaussianTexture(context, count, texels=texels) for count in components]
+        self._made: tuple[list[moderngl.Texture], moderngl.Framebuffer] | None = None
+
+    def reserve(self, count: int) -> tuple[list[moderngl.Texture], moderngl.Framebuffer]:
+        """The textures and a framebuffer of them, bound and cut to the rows of ``count`` Gaussians."""
+        old, textures = self._made, [texture.reserve(count) for texture in self._textures]
+        if old is None or old[0][0] is not textures[0]:
+            self._made = textures, self._context.framebuffer(textures)
+        assert self._made is not None
+        framebuffer = self._made[1]
+        framebuffer.viewport = (0, 0, ROW_GAUSSIANS * self._texels, -(-count // ROW_GAUSSIANS))
+        framebuffer.use()
+        if old is not None and old is not self._made:
+            old[1].release()  # only now: moderngl binds the one in use again whenever it makes another
+        return self._made
+
+    def release(self) -> None:
+        if self._made is not None:
+            self._made[1].release()
+            self._made = None
+        for texture in self._textures:
+            texture.release()
+
+
 class Pass:
     """A program without vertex arrays: its vertex shader makes everything of ``gl_VertexID``.
 
     Args:
         context: current now.
         vertex, fragment: names of the files in ``shaders`` that make up either shader, in this order.
-        macros: what the shaders ask to be defined, beside ROW_GAUSSIANS.
+        macros: what the shaders ask to be defined, beside ROW_GAUSSIANS and ROW_WIDE.
     """
 
     def __init__(
@@ -77,7 +113,7 @@ class Pass:
         fragment: tuple[str, ...],
         macros: Mapping[str, object] | None = None,
     ) -> None:
-        head = shader_head({"ROW_GAUSSIANS": ROW_GAUSSIANS, **(macros or {})})
+        head = shader_head({"ROW_GAUSSIANS": ROW_GAUSSIANS, "ROW_WIDE": ROW_WIDE, **(macros or {})})
         self._program = context.program(
             vertex_shader=head + _source(vertex), fragment_shader=head + _source(fragment)
         )
@@ -85,7 +121,7 @@ class Pass:
         self._uniforms: dict[str, Any] = {name: self._program[name] for name in self._program}
 
     def bind(self, textures: Mapping[str, moderngl.Texture], **uniforms: Any) -> None:
-        """Textures by the names of their samplers; uniforms as int, or as arrays of float32 (matrices by column).
+        """Textures by the names of their samplers; uniforms as int, or as arrays of numbers (matrices by column).
 
         Names that the program does not use are passed over.
         """
@@ -106,10 +142,8 @@ class Pass:
     def render(self, mode: int, vertices: int, *, first: int = 0) -> None:
         self._vertices.render(mode, vertices, first=first)
 
-    def fill(self, framebuffer: moderngl.Framebuffer, count: int) -> None:
-        """Run the fragment shader for the texels of ``count`` Gaussians, and for the rest of their last row."""
-        framebuffer.viewport = (0, 0, ROW_GAUSSIANS, -(-count // ROW_GAUSSIANS))
-        framebuffer.use()
+    def fill(self) -> None:
+        """Run the fragment shader for every texel of the framebuffer in use."""
         self.render(moderngl.TRIANGLES, 3)
 
     def release(self) -> None:

@@ -95,12 +95,10 @@ class RestPose:
             visibility: [M, S] harmonics, S ≤ 16; what is missing is 0.
             bones: [J, 3, 4] rest pose → posed world.
         """
-        rest = self._arrays
+        rest = self.arrays
         rows = np.zeros((self.log_template.shape[1], WIDTH), np.float32)
         rows[:, :12] = np.asarray(bones, np.float32).reshape(len(rows), 12)
-        logits = np.zeros((len(np.asarray(offsets)), 0)) if logits is None else logits
-        nodes = (np.require(values, np.float32, ["C", "W"]) for values in (logits, offsets, visibility))
-        fields = _pack(*nodes, rest.log_template.shape[1])
+        fields = self.fields(logits, offsets, visibility)
         count = len(self.points)
         posed = Posed(
             np.empty((count, 3), np.float32),
@@ -112,8 +110,16 @@ class RestPose:
         _pose(fields, rest, rows, limits, posed)
         return posed
 
+    def fields(self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike) -> Floats32:
+        """What is interpolated between the nodes, [M, C + 32]: C logits (J up to a whole number of 16), 16 for the
+        offsets, of which six are used, and 16 harmonics; zeros between."""
+        logits = np.zeros((len(np.asarray(offsets)), 0)) if logits is None else logits
+        nodes = (np.require(values, np.float32, ["C", "W"]) for values in (logits, offsets, visibility))
+        packed: Floats32 = _pack(*nodes, self.arrays.log_template.shape[1])
+        return packed
+
     @cached_property
-    def _arrays(self) -> _RestArrays:
+    def arrays(self) -> RestArrays:
         """As the kernel wants them."""
         count, joints = self.log_template.shape
         log_template = np.full((count, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
@@ -127,14 +133,34 @@ class RestPose:
         ):
             own[first : first + values.shape[1], :count] = values.T
         weights = np.array(self.neighbour_weights, np.float32, order="C")
-        return _RestArrays(np.array(self.neighbours, np.int32), weights, log_template, own)
+        return RestArrays(np.array(self.neighbours, np.int32), weights, log_template, own)
 
 
-class _RestArrays(NamedTuple):
+class RestArrays(NamedTuple):
+    """Constants of a :class:`RestPose`, C the joints J up to a whole number of registers of 16."""
+
     neighbours: NDArray[np.int32]  # [N, K]
     weights: Floats32  # [N, K]
-    log_template: Floats32  # [N, J up to whole registers]
+    log_template: Floats32  # [N, C]
     own: Floats32  # [22, N up to whole registers] points, factors, normals and limbs by component
+
+
+class Unposed(NamedTuple):
+    """N Gaussians before they are posed: arguments of :meth:`RestPose.pose` for M nodes, and their material."""
+
+    rest: RestPose
+    logits: Floats32 | None  # [M, J]
+    offsets: Floats32  # [M, 6]
+    visibility: Floats32  # [M, S]
+    bones: Floats32  # [J, 3, 4] rest pose → posed world
+    opacities: Floats32  # [N]
+    albedo: Floats32  # [N, 3]
+    roughness: Floats32  # [N]
+
+    @property
+    def root_rotation(self) -> Floats32:
+        """[3, 3], root frame → world."""
+        return self.bones[0, :, :3]
 
 
 @njit(parallel=True, nogil=True, cache=True)

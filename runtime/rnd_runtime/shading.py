@@ -40,8 +40,8 @@ _MOST_LIGHTS = 8192
 SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 # A Gaussian's disc in the depth map, in standard deviations: neighbours of a trained avatar stand 1.4 σ apart. Discs
 # of 2 σ hide nothing more, but rise above their neighbours where normals disagree: speckled thighs.
-_DISC_SIGMAS = 1.4
-_CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
+DISC_SIGMAS = 1.4
+CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
 # What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
 # shade. Suns fade out over these n·v, chosen on training pictures of the dancer (36.19 dB without, 36.27 with).
 _TURNED_AWAY, _AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
@@ -148,7 +148,7 @@ def shadow_radii(gaussians: Gaussians) -> Floats32:
 def _radii(covariances, opacities, radii):  # type: ignore[no-untyped-def]
     for i in range(len(radii)):
         trace = covariances[i, 0] + covariances[i, 3] + covariances[i, 5]
-        radii[i] = _DISC_SIGMAS * np.sqrt(trace / 2) if opacities[i] > _CASTING_OPACITY else 0
+        radii[i] = DISC_SIGMAS * np.sqrt(trace / 2) if opacities[i] > CASTING_OPACITY else 0
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")

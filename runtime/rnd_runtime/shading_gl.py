@@ -8,22 +8,22 @@ Nothing is read back.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .gaussians import Gaussians
-from .gl_passes import GaussianTexture, Pass
+from .gl_passes import GaussianTargets, Pass
 from .sh import SH_COUNT, sh_basis, sh_rotation
-from .shading import SHADOW_RESOLUTION, Shader, shadow_radii
+from .shading import SHADOW_RESOLUTION, Shader
 from .shading_ambient import AmbientLight
 from .shading_sum import DistantLights
 from .shading_tables import DIFFUSE_SIZE, SPECULAR_SIZE, SkyTables
 from .shadow import axes_towards
 from .shadow_gl import SunMaps
 from .specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
+from .surfaces_gl import Surfaces
 
 Floats32 = NDArray[np.float32]
 
@@ -32,40 +32,6 @@ _LIGHT_TEXELS = 6
 _DIFFUSE_TEXELS = 12  # of a node: sixteen numbers of each colour
 # The blocks of 4 × 4 of a rotation of harmonics that are not all zero, as surface.glsl multiplies them.
 _TURN_BLOCKS = ((0, 0), (1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 2), (3, 3))
-
-
-class Surfaces(NamedTuple):
-    """N Gaussians on the device, as shading sees them."""
-
-    points: moderngl.Texture  # mean m, world; disc radius m
-    normals: moderngl.Texture  # unit, world
-    materials: moderngl.Texture  # albedo, roughness
-    visibility: moderngl.Texture  # four texels: harmonics in the root's frame
-    gaussians: int  # N
-
-
-class SurfaceUpload:
-    """Brings :class:`rnd_runtime.gaussians.Gaussians` to the device."""
-
-    def __init__(self, context: moderngl.Context) -> None:
-        self._points, self._normals = GaussianTexture(context, 4), GaussianTexture(context, 3)
-        self._materials, self._visibility = GaussianTexture(context, 4), GaussianTexture(context, 4, texels=4)
-
-    def write(self, gaussians: Gaussians) -> Surfaces:
-        points, materials = (np.empty((len(gaussians.means), 4), np.float32) for _ in range(2))
-        points[:, :3], points[:, 3] = gaussians.means, shadow_radii(gaussians)
-        materials[:, :3], materials[:, 3] = gaussians.albedo, gaussians.roughness
-        return Surfaces(
-            self._points.write(points),
-            self._normals.write(np.ascontiguousarray(gaussians.normals, np.float32)),
-            self._materials.write(materials),
-            self._visibility.write(np.ascontiguousarray(gaussians.visibility, np.float32)),
-            len(points),
-        )
-
-    def release(self) -> None:
-        for texture in (self._points, self._normals, self._materials, self._visibility):
-            texture.release()
 
 
 class GlShading:
@@ -77,8 +43,7 @@ class GlShading:
         self._passes: dict[tuple[type, int], Pass] = {}  # by the kind of sky and the number of suns
         self._sky: tuple[Any, dict[str, moderngl.Texture], dict[str, Any]] | None = None
         self._lobes: moderngl.Texture | None = None
-        self._radiance = GaussianTexture(context, 4)
-        self._target: tuple[moderngl.Texture, moderngl.Framebuffer] | None = None
+        self._radiance = GaussianTargets(context, (4,))
 
     def shade(
         self,
@@ -97,14 +62,7 @@ class GlShading:
         """
         light_to_world = shader.light.rotation
         textures, uniforms = self._sky_of(shader.sky)
-        textures = {
-            **textures,
-            "order": order,
-            "points": surfaces.points,
-            "normals": surfaces.normals,
-            "materials": surfaces.materials,
-            "visibility": surfaces.visibility,
-        }
+        textures = {**textures, **surfaces.textures(), "order": order}
         suns = shader.suns
         if suns:
             directions = np.array([sun.direction for sun in suns])
@@ -118,7 +76,7 @@ class GlShading:
                 "sun_blurs": np.array([sun.spread**2 for sun in suns]),
             }
         program = self._pass_of(shader)
-        radiance, target = self._target_of(ranks)
+        (radiance,), _ = self._radiance.reserve(ranks)
         program.bind(
             textures,
             count=ranks,
@@ -128,7 +86,7 @@ class GlShading:
             **uniforms,
         )
         self._context.enable_only(moderngl.NOTHING)
-        program.fill(target, ranks)
+        program.fill()
         return radiance
 
     def release(self) -> None:
@@ -137,9 +95,6 @@ class GlShading:
             program.release()
         self._passes = {}
         self._forget_sky()
-        if self._target is not None:
-            self._target[1].release()
-            self._target = None
         self._radiance.release()
         if self._lobes is not None:
             self._lobes.release()
@@ -206,15 +161,6 @@ class GlShading:
             fragment = ("sh.glsl", "ggx.glsl", "surface.glsl", *parts, "shade.frag")
             self._passes[key] = Pass(self._context, ("fill.vert",), fragment, macros)
         return self._passes[key]
-
-    def _target_of(self, count: int) -> tuple[moderngl.Texture, moderngl.Framebuffer]:
-        texture = self._radiance.reserve(count)
-        if self._target is None or self._target[0] is not texture:
-            old, self._target = self._target, (texture, self._context.framebuffer([texture]))
-            self._target[1].use()  # else moderngl would bind the old one again when it makes the next
-            if old is not None:
-                old[1].release()
-        return self._target
 
 
 def _turn(rotation: NDArray[np.float64]) -> Floats32:
