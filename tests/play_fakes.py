@@ -51,6 +51,9 @@ class FakeAvatar:
     def posed(self, encoded: tuple[Motion, float]) -> Gaussians:
         return self.pose(*encoded)
 
+    def unposed(self, encoded: tuple[Motion, float]) -> None:
+        """It has no networks."""
+
     def pose(self, motion: Motion, time: float) -> Gaussians:
         now = motion.at([time])
         joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]

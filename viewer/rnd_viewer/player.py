@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import KeptRadiance, draw
+from rnd_runtime.frame import KeptRadiance, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light
@@ -103,12 +103,15 @@ class Player:
 
     def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
         """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
-        with self.times.stage("posing"):
-            gaussians = self.avatar.posed(encoded)
-        if quality == FULL or self.aovs:
-            raster = self._raster(gaussians, camera)
+        if quality == FULL and not self.aovs:
+            raster = draw_encoded(self.avatar, encoded, self.shader, camera, self.rasterizer)
         else:
-            raster = self._cheaper_raster(gaussians, camera, quality)
+            with self.times.stage("posing"):
+                gaussians = self.avatar.posed(encoded)
+            if self.aovs:
+                raster = self._raster_with_aovs(gaussians, camera)
+            else:
+                raster = self._cheaper_raster(gaussians, camera, quality)
         for stage, seconds in raster.seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):
@@ -139,10 +142,8 @@ class Player:
         depth = np.zeros((camera.height, camera.width), np.float32)
         return Raster(picture[..., :3], picture[..., 3], depth, raster.seconds)
 
-    def _raster(self, gaussians: Gaussians, camera: Camera) -> Raster:
-        """Radiance, then the AOVs' features, splatted."""
-        if not self.aovs:
-            return draw(gaussians, self.shader, camera, self.rasterizer)
+    def _raster_with_aovs(self, gaussians: Gaussians, camera: Camera) -> Raster:
+        """Radiance, then the AOVs' features, splatted; both are the CPU's."""
         with self.times.stage("shading"):
             radiance = self.shader.shade(gaussians, camera.position)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)

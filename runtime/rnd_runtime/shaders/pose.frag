@@ -38,16 +38,18 @@ void main() {
     find_neighbours(gaussian);
 
     ivec2 texel = ivec2(gaussian % ROW_WIDE * JOINT_TEXELS, gaussian / ROW_WIDE);
-    float top = -1e30;
-    for (int q = 0; q < JOINT_TEXELS; q++) {
+    float top = -1e30, sum = 0.0;
+    vec4 row_0 = vec4(0.0), row_1 = vec4(0.0), row_2 = vec4(0.0);  // of A = [A_R | A_T], times sum
+    for (int q = 0; q < JOINT_QUADS; q++) {
         vec4 logits = texelFetch(log_template, texel + ivec2(q, 0), 0) + field(q);
-        top = max(top, max(max(logits.x, logits.y), max(logits.z, logits.w)));
-    }
-    float sum = 0.0;
-    vec4 row_0 = vec4(0.0), row_1 = vec4(0.0), row_2 = vec4(0.0);  // of A = [A_R | A_T]
-    for (int q = 0; q < JOINT_TEXELS; q++) {
-        vec4 share = exp(texelFetch(log_template, texel + ivec2(q, 0), 0) + field(q) - top);
-        sum += dot(share, vec4(1.0));
+        float higher = max(top, max(max(logits.x, logits.y), max(logits.z, logits.w)));
+        float scale = exp(top - higher);  // of what was summed relative to a lower top
+        vec4 share = exp(logits - higher);
+        top = higher;
+        sum = scale * sum + dot(share, vec4(1.0));
+        row_0 *= scale;
+        row_1 *= scale;
+        row_2 *= scale;
         for (int c = 0; c < 4; c++) {
             row_0 += share[c] * texelFetch(bones, ivec2(0, 4 * q + c), 0);
             row_1 += share[c] * texelFetch(bones, ivec2(1, 4 * q + c), 0);
