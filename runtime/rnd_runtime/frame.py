@@ -50,7 +50,8 @@ class Frame:
 class FrameRenderer:
     """Renders one avatar; frames depend on the arguments and on ``camera`` and the light alone.
 
-    Only Gaussians that reach the picture are shaded.
+    Only Gaussians that reach the picture are shaded. With OpenGL everything after the encoders is done on its device:
+    see :mod:`rnd_runtime.frame_gl`.
 
     Args:
         avatar: as :meth:`rnd_runtime.avatar.Avatar.load` gives it, with the threads chosen there.
