@@ -35,6 +35,7 @@ class GlPosing:
         if self._avatar is None or self._avatar.rest is not unposed.rest:
             if self._avatar is not None:
                 self._avatar.release()
+                self._avatar = None
             self._avatar = _OnDevice(self._context, unposed)
         avatar, count = self._avatar, len(unposed.opacities)
         avatar.write(unposed)
