@@ -103,14 +103,14 @@ def test_posing_is_the_float64_formula(device, joints, harmonics, count, templat
     assert count == 1 or 0.2 < (radii > 0).mean() < 0.8
 
 
-def test_constants_stay_and_another_avatar_replaces_them(device):
+def test_another_avatar_takes_the_place_of_the_last(device):
     scenes = [_scene(joints, count=count) for joints, count in ((24, 300), (16, 2000), (24, 40))]
-    posed = []
     for rest, inputs in (*scenes, *scenes[::-1]):
         surfaces = device.posing.pose(_unposed(rest, inputs))
-        posed.append(_rows(surfaces.points, len(rest.points)))
-    for first, again in zip(posed[:3], posed[:2:-1]):
-        np.testing.assert_array_equal(first, again)
+        means = pose_reference(rest, *inputs)[0]
+        assert (
+            np.abs(_rows(surfaces.points, len(means))[:, :3] - means).max() <= ROUNDING * np.abs(means).max()
+        )
 
 
 def test_more_joints_than_a_texture_holds_are_refused():

@@ -3,7 +3,7 @@
 uniform isampler2D order;  // the Gaussian of each rank
 uniform int count;         // ranks
 
-out vec4 radiance;
+out vec4 radiance;  // its fourth component is 0 where it is no number, and 1 elsewhere
 
 void main() {
     ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -13,5 +13,6 @@ void main() {
 #ifdef SUNS
     linear += suns();
 #endif
-    radiance = vec4(linear, 1.0);
+    bool none = isnan(checksum) || isinf(checksum) || any(isnan(linear)) || any(isinf(linear));
+    radiance = none ? vec4(0.0) : vec4(linear, 1.0);
 }

@@ -28,7 +28,7 @@ void main() {
     texel = ivec2(gaussian % ROW_GAUSSIANS, gaussian / ROW_GAUSSIANS);
     vec4 place = texelFetch(places, texel, 0);
     vec3 shape = texelFetch(shapes, texel, 0).xyz;
-    if (any(isnan(attributes[0])) || any(isinf(attributes[0]))) place.z = 0.0;  // radiance that is no number is not drawn
+    if (attributes[0].w < 0.5) place.z = 0.0;  // radiance that is no number is not drawn
 #else
     ivec2 texel = ivec2(rank % ROW_GAUSSIANS * TEXELS, rank / ROW_GAUSSIANS);
     vec4 place = texelFetch(records, texel, 0);                // centre x, y px; reach in u, v; peak

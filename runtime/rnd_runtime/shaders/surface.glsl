@@ -16,6 +16,7 @@ float disc_radius;
 vec3 normal, view, albedo;
 float roughness, n_dot_v;
 mat4 coefficients;  // of the visibility, in the light's frame
+float checksum;     // no number where anything of the Gaussian is none; max() and clamp() may lose that
 
 void load_surface(int index) {
     ivec2 place = ivec2(index % ROW_GAUSSIANS, index / ROW_GAUSSIANS);
@@ -34,6 +35,8 @@ void load_surface(int index) {
     ivec2 first = ivec2(4 * place.x, place.y);
     vec4 a = texelFetch(visibility, first, 0), b = texelFetch(visibility, first + ivec2(1, 0), 0);
     vec4 c = texelFetch(visibility, first + ivec2(2, 0), 0), d = texelFetch(visibility, first + ivec2(3, 0), 0);
+    const vec4 ONES = vec4(1.0);
+    checksum = dot(point, ONES) + dot(material, ONES) + dot(normal_world, ONES.xyz) + dot(a + b + c + d, ONES);
     // a rotation mixes harmonics of one degree only: degrees 0 and 1 are a, 2 is b and c.x, 3 is c.yzw and d
     coefficients = mat4(
         turn[0] * a,
