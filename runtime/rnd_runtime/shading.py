@@ -44,7 +44,7 @@ DISC_SIGMAS = 1.4
 CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
 # What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
 # shade. Suns fade out over these n·v, chosen on training pictures of the dancer (36.19 dB without, 36.27 with).
-_TURNED_AWAY, _AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
+TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
 
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-12)
 _ONE_OVER_PI = np.float32(1 / np.pi)
@@ -164,7 +164,7 @@ def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, rad
         distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)
         vx, vy, vz = vx / distance, vy / distance, vz / distance
         n_dot_v = nx * vx + ny * vy + nz * vz
-        facing = min((n_dot_v - _TURNED_AWAY) / (_AT_SILHOUETTE - _TURNED_AWAY), _ONE)
+        facing = min((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), _ONE)
         if not facing > _ZERO:
             continue
         for sun in range(len(directions)):

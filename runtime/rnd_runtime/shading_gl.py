@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .gl_passes import GaussianTargets, Pass
 from .sh import SH_COUNT, sh_basis, sh_rotation
-from .shading import SHADOW_RESOLUTION, Shader
+from .shading import AT_SILHOUETTE, SHADOW_RESOLUTION, TURNED_AWAY, Shader
 from .shading_ambient import AmbientLight
 from .shading_sum import DistantLights
 from .shading_tables import DIFFUSE_SIZE, SPECULAR_SIZE, SkyTables
@@ -146,7 +146,7 @@ class GlShading:
                 SkyTables: ("lobe.glsl", "sky_table.glsl"),
                 DistantLights: ("sky_lights.glsl",),
             }[key[0]]
-            macros = {
+            macros: dict[str, float] = {
                 "LOBE_ROWS": ROUGHNESS_COUNT,
                 "LOBE_COLUMNS": COSINE_COUNT,
                 "DIFFUSE_SIZE": DIFFUSE_SIZE,
@@ -157,6 +157,7 @@ class GlShading:
             }
             if shader.suns:
                 macros["SUNS"] = len(shader.suns)
+                macros |= {"TURNED_AWAY": float(TURNED_AWAY), "AT_SILHOUETTE": float(AT_SILHOUETTE)}
                 parts = (*parts, "shadow_map.glsl", "suns.glsl")
             fragment = ("sh.glsl", "ggx.glsl", "surface.glsl", *parts, "shade.frag")
             self._passes[key] = Pass(self._context, ("fill.vert",), fragment, macros)

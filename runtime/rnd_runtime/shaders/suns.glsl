@@ -1,4 +1,5 @@
-// shading.py's suns: the whole BRDF, the highlight widened by the sun's size, a hard shadow from the depth map.
+// shading.py's suns: the whole BRDF, the highlight widened by the sun's size, a hard shadow from the depth map. They fade
+// out between the n·v AT_SILHOUETTE and TURNED_AWAY.
 
 uniform sampler2D depths;  // m towards the sun
 uniform vec3 sun_directions[SUNS];  // unit, in the light's frame
@@ -27,10 +28,12 @@ float reached_by(int sun) {
 
 vec3 suns() {
     vec3 sum = vec3(0.0);
+    float facing = min((n_dot_v - (TURNED_AWAY)) / (AT_SILHOUETTE - (TURNED_AWAY)), 1.0);
+    if (!(facing > 0.0)) return sum;
     for (int sun = 0; sun < SUNS; sun++) {
         vec3 l = sun_directions[sun];
         float n_dot_l = dot(normal, l);
-        float arriving = reached_by(sun) * n_dot_l;
+        float arriving = facing * reached_by(sun) * n_dot_l;
         if (!(arriving > 0.0)) continue;
         vec3 h = l + view;
         float half_squared = max(dot(h, h), TINY);
