@@ -110,3 +110,6 @@ def test_existing_file(tmp_path):
         existing_file(tmp_path / "b.npz", what="motion")
     with pytest.raises(InputError, match="motion not found: got a folder"):
         existing_file(tmp_path, what="motion")
+    with pytest.raises(InputError, match="motion not found: got File name too long") as refused:
+        existing_file(tmp_path / ("x" * 10_000), what="motion")
+    assert len(str(refused.value)) < 300

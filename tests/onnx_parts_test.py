@@ -67,6 +67,15 @@ def test_values_are_known_by_name():
     assert file.has(["a", "one", "c", "f"]) and not file.has(["a", "z"])
 
 
+def test_an_output_that_nothing_makes_is_refused():
+    model = _model()
+    del model.graph.node[3]  # f stays among the graph's outputs
+    file = OnnxFile(model.SerializeToString())
+    assert file.outputs.keys() == {"e", "f"}
+    with pytest.raises(InputError, match="graph outputs: expected something that makes f, got nothing"):
+        file.cut(["e", "f"])
+
+
 @pytest.mark.parametrize("length", [0, 1, 20, 150, -1])
 def test_a_file_cut_short_is_refused(length):
     with pytest.raises(InputError, match="not a readable ONNX model"):

@@ -84,7 +84,9 @@ class Body:
                     archive.numbers("faces", (None, 3)),  # type: ignore[arg-type]  # checked to be whole
                     archive.numbers("skinning_weights", (None, joints)),  # type: ignore[arg-type]
                     skeleton,
-                    archive.strings("license")[0] if "license" in archive.names else "unknown",
+                    next(iter(archive.strings("license")), "unknown")
+                    if "license" in archive.names
+                    else "unknown",
                 )
             except InputError as error:
                 raise error.at(file=path) from error

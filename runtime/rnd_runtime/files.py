@@ -56,6 +56,9 @@ def output_folder(path: str | Path) -> Path:
 def existing_file(path: str | Path, *, what: str) -> Path:
     """Return ``path`` if it is a file, else raise :class:`InputError` naming ``what`` it should have been."""
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{what} not found", got="a folder" if path.is_dir() else None, file=path)
+    try:
+        if not path.is_file():
+            raise InputError(f"{what} not found", got="a folder" if path.is_dir() else None, file=path)
+    except OSError as error:  # a name that is too long, a folder that may not be entered
+        raise InputError(f"{what} not found", got=error.strerror, file=str(path)[:200]) from error
     return path

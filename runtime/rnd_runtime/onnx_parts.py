@@ -98,8 +98,15 @@ class OnnxFile:
         """A model that makes values ``outputs`` (any of the graph's, inner ones too) and nothing else.
 
         Its inputs are those of the whole that are needed for that; metadata are kept.
+
+        Raises:
+            InputError: nothing in the graph makes one of them.
         """
-        assert self.has(outputs), outputs
+        lost = [name for name in outputs if not self.has([name])]
+        if lost:
+            raise InputError(
+                "graph outputs", expected=f"something that makes {', '.join(lost)}", got="nothing"
+            )
         wanted = set(outputs)
         kept: list[Node] = []
         for node in reversed(self._nodes):  # ONNX demands topological order
