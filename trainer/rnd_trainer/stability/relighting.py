@@ -60,7 +60,7 @@ def bright_suns(subject: Subject) -> Result:
             cosine = float(subjects.normals[facing] @ way)
             expected = np.pi * np.sin(SUN_RADIUS) ** 2 * radiance * cosine / np.pi
             dark = replace(subjects, albedo=np.zeros_like(subjects.albedo))
-            eye = -20.0 * way  # behind, so that nothing shines
+            eye = 20.0 * way  # suns light what faces the camera; what shines is the same on the dark ball
             lit = Shader(light, "table+sun").shade(subjects, eye) - Shader(light, "table+sun").shade(
                 dark, eye
             )
