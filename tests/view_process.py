@@ -16,7 +16,9 @@ START = "import sys; from rnd_viewer.view_cli import main; sys.exit(main())"
 def running(*arguments: str) -> Iterator[str]:
     """Start rnd-view on a free port, yield the address that it prints, and end it as Ctrl-C does."""
     command = [sys.executable, "-c", START, *arguments, "--port", "0", "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as viewer:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_heed_interrupts
+    ) as viewer:
         assert viewer.stdout and viewer.stderr
         line = viewer.stdout.readline()
         assert line.startswith("rnd-view: http://"), (line, viewer.stderr.read())
@@ -25,3 +27,8 @@ def running(*arguments: str) -> Iterator[str]:
         finally:
             viewer.send_signal(signal.SIGINT)
         assert viewer.wait() == INTERRUPTED
+
+
+def _heed_interrupts() -> None:
+    """What a shell starts in the background, tests among it, passes on that Ctrl-C is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
