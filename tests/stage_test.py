@@ -439,16 +439,6 @@ def test_a_turned_light_turns_the_picture() -> None:
     assert red[:, :7].mean() > 1.3 * red[:, 9:].mean()
 
 
-def test_means_count_a_subject_once_however_many_seeds_it_has() -> None:
-    from rnd_trainer.stage.benchmark import means
-
-    rows = [
-        {"method": "ours", "split": "relight", "subject": subject, "seed": seed, "psnr": value}
-        for subject, seed, value in ((0, 0, 20.0), (0, 1, 22.0), (1, 0, 30.0))
-    ]
-    assert means(rows, "psnr") == [("ours", {"relight": 25.5})]
-
-
 def test_the_benchmark_trains_scores_and_does_nothing_twice(
     filmed: Path, tmp_path: Path, monkeypatch
 ) -> None:
