@@ -91,8 +91,12 @@ class OnnxFile:
 
     def has(self, names: Iterable[str]) -> bool:
         """Is every one of ``names`` a value of the graph: a constant, an input or what a node makes?"""
+        return not self._lost(names)
+
+    def _lost(self, names: Iterable[str]) -> list[str]:
+        """Those of ``names`` that are no value of the graph."""
         made = {name for node in self._nodes for name in node.outputs}
-        return all(name in made or name in self._constants or name in self._input_data for name in names)
+        return [n for n in names if not (n in made or n in self._constants or n in self._input_data)]
 
     def cut(self, outputs: Sequence[str]) -> bytes:
         """A model that makes values ``outputs`` (any of the graph's, inner ones too) and nothing else.
@@ -102,8 +106,7 @@ class OnnxFile:
         Raises:
             InputError: nothing in the graph makes one of them.
         """
-        lost = [name for name in outputs if not self.has([name])]
-        if lost:
+        if lost := self._lost(outputs):
             raise InputError(
                 "graph outputs", expected=f"something that makes {', '.join(lost)}", got="nothing"
             )
