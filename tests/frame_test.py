@@ -10,11 +10,12 @@ import pytest
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import FrameRenderer, facing
+from rnd_runtime.frame import FrameRenderer, as_seen_from, facing
 from rnd_runtime.images import linear_to_srgb, to_bytes
-from rnd_runtime.light import load_light
-from rnd_runtime.motion import load_motion
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.raster_cpu import Projected, rasterize
+from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 
 ASSETS = Path(__file__).parent.parent / "assets"
@@ -38,11 +39,21 @@ def sky():
     return load_light(ASSETS / "sky.exr")
 
 
+def _taken(motion, place, moved):
+    """``motion`` with the whole body taken along by ``moved`` [4, 4]; ``place``: [3] of the root at rest."""
+    turn, rotations = moved[:3, :3], motion.rotations.copy()
+    rotations[:, 0] = turn @ rotations[:, 0]
+    translations = (place + motion.translations) @ turn.T + moved[:3, 3] - place
+    return Motion(rotations, translations, motion.fps, motion.joint_names)
+
+
 def test_a_frame_is_its_parts(avatar, motion, sky):
     frame = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3)
-    gaussians = avatar.pose(motion, 0.3)
-    radiance = Shader(sky).shade(gaussians, CAMERA.position)
-    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, CAMERA)
+    encoded = avatar.encode(motion, 0.3)
+    gaussians = avatar.posed(encoded)
+    shader, camera = as_seen_from(encoded.root, Shader(sky), CAMERA)
+    radiance = shader.shade(gaussians, camera.position)
+    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera)
     np.testing.assert_array_equal(frame.radiance, expected.image)
     np.testing.assert_array_equal(frame.alpha, expected.alpha)
     np.testing.assert_array_equal(frame.image, to_bytes(linear_to_srgb(expected.image)))
@@ -56,6 +67,32 @@ def test_turning_the_light_equals_another_light(avatar, motion, sky):
     fresh.relight(load_light(ASSETS / "sky.exr", yaw=1.0))
     np.testing.assert_array_equal(turned.render(motion, 0.3).image, fresh.render(motion, 0.3).image)
     assert (turned.render(motion, 0.3).image != still).any()
+
+
+def test_a_turn_of_body_and_camera_changes_no_more_than_rounding(avatar, motion):
+    """Shadow maps and the order of depths turn with the root; a grey sky has no sides."""
+    grey = Light(np.full((16, 32, 3), 0.7, np.float32))
+    renderer = FrameRenderer(avatar, grey, CAMERA, shade="table")
+    still = renderer.render(motion, 0.3).image.astype(int)
+    turn = axis_angle_to_matrix([0.8, -1.1, 0.4])
+    moved = np.eye(4)
+    moved[:3, :3], moved[:3, 3] = turn, [300.0, -20.0, 1000.0]
+    renderer.camera = CAMERA.in_frame(np.linalg.inv(moved))
+    turned = renderer.render(_taken(motion, avatar.skeleton.rest_joints[0], moved), 0.3).image
+    assert still.max() > 50
+    assert np.abs(turned - still).max() <= 1
+
+
+def test_what_is_posed_in_the_world_stands_where_the_motion_says(avatar, motion):
+    encoded = avatar.encode(motion, 0.3)
+    local, world = avatar.posed(encoded), avatar.posed(encoded.in_world())
+    root = encoded.root
+    expected = local.means @ root[:3, :3].T + root[:3, 3]
+    np.testing.assert_allclose(world.means, expected, atol=2e-6)
+    np.testing.assert_allclose(world.normals, local.normals @ root[:3, :3].T, atol=2e-6)
+    np.testing.assert_allclose(world.root_rotation, root[:3, :3], atol=1e-6)
+    np.testing.assert_array_equal(local.root_rotation, np.eye(3))
+    assert np.abs(root - np.eye(4)).max() > 0.01
 
 
 def test_only_what_is_seen_is_shaded(avatar, motion, sky):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,12 @@ def fake_skeleton() -> Skeleton:
     return smpl_skeleton(REST_JOINTS)
 
 
+class Encoded(NamedTuple):
+    motion: Motion
+    time: float
+    root: np.ndarray  # it is posed in the world
+
+
 @dataclass(frozen=True)
 class FakeAvatar:
     """What the player asks of an Avatar."""
@@ -45,13 +52,13 @@ class FakeAvatar:
     trained_light: np.ndarray = field(default_factory=lambda: np.full((32, 64, 3), 0.5, np.float32))
     spacing: float = 0.02
 
-    def encode(self, motion: Motion, time: float) -> tuple[Motion, float]:
-        return motion, time
+    def encode(self, motion: Motion, time: float) -> Encoded:
+        return Encoded(motion, time, np.eye(4))
 
-    def posed(self, encoded: tuple[Motion, float]) -> Gaussians:
-        return self.pose(*encoded)
+    def posed(self, encoded: Encoded) -> Gaussians:
+        return self.pose(encoded.motion, encoded.time)
 
-    def unposed(self, encoded: tuple[Motion, float]) -> None:
+    def unposed(self, encoded: Encoded) -> None:
         """It has no networks."""
 
     def pose(self, motion: Motion, time: float) -> Gaussians:

@@ -36,6 +36,9 @@ class FlatShader:
     def shade(self, gaussians: Gaussians, camera_position: np.ndarray, seen=None) -> np.ndarray:
         return np.full((len(gaussians.means), 3), self.radiance, np.float32)
 
+    def in_frame(self, frame_to_world: np.ndarray) -> FlatShader:
+        return self
+
 
 def _player(radiance: float = 0.18, light: Light | None = None, **options) -> Player:
     return Player(FakeAvatar(), light or white_light(), FlatShader(radiance), rasterize, **options)

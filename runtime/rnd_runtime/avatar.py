@@ -105,11 +105,22 @@ class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class Encoded(NamedTuple):
-    """What the networks say of one pose; hold it for :meth:`Avatar.posed`, do not look into it."""
+    """What the networks say of one pose, for :meth:`Avatar.posed`.
+
+    It is posed in the root's frame, which leaves the root's own turn and path to camera and light: float32 then has to
+    resolve a body and not its place in the world, and where all three turn together the picture stays.
+    """
 
     values: list[NDArray[np.float32]]
-    bones: NDArray[np.float32]
+    bones: NDArray[np.float32]  # [J, 3, 4] m, rest pose → this frame
+    root: NDArray[np.float64]  # [4, 4] m, this frame → world
     seconds: dict[str, float]  # that "motion" and "encoders" took
+
+    def in_world(self) -> Encoded:
+        """The same, to be posed in the world."""
+        bones = np.array(self.root[:3, :3] @ self.bones, np.float64)
+        bones[:, :, 3] += self.root[:3, 3]
+        return self._replace(bones=bones.astype(np.float32), root=np.eye(4))
 
 
 class Avatar:
@@ -164,22 +175,22 @@ class Avatar:
 
     def pose(self, motion: Motion, time: float) -> Gaussians:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton), in the world frame."""
-        return self.posed(self.encode(motion, time))
+        return self.posed(self.encode(motion, time).in_world())
 
     def encode(self, motion: Motion, time: float) -> Encoded:
         """The first half of :meth:`pose`: what the networks say. Runs in onnxruntime, so it may overlap any kernel."""
         started = perf_counter()
         window, velocity = motion_window(motion, time, poses=self.window_poses, seconds=self.window_seconds)
         now = motion.at(np.array([time]))
-        bones = bone_transforms(self.skeleton, now.rotations[0], now.translations[0])
+        bones, root = self._bones(now.rotations[0], now.translations[0])
         known = perf_counter()
         outputs = POSED_OUTPUTS if self._rest is None else self._node_outputs
         values = self.run((window, velocity, bones), outputs)
-        return Encoded(values, bones, {"motion": known - started, "encoders": perf_counter() - known})
+        return Encoded(values, bones, root, {"motion": known - started, "encoders": perf_counter() - known})
 
     def posed(self, encoded: Encoded) -> Gaussians:
-        """The second half of :meth:`pose`."""
-        values, bones, _ = encoded
+        """The second half of :meth:`pose`, in the frame of ``encoded``."""
+        values, bones = encoded.values, encoded.bones
         if self._rest is None:
             means, covariances, normals, visibility = values
         else:
@@ -213,6 +224,16 @@ class Avatar:
         }
         results: list[NDArray[np.float32]] = session.run(list(outputs), values)
         return results
+
+    def _bones(
+        self, rotations: NDArray[np.float64], translation: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """``bones`` and ``root`` of :class:`Encoded` for one pose [J, 3, 3] and its translation [3] m."""
+        root, place = np.eye(4), self.skeleton.rest_joints[0]
+        root[:3, :3] = rotations[0]
+        root[:3, 3] = place + translation - rotations[0] @ place
+        local = np.concatenate([np.eye(3)[None], rotations[1:]])
+        return bone_transforms(self.skeleton, local, np.zeros(3)), root
 
     def _rest_pose(self) -> RestPose:
         neighbours, weights, log_template, *rest, limits = self._constants(REST_OUTPUTS)

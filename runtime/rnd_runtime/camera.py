@@ -58,6 +58,10 @@ class Camera:
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(width, height, scale @ self.K, self.world_to_camera)
 
+    def in_frame(self, frame_to_world: Floats) -> Camera:
+        """The same view for points in another frame, which ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
+        return Camera(self.width, self.height, self.K, self.world_to_camera @ frame_to_world)
+
     @classmethod
     def look_at(
         cls,

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import raster_cpu
 from ._raster_input import floats
 from .avatar import Avatar, Encoded
-from .camera import Camera
+from .camera import Camera, Floats
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
 from .light import Light
 from .motion import Motion
@@ -114,6 +114,7 @@ def draw_encoded(
 
     The raster's ``seconds`` have "posing" too.
     """
+    shader, camera = as_seen_from(encoded.root, shader, camera)
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
         unposed = avatar.unposed(encoded)
         if unposed is not None:
@@ -123,6 +124,11 @@ def draw_encoded(
     posing = perf_counter() - started
     raster = draw(gaussians, shader, camera, rasterizer, cull=cull)
     return replace(raster, seconds={"posing": posing, **raster.seconds})
+
+
+def as_seen_from(frame_to_world: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:
+    """Light and camera for what is posed in the frame that ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
+    return shader.in_frame(frame_to_world[:3, :3]), camera.in_frame(frame_to_world)
 
 
 def draw(

@@ -1,6 +1,6 @@
 """Frames on an OpenGL device: posed, projected, shaded and splatted there.
 
-What the networks say goes up and the picture comes back. In between only the depths cross, for their order (see
+What the networks say goes up and the picture comes back. In between only means cross, for their order (see
 ``projection_gl``).
 """
 

@@ -16,7 +16,7 @@ Floats32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N posed Gaussians with their material, in the world frame.
+    """N posed Gaussians with their material, in the frame of camera and light: the world, or in playback the root.
 
     Attributes:
         means: [N, 3] m.
@@ -27,7 +27,7 @@ class Gaussians:
         roughness: [N] perceptual roughness γ; GGX's α is γ².
         visibility: [N, 16] real spherical harmonics (degree 3) of the light that reaches the point, as a
             function of the direction **towards** the light in the root's frame.
-        root_rotation: [3, 3], root frame → world.
+        root_rotation: [3, 3], root frame → this one.
     """
 
     means: Floats32

@@ -50,7 +50,7 @@ _POINTS, _FACTORS, _NORMALS, _LIMBS, _OWN = (
 
 
 class Posed(NamedTuple):
-    """Posed Gaussians in the world frame; see :class:`rnd_runtime.gaussians.Gaussians`."""
+    """Posed Gaussians in the frame of the bones; see :class:`rnd_runtime.gaussians.Gaussians`."""
 
     means: Floats32  # [N, 3] m
     covariances: Floats32  # [N, 6] m²
@@ -93,7 +93,7 @@ class RestPose:
             logits: [M, J] Δ logits at the nodes; None where skinning is the template's.
             offsets: [M, 6] Δx and Δr before tanh.
             visibility: [M, S] harmonics, S ≤ 16; what is missing is 0.
-            bones: [J, 3, 4] rest pose → posed world.
+            bones: [J, 3, 4] m, rest pose → posed.
         """
         rest = self.arrays
         rows = np.zeros((self.log_template.shape[1], WIDTH), np.float32)
@@ -152,14 +152,14 @@ class Unposed(NamedTuple):
     logits: Floats32 | None  # [M, J]
     offsets: Floats32  # [M, 6]
     visibility: Floats32  # [M, S]
-    bones: Floats32  # [J, 3, 4] rest pose → posed world
+    bones: Floats32  # [J, 3, 4] m, rest pose → posed
     opacities: Floats32  # [N]
     albedo: Floats32  # [N, 3]
     roughness: Floats32  # [N]
 
     @property
     def root_rotation(self) -> Floats32:
-        """[3, 3], root frame → world."""
+        """[3, 3], root frame → that of the bones."""
         return self.bones[0, :, :3]
 
 

@@ -1,7 +1,8 @@
 """Projection, culling and depth order of Gaussians that lie on an OpenGL device.
 
-A fragment for each Gaussian projects it, in float32. Their order is the CPU's radix sort of the depths, and these are
-all that crosses: 4 bytes a Gaussian come back, 4 go up again, and the device waits for them. A bitonic sort in fragment
+A fragment for each Gaussian projects it, in float32. Their order is the CPU's radix sort of depths in float64 (in
+float32 neighbours change places), so means are what crosses: 16 bytes a Gaussian come back, 4 go up again, and the
+device waits for them. A bitonic sort in fragment
 passes would keep them there; for 32 768 Gaussians it is 120 passes, each a call from Python, so it is not what is done.
 """
 
@@ -40,7 +41,7 @@ class GlProjection:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._targets = GaussianTargets(context, (4, 4, 1))
+        self._targets = GaussianTargets(context, (4, 4, 4))
         self._order = GaussianTexture(context, 1, dtype="i4")
         self._pass = Pass(context, ("fill.vert",), ("project.frag",))
 
@@ -62,9 +63,9 @@ class GlProjection:
         )
         self._context.enable_only(moderngl.NOTHING)
         self._pass.fill()
-        depths = np.empty(target.viewport[2:][::-1], np.float32)
-        target.read_into(depths, viewport=target.viewport, components=1, attachment=2, dtype="f4")
-        order = _back_to_front(depths.reshape(-1)[:count])
+        drawn = np.empty((*target.viewport[2:][::-1], 4), np.float32)
+        target.read_into(drawn, viewport=target.viewport, components=4, attachment=2, dtype="f4")
+        order = _back_to_front(drawn.reshape(-1, 4)[:count], view.rotation[2])
         return Projected(self._order.write(order), places, shapes, len(order))
 
     def release(self) -> None:
@@ -73,10 +74,13 @@ class GlProjection:
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _back_to_front(depths):  # type: ignore[no-untyped-def]
-    """Indices [V] of those of positive depth; equal depths by falling index."""
-    starts = np.zeros(depths.size + 1, np.int64)
-    for i in range(depths.size):
-        starts[i + 1] = starts[i] + (1 if depths[i] > 0 else 0)
-    order = _front_to_back(depths.astype(np.float64), starts)
+def _back_to_front(drawn, forward):  # type: ignore[no-untyped-def]
+    """Indices [V] by how far means lie along ``forward`` of those whose fourth number is positive; equal ones by
+    falling index."""
+    count = len(drawn)
+    depths, starts = np.empty(count, np.float64), np.zeros(count + 1, np.int64)
+    for i in range(count):
+        depths[i] = forward[0] * drawn[i, 0] + forward[1] * drawn[i, 1] + forward[2] * drawn[i, 2]
+        starts[i + 1] = starts[i] + (1 if drawn[i, 3] > 0 else 0)
+    order = _front_to_back(depths, starts)
     return order[::-1].copy()

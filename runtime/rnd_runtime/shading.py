@@ -60,6 +60,7 @@ class Shader:
             and was trained on 32 × 64; more changes highlights below roughness 0.4 only.
 
     Attributes:
+        light_to_world: [3, 3], the probe's frame → that of the Gaussians that are shaded, see :meth:`in_frame`.
         sky: all the light but the suns, as the mode has it.
         suns: what ``table+sun`` took out of the map; empty when nothing in it is bright and compact enough.
 
@@ -69,6 +70,7 @@ class Shader:
 
     def __init__(self, light: Light, mode: str = "table+sun", *, texels: tuple[int, int] = (32, 64)) -> None:
         self.light, self.mode = light, mode
+        self.light_to_world = light.rotation
         self.suns: tuple[Sun, ...] = ()
         self.sky: AmbientLight | SkyTables | DistantLights
         if mode == "ao":
@@ -87,17 +89,24 @@ class Shader:
         """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
         shader = copy.copy(self)
         shader.light = replace(self.light, yaw=yaw)
+        shader.light_to_world = shader.light.rotation
+        return shader
+
+    def in_frame(self, frame_to_world: ArrayLike) -> Shader:
+        """The same light for Gaussians in a frame that ``frame_to_world`` [3, 3] turns to the world's axes."""
+        shader = copy.copy(self)
+        shader.light_to_world = np.asarray(frame_to_world, np.float64).T @ self.light.rotation
         return shader
 
     def shade(
         self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None
     ) -> Floats32:
-        """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m, world.
+        """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m.
 
         Gaussians that face away from the camera are shaded too: at a silhouette they are seen. Those that are
         not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same.
         """
-        light_to_world = self.light.rotation
+        light_to_world = self.light_to_world
         seen = mask(seen, len(gaussians.means))
         radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
         if self.suns and len(radiance):

@@ -54,13 +54,13 @@ class GlShading:
         eye: ArrayLike,
         root_rotation: ArrayLike,
     ) -> moderngl.Texture:
-        """Linear radiance of ``ranks`` Gaussians towards ``eye`` [3] m, world, a texel for each rank.
+        """Linear radiance of ``ranks`` Gaussians towards ``eye`` [3] m, a texel for each rank.
 
         Args:
             order: of type i4, the Gaussian of each rank. All Gaussians of ``surfaces`` cast shadows.
-            root_rotation: [3, 3], root frame → world.
+            root_rotation: [3, 3], root frame → that of the surfaces.
         """
-        light_to_world = shader.light.rotation
+        light_to_world = shader.light_to_world
         textures, uniforms = self._sky_of(shader.sky)
         textures = {**textures, **surfaces.textures(), "order": order}
         suns = shader.suns

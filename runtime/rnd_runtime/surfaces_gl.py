@@ -16,7 +16,10 @@ from .shading import shadow_radii
 
 
 class Surfaces(NamedTuple):
-    """N Gaussians in textures as :class:`rnd_runtime.gl_passes.GaussianTexture` lays them out; world frame."""
+    """N Gaussians in textures as :class:`rnd_runtime.gl_passes.GaussianTexture` lays them out.
+
+    What the shaders call world is the frame of camera and light, as in :class:`rnd_runtime.gaussians.Gaussians`.
+    """
 
     points: moderngl.Texture  # mean m; disc radius m, 0 where it casts no shadow
     normals: moderngl.Texture  # unit; opacity

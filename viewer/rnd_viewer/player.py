@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import KeptRadiance, draw, draw_encoded
+from rnd_runtime.frame import KeptRadiance, as_seen_from, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light
@@ -108,10 +108,11 @@ class Player:
         else:
             with self.times.stage("posing"):
                 gaussians = self.avatar.posed(encoded)
+            brought = as_seen_from(encoded.root, self.shader, camera)
             if self.aovs:
-                raster = self._raster_with_aovs(gaussians, camera)
+                raster = self._raster_with_aovs(gaussians, *brought)
             else:
-                raster = self._cheaper_raster(gaussians, camera, quality)
+                raster = self._cheaper_raster(gaussians, *brought, quality)
         for stage, seconds in raster.seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):
@@ -126,14 +127,16 @@ class Player:
             aovs[name] = aov_values(name, splatted, raster.alpha)
         return Frame(raster.image[..., :3], raster.alpha, behind, aovs)
 
-    def _cheaper_raster(self, gaussians: Gaussians, camera: Camera, quality: Quality) -> Raster:
+    def _cheaper_raster(
+        self, gaussians: Gaussians, shader: Shader, camera: Camera, quality: Quality
+    ) -> Raster:
         count = len(gaussians.means)
         if self._kept is None or self._kept[1] >= quality.shade_every or len(self._kept[0].known) != count:
             self._kept = KeptRadiance(count), 0
         kept, age = self._kept
         self._kept = kept, age + 1
         sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
-        raster = draw(gaussians, self.shader, camera.resized(*sides), self.rasterizer, kept=kept)
+        raster = draw(gaussians, shader, camera.resized(*sides), self.rasterizer, kept=kept)
         if quality.scale == 1:
             return raster
         with self.times.stage("enlarging"):
@@ -142,10 +145,10 @@ class Player:
         depth = np.zeros((camera.height, camera.width), np.float32)
         return Raster(picture[..., :3], picture[..., 3], depth, raster.seconds)
 
-    def _raster_with_aovs(self, gaussians: Gaussians, camera: Camera) -> Raster:
+    def _raster_with_aovs(self, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
         """Radiance, then the AOVs' features, splatted; both are the CPU's."""
         with self.times.stage("shading"):
-            radiance = self.shader.shade(gaussians, camera.position)
+            radiance = shader.shade(gaussians, camera.position)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
         return self.rasterizer(
             gaussians.means,

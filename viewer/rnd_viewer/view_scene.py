@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.camera import Camera
+from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.frame import draw
+from rnd_runtime.frame import as_seen_from, draw
 from rnd_runtime.gaussians import Gaussians, Raster
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion, load_motion
@@ -68,7 +68,7 @@ class Scene:
         self.name, self.size = options.avatar.name, options.size
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
         self._behind: tuple[tuple[Any, ...], Floats32] | None = None
-        self._posed: tuple[Motion, float, Gaussians] | None = None
+        self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
 
     def description(self) -> dict[str, Any]:
         """What a page needs to know before it asks for pictures."""
@@ -110,13 +110,15 @@ class Scene:
         """The picture of ``state`` with the time that each stage took."""
         seconds: dict[str, float] = {}
         camera, motion, time_s = self._view(state)
-        gaussians = _fewer(self._pose(motion, time_s, seconds), state.gaussians)
+        gaussians, root = self._pose(motion, time_s, seconds)
+        gaussians = _fewer(gaussians, state.gaussians)
+        shader, beside = as_seen_from(root, self._turned_shader(state), camera)
         if state.output in ("lit", "light"):
-            raster = self._draw_lit(state, gaussians, camera)
+            raster = self._draw_lit(state, gaussians, shader, beside)
         else:
-            features = splat_features((state.output,), gaussians, camera)[0].astype(np.float32)
+            features = splat_features((state.output,), gaussians, beside)[0].astype(np.float32)
             arrays = gaussians.means, gaussians.covariances, gaussians.opacities
-            raster = self.rasterizer(*arrays, features, camera, depth=False)
+            raster = self.rasterizer(*arrays, features, beside, depth=False)
         started = perf_counter()
         if state.output in ("lit", "light", "albedo"):
             srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))
@@ -178,21 +180,24 @@ class Scene:
         size = (max(round(side * scale), 1) for side in (camera.width, camera.height))
         return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
 
-    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> Gaussians:
-        """The posed avatar, kept while only camera and light move."""
+    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> tuple[Gaussians, Floats]:
+        """The avatar in its root's frame, and that frame → world [4, 4]; kept while only camera and light move."""
         if self._posed is None or self._posed[0] is not motion or self._posed[1] != time_s:
             started = perf_counter()
             encoded = self.avatar.encode(motion, time_s)
             known = perf_counter()
-            self._posed = motion, time_s, self.avatar.posed(encoded)
+            self._posed = motion, time_s, self.avatar.posed(encoded), encoded.root
             seconds |= {"encoders": known - started, "posing": perf_counter() - known}
-        return self._posed[2]
+        return self._posed[2:]
 
-    def _draw_lit(self, state: ViewState, gaussians: Gaussians, camera: Camera) -> Raster:
+    def _turned_shader(self, state: ViewState) -> Shader:
+        shader = self._shader(self._light_name(state), state.shade)
+        return shader.turned(shader.light.yaw + state.yaw)
+
+    def _draw_lit(self, state: ViewState, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
         if state.output == "light":
             gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
-        shader = self._shader(self._light_name(state), state.shade)
-        raster = draw(gaussians, shader.turned(shader.light.yaw + state.yaw), camera, self.rasterizer)
+        raster = draw(gaussians, shader, camera, self.rasterizer)
         if state.exposure == 0:
             return raster
         return replace(raster, image=raster.image * np.float32(2.0**state.exposure))

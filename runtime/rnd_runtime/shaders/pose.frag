@@ -2,7 +2,7 @@
 
 uniform sampler2D log_template;  // JOINT_TEXELS texels a Gaussian
 uniform sampler2D rest;          // six texels a Gaussian: see posing_gl.py
-uniform sampler2D bones;         // three texels a joint, a joint a row: rest pose → posed world
+uniform sampler2D bones;         // three texels a joint, a joint a row: rest pose → posed
 uniform float max_offset;        // m
 uniform float variance_floor;    // m²
 uniform float fallback;

@@ -15,7 +15,7 @@ uniform float facing;       // n·v below which nothing is drawn
 
 layout(location = 0) out vec4 place;   // centre px; reach in units of the ellipse; log2 of the opacity
 layout(location = 1) out vec4 shape;   // √fall_x, √fall_y, shear, –
-layout(location = 2) out float depth;  // m; −1 where nothing is drawn
+layout(location = 2) out vec4 drawn;   // mean m; 1, or −1 where nothing is drawn
 
 const float NEAR = 0.1;       // m
 const float DILATION = 0.3;   // px²
@@ -33,7 +33,7 @@ void main() {
     float opacity = outward.w, trace = s.x + s.w + t.y;
     place = vec4(0.0);
     shape = vec4(1.0, 1.0, 0.0, 0.0);
-    depth = -1.0;
+    drawn = vec4(mean, -1.0);
 
     vec3 p = mean * axes + translation;
     vec3 to_eye = eye - mean;
@@ -62,5 +62,5 @@ void main() {
 
     place = vec4(centre, sqrt(reach), peak);
     shape = vec4(sqrt(HALF_LOG2_E / conditional), sqrt(HALF_LOG2_E / yy), shear, 0.0);
-    depth = p.z;
+    drawn.w = 1.0;
 }

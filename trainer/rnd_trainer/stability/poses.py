@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from rnd_runtime.avatar import POSED_OUTPUTS
+from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, texel_directions
 from rnd_runtime.motion import Motion
@@ -15,7 +16,7 @@ from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import bone_transforms
 
-from .figures import Floats, Result, above, at_most, below, decibels, stated
+from .figures import Floats, Result, above, at_most, below, coded, decibels, stated
 from .subject import ARMS_DOWN, EXTREMES, Angles, Subject, bytes_of
 
 BYTE = 1 / 255
@@ -256,8 +257,8 @@ def global_rotation(subject: Subject) -> Result:
     rng = np.random.default_rng(3)
     walk = subject.walk(0.5)
     time, camera = 0.4, subject.camera()
-    base = subject.avatar.pose(walk, time)
-    reference = subject.picture(base, camera, Shader(_smooth_light(np.eye(3)), "table"))
+    renderer = FrameRenderer(subject.avatar, _smooth_light(np.eye(3)), camera, shade="table")
+    reference = coded(renderer.render(walk, time).radiance)
     weights = subject.weights(walk, time)
     image, encoders = 0.0, 0.0
     for _ in range(subject.few(5, 20)):
@@ -268,12 +269,11 @@ def global_rotation(subject: Subject) -> Result:
         turned = Motion(
             rotations, np.tile(turn @ pivot - pivot, (walk.frame_count, 1)), walk.fps, walk.joint_names
         )
-        pose = np.eye(4)
-        pose[:3, :3] = turn.T
-        view = type(camera)(camera.width, camera.height, camera.K, camera.world_to_camera @ pose)
-        posed = subject.avatar.pose(turned, time)
-        shader = Shader(_smooth_light(turn), "table")
-        image = max(image, largest(subject.picture(posed, view, shader), reference))
+        back = np.eye(4)
+        back[:3, :3] = turn.T
+        renderer.camera = camera.in_frame(back)
+        renderer.relight(_smooth_light(turn))
+        image = max(image, largest(coded(renderer.render(turned, time).radiance), reference))
         encoders = max(encoders, float(np.abs(subject.weights(turned, time) - weights).max()))
     figures = (
         below("largest pixel difference", image / BYTE, 2, "/255"),

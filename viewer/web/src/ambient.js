@@ -20,19 +20,16 @@ export function buildAmbient(light) {
   return coefficients;
 }
 
-/** Radiance [count·3] towards `eye` under the harmonics, turned by the 3×3 `lightToWorld`. */
-export function shadeAmbient(coefficients, { means, normals, albedo, roughness, visibility, root: q }, count, eye, r, radiance) {
-  const rootToLight = new Float64Array(9);  // as the harmonics are turned: rootᵀ · lightToWorld
-  for (let i = 0; i < 3; i++)
-    for (let j = 0; j < 3; j++) rootToLight[3 * i + j] = q[i] * r[j] + q[3 + i] * r[3 + j] + q[6 + i] * r[6 + j];
-  const light = times(shRotation(rootToLight), coefficients), lobes = lobeTable(), lobe = new Float64Array(8);
+/** Radiance [count·3] towards `eye` under the harmonics, turned by the 3×3 `lightToRoot`. */
+export function shadeAmbient(coefficients, { means, normals, albedo, roughness, visibility }, count, eye, lightToRoot, radiance) {
+  const light = times(shRotation(lightToRoot), coefficients), lobes = lobeTable(), lobe = new Float64Array(8);
   const atNormal = new Float64Array(16), atLobe = new Float64Array(16), n = [0, 0, 0], v = [0, 0, 0];
   for (let i = 0; i < count; i++) {
     const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
     const distance = Math.max(Math.hypot(dx, dy, dz), 1e-12);
     for (let k = 0; k < 3; k++) {
-      n[k] = q[k] * normals[3 * i] + q[3 + k] * normals[3 * i + 1] + q[6 + k] * normals[3 * i + 2];
-      v[k] = (q[k] * dx + q[3 + k] * dy + q[6 + k] * dz) / distance;
+      n[k] = normals[3 * i + k];
+      v[k] = (k === 0 ? dx : k === 1 ? dy : dz) / distance;
     }
     lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
     shBasis(...n, atNormal);

@@ -2,7 +2,7 @@
 
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { motionWindow, poseAt } from "./motion.js";
-import { multiply } from "./rotations.js";
+import { multiply, rotate } from "./rotations.js";
 
 const METADATA_PROPS = 14;  // field of onnx.ModelProto: repeated {1: key, 2: value}
 const SCHEMA = "rnd-avatar/1";
@@ -48,20 +48,24 @@ export class Avatar {
     }, outputs);
   }
 
-  /** The Gaussians at `time` of `motion` in the world, as rnd_runtime/gaussians.py has them, and joints [J·3] m. */
+  /** The Gaussians at `time` of `motion`, as rnd_runtime/gaussians.py has them, in the frame of the `root`: {rotation [9],
+   *  translation [3]} → world; and joints [J·3] m in the world. */
   async pose(motion, time) {
     const { window, velocity } = motionWindow(motion, time, this.windowPoses, this.windowSeconds);
     const now = poseAt(motion, time);
-    const { bones, joints } = boneTransforms(this.skeleton, now.rotations, now.translation);
+    const joints = boneTransforms(this.skeleton, now.rotations, now.translation).joints;
+    const place = this.skeleton.rest.subarray(0, 3), rotation = now.rotations.slice(0, 9), turned = rotate(rotation, place);
+    const root = { rotation, translation: turned.map((value, k) => place[k] + now.translation[k] - value) };
+    now.rotations.set([1, 0, 0, 0, 1, 0, 0, 0, 1]);
+    const { bones } = boneTransforms(this.skeleton, now.rotations, [0, 0, 0]);
     const posed = await this.run(window, velocity, bones, POSED);
     const [means, covariances, normals, visibility] = POSED.map((name) => posed[name].data);
-    const root = [0, 1, 2].flatMap((row) => [bones[4 * row], bones[4 * row + 1], bones[4 * row + 2]]);
     const { opacities, albedo, roughness } = this;
     return { count: this.gaussians, means, covariances, normals, visibility, opacities, albedo, roughness, root, joints };
   }
 }
 
-/** Bones [J·12], rest pose → world, and joint positions [J·3]. */
+/** Bones [J·12], rest pose → posed, and joint positions [J·3]. */
 function boneTransforms(skeleton, rotations, translation) {
   const { parents, rest } = skeleton, count = parents.length;
   const turns = new Float64Array(9 * count), joints = new Float64Array(3 * count), bones = new Float32Array(12 * count);

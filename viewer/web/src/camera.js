@@ -1,6 +1,7 @@
 // Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/camera.py, rnd_viewer/cameras.py).
 
 import { jointsAt } from "./avatar.js";
+import { multiply, rotate, transposed } from "./rotations.js";
 
 const PADDING = 0.14;  // of the skeleton's height: what the body reaches beyond its joints
 const ELEVATION = 5 * Math.PI / 180, FIELD_OF_VIEW = 35 * Math.PI / 180;
@@ -21,6 +22,15 @@ export function cameraOf({ azimuth, elevation, distance, target, fov, width, hei
   const translation = [0, 1, 2].map((row) =>
     -(rotation[3 * row] * position[0] + rotation[3 * row + 1] * position[1] + rotation[3 * row + 2] * position[2]));
   return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), rotation, translation, position };
+}
+
+/** The same view for points in a frame {rotation [9], translation [3]} → world. */
+export function inFrame(camera, frame) {
+  const rotation = new Float64Array(9), moved = rotate(camera.rotation, frame.translation);
+  multiply(camera.rotation, 0, frame.rotation, 0, rotation, 0);
+  const translation = moved.map((value, k) => value + camera.translation[k]);
+  const position = rotate(transposed(rotation), translation).map((value) => -value);
+  return { ...camera, rotation, translation, position };
 }
 
 /** rnd-play's front view of `motion` in a square picture. */

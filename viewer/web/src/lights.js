@@ -2,6 +2,7 @@
 
 import { clampRoughness, ggx } from "./brdf.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
+import { rotate } from "./rotations.js";
 import { shBasis } from "./sh.js";
 
 const TEXELS = [32, 64], CUT_TEXELS = [128, 256], HALF_FLOOR = 1e-8;
@@ -74,14 +75,13 @@ function halves({ top, bottom, left, right }, total, height, width) {
   });
 }
 
-/** Radiance [count·3] towards `eye` under the lights, turned by the 3×3 `lightToWorld`. */
-export function shadeLights(lights, { means, normals, albedo, roughness, visibility, root: q }, count, eye, r, radiance) {
+/** Radiance [count·3] towards `eye` under the lights, turned by the 3×3 `lightToRoot`. */
+export function shadeLights(lights, { means, normals, albedo, roughness, visibility }, count, eye, lightToRoot, radiance) {
   const K = lights.flux.length / 3, { flux } = lights, toward = new Float64Array(3 * K), basis = new Float64Array(16 * K);
   for (let k = 0; k < K; k++) {
-    const [x, y, z] = lights.directions.subarray(3 * k, 3 * k + 3);
-    const l = [0, 1, 2].map((axis) => r[3 * axis] * x + r[3 * axis + 1] * y + r[3 * axis + 2] * z);
+    const l = rotate(lightToRoot, lights.directions.subarray(3 * k, 3 * k + 3));
     toward.set(l, 3 * k);
-    shBasis(...[0, 1, 2].map((axis) => q[axis] * l[0] + q[3 + axis] * l[1] + q[6 + axis] * l[2]), basis.subarray(16 * k));
+    shBasis(...l, basis.subarray(16 * k));
   }
   for (let i = 0; i < count; i++) {
     const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];

@@ -46,3 +46,9 @@ export function transposedTimes(a, atA, b, atB, out, at) {
     for (let j = 0; j < 3; j++)
       out[at + 3 * i + j] = a[atA + i] * b[atB + j] + a[atA + 3 + i] * b[atB + 3 + j] + a[atA + 6 + i] * b[atB + 6 + j];
 }
+
+/** aᵀ of a 3×3. */
+export const transposed = (a) => [a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]];
+
+/** a · v of a 3×3 and [3]. */
+export const rotate = (a, v) => [0, 1, 2].map((k) => a[3 * k] * v[0] + a[3 * k + 1] * v[1] + a[3 * k + 2] * v[2]);

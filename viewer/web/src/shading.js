@@ -2,21 +2,22 @@
 
 import { buildAmbient, shadeAmbient } from "./ambient.js";
 import { allTexels, medianCut, shadeLights } from "./lights.js";
+import { rotate } from "./rotations.js";
 import { addSuns } from "./shadow.js";
 import { buildSky, shadeSky } from "./sky.js";
 import { extractSuns } from "./sun.js";
 
 /**
- * A light made ready for the mode `shade`: a function (gaussians, count, eye, lightToWorld, grown) → radiance [count·3].
+ * A light made ready for the mode `shade`: a function (gaussians, count, eye, lightToRoot, grown) → radiance [count·3].
  * `grown`: by how much covariances are multiplied.
  */
 export function makeShader(light, shade) {
   const { sky, suns } = shade === "table+sun" ? extractSuns(light) : { sky: light, suns: [] };
   const [prepared, shadeUnder] = prepare(sky, shade);
-  return (gaussians, count, eye, lightToWorld, grown) => {
+  return (gaussians, count, eye, lightToRoot, grown) => {
     const radiance = new Float32Array(3 * count);
-    shadeUnder(prepared, gaussians, count, eye, lightToWorld, radiance);
-    const turned = suns.map((sun) => ({ ...sun, direction: rotate(lightToWorld, sun.direction) }));
+    shadeUnder(prepared, gaussians, count, eye, lightToRoot, radiance);
+    const turned = suns.map((sun) => ({ ...sun, direction: rotate(lightToRoot, sun.direction) }));
     addSuns(turned, gaussians, count, eye, grown, radiance);
     return radiance;
   };
@@ -27,5 +28,3 @@ function prepare(light, shade) {
   if (shade.startsWith("table")) return [buildSky(light), shadeSky];
   return [shade === "brute" ? allTexels(light) : medianCut(light, Number(shade.split(":")[1])), shadeLights];
 }
-
-const rotate = (m, v) => [0, 1, 2].map((k) => m[3 * k] * v[0] + m[3 * k + 1] * v[1] + m[3 * k + 2] * v[2]);

@@ -6,7 +6,7 @@ const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
 const TURNED_AWAY = -0.2, AT_SILHOUETTE = 0;  // n·v over which suns fade out on what faces away (shading.py)
 const CLEARANCE_TEXELS = Math.fround(0.35), COSINE_FLOOR = Math.fround(0.1);  // and of a disc's radius, once
 
-/** Add to `radiance` [count·3] what `suns` ({direction in the world, irradiance, spread}) lay on the Gaussians. */
+/** Add to `radiance` [count·3] what `suns` ({direction in the root's frame, irradiance, spread}) lay on the Gaussians. */
 export function addSuns(suns, gaussians, count, eye, grown, radiance) {
   const radii = suns.length ? discRadii(gaussians, count, grown) : null;
   for (const sun of suns) shadeSun(sun, gaussians, count, eye, sunVisibility(sun.direction, gaussians, count, radii), radiance);

@@ -2,6 +2,7 @@
 
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { WIDTHS, lobeAt, lobeTable } from "./lobe.js";
+import { transposed } from "./rotations.js";
 import { shBasis, shRotation } from "./sh.js";
 
 const TEXELS = [32, 64], DIFFUSE = 33, SPECULAR = 49;
@@ -84,14 +85,10 @@ function octahedralCell(x, y, z, size, out) {
   out[2] = b - row;
 }
 
-/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, turned by the 3×3 `lightToWorld`. */
-export function shadeSky(sky, gaussians, count, eye, lightToWorld, radiance) {
-  const { means, normals, albedo, roughness, visibility, root } = gaussians, lobes = lobeTable(), r = lightToWorld;
-  const rootToLight = new Float64Array(9);  // lightToWorldᵀ · root
-  for (let i = 0; i < 3; i++)
-    for (let j = 0; j < 3; j++)
-      rootToLight[3 * i + j] = r[i] * root[j] + r[3 + i] * root[3 + j] + r[6 + i] * root[6 + j];
-  const diffuse = turned(sky.diffuse, shRotation(rootToLight)), { specular } = sky, q = rootToLight;
+/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, turned by the 3×3 `lightToRoot`. */
+export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
+  const { means, normals, albedo, roughness, visibility } = gaussians, lobes = lobeTable(), r = lightToRoot;
+  const diffuse = turned(sky.diffuse, shRotation(transposed(r))), { specular } = sky;
   const n = [0, 0, 0], v = [0, 0, 0], lobe = new Float64Array(8), basis = new Float64Array(16);
   const cell = new Float64Array(3), node = new Float64Array(3), level = 3 * SPECULAR * SPECULAR;
   for (let i = 0; i < count; i++) {
@@ -103,7 +100,7 @@ export function shadeSky(sky, gaussians, count, eye, lightToWorld, radiance) {
     }
     lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
     const mx = lobe[1], my = lobe[2], mz = lobe[3], place = lobe[4];
-    shBasis(q[0] * mx + q[3] * my + q[6] * mz, q[1] * mx + q[4] * my + q[7] * mz, q[2] * mx + q[5] * my + q[8] * mz, basis);
+    shBasis(r[0] * mx + r[1] * my + r[2] * mz, r[3] * mx + r[4] * my + r[5] * mz, r[6] * mx + r[7] * my + r[8] * mz, basis);
     let seen = visibility[16 * i] * basis[0];  // averaged over the lobe
     for (let j = 1; j < 16; j++) seen += lobe[j < 4 ? 5 : j < 9 ? 6 : 7] * visibility[16 * i + j] * basis[j];
     const low = Math.min(Math.floor(place), WIDTHS.length - 2), up = place - low;

@@ -1,10 +1,11 @@
 // Everything but the page: reads the files, makes pictures of states; the same states and answers as rnd-view's.
 
 import { Avatar } from "./avatar.js";
-import { cameraOf, homeView, projectJoints } from "./camera.js";
+import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
 import { downsize, readLight } from "./light.js";
 import { readMotion, restMotion } from "./motion.js";
 import { project } from "./project.js";
+import { multiply, transposed } from "./rotations.js";
 import { shBasis } from "./sh.js";
 import { makeShader } from "./shading.js";
 import { Splatter } from "./splat.js";
@@ -55,11 +56,11 @@ async function render({ number, state }) {
   if (!posed || posed.time !== state.time) posed = { time: state.time, gaussians: await avatar.pose(motion, state.time) };
   clock("encoders");
   const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
-  const grown = avatar.gaussians / count, { gaussians } = posed;
+  const grown = avatar.gaussians / count, { gaussians } = posed, beside = inFrame(camera, gaussians.root);
   const features = state.output === "lit" || state.output === "light"
-    ? radianceOf(state, gaussians, count, camera, grown) : material(state.output, gaussians, count, camera);
+    ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
-  const records = project(gaussians, count, features, camera, grown);
+  const records = project(gaussians, count, features, beside, grown);
   clock("sorting");
   splatter.draw(records, state.width, state.height, look(state, camera));
   const image = splatter.canvas.transferToImageBitmap();
@@ -69,17 +70,19 @@ async function render({ number, state }) {
   postMessage(answer, [image]);
 }
 
-function radianceOf(state, gaussians, count, camera, grown) {
+function radianceOf(state, gaussians, count, eye, grown) {
   const entry = lights[state.light];
   if (!entry.shaders.has(state.shade)) entry.shaders.set(state.shade, makeShader(entry.light, state.shade));
   const shown = state.output === "light" ? { ...gaussians, albedo: new Float32Array(3 * count).fill(CLAY) } : gaussians;
-  const radiance = entry.shaders.get(state.shade)(shown, count, camera.position, lightToWorld(state.yaw), grown);
+  const lightToRoot = new Float64Array(9);
+  multiply(transposed(gaussians.root.rotation), 0, lightToWorld(state.yaw), 0, lightToRoot, 0);
+  const radiance = entry.shaders.get(state.shade)(shown, count, eye, lightToRoot, grown);
   const gain = 2 ** state.exposure;
   return gain === 1 ? radiance : radiance.map((value) => value * gain);
 }
 
 /** Three features [count·3] of a material map. */
-function material(output, { albedo, normals, roughness, visibility, root }, count, { rotation }) {
+function material(output, { albedo, normals, roughness, visibility }, count, { rotation }) {
   if (output === "albedo") return albedo;
   const features = new Float32Array(3 * count), basis = new Float64Array(16);
   for (let i = 0; i < count; i++) {
@@ -88,7 +91,7 @@ function material(output, { albedo, normals, roughness, visibility, root }, coun
       for (let k = 0; k < 3; k++) features[3 * i + k] = rotation[3 * k] * x + rotation[3 * k + 1] * y + rotation[3 * k + 2] * z;
     else if (output === "roughness") features[3 * i] = roughness[i];
     else {
-      shBasis(root[0] * x + root[3] * y + root[6] * z, root[1] * x + root[4] * y + root[7] * z, root[2] * x + root[5] * y + root[8] * z, basis);
+      shBasis(x, y, z, basis);
       let sum = 0;
       for (let j = 0; j < 16; j++) sum += visibility[16 * i + j] * COSINE_LOBE[j] * basis[j];
       features[3 * i] = Math.min(Math.max(sum, 0), 1);
