@@ -254,6 +254,39 @@ def store(context, array, index, value):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp, value), emit
 
 
+@intrinsic
+def spread(context, array, index):  # type: ignore[no-untyped-def]
+    """Sixteen times ``array[index]`` of a flat contiguous float32 array; no bounds are checked."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = ctx.make_array(sig.args[0])(ctx, builder, args[0]).data
+        return _splat(builder, builder.load(builder.gep(data, [args[1]])))
+
+    return LANES(array, types.intp), emit
+
+
+@intrinsic
+def transpose(context, source, target):  # type: ignore[no-untyped-def]
+    """The 16 × 16 numbers of ``source`` into ``target``, rows as columns; both flat, contiguous and float32."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        places = [ir.Constant(ir.IntType(64), WIDTH * k) for k in range(WIDTH)]
+        rows = [builder.load(_address(ctx, builder, sig.args[0], args[0], at), align=4) for at in places]
+        for step in (1, 2, 4, 8):  # swap the blocks of this size that lie off the diagonal
+            upper = [k for k in range(WIDTH) if not k & step]
+            low = [j if not j & step else WIDTH + j - step for j in range(WIDTH)]
+            high = [j + step if not j & step else WIDTH + j for j in range(WIDTH)]
+            for k in upper:
+                a, b = rows[k], rows[k + step]
+                rows[k] = builder.shuffle_vector(a, b, _constant(low, _INT, _INTS))
+                rows[k + step] = builder.shuffle_vector(a, b, _constant(high, _INT, _INTS))
+        for at, row in zip(places, rows):
+            builder.store(row, _address(ctx, builder, sig.args[1], args[1], at), align=4)
+        return ctx.get_dummy_value()
+
+    return types.void(source, target), emit
+
+
 def _exp2_coefficients() -> list[float]:
     """Coefficients of 2^x on [-½, ½], degree 5, near minimax (relative error 1e-7): interpolation at
     Chebyshev's points."""

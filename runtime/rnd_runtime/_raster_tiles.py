@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from ._raster_project import TILE, tile_range
@@ -22,7 +22,7 @@ class Splats(NamedTuple):
     slot_starts: NDArray[np.int64]  # [N + 1]: the slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]
     tile_starts: NDArray[np.int64]  # [tiles + 1] into the pairs
     pair_gaussians: NDArray[np.int32]  # [P]
-    pair_slots: NDArray[np.int32]  # [P] where the pair's gradient goes
+    pair_slots: NDArray[np.int32]  # [P] where the pair's gradient goes; empty where none is asked for
 
 
 @njit(error_model="numpy")
@@ -74,33 +74,52 @@ def _next_tile(tile, x, x0, x1, tiles_x):  # type: ignore[no-untyped-def]
     return tile + (tiles_x - (x1 - x0) if wraps else 1), x0 if wraps else x + 1
 
 
-@njit(error_model="numpy", nogil=True, cache=True)
-def sort_into_tiles(boxes, depths, slot_starts, width, height):  # type: ignore[no-untyped-def]
+@njit(parallel=True, error_model="numpy", nogil=True, cache=True)
+def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # type: ignore[no-untyped-def]
     """Counting sort of the (Gaussian, tile) pairs into tiles, front to back within each.
 
-    Takes what :func:`._raster_project.project` returns. Returns tile_starts, pair_gaussians and pair_slots of
-    :class:`Splats`.
+    Takes what :func:`._raster_project.project` returns and the picture's ``size`` (width, height). Returns tile_starts,
+    pair_gaussians and pair_slots of :class:`Splats`, the last one empty unless ``with_slots``. Each thread counts and
+    places a stretch of the Gaussians, near ones first, so their number changes nothing.
     """
-    tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    tiles = tiles_x * tiles_y
+    tiles_x, tiles_y = (size[0] + TILE - 1) // TILE, (size[1] + TILE - 1) // TILE
     order = _front_to_back(depths, slot_starts)
-    starts = np.zeros(tiles + 1, np.int64)
-    for g in order:
-        x0, y0, x1, _ = tile_range(boxes, g)
-        tile, x = y0 * tiles_x + x0, x0
-        for _ in range(slot_starts[g], slot_starts[g + 1]):
-            starts[tile + 1] += 1
-            tile, x = _next_tile(tile, x, x0, x1, tiles_x)
-    for tile in range(tiles):
-        starts[tile + 1] += starts[tile]
-    cursor = starts[:-1].copy()
-    pair_gaussians, pair_slots = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    for g in order:
-        x0, y0, x1, _ = tile_range(boxes, g)
-        tile, x = y0 * tiles_x + x0, x0
-        for slot in range(slot_starts[g], slot_starts[g + 1]):
-            place = cursor[tile]
-            cursor[tile] = place + 1
-            pair_gaussians[place], pair_slots[place] = g, slot
-            tile, x = _next_tile(tile, x, x0, x1, tiles_x)
+    stretch = (order.size + threads - 1) // threads
+    places = np.zeros((threads, tiles_x * tiles_y), np.int32)
+    for part in prange(threads):
+        own = places[part]
+        for g in order[part * stretch : (part + 1) * stretch]:
+            x0, y0, x1, _ = tile_range(boxes, g)
+            tile, x = y0 * tiles_x + x0, x0
+            for _ in range(slot_starts[g], slot_starts[g + 1]):
+                own[tile] += 1
+                tile, x = _next_tile(tile, x, x0, x1, tiles_x)
+    starts = _starts(places)
+    pair_gaussians = np.empty(starts[-1], np.int32)
+    pair_slots = np.empty(starts[-1] if with_slots else 0, np.int32)
+    for part in prange(threads):
+        own = places[part]
+        for g in order[part * stretch : (part + 1) * stretch]:
+            x0, y0, x1, _ = tile_range(boxes, g)
+            tile, x = y0 * tiles_x + x0, x0
+            for slot in range(slot_starts[g], slot_starts[g + 1]):
+                place = own[tile]
+                own[tile] = place + 1
+                pair_gaussians[place] = g
+                if with_slots:
+                    pair_slots[place] = slot
+                tile, x = _next_tile(tile, x, x0, x1, tiles_x)
     return starts, pair_gaussians, pair_slots
+
+
+@njit(error_model="numpy")
+def _starts(places):  # type: ignore[no-untyped-def]
+    """Where each tile's pairs begin [tiles + 1]; the counts [threads, tiles] become where each thread's begin."""
+    starts = np.empty(places.shape[1] + 1, np.int64)
+    total = 0
+    for tile in range(places.shape[1]):
+        starts[tile] = total
+        for part in range(len(places)):
+            total, places[part, tile] = total + places[part, tile], total
+    starts[-1] = total
+    return starts

@@ -25,7 +25,20 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
-from ._lanes import WIDTH, aligned_floats, exp2, lanes, largest, load, root, select, store, total
+from ._lanes import (
+    WIDTH,
+    aligned_floats,
+    exp2,
+    lanes,
+    largest,
+    load,
+    root,
+    select,
+    spread,
+    store,
+    total,
+    transpose,
+)
 
 Floats32 = NDArray[np.float32]
 
@@ -99,16 +112,11 @@ class RestPose:
         rows = np.zeros((self.log_template.shape[1], WIDTH), np.float32)
         rows[:, :12] = np.asarray(bones, np.float32).reshape(len(rows), 12)
         fields = self.fields(logits, offsets, visibility)
-        count = len(self.points)
-        posed = Posed(
-            np.empty((count, 3), np.float32),
-            np.empty((count, 6), np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty((count, _HARMONICS), np.float32),
-        )
+        count = len(rest.log_template)
+        posed = Posed(*(np.empty((count, width), np.float32) for width in (3, 6, 3, _HARMONICS)))
         limits = tuple(np.float32(x) for x in (self.max_offset, self.floor, self.fallback))
         _pose(fields, rest, rows, limits, posed)
-        return posed
+        return Posed(*(values[: len(self.points)] for values in posed))
 
     def fields(self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike) -> Floats32:
         """What is interpolated between the nodes, [M, C + 32]: C logits (J up to a whole number of 16), 16 for the
@@ -122,9 +130,10 @@ class RestPose:
     def arrays(self) -> RestArrays:
         """As the kernel wants them."""
         count, joints = self.log_template.shape
-        log_template = np.full((count, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
-        log_template[:, :joints] = self.log_template
-        own = np.zeros((_OWN, -(-count // WIDTH) * WIDTH), np.float32)
+        whole = -(-count // WIDTH) * WIDTH
+        log_template = np.full((whole, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
+        log_template[:count, :joints] = self.log_template
+        own = np.zeros((_OWN, whole), np.float32)
         for first, values in (
             (_POINTS, self.points),
             (_FACTORS, self.factors),
@@ -132,17 +141,19 @@ class RestPose:
             (_LIMBS, self.limbs),
         ):
             own[first : first + values.shape[1], :count] = values.T
-        weights = np.array(self.neighbour_weights, np.float32, order="C")
-        return RestArrays(np.array(self.neighbours, np.int32), weights, log_template, own)
+        neighbours = np.zeros((whole, self.neighbours.shape[1]), np.int32)
+        weights = np.zeros(neighbours.shape, np.float32)
+        neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
+        return RestArrays(neighbours, weights, log_template, own)
 
 
 class RestArrays(NamedTuple):
-    """Constants of a :class:`RestPose`, C the joints J up to a whole number of registers of 16."""
+    """Constants of a :class:`RestPose`; N and the joints' C are here whole numbers of registers of 16."""
 
     neighbours: NDArray[np.int32]  # [N, K]
     weights: Floats32  # [N, K]
     log_template: Floats32  # [N, C]
-    own: Floats32  # [22, N up to whole registers] points, factors, normals and limbs by component
+    own: Floats32  # [22, N] points, factors, normals and limbs by component
 
 
 class Unposed(NamedTuple):
@@ -199,29 +210,45 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _blend(i, fields, rest, bones, weights, blend):  # type: ignore[no-untyped-def]
-    """A [3, 4] of Gaussian i into ``blend``; ``weights`` is room for its weights."""
+def _shares(i, fields, rest, weights, at):  # type: ignore[no-untyped-def]
+    """e^(logit − the greatest) of Gaussian i's joints into ``weights`` from ``at`` on, and one over their sum."""
     columns = rest.log_template.shape[1]
     greatest = lanes(np.float32(_NEVER))
     for column in range(0, columns, WIDTH):
         logits = load(rest.log_template, i * columns + column) + _interpolated(fields, rest, i, column)
         greatest = select(logits > greatest, logits, greatest)
-        store(weights, column, logits)
+        store(weights, at + column, logits)
     top = largest(greatest)
     sums = lanes(_ZERO)
     for column in range(0, columns, WIDTH):
-        share = _exp(load(weights, column) - top)
+        share = _exp(load(weights, at + column) - top)
         sums += share
-        store(weights, column, share)
-    # two sums: each product would have to wait for the one before
-    even, odd = lanes(_ZERO), lanes(_ZERO)
-    joints = len(bones)
-    for j in range(0, joints - 1, 2):
-        even += weights[j] * load(bones, j * WIDTH)
-        odd += weights[j + 1] * load(bones, (j + 1) * WIDTH)
-    if joints % 2:
-        even += weights[joints - 1] * load(bones, (joints - 1) * WIDTH)
-    store(blend, 0, (even + odd) * (_ONE / total(sums)))
+        store(weights, at + column, share)
+    return _ONE / total(sums)
+
+
+@njit(error_model="numpy")
+def _blend_four(i, fields, rest, bones, weights, rows, at):  # type: ignore[no-untyped-def]
+    """A [3, 4] of Gaussians i … i + 3 into four of ``rows`` from ``at`` on; ``weights`` is room for their weights.
+
+    Four at once: each bone is loaded once for all, and no product waits for the one before.
+    """
+    columns = rest.log_template.shape[1]
+    scale0 = _shares(i, fields, rest, weights, 0)
+    scale1 = _shares(i + 1, fields, rest, weights, columns)
+    scale2 = _shares(i + 2, fields, rest, weights, 2 * columns)
+    scale3 = _shares(i + 3, fields, rest, weights, 3 * columns)
+    sum0, sum1, sum2, sum3 = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
+    for j in range(len(bones)):
+        bone = load(bones, j * WIDTH)
+        sum0 += spread(weights, j) * bone
+        sum1 += spread(weights, columns + j) * bone
+        sum2 += spread(weights, 2 * columns + j) * bone
+        sum3 += spread(weights, 3 * columns + j) * bone
+    store(rows, at, sum0 * scale0)
+    store(rows, at + WIDTH, sum1 * scale1)
+    store(rows, at + 2 * WIDTH, sum2 * scale2)
+    store(rows, at + 3 * WIDTH, sum3 * scale3)
 
 
 @njit
@@ -344,26 +371,29 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
-    count, columns = len(rest.log_template), rest.log_template.shape[1]
+    """All Gaussians, whose arrays are as long as a whole number of registers."""
+    count, columns = rest.log_template.shape
     means, covariances, normals = posed.means, posed.covariances, posed.normals
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        weights, row, out = aligned_floats(columns), aligned_floats(WIDTH), aligned_floats(12 * WIDTH)
-        blend, offset = aligned_floats(12 * WIDTH), aligned_floats(6 * WIDTH)
-        blend[:], offset[:] = _ZERO, _ZERO
+        weights, rows = aligned_floats(4 * columns), aligned_floats(WIDTH * WIDTH)
+        blend, offset = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
+        out = aligned_floats(WIDTH * WIDTH)
+        out[:] = _ZERO
         for first in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), WIDTH):
-            last = min(first + WIDTH, count)
-            for i in range(first, last):
-                _blend(i, fields, rest, bones, weights, row)
-                for c in range(12):
-                    blend[c * WIDTH + i - first] = row[c]
-                store(row, 0, _tanh(_interpolated(fields, rest, i, columns)))
-                for c in range(6):
-                    offset[c * WIDTH + i - first] = row[c]
+            for four in range(0, WIDTH, 4):
+                _blend_four(first + four, fields, rest, bones, weights, rows, four * WIDTH)
+            transpose(rows, blend)
+            for i in range(first, first + WIDTH):
+                store(rows, (i - first) * WIDTH, _interpolated(fields, rest, i, columns))
                 store(posed.visibility, i * WIDTH, _interpolated(fields, rest, i, columns + WIDTH))
+            transpose(rows, offset)
+            for c in range(6):
+                store(offset, c * WIDTH, _tanh(load(offset, c * WIDTH)))
             _pose_sixteen(first, blend, offset, rest, limits, out)
-            for i in range(first, last):
-                at = i - first
+            transpose(out, rows)
+            for i in range(first, first + WIDTH):
+                at = (i - first) * WIDTH
                 for c in range(3):
-                    means[i, c], normals[i, c] = out[c * WIDTH + at], out[(9 + c) * WIDTH + at]
+                    means[i, c], normals[i, c] = rows[at + c], rows[at + 9 + c]
                 for c in range(6):
-                    covariances[i, c] = out[(3 + c) * WIDTH + at]
+                    covariances[i, c] = rows[at + 3 + c]

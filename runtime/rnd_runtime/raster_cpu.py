@@ -65,10 +65,11 @@ class Projected:
         if not np.isfinite(features).all():  # then who is drawn depends on it
             return rasterize(means, covariances, opacities, features, camera, depth=False)
         started = perf_counter()
-        pairs = sort_into_tiles(self._boxes, self._depths, self._slot_starts, camera.width, camera.height)
+        size, threads = (camera.width, camera.height), get_num_threads()
+        pairs = sort_into_tiles(self._boxes, self._depths, self._slot_starts, size, threads, False)
         splats = Splats(self._centers, self._shapes, features, self._slot_starts, *pairs)
         sorted_at = perf_counter()
-        image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
+        image, coverage = blend(splats, camera.width, camera.height, threads)
         seconds = {"sort": sorted_at - started, "raster": perf_counter() - sorted_at}
         return Raster(image, coverage, np.zeros_like(coverage), seconds)
 
@@ -117,10 +118,11 @@ def forward(
     centers, shapes, boxes, attributes, depths, slot_starts = project(
         means, covariances, opacities, features, view, depth
     )
-    pairs = sort_into_tiles(boxes, depths, slot_starts, camera.width, camera.height)
+    size, threads = (camera.width, camera.height), get_num_threads()
+    pairs = sort_into_tiles(boxes, depths, slot_starts, size, threads, True)
     splats = Splats(centers, shapes, attributes, slot_starts, *pairs)
     sorted_at = perf_counter()
-    image, coverage = blend(splats, camera.width, camera.height, get_num_threads())
+    image, coverage = blend(splats, camera.width, camera.height, threads)
     seconds = {"projection+sort": sorted_at - started, "raster": perf_counter() - sorted_at}
     channels = features.shape[1]
     far = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rnd_runtime.camera import Camera
+from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
@@ -49,18 +49,29 @@ def render_runtime(
     albedo_scale: Tensor | None = None,
 ) -> Rendered:
     """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional."""
+    pose, root = _in_root_frame(pose)
+    camera = camera.in_frame(root)
     posed = model(pose)
     gaussians = to_gaussians(posed, pose)
     if albedo_scale is not None:
         gaussians = replace(gaussians, albedo=gaussians.albedo * albedo_scale.numpy())
     radiance = posed.attributes.colour.cpu().numpy()
     if shader is not None:
-        radiance = _shade(model, gaussians, posed, pose, camera, shader)
+        radiance = _shade(model, gaussians, posed, pose, camera, shader.in_frame(root[:3, :3]))
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
     raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
     image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
+
+
+def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
+    """``pose`` in the frame in which playback poses, and that frame → world [4, 4]."""
+    bones = pose.bones.detach().cpu().numpy().astype(np.float64)
+    root = np.vstack([bones[0], [0, 0, 0, 1]])
+    local = np.linalg.inv(root)[:3, :3] @ bones
+    local[:, :, 3] += np.linalg.inv(root)[:3, 3]
+    return replace(pose, bones=torch.from_numpy(local).to(pose.bones)), root
 
 
 def _shade(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.amass import write_amass
-from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file, output_folder
@@ -31,6 +31,7 @@ from .splats import Splats, fixed_colour, make_splats, stored_colours, turned_ov
 from .visionary import check_clip, write_visionary
 
 Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
 SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog", "visionary"), ("glb", "obj")
 # The front camera of rnd-play; only where it stands matters here.
 FRONT = View(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
@@ -64,9 +65,10 @@ def _splats(options: SplatOptions) -> Iterator[str]:
     out = output_folder(options.out)
     clip: list[Splats] = []
     for number in frames:
-        gaussians = avatar.pose(motion, number / motion.fps)
+        encoded = avatar.encode(motion, number / motion.fps)
+        gaussians, lit = avatar.posed(encoded.in_world()), _lit_as_played(avatar, encoded, shader)
         eye = camera_at(number, number / motion.fps).position
-        splats = make_splats(gaussians, _harmonics(options, avatar, gaussians, shader, eye))
+        splats = make_splats(gaussians, _harmonics(options, avatar, gaussians, lit, eye))
         stored = turned_over(splats) if options.ply_axes == "3dgs" else splats
         if "ply" in formats:
             write_ply(out / f"{number:06d}.ply", stored)
@@ -83,8 +85,19 @@ def _splats(options: SplatOptions) -> Iterator[str]:
     yield f"{len(frames)} frames of {avatar.gaussians} Gaussians in {out}: {listed}"
 
 
+def _lit_as_played(avatar: Avatar, encoded: Encoded, shader: Shader) -> Callable[[Floats], Floats32]:
+    """Radiance [N, 3] towards a place in the world; shaded in the root's frame, where the player's shadow maps lie."""
+    gaussians, turn, place = avatar.posed(encoded), encoded.root[:3, :3], encoded.root[:3, 3]
+    here = shader.in_frame(turn)
+    return lambda eye: here.shade(gaussians, turn.T @ (eye - place))
+
+
 def _harmonics(
-    options: SplatOptions, avatar: Avatar, gaussians: Gaussians, shader: Shader, eye: Floats
+    options: SplatOptions,
+    avatar: Avatar,
+    gaussians: Gaussians,
+    lit: Callable[[Floats], Floats32],
+    eye: Floats,
 ) -> Floats:
     def stored(linear: NDArray[np.float32]) -> Floats:
         return stored_colours(gaussians, linear, options.coding, avatar.spacing)
@@ -92,10 +105,8 @@ def _harmonics(
     if options.colour == "albedo":
         return fixed_colour(stored(gaussians.albedo))
     if options.sh_degree == 0:
-        return fixed_colour(stored(shader.shade(gaussians, eye)))
-    return view_dependent_colour(
-        gaussians, lambda position: stored(shader.shade(gaussians, position)), options.sh_degree
-    )
+        return fixed_colour(stored(lit(eye)))
+    return view_dependent_colour(gaussians, lambda position: stored(lit(position)), options.sh_degree)
 
 
 def _transformed(program: str, stem: Path, splats: Splats, formats: tuple[str, ...]) -> None:
