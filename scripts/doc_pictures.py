@@ -1,4 +1,4 @@
-"""Renders the pictures of docs/method.md from the embedded avatar: python scripts/doc_pictures.py"""
+"""Renders README's first picture and those of docs/method.md from the embedded avatar: python scripts/doc_pictures.py"""
 
 from __future__ import annotations
 
@@ -16,23 +16,25 @@ from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_viewer.aov import aov_picture
-from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.background import Background
+from rnd_viewer.cameras import View, frame_motion, front_path, orbit_path
 from rnd_viewer.player import Player
 
 ROOT = Path(__file__).parent.parent
 SIDE, TIME_S = 400, 0.55
+ANGLES = math.radians(35), math.radians(5)  # field of view and elevation
+CYCLE_S = 1.1  # of the walk
 AOVS = ("albedo", "normal", "roughness", "visibility")
 
 
 def main() -> None:
-    """Write docs/pictures/*.png."""
+    """Write assets/bench/demo.png and docs/pictures/*.png."""
     avatar = Avatar.load(ROOT / "assets/avatar.onnx")
     walk = load_motion(ROOT / "assets/walk.npz", avatar.skeleton)
-    moment = walk.at([TIME_S])
-    camera = front_path(
-        frame_motion(avatar.skeleton, moment), View(SIDE, SIDE, math.radians(35), math.radians(5))
-    )(0, 0.0)
     sky = load_light(ROOT / "assets/sky.exr")
+    _strip(avatar, walk, sky)
+    moment = walk.at([TIME_S])
+    camera = front_path(frame_motion(avatar.skeleton, moment), View(SIDE, SIDE, *ANGLES))(0, 0.0)
 
     frame = Player(avatar, sky, Shader(sky), rasterize, aovs=AOVS).render(walk, TIME_S, camera)
     tiles = [frame.srgb]
@@ -55,10 +57,21 @@ def main() -> None:
     for motion, time_s in ((rest, 0.0), (walk, TIME_S)):
         view = front_path(
             frame_motion(avatar.skeleton, motion.at([time_s])),
-            View(SIDE, SIDE, math.radians(35), math.radians(5)),
+            View(SIDE, SIDE, *ANGLES),
         )
         tiles.append(_weights(avatar, motion, time_s, view(0, 0.0)))
     _write("weights.png", tiles)
+
+
+def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
+    """Six moments of one step cycle, each seen from another side and under the sun of another hour."""
+    orbit = orbit_path(frame_motion(avatar.skeleton, walk), View(240, 384, *ANGLES), seconds=1.0)
+    tiles = []
+    for k in range(6):
+        light = replace(sky, yaw=math.radians(50 * k - 20))
+        player = Player(avatar, light, Shader(light), rasterize, Background("hdr"))
+        tiles.append(player.render(walk, TIME_S + CYCLE_S * k / 6, orbit(0, (k - 2) / 6)).srgb)
+    write_image(ROOT / "assets/bench/demo.png", np.ascontiguousarray(np.concatenate(tiles, axis=1)))
 
 
 def _weights(avatar: Avatar, motion: Motion, time_s: float, camera) -> np.ndarray:

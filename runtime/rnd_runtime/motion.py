@@ -55,6 +55,8 @@ class Motion:
         assert self.rotations.shape == (frames, joints, 3, 3), self.rotations.shape
         assert self.translations.shape == (frames, 3) and frames > 0, self.translations.shape
         assert self.fps > 0, self.fps
+        for name in ("rotations", "translations"):  # once, and not whenever a pose is asked for
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
 
     @property
     def frame_count(self) -> int:
@@ -71,8 +73,8 @@ class Motion:
         ``fps`` of the result is still that of the recording and says nothing about ``times_s``.
         """
         place = np.clip(np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps, 0, self.frame_count - 1)
-        rotations = interpolate_rotations(np.ascontiguousarray(self.rotations, np.float64), place)
-        translations = interpolate_points(np.ascontiguousarray(self.translations, np.float64), place)
+        rotations = interpolate_rotations(self.rotations, place)
+        translations = interpolate_points(self.translations, place)
         return Motion(rotations, translations, self.fps, self.joint_names, self.source, self.notes)
 
 

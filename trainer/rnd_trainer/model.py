@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from rnd_runtime.brdf import ROUGHNESS_RANGE
+
 from .config import ModelConfig
 from .encoders import (
     AttributeEncoder,
@@ -24,8 +26,6 @@ from .twist import TwistFrames
 
 ALBEDO_RANGE = (0.03, 0.80)
 """of natural diffuse materials; holds the albedo–light scale in a plausible place"""
-ROUGHNESS_RANGE = (0.09, 0.99)
-"""GGX's D overflows half floats below 0.089"""
 TANGENT_SCALE = (0.25, 2.0)
 """standard deviations along the surface, in units of the spacing: neither gaps nor needles"""
 NORMAL_SCALE = (0.05, 0.5)

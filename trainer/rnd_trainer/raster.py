@@ -10,8 +10,7 @@ from torch import Tensor
 from rnd_runtime import raster_cpu
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
-
-NEAR = 0.1  # m, see rnd_runtime.raster_oracle
+from rnd_runtime.raster_oracle import NEAR
 
 
 def rasterize(
