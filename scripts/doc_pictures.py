@@ -1,4 +1,4 @@
-"""Renders README's first picture and those of docs/method.md from the embedded avatar: python scripts/doc_pictures.py"""
+"""Renders README's first picture and those of docs/method.md: python scripts/doc_pictures.py"""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ SIZE, FRAME = 192, 20
 
 TOLERANCE = 3  # of 255; measured 1
 TIES = 4  # pixels of a state that may be off by more: the last bit of a place decides which of two Gaussians at one
-# depth is in front, or which texel of the sun's map a disc covers; measured 2 in one of 17 states
+# depth is in front, or which texel of the sun's map a disc covers; measured 3 in two of 17 states
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
 pytestmark = [
