@@ -140,6 +140,9 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     ]
     assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
     assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
+    ssim = [r["ssim"] for r in rows if (r["method"], r["split"]) == ("static skinning", "novel_view")]
+    assert cell["ssim"] == pytest.approx(sum(ssim) / 2) and "lpips" not in cell
+    assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
 
 
 def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:

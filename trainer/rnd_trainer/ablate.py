@@ -10,7 +10,7 @@ import dataclasses
 import json
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ POSE_SECONDS = 0.3 / 9
 """between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
 NOISY_MOTION = "motion_noisy.npz"
 """beside a capture's exact motion"""
+MEANS = ("psnr", "ssim", "lpips", "psnr_n")
+"""figures whose means a summary has"""
 TIMED = 20
 """evaluations of the motion encoder whose median is reported"""
 
@@ -157,7 +159,7 @@ def summarise(
     """One row for each variant: mean and spread (standard deviation) over seeds of ``figure`` on every split.
 
     ``gain`` is the mean over seeds of the difference to the variant that it is to be read beside, seed by seed,
-    and ``shows`` whether it exceeds the spread of those differences.
+    and ``shows`` whether it exceeds the spread of those differences; None where one seed has no spread. Beside them stand the means of ``MEANS``.
     """
     by_key = {(row["method"], row["split"], row["seed"]): row for row in rows}
     splits = list(dict.fromkeys(row["split"] for row in rows))
@@ -172,6 +174,8 @@ def summarise(
             if not own:
                 continue
             cells[split] = {"mean": statistics.fmean(own.values()), "spread": _spread(list(own.values()))}
+            scored = [by_key[variant.name, split, s] for s in own]
+            cells[split] |= _means(scored, (name for name in MEANS if name != figure))
             gains = [
                 value - by_key[variant.beside, split, s][figure]
                 for s, value in own.items()
@@ -180,11 +184,13 @@ def summarise(
             if gains:
                 spread = _spread(gains)
                 gain = statistics.fmean(gains)
-                cells[split] |= {"gain": gain, "gain_spread": spread, "shows": abs(gain) > spread}
+                cells[split] |= {"gain": gain, "gain_spread": spread}
+                cells[split] |= {"shows": None if spread is None else abs(gain) > spread}
         costs = [row for row in rows if row["method"] == variant.name]
         if costs:
             cells["encoder_gflop"] = costs[0]["encoder_gflop"]
             cells["encoder_ms"] = statistics.median(row["encoder_ms"] for row in costs)
+            cells |= _means(costs, ("minutes", "pose_error_before_deg", "pose_error_after_deg"))
         table.append(cells)
     return table
 
@@ -226,8 +232,18 @@ def _train(
     }
 
 
-def _spread(values: list[float]) -> float:
-    return statistics.stdev(values) if len(values) > 1 else float("nan")
+def _means(rows: Sequence[dict[str, Any]], names: Iterable[str]) -> dict[str, float]:
+    """Of the columns ``names`` that all ``rows`` have a number in."""
+    return {
+        name: statistics.fmean(row[name] for row in rows)
+        for name in names
+        if all(row.get(name) is not None for row in rows)
+    }
+
+
+def _spread(values: list[float]) -> float | None:
+    """None of a single value: JSON has no NaN."""
+    return statistics.stdev(values) if len(values) > 1 else None
 
 
 def _slug(name: str) -> str:

@@ -210,8 +210,8 @@ def wide_console() -> Console:
 
 def _with_gain(cell: dict[str, Any]) -> str:
     """Mean ± spread, and the difference to the row it is read beside; in brackets where the seeds differ by more."""
-    text = f"{cell['mean']:.2f} ± {cell['spread']:.2f}"
+    text = f"{cell['mean']:.2f}" + ("" if cell["spread"] is None else f" ± {cell['spread']:.2f}")
     if "gain" not in cell:
         return text
     gain = f"{cell['gain']:+.2f}"
-    return f"{text}  {gain if cell['shows'] else f'({gain})'}"
+    return f"{text}  {f'({gain})' if cell['shows'] is False else gain}"
