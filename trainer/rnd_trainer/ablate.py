@@ -159,7 +159,8 @@ def summarise(
     """One row for each variant: mean and spread (standard deviation) over seeds of ``figure`` on every split.
 
     ``gain`` is the mean over seeds of the difference to the variant that it is to be read beside, seed by seed,
-    and ``shows`` whether it exceeds the spread of those differences; None where one seed has no spread. Beside them stand the means of ``MEANS``.
+    and ``shows`` whether it exceeds the spread of those differences; None where one seed has no spread. Beside them
+    stand the means of ``MEANS``.
     """
     by_key = {(row["method"], row["split"], row["seed"]): row for row in rows}
     splits = list(dict.fromkeys(row["split"] for row in rows))
