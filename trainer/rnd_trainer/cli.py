@@ -39,6 +39,8 @@ class TrainOptions:
     """instead of the preset's"""
     gaussians: int | None = None
     """instead of the preset's; a quarter of them are nodes"""
+    save_every: int | None = None
+    """steps between saved states, instead of the preset's; --resume goes on from the last one"""
     image_scale: float | None = None
     """shrink the pictures by this factor"""
     seed: int = 0
@@ -89,8 +91,10 @@ def _train(options: TrainOptions) -> None:
         probe_channels=options.probe_channels,
         refine_poses=options.refine_poses,
         image_scale=config.image_scale if options.image_scale is None else options.image_scale,
+        save_every=config.save_every if options.save_every is None else options.save_every,
     )
     _check(config.steps >= 1, "--steps", "at least 1", config.steps)
+    _check(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
     _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,13 +24,19 @@ from .figures import Figure, at_most, holds
 from .subject import Subject
 from .trainings import studio
 
-STEPS = 24
+STEPS, SAVED_EVERY = 48, 4
 STEP_SECONDS = 60.0
 """a command that takes longer is killed at the latest then"""
+PATIENCE = 4
+"""runs for each kill, at most: some end by themselves before they are killed"""
 
 
 def kill_all(subject: Subject, times: int) -> list[Figure]:
-    """Kill training, export and play ``times`` times each; then let the training finish and compare its curve."""
+    """Kill training, export and play ``times`` times each.
+
+    Training goes on after each kill from its last state; whenever it comes to its end its curve is compared with an
+    unbroken one, and the next starts anew.
+    """
     folder = subject.work / "kill"
     folder.mkdir(parents=True, exist_ok=True)
     capture = studio(subject).folder
@@ -38,37 +45,69 @@ def kill_all(subject: Subject, times: int) -> list[Figure]:
 
     save_motion(motion, subject.walk(1.0))
     train = [
-        str(capture), "--preset", "quick", "--steps", str(STEPS), "--gaussians", "400", "--image-scale", "0.5",
+        str(capture), "--preset", "quick", "--steps", str(STEPS), "--save-every", str(SAVED_EVERY),
+        "--gaussians", "400", "--image-scale", "0.5",
     ]  # fmt: skip
     play = [str(subject.avatar_file), "--motion", str(motion), "--size", "48", "--format", "png,exr,mp4"]
-    jobs: dict[str, tuple[str, list[str]]] = {
-        "training": (TRAIN, [*train, "--out", str(folder / "training")]),
-        "export": (EXPORT, [str(subject.checkpoint), "--out", str(folder / "export/avatar.onnx")]),
-        "play": (PLAY, [*play, "--out", str(folder / "play")]),
-    }
-    whole = folder / "whole"
-    duration = {name: _timed(module, arguments, folder) for name, (module, arguments) in jobs.items()}
-    (folder / "training").rename(whole)
-    rng = np.random.default_rng(6)
-    figures = []
-    for name, (module, arguments) in jobs.items():
-        wrong: list[str] = []
-        killed = 0
-        for _ in range(times):
-            more = ["--resume"] if name == "training" and (folder / name / "training.state").exists() else []
-            moment = float(rng.uniform(0.3, 1.0)) * duration[name]
-            killed += _killed(module, [*arguments, *more], folder, moment)
-            wrong += half_files(folder / name)
-        figures.append(
-            holds(f"{name}: killed {killed} of {times} runs, files that are not whole", sorted(set(wrong)))
-        )
-    module, arguments = jobs["training"]
-    more = ["--resume"] if (folder / "training/training.state").exists() else []
-    _timed(module, [*arguments, *more], folder)
-    figures.append(
-        at_most("training after all kills: curve off the unbroken one", _off(whole, folder / "training"), 0)
-    )
-    return figures
+    rounds = _Rounds(folder, times)
+    export = [str(subject.checkpoint), "--out", str(folder / "export/avatar.onnx")]
+    rounds.kill("export", EXPORT, export, _timed(EXPORT, export, folder))
+    play += ["--out", str(folder / "play")]
+    rounds.kill("play", PLAY, play, _timed(PLAY, play, folder))
+    # first once for nothing: what numba has just compiled adds in another order than what it finds compiled
+    _timed(TRAIN, [*train, "--out", str(folder / "compiled")], folder)
+    duration = _timed(TRAIN, [*train, "--out", str(folder / "whole")], folder)
+    curves: list[float] = []
+
+    def ended() -> None:
+        curves.append(_off(folder / "whole", folder / "training"))
+        shutil.rmtree(folder / "training")
+
+    line = [*train, "--out", str(folder / "training")]
+    rounds.kill("training", TRAIN, line, duration, folder / "training/training.state", ended)
+    _timed(TRAIN, [*line, *_resumed(folder / "training/training.state")], folder)
+    ended()
+    text = f"training, {len(curves)} times to its end: curve off the unbroken one"
+    return [*rounds.figures, at_most(text, max(curves), 0)]
+
+
+class _Rounds:
+    """Kills of one command after the other at random moments, until there are ``times`` of each."""
+
+    def __init__(self, folder: Path, times: int) -> None:
+        self.folder, self.times = folder, times
+        self.figures: list[Figure] = []
+        self._rng = np.random.default_rng(6)
+
+    def kill(
+        self,
+        name: str,
+        module: str,
+        arguments: list[str],
+        duration: float,
+        state: Path | None = None,
+        ended: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Add the figure of ``name``, which takes ``duration`` seconds when nobody kills it.
+
+        With a ``state`` runs go on from it; ``ended`` follows each that comes to its end.
+        """
+        wrong: set[str] = set()
+        killed = runs = 0
+        while killed < self.times and runs < PATIENCE * self.times:
+            runs += 1
+            moment = float(self._rng.uniform(0.3, 1.0)) * duration
+            if _killed(module, [*arguments, *_resumed(state)], self.folder, moment):
+                killed += 1
+            else:
+                ended()
+            wrong |= set(half_files(self.folder / name))
+        text = f"{name}: killed {killed} of {self.times} times, files that are not whole"
+        self.figures.append(holds(text, sorted(wrong)))
+
+
+def _resumed(state: Path | None) -> list[str]:
+    return ["--resume"] if state is not None and state.exists() else []
 
 
 def _command(module: str, arguments: list[str]) -> list[str]:
