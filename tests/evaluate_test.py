@@ -13,7 +13,16 @@ import torch
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
-from rnd_trainer.ablate import CAUSES, LENGTHS, VARIANTS, ablate, chosen, encoder_cost, summarise
+from rnd_trainer.ablate import (
+    CAUSES,
+    LENGTHS,
+    VARIANTS,
+    ablate,
+    chosen,
+    encoder_cost,
+    summarise,
+    time_encoders,
+)
 from rnd_trainer.charts import draw_lengths
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.evaluate import Judge, evaluate, flicker
@@ -130,7 +139,9 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     assert len(calls) == 6 and {row["seed"] for row in rows} == {0, 1}
     written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
     assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
-    table = summarise(rows, VARIANTS[:3])
+    timed = time_encoders(rows, tmp_path, VARIANTS[:3], 0)
+    assert [row["encoder_gflop"] for row in timed] == [row["encoder_gflop"] for row in rows]
+    table = summarise(timed, VARIANTS[:3])
     assert [line["method"] for line in table] == ["ours", "LBS, plain colour", "static skinning"]
     cell = table[2]["novel_view"]
     both = [

@@ -138,7 +138,7 @@ def ablate(
     jobs = [(variant, seed) for seed in seeds for variant in variants]
     for done, (variant, seed) in enumerate(jobs):
         on_run(variant.name, seed, done, len(jobs))
-        place = folder / f"{_slug(variant.name)}-{seed}"
+        place = _place(folder, variant, seed)
         if not (place / "rows.json").exists():
             model = dataclasses.replace(base.model, **variant.model)
             steps = round(base.steps * variant.length)
@@ -151,6 +151,20 @@ def ablate(
             write_json(place / "rows.json", [row | cost | extra for row in scored])
         rows += json.loads((place / "rows.json").read_text(encoding="utf-8"))
     return rows
+
+
+def time_encoders(
+    rows: list[dict[str, Any]], folder: Path, variants: Sequence[Variant], seed: int
+) -> list[dict[str, Any]]:
+    """``rows`` with every variant's :func:`encoder_cost` measured now, one after the other, on its avatar of ``seed``.
+
+    Those of the trainings were taken hours apart, beside whatever else ran then.
+    """
+    costs = {
+        variant.name: encoder_cost(load_checkpoint(_place(folder, variant, seed) / "avatar.ckpt").model)
+        for variant in variants
+    }
+    return [row | costs[row["method"]] for row in rows]
 
 
 def summarise(
@@ -245,6 +259,10 @@ def _means(rows: Sequence[dict[str, Any]], names: Iterable[str]) -> dict[str, fl
 def _spread(values: list[float]) -> float | None:
     """None of a single value: JSON has no NaN."""
     return statistics.stdev(values) if len(values) > 1 else None
+
+
+def _place(folder: Path, variant: Variant, seed: int) -> Path:
+    return folder / f"{_slug(variant.name)}-{seed}"
 
 
 def _slug(name: str) -> str:

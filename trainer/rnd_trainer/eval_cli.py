@@ -158,7 +158,7 @@ def ablate_run(options: EvalOptions) -> None:
 
     from rnd_runtime.capture import load_capture
 
-    from .ablate import STUDIES, ablate, chosen, summarise
+    from .ablate import STUDIES, ablate, chosen, summarise, time_encoders
     from .charts import draw_lengths
     from .config import preset, resized
 
@@ -187,6 +187,7 @@ def ablate_run(options: EvalOptions) -> None:
             mode=options.shade,
             on_run=on_run,
         )
+    rows = time_encoders(rows, options.run, variants, seeds[0])
     summary = summarise(rows, variants)
     if options.chart is not None:
         draw_lengths(rows, [options.chart])
