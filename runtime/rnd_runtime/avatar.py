@@ -43,7 +43,7 @@ from .gaussians import Gaussians
 from .motion import Motion
 from .onnx_parts import OnnxFile
 from .posing import RestPose, Unposed
-from .skeleton import Skeleton, bone_transforms
+from .skeleton import Skeleton, bone_transforms, taken_along
 from .window import motion_window
 
 SCHEMA = "rnd-avatar/1"
@@ -118,9 +118,7 @@ class Encoded(NamedTuple):
 
     def in_world(self) -> Encoded:
         """The same, to be posed in the world."""
-        bones = np.array(self.root[:3, :3] @ self.bones, np.float64)
-        bones[:, :, 3] += self.root[:3, 3]
-        return self._replace(bones=bones.astype(np.float32), root=np.eye(4))
+        return self._replace(bones=taken_along(self.bones, self.root), root=np.eye(4))
 
 
 class Avatar:

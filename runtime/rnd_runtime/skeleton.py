@@ -127,6 +127,13 @@ def bone_transforms(
     return np.concatenate([turn, shift[..., None]], -1).astype(np.float32)
 
 
+def taken_along(bones: ArrayLike, motion: Floats) -> NDArray[np.float32]:
+    """Bones [J, 3, 4] m after ``motion`` [4, 4] (rigid, m) of what they have posed."""
+    moved = np.asarray(motion[:3, :3] @ np.asarray(bones, np.float64))
+    moved[:, :, 3] += motion[:3, 3]
+    return moved.astype(np.float32)
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 def _chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
     """Fill ``posed`` [B, J, 4, 4], whose roots' places and last rows are there, from the root outwards."""

@@ -13,6 +13,7 @@ from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
+from rnd_runtime.skeleton import taken_along
 
 from .encoders import SH_DC_OF_ONE
 from .model import AvatarModel, Posed, PoseInput
@@ -67,10 +68,9 @@ def render_runtime(
 
 def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
     """``pose`` in the frame in which playback poses, and that frame → world [4, 4]."""
-    bones = pose.bones.detach().cpu().numpy().astype(np.float64)
-    root = np.vstack([bones[0], [0, 0, 0, 1]])
-    local = np.linalg.inv(root)[:3, :3] @ bones
-    local[:, :, 3] += np.linalg.inv(root)[:3, 3]
+    bones = pose.bones.detach().cpu().numpy()
+    root = np.vstack([bones[0].astype(np.float64), [0, 0, 0, 1]])
+    local = taken_along(bones, np.linalg.inv(root))
     return replace(pose, bones=torch.from_numpy(local).to(pose.bones)), root
 
 

@@ -25,12 +25,12 @@ export function shadeAmbient(coefficients, { means, normals, albedo, roughness, 
   const light = times(shRotation(lightToRoot), coefficients), lobes = lobeTable(), lobe = new Float64Array(8);
   const atNormal = new Float64Array(16), atLobe = new Float64Array(16), n = [0, 0, 0], v = [0, 0, 0];
   for (let i = 0; i < count; i++) {
-    const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
-    const distance = Math.max(Math.hypot(dx, dy, dz), 1e-12);
     for (let k = 0; k < 3; k++) {
       n[k] = normals[3 * i + k];
-      v[k] = (k === 0 ? dx : k === 1 ? dy : dz) / distance;
+      v[k] = eye[k] - means[3 * i + k];
     }
+    const distance = Math.max(Math.hypot(...v), 1e-12);
+    for (let k = 0; k < 3; k++) v[k] /= distance;
     lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
     shBasis(...n, atNormal);
     shBasis(lobe[1], lobe[2], lobe[3], atLobe);
