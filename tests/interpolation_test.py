@@ -5,7 +5,13 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from rnd_runtime.interpolation import LARGEST_MOVE, LARGEST_STEP, interpolate_points, interpolate_rotations
+from rnd_runtime.interpolation import (
+    LARGEST_MOVE,
+    LARGEST_STEP,
+    interpolate_points,
+    interpolate_rotations,
+    steps,
+)
 from rnd_runtime.rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 
 ROUND_OFF = 1e-12  # float64, some hundred operations
@@ -36,6 +42,13 @@ def _errors(fps: float) -> tuple[float, float]:
     straight = slerp_matrices(frames[before], frames[before + 1], (place - before)[:, None])
     truth = _rotations(place / fps)
     return _off(interpolate_rotations(frames, place), truth), _off(straight, truth)
+
+
+def test_steps_are_the_logarithms_of_scipy():
+    before, after = _rotations(np.array([0.3]))[0], _rotations(np.array([0.9]))[0]
+    truth = (Rotation.from_matrix(before).inv() * Rotation.from_matrix(after)).as_rotvec()
+    assert_allclose(steps(before, after), truth, atol=ROUND_OFF)
+    assert_allclose(steps(before, before), np.zeros((3, 3)), atol=ROUND_OFF)
 
 
 def test_a_walk_is_followed_in_third_order_where_slerp_has_second():

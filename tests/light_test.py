@@ -107,6 +107,15 @@ def test_positive_yaw_moves_the_light_from_x_towards_z():
     assert_allclose(light.rotation @ [0, 1, 0], [0, 1, 0], atol=1e-15)
 
 
+def test_turning_shares_the_texels_and_refuses_what_is_no_angle():
+    light = Light(np.ones((4, 8, 3), np.float32), yaw=0.2, up="z")
+    turned = light.turned(1.0)
+    assert turned.radiance is light.radiance and (turned.yaw, turned.up, light.yaw) == (1.0, "z", 0.2)
+    assert_allclose(turned.rotation, Light(light.radiance, yaw=1.0, up="z").rotation, atol=0)
+    with pytest.raises(InputError, match="finite radians"):
+        light.turned(float("nan"))
+
+
 def test_yaw_by_whole_texels_is_a_shift_of_columns():
     pixels = _sky(16)
     shifted = Light(np.roll(pixels, 5, axis=1))

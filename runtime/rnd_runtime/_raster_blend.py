@@ -42,17 +42,25 @@ TRANSMITTANCE_MIN = np.float32(0.9999e-4)  # see raster_oracle
 LN2 = np.float32(math.log(2.0))
 ZERO = np.float32(0)
 ONE = np.float32(1)
+NEVER = np.float32(-1e30)  # log2 of an opacity that reaches no pixel
 MOMENTS = 6
+BATCH = 4 * WIDTH  # Gaussians gathered at a time, one bit of an int64 each
+_Y, _SHEAR, _FALL_Y, _FALL_X, _PEAK = (BATCH * k for k in range(1, 6))  # of gathered shapes, after their x
 
 
 @njit(inline="always")
-def _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance):  # type: ignore[no-untyped-def]
-    """Pixel centres in the tile; transmittance 1 inside the picture, 0 (as if saturated) outside."""
+def _centers(block):  # type: ignore[no-untyped-def]
+    """Columns and rows of a block's pixel centres in the tile."""
+    x = block_x() + np.float32(block % BLOCKS * BLOCK + 0.5)
+    y = block_y() + np.float32(block // BLOCKS * BLOCK + 0.5)
+    return x, y
+
+
+@njit(inline="always")
+def _start_tile(tile_x, tile_y, width, height, transmittance):  # type: ignore[no-untyped-def]
+    """Transmittance 1 inside the picture, 0 (as if saturated) outside."""
     for block in range(BLOCKS * BLOCKS):
-        x = block_x() + np.float32(block % BLOCKS * BLOCK + 0.5)
-        y = block_y() + np.float32(block // BLOCKS * BLOCK + 0.5)
-        store(columns, block * WIDTH, x)
-        store(rows, block * WIDTH, y)
+        x, y = _centers(block)
         inside = (x < np.float32(width - tile_x)) & (y < np.float32(height - tile_y))
         store(transmittance, block * WIDTH, select(inside, ONE, ZERO))
 
@@ -72,40 +80,107 @@ def _reached_blocks(x, y, shear, fall_y, fall_x, peak):  # type: ignore[no-untyp
     return bits(peak - fall_y * dy * dy - fall_x * d * d >= LOG2_ALPHA_NEARLY_MIN)
 
 
+@njit(inline="always")
+def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # type: ignore[no-untyped-def]
+    """A batch of pairs side by side: ``shapes`` by component, ``colours`` [BATCH, columns]; the rest reach nothing."""
+    channels = splats.attributes.shape[1]
+    for k in range(last - first):
+        g = splats.pair_gaussians[first + k]
+        shapes[k] = np.float32(splats.centers[g, 0] - tile_x)
+        shapes[_Y + k] = np.float32(splats.centers[g, 1] - tile_y)
+        for c in range(4):
+            shapes[_SHEAR + c * BATCH + k] = splats.shapes[g, c]
+        for c in range(channels):
+            colours[k * columns + c] = splats.attributes[g, c]
+    for k in range(last - first, BATCH):
+        shapes[_PEAK + k] = NEVER
+
+
+@njit(inline="always")
+def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
+    """:func:`_reached_blocks` the other way round: which of ``count`` gathered Gaussians reach a block, a bit each."""
+    row = np.float32(block // BLOCKS * BLOCK + 0.5 * BLOCK)
+    column = np.float32(block % BLOCKS * BLOCK + 0.5 * BLOCK)
+    reaching = 0
+    for k in range(0, count, WIDTH):
+        shear = load(shapes, _SHEAR + k)
+        dy = row - load(shapes, _Y + k)
+        d = magnitude(column - load(shapes, k) - shear * dy)
+        dy = magnitude(dy) - HALF_BLOCK
+        d = d - (magnitude(shear) * HALF_BLOCK + HALF_BLOCK)
+        dy, d = select(dy > ZERO, dy, ZERO), select(d > ZERO, d, ZERO)
+        peak, fall_y, fall_x = load(shapes, _PEAK + k), load(shapes, _FALL_Y + k), load(shapes, _FALL_X + k)
+        reaching |= bits(peak - fall_y * dy * dy - fall_x * d * d >= LOG2_ALPHA_NEARLY_MIN) << k
+    return reaching
+
+
+@njit(inline="always")
+def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped-def]
+    """Fill ``weights`` [BATCH, 16] of Gaussians ``reaching`` a block of transmittance ``left``; what is left then."""
+    columns, rows = _centers(block)
+    while reaching != 0:
+        k = lowest_bit(reaching)
+        reaching &= reaching - 1
+        dy = rows - shapes[_Y + k]
+        d = columns - shapes[k] - shapes[_SHEAR + k] * dy
+        power = shapes[_PEAK + k] - shapes[_FALL_Y + k] * dy * dy - shapes[_FALL_X + k] * d * d
+        alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
+        weight = left * select(power >= LOG2_ALPHA_MIN, alpha, ZERO)
+        after = left - weight
+        unfinished = after >= TRANSMITTANCE_MIN
+        store(weights, k * WIDTH, select(unfinished, weight, ZERO))
+        left = select(unfinished, after, ZERO)
+    return left
+
+
+@njit(inline="always")
+def _add_up(at, reaching, weights, colours, first, columns, sums):  # type: ignore[no-untyped-def]
+    """Add four of the attributes, from ``first`` on, to their ``sums`` from ``at`` on."""
+    a, b, c, d = (
+        load(sums, at),
+        load(sums, at + WIDTH),
+        load(sums, at + 2 * WIDTH),
+        load(sums, at + 3 * WIDTH),
+    )
+    while reaching != 0:
+        k = lowest_bit(reaching)
+        reaching &= reaching - 1
+        weight, row = load(weights, k * WIDTH), k * columns + first
+        a += weight * colours[row]
+        b += weight * colours[row + 1]
+        c += weight * colours[row + 2]
+        d += weight * colours[row + 3]
+    store(sums, at, a)
+    store(sums, at + WIDTH, b)
+    store(sums, at + 2 * WIDTH, c)
+    store(sums, at + 3 * WIDTH, d)
+
+
 @njit(error_model="numpy")
 def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[no-untyped-def]
-    """Add up, for each block, K blended attributes, then alpha (sixteen lanes each)."""
-    columns, rows, transmittance, sums = buffers
-    centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
-    pair_gaussians = splats.pair_gaussians
-    channels = attributes.shape[1]
-    stride = (channels + 1) * WIDTH
+    """Add up, for each block, K blended attributes, then alpha, then nothing up to whole fours (sixteen lanes each).
+
+    A batch of Gaussians at a time, block by block, so that a block's sums stay in registers meanwhile.
+    """
+    transmittance, sums, shapes, colours, weights = buffers
+    columns = len(colours) // BATCH
     open_blocks = ALL_BLOCKS
-    for pair in range(first, last):
-        g = pair_gaussians[pair]
-        x, y = np.float32(centers[g, 0] - tile_x), np.float32(centers[g, 1] - tile_y)
-        shear, fall_y, fall_x, peak = shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3]
-        reached = _reached_blocks(x, y, shear, fall_y, fall_x, peak) & open_blocks
-        while reached != 0:
-            block = lowest_bit(reached)
-            reached &= reached - 1
-            dy = load(rows, block * WIDTH) - y
-            d = load(columns, block * WIDTH) - x - shear * dy
-            power = peak - fall_y * dy * dy - fall_x * d * d
-            alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
-            before = load(transmittance, block * WIDTH)
-            weight = before * select(power >= LOG2_ALPHA_MIN, alpha, ZERO)
-            after = before - weight
-            unfinished = after >= TRANSMITTANCE_MIN
-            weight = select(unfinished, weight, ZERO)
-            store(transmittance, block * WIDTH, select(unfinished, after, ZERO))
-            if not any_lane(unfinished):
+    for start in range(first, last, BATCH):
+        count = min(BATCH, last - start)
+        _gather(start, start + count, splats, tile_x, tile_y, shapes, colours, columns)
+        blocks = open_blocks
+        while blocks != 0:
+            block = lowest_bit(blocks)
+            blocks &= blocks - 1
+            reaching = _reaching(block, count, shapes)
+            if reaching == 0:
+                continue
+            left = _weights(block, reaching, shapes, load(transmittance, block * WIDTH), weights)
+            store(transmittance, block * WIDTH, left)
+            if not any_lane(left > ZERO):
                 open_blocks &= ~(1 << block)
-            at = block * stride
-            for c in range(channels):
-                store(sums, at, load(sums, at) + weight * attributes[g, c])
-                at += WIDTH
-            store(sums, at, load(sums, at) + weight)
+            for c in range(0, columns, 4):
+                _add_up((block * columns + c) * WIDTH, reaching, weights, colours, c, columns, sums)
         if open_blocks == 0:
             break
 
@@ -119,28 +194,32 @@ def _fullest_first(starts):  # type: ignore[no-untyped-def]
 def blend(splats, width, height, threads):  # type: ignore[no-untyped-def]
     """Pictures [H, W, K] of the attributes and [H, W] of alpha."""
     channels = splats.attributes.shape[1]
+    columns = channels // 4 * 4 + 4  # and alpha, up to whole fours
     image, coverage = np.zeros((height, width, channels), np.float32), np.zeros((height, width), np.float32)
     tiles_x = (width + TILE - 1) // TILE
     starts = splats.tile_starts
     tiles = _fullest_first(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
-        columns, rows, transmittance = aligned_floats(PIXELS), aligned_floats(PIXELS), aligned_floats(PIXELS)
-        sums = aligned_floats((channels + 1) * PIXELS)
-        buffers = (columns, rows, transmittance, sums)
+        transmittance, sums = aligned_floats(PIXELS), aligned_floats(columns * PIXELS)
+        shapes, weights = aligned_floats(6 * BATCH), aligned_floats(BATCH * WIDTH)
+        colours = aligned_floats(columns * BATCH)
+        colours[:] = ZERO
+        colours[channels::columns] = ONE  # of alpha
+        buffers = (transmittance, sums, shapes, colours, weights)
         while True:
             n = fetch_add(counter)
             if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-            _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance)
+            _start_tile(tile_x, tile_y, width, height, transmittance)
             sums[:] = ZERO
             _blend_tile(tile_x, tile_y, starts[tile], starts[tile + 1], splats, buffers)
             for y in range(min(TILE, height - tile_y)):
                 for x in range(min(TILE, width - tile_x)):
                     block, lane = y // BLOCK * BLOCKS + x // BLOCK, y % BLOCK * BLOCK + x % BLOCK
-                    at = block * (channels + 1) * WIDTH + lane
+                    at = block * columns * WIDTH + lane
                     for c in range(channels):
                         image[tile_y + y, tile_x + x, c] = sums[at + c * WIDTH]
                     coverage[tile_y + y, tile_x + x] = sums[at + channels * WIDTH]
@@ -154,7 +233,7 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
 
     ``wanted`` holds, for each block, the incoming gradients of K attributes, then of alpha.
     """
-    columns, rows, transmittance, behind, wanted, gathered = buffers
+    transmittance, behind, wanted, gathered = buffers
     centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
     pair_gaussians, pair_slots = splats.pair_gaussians, splats.pair_slots
     channels = attributes.shape[1]
@@ -176,8 +255,9 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
         while reached != 0:
             block = lowest_bit(reached)
             reached &= reached - 1
-            dy = load(rows, block * WIDTH) - y
-            d = load(columns, block * WIDTH) - x - shear * dy
+            columns, rows = _centers(block)
+            dy = rows - y
+            d = columns - x - shear * dy
             power = peak - fall_y * dy * dy - fall_x * d * d
             alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
             before = load(transmittance, block * WIDTH)
@@ -228,17 +308,16 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
     tiles = _fullest_first(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
-        columns, rows, transmittance = aligned_floats(PIXELS), aligned_floats(PIXELS), aligned_floats(PIXELS)
-        behind = aligned_floats(PIXELS)
+        transmittance, behind = aligned_floats(PIXELS), aligned_floats(PIXELS)
         wanted, gathered = aligned_floats((channels + 1) * PIXELS), aligned_floats(channels * WIDTH)
-        buffers = (columns, rows, transmittance, behind, wanted, gathered)
+        buffers = (transmittance, behind, wanted, gathered)
         while True:
             n = fetch_add(counter)
             if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-            _start_tile(tile_x, tile_y, width, height, columns, rows, transmittance)
+            _start_tile(tile_x, tile_y, width, height, transmittance)
             wanted[:] = ZERO
             behind[:] = ZERO
             for y in range(min(TILE, height - tile_y)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +61,9 @@ class Camera:
 
     def in_frame(self, frame_to_world: Floats) -> Camera:
         """The same view for points in another frame, which ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
-        return Camera(self.width, self.height, self.K, self.world_to_camera @ frame_to_world)
+        camera = copy(self)  # what is rigid stays so and need not be looked at again in every frame
+        object.__setattr__(camera, "world_to_camera", self.world_to_camera @ frame_to_world)
+        return camera
 
     @classmethod
     def look_at(

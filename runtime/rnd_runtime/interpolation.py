@@ -76,6 +76,15 @@ def interpolate_points(points: Floats, place: Floats) -> Floats:
     return result
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def steps(before: Floats, after: Floats) -> Floats:
+    """log(Aᵀ B) [J, 3] rad of rotations A [J, 3, 3] ``before`` and B ``after``."""
+    result = np.empty((len(before), 3), np.float64)
+    for joint in range(len(before)):
+        _step(before[joint], after[joint], result[joint])
+    return result
+
+
 @njit(inline="always")
 def _cubic(step, start, end, t):  # type: ignore[no-untyped-def]
     """The cubic from 0 to ``step`` with slopes ``start`` and ``end``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -52,8 +53,7 @@ class Light:
             raise InputError("light", expected="[H, 2H, 3]", got=list(radiance.shape))
         if not np.isfinite(radiance).all() or radiance.min() < 0:
             raise InputError("light", expected="finite radiance, not negative")
-        if not np.isfinite(self.yaw):
-            raise InputError("light yaw", expected="finite radians", got=self.yaw)
+        _check_yaw(self.yaw)
         if self.up not in _TO_Y_UP:
             raise InputError("light up", expected=" or ".join(_TO_Y_UP), got=self.up)
         object.__setattr__(self, "radiance", radiance)
@@ -76,6 +76,13 @@ class Light:
         height, width = self.radiance.shape[:2]
         weights = texel_solid_angles(height, width) / (4 * np.pi)
         return np.asarray(np.einsum("hwc,hw->c", self.radiance.astype(np.float64), weights))
+
+    def turned(self, yaw: float) -> Light:
+        """The same light at another ``yaw``; no texel is looked at, so it may be turned in every frame."""
+        _check_yaw(yaw)
+        light = copy(self)
+        object.__setattr__(light, "yaw", yaw)
+        return light
 
     def resized(self, height: int, width: int) -> Light:
         """The same light on another grid, by :func:`downsize`."""
@@ -102,6 +109,11 @@ class Light:
         upper = (1 - s) * self.radiance[top, left] + s * self.radiance[top, right]
         lower = (1 - s) * self.radiance[bottom, left] + s * self.radiance[bottom, right]
         return np.asarray((1 - t) * upper + t * lower, np.float32)
+
+
+def _check_yaw(yaw: float) -> None:
+    if not np.isfinite(yaw):
+        raise InputError("light yaw", expected="finite radians", got=yaw)
 
 
 def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: float = 0.0) -> Light:

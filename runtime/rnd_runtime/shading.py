@@ -15,7 +15,6 @@ All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_refer
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 
 import numba
 import numpy as np
@@ -88,7 +87,7 @@ class Shader:
     def turned(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
         shader = copy.copy(self)
-        shader.light = replace(self.light, yaw=yaw)
+        shader.light = self.light.turned(yaw)
         shader.light_to_world = shader.light.rotation
         return shader
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .interpolation import steps
 from .motion import Motion
-from .rotations import matrix_to_axis_angle, rotation_6d
+from .rotations import rotation_6d
 
 Floats32 = NDArray[np.float32]
 
@@ -23,10 +24,22 @@ def motion_window(motion: Motion, time_s: float, *, poses: int, seconds: float) 
         joint_velocity: [J − 1, 3] rad/s, ``log(R_{t−δ}ᵀ R_t) / δ`` with δ the spacing of the window
             (``seconds`` itself when ``poses`` is 1): continuous where axis-angles jump at π.
     """
+    return described(recent_poses(motion, time_s, poses=poses, seconds=seconds), poses=poses, seconds=seconds)
+
+
+def recent_poses(motion: Motion, time_s: float, *, poses: int, seconds: float) -> Motion:
+    """The poses that :func:`motion_window` describes, the one at ``time_s`` last; two where ``poses`` is 1."""
     assert poses >= 1 and seconds > 0, (poses, seconds)
-    spacing = seconds / max(poses - 1, 1)
-    times = time_s - spacing * np.arange(max(poses - 1, 1), -1, -1)
-    rotations = motion.at(times).rotations[:, 1:]
-    step = np.swapaxes(rotations[-2], -1, -2) @ rotations[-1]
-    velocity = matrix_to_axis_angle(step) / spacing
+    count = max(poses, 2)
+    return motion.at(time_s - _spacing(poses, seconds) * np.arange(count - 1, -1, -1))
+
+
+def described(recent: Motion, *, poses: int, seconds: float) -> tuple[Floats32, Floats32]:
+    """What :func:`motion_window` returns, of :func:`recent_poses`."""
+    rotations = recent.rotations[:, 1:]
+    velocity = steps(rotations[-2], rotations[-1]) / _spacing(poses, seconds)
     return rotation_6d(rotations[-poses:]).astype(np.float32), velocity.astype(np.float32)
+
+
+def _spacing(poses: int, seconds: float) -> float:
+    return seconds / max(poses - 1, 1)

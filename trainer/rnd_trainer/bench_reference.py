@@ -96,7 +96,7 @@ def _lit(avatar_file: Path, motion_file: Path, hdr: Path) -> dict[str, Any]:
         posed = posed_reference(avatar, motion, STEP_S * number)
         values["means"].append(posed.means)
         values["covariances"].append(posed.covariances)
-        values["radiance"].append(shade_reference(posed, replace(light, yaw=TURN * number), eye))
+        values["radiance"].append(shade_reference(posed, light.turned(TURN * number), eye))
     return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -147,7 +146,7 @@ def _motion(options: MotionOptions) -> Iterator[str]:
 def _light(options: SplatOptions, avatar: Avatar) -> Light:
     yaw = math.radians(options.hdr_yaw)
     if options.hdr is None:
-        return replace(Light(avatar.trained_light).scaled(2.0**options.exposure), yaw=yaw)
+        return Light(avatar.trained_light).scaled(2.0**options.exposure).turned(yaw)
     return load_light(options.hdr, yaw=yaw, exposure=options.exposure)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 
@@ -166,7 +166,7 @@ def _light(options: PlayOptions, avatar: Avatar) -> Light:
     """The light named by ``--hdr``, or the one that was learnt with the avatar."""
     yaw = math.radians(options.hdr_yaw)
     if options.hdr is None:
-        return replace(Light(avatar.trained_light).scaled(2.0**options.exposure), yaw=yaw)
+        return Light(avatar.trained_light).scaled(2.0**options.exposure).turned(yaw)
     return load_light(options.hdr, up=options.hdr_up, yaw=yaw, exposure=options.exposure)
 
 

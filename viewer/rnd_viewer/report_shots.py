@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -59,7 +58,7 @@ class Shots:
 
     def relights(self, hdrs: tuple[Path, ...]) -> Iterator[tuple[str, Bytes]]:
         """Captions and pictures: the learned light turned, then each of ``hdrs``, of the motion's middle."""
-        lights = [(f"learned light, {yaw}°", replace(self._learned, yaw=math.radians(yaw))) for yaw in YAWS]
+        lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
         lights += [(hdr.stem, load_light(hdr)) for hdr in hdrs]
         time_s = self.motion.duration / 2
         camera = self._front(0, time_s)

@@ -229,7 +229,7 @@ class Scene:
         light = self._shader(self._light_name(state), state.shade).light
         key = (id(light), state.yaw, camera.width, camera.K.tobytes(), camera.world_to_camera.tobytes())
         if self._behind is None or self._behind[0] != key:
-            turned = replace(light, yaw=light.yaw + state.yaw)
+            turned = light.turned(light.yaw + state.yaw)
             self._behind = key, background.radiance(camera, turned)
         return self._behind[1] * np.float32(2.0**state.exposure)
 
