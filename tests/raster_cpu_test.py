@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from raster_scenes import off_centre_camera, random_scene
-from rnd_runtime import raster_cpu
+from rnd_runtime import _raster_blend, raster_cpu
 from rnd_runtime import raster_oracle as oracle
+from rnd_runtime._raster_tiles import Splats
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 
@@ -191,3 +192,17 @@ def test_wrong_shapes_are_refused(wrong, name):
     scene[wrong] = scene[wrong][:-1] if wrong else scene[wrong][:, :2]
     with pytest.raises(InputError, match=f"^{name}: expected shape"):
         raster_cpu.rasterize(*scene, off_centre_camera(8, 8))
+
+
+def test_places_of_a_batch_that_stay_empty_reach_nothing_whatever_memory_held():
+    one = np.ones((1, 4), np.float32)  # of a broad Gaussian in the corner
+    starts = np.array([0, 1])
+    splats = Splats(
+        np.ones((1, 2)), one, one[:, :3], starts, starts, np.zeros(1, np.int32), np.zeros(0, np.int32)
+    )
+    for junk in (np.float32(-1e38), np.float32(1e38), np.float32(np.nan)):
+        shapes = np.full(6 * _raster_blend.BATCH, junk, np.float32)
+        colours = np.zeros(4 * _raster_blend.BATCH, np.float32)
+        _raster_blend._gather(0, 1, splats, 0, 0, shapes, colours, 4)
+        assert all(_raster_blend._reaching(block, 1, shapes) in (0, 1) for block in range(16))
+        assert _raster_blend._reaching(0, 1, shapes) == 1

@@ -93,6 +93,8 @@ def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # t
         for c in range(channels):
             colours[k * columns + c] = splats.attributes[g, c]
     for k in range(last - first, BATCH):
+        for c in range(5):
+            shapes[c * BATCH + k] = ZERO
         shapes[_PEAK + k] = NEVER
 
 
