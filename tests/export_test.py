@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from rnd_export import export as exports
+from rnd_export.bake import bake
 from rnd_export.export import (
     MAX_P99_M,
     MAX_POSITION_ERROR_M,
@@ -19,6 +20,7 @@ from rnd_export.export import (
     measure_drift,
     random_motion,
 )
+from rnd_export.places import gaussians_by_place
 from rnd_export.variant import Variant, line_through
 from rnd_runtime.avatar import POSED_OUTPUTS, Avatar
 from rnd_runtime.errors import InputError
@@ -34,11 +36,31 @@ from tiny import body, motion
 def test_onnxruntime_says_what_torch_says(tiny_avatar, tiny_checkpoint) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     moves = random_motion(checkpoint.skeleton, frames=60, seed=3)
-    drift = measure_drift(Avatar.load(tiny_avatar), checkpoint, moves)
+    drift = measure_drift(Avatar.load(tiny_avatar), checkpoint, moves, _rows(checkpoint))
     assert drift.weights < MAX_WEIGHT_ERROR / 10
     assert drift.position_m < MAX_POSITION_ERROR_M / 10
     assert drift.normal < 1e-4 and drift.visibility < 1e-4
     assert drift.covariance_relative < 1e-4
+
+
+def _rows(checkpoint) -> np.ndarray:
+    """The model's Gaussians in the file's order."""
+    return gaussians_by_place(bake(checkpoint.model)).rows
+
+
+def test_neighbours_on_the_body_are_neighbours_in_the_file(tiny_avatar, tiny_checkpoint) -> None:
+    model = load_checkpoint(tiny_checkpoint).model
+    nodes, points = model.config.nodes, model.points.numpy()
+    rows = _rows(load_checkpoint(tiny_checkpoint))
+    assert (np.sort(rows) == np.arange(len(points))).all()
+    apart = [np.linalg.norm(np.diff(p, axis=0), axis=1).mean() for p in (points, points[rows])]
+    assert apart[1] < 0.2 * apart[0]
+    rest = Avatar.load(tiny_avatar)._rest  # nodes too: sixteen Gaussians in a row read few of them
+    used = [len(np.unique(some)) for some in np.array_split(rest.neighbours, len(points) // 16)]
+    spans = [int(np.ptp(some)) for some in np.array_split(rest.neighbours, len(points) // 16)]
+    assert (
+        np.median(used) < 32 and np.median(spans) < nodes / 2
+    )  # measured 17 and 58; of any order 55 and 195
 
 
 def test_the_same_checkpoint_gives_the_same_bytes(tiny_avatar, tiny_checkpoint, tmp_path) -> None:
@@ -134,6 +156,7 @@ def test_static_is_the_template(tiny_checkpoint, tmp_path) -> None:
     export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant("static"))
     template = checkpoint.model.log_weights.softmax(-1).numpy()
     weights = _weights(tmp_path / "a.onnx", motion(body()), checkpoint)
+    template = template[_rows(checkpoint)]
     assert np.abs(weights - template).max() < MAX_WEIGHT_ERROR / 10
     names = {node.name for node in onnx.load(tmp_path / "a.onnx").graph.node}
     assert not any("temporal" in name for name in names)

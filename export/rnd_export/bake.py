@@ -52,6 +52,7 @@ class BakedSkinning:
 class BakedAvatar:
     """The constants of an avatar. N Gaussians, M nodes, J joints.
 
+    ``rows`` [N] are the model's Gaussians that stand here, in whose farthest-point order any prefix covers the body;
     ``codes`` [M, 3] m and ``node_rows`` [M] (the Gaussian that stands at a node) are in the order of the nodes,
     ``all_codes`` [N, 3] m belong to the Gaussians;
     ``factors`` [N, 3, 3] m is R S in the rest pose; ``offsets`` and ``visibility`` are a
@@ -79,6 +80,7 @@ class BakedAvatar:
     opacities: Floats
     albedo: Floats
     roughness: Floats
+    rows: NDArray[np.int64]
     max_offset: float
 
 
@@ -110,6 +112,7 @@ def bake(model: AvatarModel) -> BakedAvatar:
         opacities=_array(static.opacity),
         albedo=_array(static.albedo),
         roughness=_array(static.roughness),
+        rows=np.arange(len(model.codes)),
         max_offset=config.max_offset,
     )
 

@@ -27,6 +27,7 @@ from rnd_trainer.checkpoint import load_checkpoint
 from .bake import BakedAvatar, bake
 from .export import refuse_ablations, surface_area, written
 from .merge import contributions, fitted_albedo, merged
+from .places import gaussians_by_place
 from .variant import Variant, reduced, static_where
 
 Floats = NDArray[np.float64]
@@ -86,7 +87,7 @@ class Workbench:
         refuse_ablations(self.checkpoint, path)
         self.config = self.checkpoint.config.model
         self._clock = clock or self._fastest
-        self._baked = bake(self.checkpoint.model)
+        self._baked = gaussians_by_place(bake(self.checkpoint.model))
         self._whole = _loaded(self.model(Recipe()))
         times = (np.arange(2 * POSES) + 0.5) / (2 * POSES) * scene.motion.duration
         shots = [Shot(float(t), self._view(float(t), k)) for k, t in enumerate(times)]

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 
 from rnd_runtime import __version__
 from rnd_runtime.avatar import (
@@ -33,6 +34,7 @@ from rnd_trainer.data import pose_input
 
 from .bake import BakedAvatar, bake
 from .graph import build_model
+from .places import gaussians_by_place, nodes_by_place
 from .variant import Variant, reduced
 
 MAX_WEIGHT_ERROR = 1e-4
@@ -73,13 +75,14 @@ def export(
     refuse_ablations(checkpoint, checkpoint_path)
     variant = variant or Variant()
     variant.check(checkpoint.config.model)
-    baked = reduced(bake(checkpoint.model), checkpoint.config.model, variant, surface_area(checkpoint))
+    baked = gaussians_by_place(bake(checkpoint.model))
+    baked = reduced(baked, checkpoint.config.model, variant, surface_area(checkpoint))
     model = written(checkpoint, checkpoint_path, baked, variant)
     if motion is None:
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
     with atomic_path(out) as temporary:
         onnx.save_model(model, str(temporary))
-        drift = measure_drift(Avatar.load(temporary), checkpoint, motion)
+        drift = measure_drift(Avatar.load(temporary), checkpoint, motion, baked.rows)
         for what, got, bound in _bounds(drift, variant):
             if not got <= bound:
                 raise InputError(
@@ -107,7 +110,7 @@ def written(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: Var
     """The file of ``baked``, which has been :func:`reduced` to ``variant``; ``path`` is hashed."""
     poses = variant.window_poses or checkpoint.config.model.window_poses
     metadata = _metadata(checkpoint, path, baked, variant)
-    return build_model(baked, variant.precision, poses, {METADATA_KEY: metadata})
+    return build_model(nodes_by_place(baked), variant.precision, poses, {METADATA_KEY: metadata})
 
 
 def surface_area(checkpoint: Checkpoint) -> float:
@@ -128,8 +131,8 @@ def _bounds(drift: Drift, variant: Variant) -> list[tuple[str, float, float]]:
 
 
 @torch.no_grad()
-def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion) -> Drift:
-    """Compare the written file with the checkpoint's model on every frame of ``motion``."""
+def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion, rows: NDArray[np.int64]) -> Drift:
+    """Compare the written file with the ``rows`` [N] of the checkpoint's model on every frame of ``motion``."""
     outputs = ("skinning_weights", "means", "normals", "visibility", "covariances")
     worst, distances = np.zeros(len(outputs)), []
     config = checkpoint.config.model
@@ -142,12 +145,11 @@ def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion) -> Dri
         )
         ours = avatar.run((window, velocity, pose.bones.numpy()), outputs)
         theirs = (posed.weights, posed.means, posed.normals, posed.visibility, posed.covariances)
-        errors = [np.abs(a - b.numpy()) for a, b in zip(ours, theirs)]
-        errors[-1] /= posed.covariances.numpy()[:, [0, 3, 5]].max(
-            axis=1, keepdims=True
-        )  # of its largest axis
+        errors = [np.abs(a - b.numpy()[rows]) for a, b in zip(ours, theirs)]
+        largest = posed.covariances.numpy()[rows][:, [0, 3, 5]].max(axis=1, keepdims=True)  # axis
+        errors[-1] /= largest
         worst = np.maximum(worst, [float(error.max()) for error in errors])
-        distances.append(np.linalg.norm(ours[1] - posed.means.numpy(), axis=1))
+        distances.append(np.linalg.norm(ours[1] - posed.means.numpy()[rows], axis=1))
     weights, position, *others = (float(error) for error in worst)
     return Drift(motion.frame_count, weights, position, float(np.percentile(distances, 99)), *others)
 

@@ -48,7 +48,7 @@ def merged(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
     contribution.
     """
     unseen = seen < UNSEEN * seen.mean()
-    first = np.argsort(unseen, kind="stable")
+    first = np.lexsort((baked.rows, unseen))
     is_node = np.zeros(len(seen), bool)
     is_node[baked.node_rows] = True
     order = np.concatenate([baked.node_rows, first[~is_node[first]]])
@@ -82,6 +82,7 @@ def merged(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
             "limb_axes",
             "limb_levers",
             "limb_shares",
+            "rows",
         )
     }
     return dataclasses.replace(

@@ -16,6 +16,7 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.template import NEIGHBOURS, node_interpolation
 
 from .bake import BakedAvatar, BakedSkinning
+from .places import nodes_in_order
 
 COARSE_SHARE = 4
 """``coarse`` evaluates the networks at one of this many nodes: 16 mm apart become 32 mm on a person"""
@@ -68,7 +69,7 @@ def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant, area: flo
     changes: dict[str, Any] = {}
     nodes, skinning = variant.node_count(config), baked.skinning
     if nodes < len(baked.codes):
-        neighbours, weights = node_interpolation(baked.all_codes, nodes, area)
+        neighbours, weights = node_interpolation(baked.all_codes, baked.codes[:nodes], area)
         changes |= {
             "codes": baked.codes[:nodes], "node_rows": baked.node_rows[:nodes],
             "neighbours": neighbours, "neighbour_weights": weights,
@@ -87,18 +88,9 @@ def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant, area: flo
 
 def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
     """The template's skinning at the nodes ``still`` [M]; the others come first in the file's order."""
-    order = np.argsort(still, kind="stable")
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
     moving = int((~still).sum())
-    return dataclasses.replace(
-        baked,
-        codes=baked.codes[order],
-        node_rows=baked.node_rows[order],
-        neighbours=place[baked.neighbours],
-        dynamic_nodes=moving,
-        skinning=baked.skinning if moving else None,
-    )
+    moved = nodes_in_order(baked, np.argsort(still, kind="stable"))
+    return dataclasses.replace(moved, dynamic_nodes=moving, skinning=baked.skinning if moving else None)
 
 
 def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:
