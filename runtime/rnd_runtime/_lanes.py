@@ -190,6 +190,14 @@ def root(context, values):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def whole(context, values):  # type: ignore[no-untyped-def]
+    """The greatest whole numbers that are not above ``values``."""
+    return LANES(values), lambda ctx, builder, sig, args: _call(
+        builder, "llvm.floor.v16f32", _FLOATS, args[0]
+    )
+
+
+@intrinsic
 def total(context, values):  # type: ignore[no-untyped-def]
     """Sum over the lanes, as a tree that is the same every time."""
 

@@ -35,27 +35,27 @@ _C3_3, _C3_2, _C3_1, _C3_0 = (
 def sh_columns(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
     """The sixteen functions at unit directions given by their columns, in whatever ``x, y, z`` compute with.
 
-    Only ``+ − ×`` are used, so numpy arrays, torch tensors and scalars inside a numba kernel all do; each of
-    the 16 results has the shape of ``x``.
+    Only ``+ − ×`` are used, so numpy arrays, torch tensors and scalars or lanes inside a numba kernel all do; each
+    of the 16 results has the shape of ``x``.
     """
     xx, yy, zz = x * x, y * y, z * z
     return (
-        _C0 + 0 * x,
+        _C0 + 0.0 * x,
         -_C1 * y,
         _C1 * z,
         -_C1 * x,
         _C2_SIDE * (x * y),
         -_C2_SIDE * (y * z),
-        _C2_ZONAL * (2 * zz - xx - yy),
+        _C2_ZONAL * (2.0 * zz - xx - yy),
         -_C2_SIDE * (x * z),
         (0.5 * _C2_SIDE) * (xx - yy),
-        -_C3_3 * (y * (3 * xx - yy)),
+        -_C3_3 * (y * (3.0 * xx - yy)),
         _C3_2 * (x * y * z),
-        -_C3_1 * (y * (4 * zz - xx - yy)),
-        _C3_0 * (z * (2 * zz - 3 * xx - 3 * yy)),
-        -_C3_1 * (x * (4 * zz - xx - yy)),
+        -_C3_1 * (y * (4.0 * zz - xx - yy)),
+        _C3_0 * (z * (2.0 * zz - 3.0 * xx - 3.0 * yy)),
+        -_C3_1 * (x * (4.0 * zz - xx - yy)),
         (0.5 * _C3_2) * (z * (xx - yy)),
-        -_C3_3 * (x * (xx - 3 * yy)),
+        -_C3_3 * (x * (xx - 3.0 * yy)),
     )
 
 

@@ -12,13 +12,13 @@ from ._raster_input import floats, mask
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
 from .sh import sh_basis, sh_columns, sh_rotation
-from .shading_tables import lobe_at, transposed
+from .shading_lookup import ROUGHNESS_LOW, ROUGHNESS_SPAN, transposed
 from .specular_lobe import lobe_table
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-_ZERO = np.float32(0)
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _TINY = np.float32(1e-12)
 # max(cos, 0)/π leaves of degree 0 to 2 (Ramamoorthi, Hanrahan 2001); of degree 3 it leaves nothing
 _COSINE = np.array([1, 2 / 3, 1 / 4], np.float32)
@@ -88,7 +88,7 @@ def _ambient(  # type: ignore[no-untyped-def]
         distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)
         vx, vy, vz = vx / distance, vy / distance, vz / distance
         n_dot_v = nx * vx + ny * vy + nz * vz
-        energy, mx, my, mz, _, shrink1, shrink2, shrink3 = lobe_at(
+        energy, mx, my, mz, _, shrink1, shrink2, shrink3 = _lobe_at(
             lobes, roughness[i], n_dot_v, nx, ny, nz, vx, vy, vz
         )
         at_normal, at_lobe = _sh_columns(nx, ny, nz), _sh_columns(mx, my, mz)
@@ -110,3 +110,37 @@ def _ambient(  # type: ignore[no-untyped-def]
         radiance[i, 0] = occlusion * (albedo[i, 0] * max(diffuse_r, _ZERO) + energy * max(shine_r, _ZERO))
         radiance[i, 1] = occlusion * (albedo[i, 1] * max(diffuse_g, _ZERO) + energy * max(shine_g, _ZERO))
         radiance[i, 2] = occlusion * (albedo[i, 2] * max(diffuse_b, _ZERO) + energy * max(shine_b, _ZERO))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _lobe_at(lobes, roughness, n_dot_v, nx, ny, nz, vx, vy, vz):  # type: ignore[no-untyped-def]
+    """``lobe_table`` between its nodes: energy, mean direction (x, y, z), place among the widths, attenuations."""
+    rows, columns = lobes.shape[0] - 1, lobes.shape[1] - 1
+    a = min(max((roughness - ROUGHNESS_LOW) / ROUGHNESS_SPAN, _ZERO), _ONE) * np.float32(rows)
+    root = np.sqrt(min(abs(n_dot_v), _ONE))
+    b = ((root if n_dot_v >= 0 else -root) + _ONE) * _HALF * np.float32(columns)
+    i, j = min(int(a), rows - 1), min(int(b), columns - 1)
+    s, t = a - np.float32(i), b - np.float32(j)
+    w00, w01, w10, w11 = (_ONE - s) * (_ONE - t), (_ONE - s) * t, s * (_ONE - t), s * t
+    c00, c01, c10, c11 = lobes[i, j], lobes[i, j + 1], lobes[i + 1, j], lobes[i + 1, j + 1]
+    along_tangent = w00 * c00[1] + w01 * c01[1] + w10 * c10[1] + w11 * c11[1]
+    along_normal = w00 * c00[2] + w01 * c01[2] + w10 * c10[2] + w11 * c11[2]
+    # the tangent away from the camera; in a view along the normal there is none, and none is needed
+    tx, ty, tz = n_dot_v * nx - vx, n_dot_v * ny - vy, n_dot_v * nz - vz
+    along_tangent /= max(np.sqrt(tx * tx + ty * ty + tz * tz), _TINY)
+    mx, my, mz = (
+        along_normal * nx + along_tangent * tx,
+        along_normal * ny + along_tangent * ty,
+        along_normal * nz + along_tangent * tz,
+    )
+    length = max(np.sqrt(mx * mx + my * my + mz * mz), _TINY)
+    return (
+        w00 * c00[0] + w01 * c01[0] + w10 * c10[0] + w11 * c11[0],
+        mx / length,
+        my / length,
+        mz / length,
+        w00 * c00[3] + w01 * c01[3] + w10 * c10[3] + w11 * c11[3],
+        w00 * c00[4] + w01 * c01[4] + w10 * c10[4] + w11 * c11[4],
+        w00 * c00[5] + w01 * c01[5] + w10 * c10[5] + w11 * c11[5],
+        w00 * c00[6] + w01 * c01[6] + w10 * c10[6] + w11 * c11[6],
+    )

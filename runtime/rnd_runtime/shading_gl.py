@@ -18,8 +18,9 @@ from .gl_passes import GaussianTargets, Pass
 from .sh import SH_COUNT, sh_basis, sh_rotation
 from .shading import AT_SILHOUETTE, SHADOW_RESOLUTION, TURNED_AWAY, Shader
 from .shading_ambient import AmbientLight
+from .shading_lookup import DIFFUSE_SIZE, SPECULAR_SIZE
 from .shading_sum import DistantLights
-from .shading_tables import DIFFUSE_SIZE, SPECULAR_SIZE, SkyTables
+from .shading_tables import SkyTables
 from .shadow import axes_towards
 from .shadow_gl import SunMaps
 from .specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
