@@ -25,7 +25,7 @@ from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
 from .sh import SH_COUNT, sh_basis, sh_rotation
 from .shading_lookup import DIFFUSE_SIZE, SPECULAR_SIZE, look_up, turned
-from .specular_lobe import LOBE_WIDTHS, lobe_table
+from .specular_lobe import LOBE_WIDTHS, lobe_rows
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -82,7 +82,7 @@ class SkyTables:
             tuple(floats(array) for array in arrays),
             np.array(camera_position, np.float32),
             tuple(np.array(r, np.float32, order="C") for r in (light_to_world, root_to_light)),
-            (diffuse, self.specular_cells, _lobe_rows()),
+            (diffuse, self.specular_cells, lobe_rows()),
             mask(seen, len(radiance)),
             radiance,
         )
@@ -98,13 +98,6 @@ class SkyTables:
             moved = nodes[:, down:, right:]
             cells[:, : moved.shape[1], : moved.shape[2], corner, :3] = moved
         return cells.reshape(len(nodes), SPECULAR_SIZE * SPECULAR_SIZE, WIDTH)
-
-
-@cache
-def _lobe_rows() -> Floats32:
-    """:func:`.specular_lobe.lobe_table` in rows of sixteen [16, 49, 16]."""
-    table = lobe_table()
-    return np.pad(table, ((0, 0), (0, 0), (0, WIDTH - table.shape[2])))
 
 
 @cache

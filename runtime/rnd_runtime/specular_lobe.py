@@ -57,6 +57,13 @@ def lobe_table() -> Floats32:
     return np.ascontiguousarray(np.stack(columns, axis=-1), np.float32)
 
 
+@cache
+def lobe_rows() -> Floats32:
+    """:func:`lobe_table` with zeros up to sixteen columns, whole registers: [16, 49, 16]."""
+    table = lobe_table()
+    return np.pad(table, ((0, 0), (0, 0), (0, 16 - table.shape[2])))
+
+
 def lobe_moments(roughness: float, cosines: Floats, samples: int = _SAMPLES) -> LobeMoments:
     """Moments of the lobe seen at each n·v of ``cosines`` [M].
 
