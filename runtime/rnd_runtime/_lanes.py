@@ -211,20 +211,6 @@ def total(context, values):  # type: ignore[no-untyped-def]
     return types.float32(values), emit
 
 
-@intrinsic
-def largest(context, values):  # type: ignore[no-untyped-def]
-    """The greatest of the lanes."""
-
-    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value, width = args[0], WIDTH
-        while width > 1:
-            value, high = _halves(builder, value, width)
-            value, width = builder.select(builder.fcmp_ordered(">", value, high), value, high), width // 2
-        return builder.extract_element(value, ir.Constant(_INT, 0))
-
-    return types.float32(values), emit
-
-
 def _halves(builder: Any, value: Any, width: int) -> tuple[Any, Any]:
     """The lower and the upper half of ``width`` lanes."""
     half = width // 2

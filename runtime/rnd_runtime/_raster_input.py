@@ -11,6 +11,8 @@ from .gaussians import Floats32
 
 def floats(array: ArrayLike) -> Floats32:
     """``array`` as the kernels are compiled for: float32, contiguous, aligned, writable; copied only if needed."""
+    if type(array) is np.ndarray and array.dtype == np.float32 and array.flags.carray:
+        return array
     return np.require(array, np.float32, ["C", "A", "W"])
 
 

@@ -30,13 +30,11 @@ from ._lanes import (
     aligned_floats,
     exp2,
     lanes,
-    largest,
     load,
     root,
     select,
     spread,
     store,
-    total,
     transpose,
 )
 
@@ -209,46 +207,43 @@ def _tanh(x):  # type: ignore[no-untyped-def]
     return lanes(_ONE) - lanes(_TWO) / (_exp(x * _TWO) + _ONE)
 
 
-@njit(error_model="numpy")
-def _shares(i, fields, rest, weights, at):  # type: ignore[no-untyped-def]
-    """e^(logit − the greatest) of Gaussian i's joints into ``weights`` from ``at`` on, and one over their sum."""
+@njit(inline="always")
+def _logits_in_lanes(first, fields, rest, rows, logits):  # type: ignore[no-untyped-def]
+    """Logits [C, lanes] of the Gaussians first … first + 15."""
     columns = rest.log_template.shape[1]
-    greatest = lanes(np.float32(_NEVER))
     for column in range(0, columns, WIDTH):
-        logits = load(rest.log_template, i * columns + column) + _interpolated(fields, rest, i, column)
-        greatest = select(logits > greatest, logits, greatest)
-        store(weights, at + column, logits)
-    top = largest(greatest)
+        for i in range(first, first + WIDTH):
+            template = load(rest.log_template, i * columns + column)
+            store(rows, (i - first) * WIDTH, template + _interpolated(fields, rest, i, column))
+        transpose(rows, logits[column * WIDTH : (column + WIDTH) * WIDTH])
+
+
+@njit(error_model="numpy")
+def _blend_sixteen(logits, bones, blend):  # type: ignore[no-untyped-def]
+    """A [3, 4] by component of sixteen Gaussians; their ``logits`` become e^(logit − the greatest)."""
+    greatest = load(logits, 0)
+    for j in range(1, len(bones)):
+        logit = load(logits, j * WIDTH)
+        greatest = select(logit > greatest, logit, greatest)
     sums = lanes(_ZERO)
-    for column in range(0, columns, WIDTH):
-        share = _exp(load(weights, at + column) - top)
-        sums += share
-        store(weights, at + column, share)
-    return _ONE / total(sums)
-
-
-@njit(error_model="numpy")
-def _blend_four(i, fields, rest, bones, weights, rows, at):  # type: ignore[no-untyped-def]
-    """A [3, 4] of Gaussians i … i + 3 into four of ``rows`` from ``at`` on; ``weights`` is room for their weights.
-
-    Four at once: each bone is loaded once for all, and no product waits for the one before.
-    """
-    columns = rest.log_template.shape[1]
-    scale0 = _shares(i, fields, rest, weights, 0)
-    scale1 = _shares(i + 1, fields, rest, weights, columns)
-    scale2 = _shares(i + 2, fields, rest, weights, 2 * columns)
-    scale3 = _shares(i + 3, fields, rest, weights, 3 * columns)
-    sum0, sum1, sum2, sum3 = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
     for j in range(len(bones)):
-        bone = load(bones, j * WIDTH)
-        sum0 += spread(weights, j) * bone
-        sum1 += spread(weights, columns + j) * bone
-        sum2 += spread(weights, 2 * columns + j) * bone
-        sum3 += spread(weights, 3 * columns + j) * bone
-    store(rows, at, sum0 * scale0)
-    store(rows, at + WIDTH, sum1 * scale1)
-    store(rows, at + 2 * WIDTH, sum2 * scale2)
-    store(rows, at + 3 * WIDTH, sum3 * scale3)
+        share = _exp(load(logits, j * WIDTH) - greatest)
+        sums += share
+        store(logits, j * WIDTH, share)
+    scale = _ONE / sums
+    for row in range(3):  # four sums at a time stay in registers
+        x, y, z, shift = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
+        for j in range(len(bones)):
+            share, at = load(logits, j * WIDTH), j * WIDTH + 4 * row
+            x += share * spread(bones, at)
+            y += share * spread(bones, at + 1)
+            z += share * spread(bones, at + 2)
+            shift += share * spread(bones, at + 3)
+        at = 4 * row * WIDTH
+        store(blend, at, x * scale)
+        store(blend, at + WIDTH, y * scale)
+        store(blend, at + 2 * WIDTH, z * scale)
+        store(blend, at + 3 * WIDTH, shift * scale)
 
 
 @njit
@@ -375,14 +370,13 @@ def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
     count, columns = rest.log_template.shape
     means, covariances, normals = posed.means, posed.covariances, posed.normals
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        weights, rows = aligned_floats(4 * columns), aligned_floats(WIDTH * WIDTH)
+        logits, rows = aligned_floats(columns * WIDTH), aligned_floats(WIDTH * WIDTH)
         blend, offset = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         out = aligned_floats(WIDTH * WIDTH)
         out[:] = _ZERO
         for first in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), WIDTH):
-            for four in range(0, WIDTH, 4):
-                _blend_four(first + four, fields, rest, bones, weights, rows, four * WIDTH)
-            transpose(rows, blend)
+            _logits_in_lanes(first, fields, rest, rows, logits)
+            _blend_sixteen(logits, bones, blend)
             for i in range(first, first + WIDTH):
                 store(rows, (i - first) * WIDTH, _interpolated(fields, rest, i, columns))
                 store(posed.visibility, i * WIDTH, _interpolated(fields, rest, i, columns + WIDTH))

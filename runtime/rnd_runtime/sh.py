@@ -11,6 +11,7 @@ from math import pi, sqrt
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
@@ -86,7 +87,32 @@ def sh_rotation(rotation: ArrayLike) -> Floats:
     M is orthogonal and block-diagonal by degree. Each entry is ∫ Y_i(ω) Y_j(Rᵀω) dω, a polynomial of degree
     6, by a quadrature that is exact up to degree 7, hence right to rounding (1e-14).
     """
+    return np.asarray(_rotation_matrix(*_weighted_basis(), np.array(rotation, np.float64, order="C")))
+
+
+@cache
+def _weighted_basis() -> tuple[Floats, Floats]:
+    """Directions [32, 3] of the quadrature, and the functions there times its weights [32, 16]."""
     directions, weights = sphere_quadrature(SH_DEGREE + 1)
-    turned = sh_basis(directions @ np.asarray(rotation, np.float64))  # rows times R: Rᵀω
-    matrix = (sh_basis(directions) * weights[:, None]).T @ turned
-    return np.where(SH_DEGREES[:, None] == SH_DEGREES, matrix, 0.0)
+    return directions, sh_basis(directions) * weights[:, None]
+
+
+compiled_sh_columns = njit(sh_columns)
+
+
+@njit(cache=True)
+def _rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-def]
+    """In numba: every frame needs one, and numpy takes a tenth of a millisecond."""
+    matrix = np.zeros((SH_COUNT, SH_COUNT))
+    for k in range(len(directions)):
+        x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]
+        turned = compiled_sh_columns(  # at Rᵀω
+            rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
+            rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
+            rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
+        )
+        for degree in range(SH_DEGREE + 1):
+            for i in range(degree * degree, (degree + 1) * (degree + 1)):
+                for j in range(degree * degree, (degree + 1) * (degree + 1)):
+                    matrix[i, j] += weighted[k, i] * turned[j]
+    return matrix

@@ -12,7 +12,7 @@ from ._lanes import WIDTH, aligned_floats, lanes, load, store
 from ._raster_input import floats, mask
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
-from .sh import SH_DEGREES, sh_basis, sh_columns, sh_rotation
+from .sh import SH_DEGREES, compiled_sh_columns, sh_basis, sh_rotation
 from .shading_lanes import (
     ALBEDO,
     CHUNK,
@@ -31,7 +31,7 @@ from .shading_lanes import (
     transposed,
     unit,
     visibility_in_lanes,
-)  # fmt: skip
+)
 from .specular_lobe import lobe_rows
 
 Floats = NDArray[np.float64]
@@ -87,9 +87,6 @@ class AmbientLight:
         return radiance
 
 
-_sh_columns = njit(sh_columns)
-
-
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: ignore[no-untyped-def]
     """As :func:`.shading_lookup.look_up`, with ``tables`` the light [16, 3] in the root's frame and the lobes."""
@@ -118,8 +115,8 @@ def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, colum
     n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
     lobes_in_lanes(lobes, n_dot_v, room, rows, columns)
     energy, shrink = load(columns, 0), three(columns, 4 * WIDTH)
-    at_lobe = _sh_columns(*mean_direction(columns, normal, view, n_dot_v))
-    at_normal = _sh_columns(*normal)
+    at_lobe = compiled_sh_columns(*mean_direction(columns, normal, view, n_dot_v))
+    at_normal = compiled_sh_columns(*normal)
     visibility_in_lanes(members, visibility, rows, columns)
 
     occlusion = lanes(ZERO)

@@ -18,7 +18,7 @@ from ._lanes import (
     transpose,
     whole,
 )
-from .sh import sh_columns
+from .sh import compiled_sh_columns
 from .shading_lanes import (
     ALBEDO,
     CHUNK,
@@ -46,7 +46,7 @@ from .shading_lanes import (
     transposed,
     unit,
     visibility_in_lanes,
-)  # fmt: skip
+)
 
 DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
 SPECULAR_SIZE = 49
@@ -62,8 +62,6 @@ _S_CONSTANT, _T_CONSTANT = np.maximum(-_S_SLOPE, 0), np.maximum(-_T_SLOPE, 0)
 (_LEVEL, _UP) = (FREE, FREE + WIDTH)  # rows of a thread's working memory
 _IRRADIANCE = FREE + 2 * WIDTH  # three
 _ROOM = FREE + 5 * WIDTH
-
-_sh_columns = njit(sh_columns)
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
@@ -157,7 +155,7 @@ def _place_in_square(x, y, z, size, room):  # type: ignore[no-untyped-def]
 @njit(inline="always")
 def _open_share(root_to_light, mean, shrink, visibility):  # type: ignore[no-untyped-def]
     """Visibility averaged over the lobe, from its coefficients [16, lanes]."""
-    basis = _sh_columns(*transposed(root_to_light, mean))
+    basis = compiled_sh_columns(*transposed(root_to_light, mean))
     first = load(visibility, WIDTH) * basis[1] + load(visibility, 2 * WIDTH) * basis[2]
     first += load(visibility, 3 * WIDTH) * basis[3]
     second = load(visibility, 4 * WIDTH) * basis[4] + load(visibility, 5 * WIDTH) * basis[5]
