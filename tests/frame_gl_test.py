@@ -25,6 +25,10 @@ MODES = ("ao", "table", "table+sun", "lights:32", "brute")
 CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
 AGREEMENT_DB = 50.0  # of 8-bit pictures, as every pair of our rasterisers
 MAX_CODES = 2  # of 255: FAILURES G10
+# Posing on the device and on the CPU differ by 1e-7 m. Where two Gaussians are as near in depth they may be blended the
+# other way round: at one moment in ten, in one or two pixels of 12 288, by up to 9 codes.
+TIES, TIE_CODES = 2, 12
+MOMENTS = (0.0, 0.3, 0.4)
 
 
 @pytest.fixture(scope="module")
@@ -48,10 +52,11 @@ def rasterizer(request):
         yield made
 
 
-def _assert_same_picture(got, expected):
+def _assert_same_picture(got, expected, ties=0):
     assert expected.max() > 100
     difference = np.abs(got.astype(int) - expected)
-    assert difference.max() <= MAX_CODES
+    assert (difference.max(axis=-1) > MAX_CODES).sum() <= ties
+    assert difference.max() <= (TIE_CODES if ties else MAX_CODES)
     assert difference.any() == 0 or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
 
 
@@ -72,11 +77,11 @@ def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
     for raster in ("cpu", backend):
         renderer = FrameRenderer(avatar, sky, CAMERA, shade=mode, raster=raster)
         renderer.turn(0.8)
-        frames.append(renderer.render(motion, 0.3))
+        frames.append([renderer.render(motion, time) for time in MOMENTS])
         renderer.close()
-    cpu, gl = frames
-    _assert_same_picture(gl.image, cpu.image)
-    np.testing.assert_allclose(gl.alpha, cpu.alpha, atol=0.01)  # GL's blending does not stop at T < 1e-4
+    for cpu, gl in zip(*frames):
+        _assert_same_picture(gl.image, cpu.image, TIES)
+        np.testing.assert_allclose(gl.alpha, cpu.alpha, atol=0.01)  # GL's blending does not stop at T < 1e-4
     stages = {"motion", "encoders", "posing", "projection+sort", "shading", "raster", "read-back", "tone map"}
     assert gl.stage_seconds.keys() == stages
     assert min(gl.stage_seconds.values()) > 0
