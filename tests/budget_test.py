@@ -85,6 +85,32 @@ def test_cost_bounds_hold_and_no_more_is_given_up_than_needed(kind, value) -> No
     assert given_up(bench, found.plan) != ["nothing"] == given_up(bench, Plan())
 
 
+class _Busy(_Formula):
+    """The same on a machine that is three times as slow while the first steps are looked at."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._calls = 0
+
+    def measure(self, recipe: Recipe, shots: str) -> Measured:
+        self._calls += 1
+        what = super().measure(recipe, shots)
+        return what._replace(ms=what.ms * (3 if 2 <= self._calls <= 8 else 1))
+
+
+def test_a_busy_moment_does_not_end_the_search() -> None:
+    found = search(_Busy(), Bound("ms", 9.0), lambda found: None)
+    assert found.held_out.ms <= 9.0
+    assert _Formula().measure(found.model, "seen").psnr > 40  # and little more is given up for it
+
+
+def test_what_no_step_reaches_is_refused_at_the_last() -> None:
+    steps = []
+    with pytest.raises(InputError, match="no file keeps the bound of ms"):
+        search(_Formula(), Bound("ms", 1.0), steps.append)
+    assert steps[-1].plan == Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
+
+
 def test_what_cannot_be_kept_is_refused() -> None:
     with pytest.raises(InputError, match=r"no file keeps the bound of mb: expected 0\.01"):
         search(_Formula(), Bound("mb", 0.01), lambda found: None)

@@ -103,6 +103,8 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
     on_step(now)
     while bound.kind == "psnr" or not _kept(bench, bound, now):
         step = _best_step(bench, bound, now, worths)
+        if step is None and bound.kind == "ms":  # a busy moment may have hidden what the steps save
+            step, worths = _mildest_step(bench, now), dict.fromkeys(LADDERS, np.inf)
         if step is None:
             break
         now = step
@@ -147,6 +149,13 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
             saved / max(_square(found) - _square(now), 1e-9) if allowed and saved > LEAST_GAIN else 0
         )
         made[name] = found
+
+
+def _mildest_step(bench: Workbench, now: Found) -> Found | None:
+    """Of the steps further down, the one that costs least in the picture."""
+    left = [name for name, rungs in LADDERS.items() if getattr(now.plan, name) < len(rungs)]
+    steps = [_made(bench, replace(now.plan, **{name: getattr(now.plan, name) + 1})) for name in left]
+    return min(steps, key=_square, default=None)
 
 
 def _made(bench: Workbench, plan: Plan) -> Found:
