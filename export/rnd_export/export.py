@@ -146,8 +146,8 @@ def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion, rows: 
         ours = avatar.run((window, velocity, pose.bones.numpy()), outputs)
         theirs = (posed.weights, posed.means, posed.normals, posed.visibility, posed.covariances)
         errors = [np.abs(a - b.numpy()[rows]) for a, b in zip(ours, theirs)]
-        largest = posed.covariances.numpy()[rows][:, [0, 3, 5]].max(axis=1, keepdims=True)  # axis
-        errors[-1] /= largest
+        largest_axis = posed.covariances.numpy()[rows][:, [0, 3, 5]].max(axis=1, keepdims=True)
+        errors[-1] /= largest_axis
         worst = np.maximum(worst, [float(error.max()) for error in errors])
         distances.append(np.linalg.norm(ours[1] - posed.means.numpy()[rows], axis=1))
     weights, position, *others = (float(error) for error in worst)

@@ -1,7 +1,8 @@
 """Neighbours on the body side by side in the file: caches of whoever plays it then hold what comes next.
 
-Gaussians and nodes stand in the order of a Z-curve (Morton 1966) through the rest pose. The farthest-point order that
-a checkpoint has them in, in which any prefix covers the body, puts neighbours as far apart as can be.
+Gaussians and nodes stand in the order of a Z-curve (Morton 1966) through the pose in which their points are encoded.
+The farthest-point order that a checkpoint has them in, in which any prefix covers the body, puts neighbours as far
+apart as can be.
 """
 
 from __future__ import annotations
