@@ -23,7 +23,6 @@ from .shading_lanes import (
     ZERO,
     at_least,
     enter,
-    fill_up,
     leave,
     lobes_in_lanes,
     mean_direction,
@@ -93,17 +92,12 @@ def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: 
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
         members, room = np.empty(WIDTH, np.int64), aligned_floats(FREE)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
-        count, last = 0, min((chunk + 1) * CHUNK, len(seen))
-        for i in range(chunk * CHUNK, last):
-            if seen[i]:
-                enter(count, i, surfaces, camera, room)
-                members[count] = i
-                count += 1
-            if count == WIDTH or (count > 0 and i == last - 1):
-                fill_up(count, members, room)
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        while i < last:
+            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            if count > 0:
                 _shade_sixteen(members, surfaces[4], root_rotation, tables, room, rows, columns)
                 leave(count, members, room, radiance)
-                count = 0
 
 
 @njit(error_model="numpy")

@@ -30,24 +30,30 @@ _ENTERED = 10 * WIDTH
 FREE = 18 * WIDTH
 
 
-@njit(inline="always")
-def enter(k, i, surfaces, camera, room):  # type: ignore[no-untyped-def]
-    """Gaussian i becomes the k-th of sixteen; ``surfaces``: means, normals, albedo, roughness, visibility."""
+@njit(error_model="numpy")
+def enter(first, last, seen, surfaces, camera, members, room):  # type: ignore[no-untyped-def]
+    """The next sixteen of the Gaussians ``seen`` [N] from ``first`` on: where the search goes on, and how many.
+
+    ``surfaces``: means, normals, albedo, roughness, visibility. Of fewer than sixteen the first stands in for the rest.
+    """
     means, normals, albedo, roughness, _ = surfaces
-    for axis in range(3):
-        room[NORMAL + axis * WIDTH + k] = normals[i, axis]
-        room[VIEW + axis * WIDTH + k] = camera[axis] - means[i, axis]
-        room[ALBEDO + axis * WIDTH + k] = albedo[i, axis]
-    room[ROUGHNESS + k] = roughness[i]
-
-
-@njit(inline="always")
-def fill_up(count, members, room):  # type: ignore[no-untyped-def]
-    """Of fewer than sixteen the first stands in for the rest."""
+    i, k = first, 0
+    while i < last and k < WIDTH:
+        if seen[i]:
+            for axis in range(3):
+                room[NORMAL + axis * WIDTH + k] = normals[i, axis]
+                room[VIEW + axis * WIDTH + k] = camera[axis] - means[i, axis]
+                room[ALBEDO + axis * WIDTH + k] = albedo[i, axis]
+            room[ROUGHNESS + k] = roughness[i]
+            members[k] = i
+            k += 1
+        i += 1
+    count = k
     for k in range(count, WIDTH):
         members[k] = members[0]
         for at in range(0, _ENTERED, WIDTH):
             room[at + k] = room[at]
+    return i, count
 
 
 @njit(inline="always")

@@ -36,7 +36,6 @@ from .shading_lanes import (
     at_least,
     clamped,
     enter,
-    fill_up,
     four_corners,
     leave,
     lobes_in_lanes,
@@ -77,17 +76,12 @@ def look_up(surfaces, camera, rotations, tables, seen, radiance):  # type: ignor
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
         members, room = np.empty(WIDTH, np.int64), aligned_floats(_ROOM)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
-        count, last = 0, min((chunk + 1) * CHUNK, len(seen))
-        for i in range(chunk * CHUNK, last):
-            if seen[i]:
-                enter(count, i, surfaces, camera, room)
-                members[count] = i
-                count += 1
-            if count == WIDTH or (count > 0 and i == last - 1):
-                fill_up(count, members, room)
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        while i < last:
+            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            if count > 0:
                 _shade_sixteen(members, surfaces[4], rotations, tables, room, rows, columns)
                 leave(count, members, room, radiance)
-                count = 0
 
 
 @njit(error_model="numpy")
