@@ -11,6 +11,7 @@ from rnd_export.budget import LADDERS, Bound, Plan, given_up, search
 from rnd_export.candidates import Measured, Recipe, Scene, Workbench
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
+from rnd_export.stopwatch import Stopwatch
 from rnd_export.variant import Variant, static_where
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.errors import InputError
@@ -96,6 +97,27 @@ class _Busy(_Formula):
         self._calls += 1
         what = super().measure(recipe, shots)
         return what._replace(ms=what.ms * (3 if 2 <= self._calls <= 8 else 1))
+
+
+class _Machine:
+    """A clock, and players whose frames take so many ms of it, three times as many from a moment on."""
+
+    def __init__(self, busy_from: float) -> None:
+        self.seconds, self._busy_from = 0.0, busy_from
+
+    def player(self, ms: float):
+        def draw(frame: int) -> None:
+            self.seconds += 1e-3 * ms * (3 if self.seconds > self._busy_from else 1)
+
+        return draw
+
+
+@pytest.mark.parametrize("busy_from", [0.4, 0.5, 0.7, 9.0])
+def test_a_busy_machine_does_not_make_a_file_slower(busy_from) -> None:
+    machine = _Machine(busy_from)
+    stopwatch = Stopwatch(machine.player(20.0), lambda: machine.seconds)
+    assert stopwatch.ms(machine.player(20.0)) == pytest.approx(20.0)
+    assert stopwatch.ms(machine.player(15.0)) == pytest.approx(15.0)
 
 
 def test_a_busy_moment_does_not_end_the_search() -> None:

@@ -103,7 +103,7 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
     on_step(now)
     while bound.kind == "psnr" or not _kept(bench, bound, now):
         step = _best_step(bench, bound, now, worths)
-        if step is None and bound.kind == "ms":  # a busy moment may have hidden what the steps save
+        if step is None and bound.kind == "ms":  # each for itself may save too little to be told from noise
             step, worths = _mildest_step(bench, now), dict.fromkeys(LADDERS, np.inf)
         if step is None:
             break

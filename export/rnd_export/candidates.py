@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +27,7 @@ from .bake import BakedAvatar, bake
 from .export import refuse_ablations, surface_area, written
 from .merge import contributions, fitted_albedo, merged
 from .places import gaussians_by_place
+from .stopwatch import Stopwatch
 from .variant import Variant, reduced, static_where
 
 Floats = NDArray[np.float64]
@@ -37,8 +37,6 @@ POSES = 6
 FIT_SIDE = 256
 """of the pictures that colours are fitted to"""
 FIELD_OF_VIEW = 0.6
-TIMED = 12
-"""frames of which the faster half is averaged: what else the machine does is not the avatar's"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,6 @@ class Workbench:
         self.checkpoint, self._path, self._scene = load_checkpoint(path), path, scene
         refuse_ablations(self.checkpoint, path)
         self.config = self.checkpoint.config.model
-        self._clock = clock or self._fastest
         self._baked = gaussians_by_place(bake(self.checkpoint.model))
         self._whole = _loaded(self.model(Recipe()))
         times = (np.arange(2 * POSES) + 0.5) / (2 * POSES) * scene.motion.duration
@@ -94,6 +91,8 @@ class Workbench:
         self.seen, self.held_out = shots[::2], shots[1::2]
         renderer = self._renderer(self._whole)
         self._truth = {shot.time: self._picture(renderer, shot) for shot in shots}
+        stopwatch = Stopwatch(self._frames(self._whole))
+        self._clock = clock or (lambda avatar: stopwatch.ms(self._frames(avatar)))
         self._fit = [Shot(shot.time, shot.camera.resized(FIT_SIDE, FIT_SIDE)) for shot in self.seen]
         self._shares = contributions(self._posed(self._whole))
         self._moves = self._node_moves()
@@ -134,15 +133,16 @@ class Workbench:
         radiance = renderer.render(self._scene.motion, shot.time).radiance
         return np.asarray(linear_to_srgb(np.clip(radiance, 0, 1)), np.float64)
 
-    def _fastest(self, avatar: Avatar) -> float:
-        taken, renderer = [], self._renderer(avatar)
-        for k in range(TIMED + 2):
+    def _frames(self, avatar: Avatar) -> Callable[[int], object]:
+        """Draws ``avatar`` in the k-th of the shots that are held out."""
+        renderer = self._renderer(avatar)
+
+        def draw(k: int) -> object:
             shot = self.held_out[k % len(self.held_out)]
             renderer.camera = shot.camera
-            start = perf_counter()
-            renderer.render(self._scene.motion, shot.time)
-            taken.append(1e3 * (perf_counter() - start))
-        return float(np.mean(sorted(taken[2:])[: TIMED // 2]))
+            return renderer.render(self._scene.motion, shot.time)
+
+        return draw
 
     def _view(self, time: float, number: int) -> Camera:
         """A picture that the avatar just fills, from another side for each shot."""
