@@ -92,6 +92,8 @@ class TrainConfig:
     """λ_n, of L1 between splatted and estimated normals: estimates err by about 10 degrees, so it must not rule"""
     weight_skinning: float = 1e-2
     """of KL(W ‖ W_template); decays to a tenth over the run"""
+    weight_edges: float = 0.1
+    """of the stretch of skin between bones in poses that nobody filmed; there too KL keeps the weights"""
     weight_offset: float = 2.0
     """of the mean square of Δx in units of its bound"""
     weight_residual: float = 0.02

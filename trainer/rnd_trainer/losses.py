@@ -9,6 +9,9 @@ from .light import luminance, natural_sky
 from .metrics import SSIM_WINDOW, ssim_map
 from .model import Posed
 
+ALLOWED_STRETCH = 1.5
+"""ratio of lengths that costs nothing: skin does stretch"""
+
 
 def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, scales: int = 1) -> Tensor:
     """L1 plus weighted 1 − SSIM of two sRGB images [H, W, 3], averaged over ``scales`` halvings of both."""
@@ -37,6 +40,14 @@ def _halved(image: Tensor) -> Tensor:
 def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:
     """KL(W ‖ W_template) [N, J] averaged over the Gaussians."""
     return (weights * (weights.clamp(min=1e-12).log() - log_template)).sum(-1).mean()
+
+
+def stretch_penalty(stretch: Tensor) -> Tensor:
+    """Mean of max(0, stretch − 1.5)² over edges [E] of given stretch (length over length at rest); 0 of none.
+
+    What as-isometric-as-possible deformation (Kilian et al. 2007) holds against lengths, beyond what skin does.
+    """
+    return torch.relu(stretch - ALLOWED_STRETCH).square().sum() / max(len(stretch), 1)
 
 
 def geometry_prior(posed: Posed, weight_offset: float, weight_residual: float) -> Tensor:

@@ -13,8 +13,17 @@ from rnd_runtime.camera import Camera
 from .config import TrainConfig
 from .consistency import POINTS, consistency_loss, covisible, project, virtual_camera
 from .data import View
+from .edges import EdgeLengths
 from .light import LightProbe, Texels, all_texels, draw_texels
-from .losses import geometry_prior, grey_prior, image_loss, linear_to_srgb, skinning_divergence, sky_prior
+from .losses import (
+    geometry_prior,
+    grey_prior,
+    image_loss,
+    linear_to_srgb,
+    skinning_divergence,
+    sky_prior,
+    stretch_penalty,
+)
 from .model import AvatarModel, Posed, PoseInput
 from .perceptual import Perceptual
 from .render import Splat, shade_visible, splat
@@ -33,7 +42,8 @@ class Objective:
         fixed_light: [32, 64, 3] a known light to use instead, or None.
         perceptual: feature network of the LPIPS and consistency terms; without one both are off, and the
             structural term looks at several scales instead.
-        generator: of all random draws.
+        edges: skin in drawn poses, for the edge-length term, or None.
+        generator: of all random draws, but those of the drawn poses.
     """
 
     def __init__(
@@ -42,10 +52,11 @@ class Objective:
         probe: LightProbe,
         fixed_light: Tensor | None,
         perceptual: Perceptual | None,
+        edges: EdgeLengths | None,
         generator: torch.Generator,
     ) -> None:
         self.config, self.probe, self.fixed_light = config, probe, fixed_light
-        self.perceptual, self.generator = perceptual, generator
+        self.perceptual, self.edges, self.generator = perceptual, edges, generator
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
@@ -57,13 +68,15 @@ class Objective:
         """Weighted loss terms of one picture by name; their sum is minimised."""
         config = self.config
         posed = model(pose)
-        decay = 0.1 ** (step / config.steps)
+        like_template = config.weight_skinning * 0.1 ** (step / config.steps)
         terms = {
-            "skinning": config.weight_skinning
-            * decay
-            * skinning_divergence(posed.weights, model.log_weights),
+            "skinning": like_template * skinning_divergence(posed.weights, model.log_weights),
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
+        if self.edges is not None:
+            skin = self.edges(model, posed.attributes.points, step)
+            kept = like_template * skinning_divergence(skin.weights, skin.log_template)
+            terms["edges"] = config.weight_edges * stretch_penalty(skin.stretch) + kept
         if config.model.visibility == "pose":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)

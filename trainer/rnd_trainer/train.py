@@ -26,6 +26,7 @@ from rnd_runtime.motion import Motion, save_motion
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
 from .data import View, load_views, pose_input
+from .edges import EdgeLengths
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .light_start import start_light
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
@@ -77,7 +78,9 @@ class Training:
         self.model = AvatarModel(config.model, template).to(self.device)
         self.probe = LightProbe(config.probe_channels).to(self.device)
         fixed_light = self._capture_light() if config.light == "capture" else None
-        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.generator)
+        felt = config.model.dynamic_skinning and config.weight_edges > 0
+        edges = EdgeLengths(self.model, capture.body.skeleton, config.seed) if felt else None
+        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, edges, self.generator)
         self.poses = [self._pose(view) for view in self.views]
         self.refinement = self._refinement() if config.refine_poses else None
         self.optimizer = self._optimizer()
