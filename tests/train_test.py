@@ -14,8 +14,8 @@ import torch
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
-from rnd_trainer.checkpoint import load_checkpoint
-from rnd_trainer.train import MAX_BAD_STEPS, Training, run
+from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
+from rnd_trainer.train import MAX_BAD_STEPS, STATE_SCHEMA, Training, run
 
 
 def _nothing(*_: object) -> None:
@@ -65,6 +65,21 @@ def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, 
     other = Training(tiny_capture, dataclasses.replace(tiny_config, seed=5))
     with pytest.raises(InputError, match=r"--resume: expected the configuration .* got other \['seed'\]"):
         other.resume(tiny_run / "training.state")
+
+
+def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refused(
+    tiny_run, tiny_capture, tiny_config, tmp_path
+) -> None:
+    tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
+    older = {key: value for key, value in header["config"].items() if key != "weight_edges"}
+    write_tensors(tmp_path / "older.state", tensors, header | {"config": older})
+    training = Training(tiny_capture, tiny_config)
+    training.resume(tmp_path / "older.state")
+    assert training.step_index == 12
+    for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, [], None):
+        write_tensors(tmp_path / "broken.state", tensors, header | {"config": broken})
+        with pytest.raises(InputError, match=r"broken\.state: not a training state"):
+            training.resume(tmp_path / "broken.state")
 
 
 def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path) -> None:

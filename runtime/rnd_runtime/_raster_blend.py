@@ -66,18 +66,24 @@ def _start_tile(tile_x, tile_y, width, height, transmittance):  # type: ignore[n
 
 
 @njit(inline="always")
-def _reached_blocks(x, y, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
-    """Blocks of a tile in which α may reach 1/255, one bit each; all sixteen are tested at once.
+def _may_reach(dx, dy, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
+    """Where α may reach 1/255 in a block whose centre is ``dx``, ``dy`` from a Gaussian's: sixteen such, one bit each.
 
     Pixel centres lie within 1.5 px of their block's centre, so |dy| and |dx − shear·dy| are at least what the
     centre has less 1.5 and 1.5·(1 + |shear|).
     """
-    dy = block_y() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - y)
-    d = magnitude(block_x() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - x) - shear * dy)
+    d = magnitude(dx - shear * dy) - (magnitude(shear) * HALF_BLOCK + HALF_BLOCK)
     dy = magnitude(dy) - HALF_BLOCK
-    d = d - (HALF_BLOCK + HALF_BLOCK * abs(shear))
     dy, d = select(dy > ZERO, dy, ZERO), select(d > ZERO, d, ZERO)
     return bits(peak - fall_y * dy * dy - fall_x * d * d >= LOG2_ALPHA_NEARLY_MIN)
+
+
+@njit(inline="always")
+def _reached_blocks(x, y, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
+    """Blocks of a tile that a Gaussian may reach, one bit each."""
+    dx = block_x() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - x)
+    dy = block_y() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - y)
+    return _may_reach(dx, dy, lanes(shear), fall_y, fall_x, peak)
 
 
 @njit(inline="always")
@@ -100,19 +106,15 @@ def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # t
 
 @njit(inline="always")
 def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
-    """:func:`_reached_blocks` the other way round: which of ``count`` gathered Gaussians reach a block, a bit each."""
+    """Which of ``count`` gathered Gaussians may reach a block, one bit each."""
     row = np.float32(block // BLOCKS * BLOCK + 0.5 * BLOCK)
     column = np.float32(block % BLOCKS * BLOCK + 0.5 * BLOCK)
     reaching = 0
     for k in range(0, count, WIDTH):
-        shear = load(shapes, _SHEAR + k)
-        dy = row - load(shapes, _Y + k)
-        d = magnitude(column - load(shapes, k) - shear * dy)
-        dy = magnitude(dy) - HALF_BLOCK
-        d = d - (magnitude(shear) * HALF_BLOCK + HALF_BLOCK)
-        dy, d = select(dy > ZERO, dy, ZERO), select(d > ZERO, d, ZERO)
-        peak, fall_y, fall_x = load(shapes, _PEAK + k), load(shapes, _FALL_Y + k), load(shapes, _FALL_X + k)
-        reaching |= bits(peak - fall_y * dy * dy - fall_x * d * d >= LOG2_ALPHA_NEARLY_MIN) << k
+        dx, dy = column - load(shapes, k), row - load(shapes, _Y + k)
+        shear, peak = load(shapes, _SHEAR + k), load(shapes, _PEAK + k)
+        fall_y, fall_x = load(shapes, _FALL_Y + k), load(shapes, _FALL_X + k)
+        reaching |= _may_reach(dx, dy, shear, fall_y, fall_x, peak) << k
     return reaching
 
 

@@ -79,6 +79,7 @@ VARIANTS = (
     Variant(
         "no edge lengths", "nothing holds the skin in poses not filmed", "ours", {}, {"weight_edges": 0.0}
     ),
+    Variant("+ edge lengths", "the skin's, in poses that nobody filmed", "ours", {}, {"weight_edges": 0.1}),
     Variant("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
     *(_window(d) for d in (2, 5, 20, 30)),
     Variant("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -47,6 +48,8 @@ class TrainOptions:
     """of every random draw"""
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses"""
+    weight_edges: float = 0.0
+    """hold the lengths of the skin's edges in poses that nobody filmed; 0.1 is much"""
     refine_poses: bool = False
     """correct the capture's body poses while training; writes refined_motion.npz"""
     light: Literal["learn", "capture", "none"] = "learn"
@@ -89,6 +92,7 @@ def _train(options: TrainOptions) -> None:
         light=options.light,
         normals=options.normals,
         probe_channels=options.probe_channels,
+        weight_edges=options.weight_edges,
         refine_poses=options.refine_poses,
         image_scale=config.image_scale if options.image_scale is None else options.image_scale,
         save_every=config.save_every if options.save_every is None else options.save_every,
@@ -96,6 +100,7 @@ def _train(options: TrainOptions) -> None:
     _check(config.steps >= 1, "--steps", "at least 1", config.steps)
     _check(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
+    _check(0 <= config.weight_edges < math.inf, "--weight-edges", "0 or more", config.weight_edges)
     _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
 
     capture = load_capture(options.capture, motion_file=options.motion)

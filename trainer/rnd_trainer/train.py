@@ -24,7 +24,7 @@ from rnd_runtime.light import texel_directions
 from rnd_runtime.motion import Motion, save_motion
 
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
-from .config import TrainConfig, to_dict
+from .config import TrainConfig, from_dict, to_dict
 from .data import View, load_views, pose_input
 from .edges import EdgeLengths
 from .light import PROBE_SHAPE, LightProbe, as_probe
@@ -258,8 +258,9 @@ class Training:
     def resume(self, path: Path) -> None:
         """Continue from a saved state as if never stopped; the configuration must be the same."""
         tensors, header = read_tensors(path, STATE_SCHEMA)
-        if header.get("config") != to_dict(self.config):
-            wrong = sorted(k for k, v in to_dict(self.config).items() if header.get("config", {}).get(k) != v)
+        before, now = to_dict(_trained_with(header, path)), to_dict(self.config)
+        if before != now:
+            wrong = sorted(name for name, value in now.items() if before[name] != value)
             raise InputError(
                 "--resume", expected="the configuration it was started with", got=f"other {wrong}", file=path
             )
@@ -330,6 +331,13 @@ def run(
                 on_preview()
         training.save(folder)
         return interrupted()
+
+
+def _trained_with(header: dict[str, Any], path: Path) -> TrainConfig:
+    try:
+        return from_dict(header["config"])
+    except (KeyError, TypeError, InputError) as error:
+        raise InputError("not a training state of this version", got=str(error), file=path) from error
 
 
 def _keep_until(path: Path, step: int) -> TextIO:
