@@ -76,9 +76,6 @@ VARIANTS = (
         "static skinning", "the template's weights, no L_gc", "ours", {"dynamic_skinning": False}, _NO_GC
     ),
     Variant("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
-    Variant(
-        "no edge lengths", "nothing holds the skin in poses not filmed", "ours", {}, {"weight_edges": 0.0}
-    ),
     Variant("+ edge lengths", "the skin's, in poses that nobody filmed", "ours", {}, {"weight_edges": 0.1}),
     Variant("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
     *(_window(d) for d in (2, 5, 20, 30)),
