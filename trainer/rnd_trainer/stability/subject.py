@@ -22,6 +22,7 @@ from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import bone_transforms
+from rnd_runtime.window import motion_window
 
 from .figures import Bytes, Floats, coded
 from .lights import sun_and_sky
@@ -127,18 +128,21 @@ class Subject:
         return self.avatar.pose(self.motion({}), 0.0)
 
     @cached_property
-    def rest_weights(self) -> Floats32:
-        """Skinning weights [N, J] in the rest pose: what plain blend skinning would use in every pose."""
-        return self.weights(self.motion({}), 0.0)
+    def template_weights(self) -> Floats32:
+        """The template's skinning weights [N, J]: plain blend skinning uses them in every pose."""
+        logs = self._of_graph("log_template", self.motion({}), 0.0)
+        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        return weights / weights.sum(axis=1, keepdims=True)
 
     def weights(self, motion: Motion, time: float) -> Floats32:
         """Skinning weights [N, J] at a moment."""
-        from rnd_runtime.window import motion_window
+        return self._of_graph("skinning_weights", motion, time)
 
-        inputs = motion_window(
+    def _of_graph(self, output: str, motion: Motion, time: float) -> Floats32:
+        window = motion_window(
             motion, time, poses=self.avatar.window_poses, seconds=self.avatar.window_seconds
         )
-        return self.avatar.run((*inputs, self.bones(motion, time)), ("skinning_weights",))[0]
+        return self.avatar.run((*window, self.bones(motion, time)), (output,))[0]
 
     def bones(self, motion: Motion, time: float) -> Floats32:
         """Bone transforms [J, 3, 4] at a moment."""
@@ -146,12 +150,12 @@ class Subject:
         return bone_transforms(self.avatar.skeleton, now.rotations[0], now.translations[0])
 
     def blend(self, motion: Motion, time: float, weights: Floats32 | None = None) -> Floats:
-        """Σ_j W_j B_j [N, 3, 4] with the rest pose's weights, or others."""
+        """Σ_j W_j B_j [N, 3, 4] with the template's weights, or others."""
         bones = self.bones(motion, time).astype(np.float64)
-        return np.einsum("nj,jrc->nrc", self.rest_weights if weights is None else weights, bones)
+        return np.einsum("nj,jrc->nrc", self.template_weights if weights is None else weights, bones)
 
     def by_template(self, motion: Motion, time: float) -> Gaussians:
-        """The baseline: the rest pose's Gaussians moved by blend skinning with fixed weights, normals by A_R n."""
+        """The baseline: the rest pose's Gaussians moved by the template's weights, normals by A_R n."""
         rest, blend = self.rest, self.blend(motion, time)
         linear = blend[:, :, :3]
         means = np.einsum("nrc,nc->nr", linear, rest.means) + blend[:, :, 3]
