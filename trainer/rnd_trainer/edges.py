@@ -56,8 +56,7 @@ class EdgeLengths:
     """The edges that hang on more than one bone, and how far drawn poses stretch them: an eighth of them a step.
 
     Edges join Gaussians to their nearest in the spread pose; stretch is their length in the drawn pose over that at
-    rest. Only skinning weights feel it: points are taken as given. (All edges at every eighth step, with eight times
-    the weight, take as much time but fill Adam's second moments: what pictures say then hardly moves the weights.)
+    rest. Only skinning weights feel it: points are taken as given.
 
     Args:
         model: of which the template is read once; every call evaluates its weights as they are then.
