@@ -15,15 +15,13 @@ from rnd_trainer.data import pose_input
 from rnd_trainer.edges import BETWEEN_BONES, LEAST_LENGTH, PARTS, WIDEST_TURN, EdgeLengths, drawn_pose
 from rnd_trainer.losses import ALLOWED_STRETCH, skinning_divergence, stretch_penalty
 from rnd_trainer.model import AvatarModel, PoseInput
+from rnd_trainer.stability.subject import EXTREMES
 from rnd_trainer.template import sample_template, skin
 from rnd_trainer.train import Training
 from tiny import body
 
 COUNT = 3000
 CONFIG = ModelConfig(gaussians=COUNT, nodes=750, width=32, window_poses=4)
-SQUAT = {
-    "left_hip": (-1.9, 0, 0.2), "right_hip": (-1.9, 0, -0.2), "left_knee": (2.2, 0, 0), "right_knee": (2.2, 0, 0),
-}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +43,7 @@ def edges(model) -> EdgeLengths:
 def _squat() -> PoseInput:
     skeleton = body().skeleton
     angles = np.zeros((2, len(skeleton), 3))
-    for name, turn in SQUAT.items():
+    for name, turn in EXTREMES["squat"].items():
         angles[:, skeleton.names.index(name)] = turn
     motion = Motion(axis_angle_to_matrix(angles), np.zeros((2, 3)), 30.0, skeleton.names)
     return pose_input(motion, skeleton, 0.0, CONFIG)

@@ -21,7 +21,6 @@ from rnd_runtime.skeleton import Skeleton
 
 from .config import ModelConfig
 from .data import pose_input
-from .encoders import positional_encoding
 from .interpolate import NodeInterpolation
 from .model import AvatarModel, PoseInput
 from .skinning import blend_transforms, transform_points
@@ -84,12 +83,13 @@ class EdgeLengths:
 
 @dataclass
 class _Part:
-    """Edges of a part of the body: their ends [E] among its Gaussians [G], and the nodes [M'] these read."""
+    """Edges of a part of the body: their ends [E] among its Gaussians [G], and the nodes that these read, encoded."""
 
     first: Tensor
     second: Tensor
     gaussians: Tensor
-    nodes: Tensor
+    log_template: Tensor
+    encoded: Tensor
     interpolate: NodeInterpolation
 
 
@@ -100,21 +100,20 @@ def _part(model: AvatarModel, pairs: NDArray[np.int64]) -> _Part:
     shares = model.interpolate.weights.cpu()[torch.as_tensor(gaussians)]
     interpolate = NodeInterpolation(torch.as_tensor(local.reshape(known.shape)), shares, len(nodes))
     device = model.points.device
-    first, second, gaussian_rows, node_rows = (
-        torch.as_tensor(rows).to(device) for rows in (*ends.reshape(-1, 2).T, gaussians, nodes)
+    first, second, rows, node_rows = (
+        torch.as_tensor(x).to(device) for x in (*ends.reshape(-1, 2).T, gaussians, nodes)
     )
-    return _Part(first, second, gaussian_rows, node_rows, interpolate.to(device))
+    encoded = model.encoded_nodes()[node_rows]
+    return _Part(first, second, rows, model.log_weights[rows], encoded, interpolate.to(device))
 
 
 def _drawn(model: AvatarModel, points: Tensor, pose: PoseInput, part: _Part) -> DrawnSkin:
-    encoded = positional_encoding(model.codes[part.nodes], model.config.frequencies)
-    logits = part.interpolate(model.skinning(encoded, pose.window, pose.velocity))
-    log_template = model.log_weights[part.gaussians]
-    weights = torch.softmax(log_template + logits, dim=-1)
+    logits = part.interpolate(model.skinning(part.encoded, pose.window, pose.velocity))
+    weights = torch.softmax(part.log_template + logits, dim=-1)
     rest = points[part.gaussians].detach()
     posed = transform_points(blend_transforms(weights, pose.bones), rest)
     long, short = ((p[part.first] - p[part.second]).norm(dim=-1) for p in (posed, rest))
-    return DrawnSkin(long / short.clamp(min=LEAST_LENGTH), weights, log_template)
+    return DrawnSkin(long / short.clamp(min=LEAST_LENGTH), weights, part.log_template)
 
 
 def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
