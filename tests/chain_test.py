@@ -93,7 +93,7 @@ def test_training_refuses_bad_captures(tiny_capture, tmp_path) -> None:
 
 
 def test_training_refuses_senseless_options(tiny_capture, tmp_path) -> None:
-    senseless = {"--steps": 0, "--image-scale": 2, "--gaussians": 3, "--save-every": 0, "--weight-edges": -1}
+    senseless = {"--steps": 0, "--image-scale": 2, "--gaussians": 3, "--save-every": 0}
     for option, value in senseless.items():
         line = _refused("rnd-train", tiny_capture.folder, "--out", tmp_path / "run", option, value)
         assert option in line and str(value) in line

@@ -39,26 +39,67 @@ def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
     assert end < 0.6 * first  # shaded: the light is learned from white in sixty steps
 
 
-def test_both_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
+def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     rows = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows] == list(range(12))
-    assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6
-    assert "grey" in rows[-1] and "grey" not in rows[0]
-    assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 12
+    assert [row["step"] for row in rows] == list(range(14))
+    assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
+    assert "grey" in rows[11] and "grey" not in rows[0]
+    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges"}
+    assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
 
 
 def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
     whole = Training(tiny_capture, tiny_config)
-    expected = [whole.step().terms for _ in range(12)]
+    expected = [whole.step().terms for _ in range(14)]
     half = Training(tiny_capture, tiny_config)
-    for _ in range(7):
-        half.step()
-    half.save(tmp_path)
-    resumed = Training(tiny_capture, tiny_config)
-    resumed.resume(tmp_path / "training.state")
-    assert [resumed.step().terms for _ in range(5)] == expected[7:]
-    for ours, theirs in zip(whole.model.parameters(), resumed.model.parameters()):
+    for stop in (7, 13):  # in the second stage, in the third
+        while half.step_index < stop:
+            half.step()
+        half.save(tmp_path)
+        resumed = Training(tiny_capture, tiny_config)
+        resumed.resume(tmp_path / "training.state")
+        assert [resumed.step().terms for _ in range(stop, 14)] == expected[stop:]
+        for ours, theirs in zip(whole.model.parameters(), resumed.model.parameters()):
+            assert torch.equal(ours, theirs)
+
+
+def test_a_training_without_its_third_stage_can_have_it_later(
+    tiny_capture, tiny_config, tmp_path, one_thread
+) -> None:
+    whole = Training(tiny_capture, tiny_config)
+    run(whole, tmp_path / "whole", on_step=_nothing, on_preview=_nothing)
+    without = dataclasses.replace(tiny_config, unseen_fraction=0.0)
+    run(Training(tiny_capture, without), tmp_path / "without", on_step=_nothing, on_preview=_nothing)
+    later = Training(tiny_capture, tiny_config)
+    later.resume(tmp_path / "without/training.state")
+    assert later.step_index == 12
+    later.step(), later.step()
+    for ours, theirs in zip(whole.model.parameters(), later.model.parameters()):
         assert torch.equal(ours, theirs)
+    with pytest.raises(InputError, match=r"got other \['unseen_fraction'\]"):  # nor back again
+        Training(tiny_capture, without).resume(tmp_path / "whole/training.state")
+
+
+@pytest.mark.parametrize("light", ["learn", "none"])
+def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, light) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, light=light))
+    while training.stage < 3:
+        training.step()
+    before = {name: p.detach().clone() for name, p in training.model.named_parameters()}
+    probe = training.probe.raw.detach().clone()
+    while training.step_index < training.total_steps:
+        training.step()
+    changed = {
+        name.split(".")[0]
+        for name, p in training.model.named_parameters()
+        if not torch.equal(p, before[name])
+    }
+    assert changed == {"skinning"} and torch.equal(probe, training.probe.raw)
+
+
+def test_skinning_that_is_not_learned_has_no_third_stage(tiny_capture, tiny_config) -> None:
+    still = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
+    assert Training(tiny_capture, dataclasses.replace(tiny_config, model=still)).total_steps == 12
 
 
 def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
@@ -71,11 +112,11 @@ def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refu
     tiny_run, tiny_capture, tiny_config, tmp_path
 ) -> None:
     tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
-    older = {key: value for key, value in header["config"].items() if key != "weight_edges"}
+    older = {key: value for key, value in header["config"].items() if key != "light_search"}
     write_tensors(tmp_path / "older.state", tensors, header | {"config": older})
     training = Training(tiny_capture, tiny_config)
     training.resume(tmp_path / "older.state")
-    assert training.step_index == 12
+    assert training.step_index == 14
     for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, [], None):
         write_tensors(tmp_path / "broken.state", tensors, header | {"config": broken})
         with pytest.raises(InputError, match=r"broken\.state: not a training state"):

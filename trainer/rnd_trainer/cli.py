@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -48,8 +47,9 @@ class TrainOptions:
     """of every random draw"""
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses"""
-    weight_edges: float = 0.0
-    """hold the lengths of the skin's edges in poses that nobody filmed; 0.1 is much"""
+    unseen_poses: bool = True
+    """when the pictures are done, teach the skinning poses that nobody filmed: a squat then tears less, and what was
+    filmed hardly changes"""
     refine_poses: bool = False
     """correct the capture's body poses while training; writes refined_motion.npz"""
     light: Literal["learn", "capture", "none"] = "learn"
@@ -92,7 +92,7 @@ def _train(options: TrainOptions) -> None:
         light=options.light,
         normals=options.normals,
         probe_channels=options.probe_channels,
-        weight_edges=options.weight_edges,
+        unseen_fraction=config.unseen_fraction if options.unseen_poses else 0.0,
         refine_poses=options.refine_poses,
         image_scale=config.image_scale if options.image_scale is None else options.image_scale,
         save_every=config.save_every if options.save_every is None else options.save_every,
@@ -100,7 +100,6 @@ def _train(options: TrainOptions) -> None:
     _check(config.steps >= 1, "--steps", "at least 1", config.steps)
     _check(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
-    _check(0 <= config.weight_edges < math.inf, "--weight-edges", "0 or more", config.weight_edges)
     _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
 
     capture = load_capture(options.capture, motion_file=options.motion)
@@ -127,7 +126,7 @@ def _train(options: TrainOptions) -> None:
     write_json(folder / "config.json", to_dict(config))
     for frame in training.bad_masks:
         print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
-    with live_view(folder, config.steps) if options.view else nullcontext() as page:
+    with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
         if page:
             print(f"rnd-train: {page}", file=sys.stderr)  # noqa: T201
         interrupted = _run_with_progress(training, folder, run)
@@ -175,12 +174,12 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=60) as progress:
         task = progress.add_task(
-            "training", total=training.config.steps, completed=training.step_index, stage=1, loss=float("nan")
+            "training", total=training.total_steps, completed=training.step_index, stage=1, loss=float("nan")
         )
         smooth = [float("nan")]
 
         def on_step(step: Any) -> None:
-            loss = step.terms["image"]
+            loss = step.terms.get("image", smooth[0])  # the third stage has no pictures
             smooth[0] = loss if smooth[0] != smooth[0] else 0.98 * smooth[0] + 0.02 * loss
             progress.update(task, completed=step.index + 1, stage=step.stage, loss=smooth[0])
             if step.skipped:
@@ -188,7 +187,8 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
 
         def on_preview() -> None:
             name = f"step_{training.step_index:06d}.png"
-            light = training.light() if training.stage == 2 else None
+            lit = training.stage > 1 and training.config.light != "none"
+            light = training.light() if lit else None
             save_preview(folder / "previews" / name, training.model, light, shown)
 
         return bool(run(training, folder, on_step=on_step, on_preview=on_preview))

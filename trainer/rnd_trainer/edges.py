@@ -7,8 +7,6 @@ in every pose there is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -24,96 +22,56 @@ from .data import pose_input
 from .interpolate import NodeInterpolation
 from .model import AvatarModel, PoseInput
 from .skinning import blend_transforms, transform_points
-from .template import along_curve
 
 NEIGHBOURS = 6
 """edges that leave a Gaussian"""
 BETWEEN_BONES = 0.02
 """Σ_j |ΔW_j| of the template from which an edge counts: what hangs on one bone cannot be stretched"""
-PARTS = 8
-"""of the skin: each step looks at the edges of one"""
 LEAST_LENGTH = 1e-3
 """metres that an edge has at least: two Gaussians may lie on one another"""
-TURNED_JOINTS = 5
-"""joints that a drawn pose turns"""
+TURNED_JOINTS = 10
+"""joints that a drawn pose turns: lengths are local, so it need not be likely, and many joints tell more at once"""
 WIDEST_TURN = 2.2
 """radians that it turns them at most, about any axis: a knee's and a hip's reach"""
 FASTEST_SHARE = 0.5
 """of its turns that a pose may have made within the window"""
 
 
-@dataclass
-class DrawnSkin:
-    """Skin in a drawn pose: stretch [E] of its edges, weights [G, J] of their ends and log_template [G, J] of those."""
-
-    stretch: Tensor
-    weights: Tensor
-    log_template: Tensor
-
-
 class EdgeLengths:
-    """The edges that hang on more than one bone, and how far drawn poses stretch them: an eighth of them a step.
+    """The edges that hang on more than one bone, and how far a pose stretches them.
 
-    Edges join Gaussians to their nearest in the spread pose; stretch is their length in the drawn pose over that at
-    rest. Only skinning weights feel it: points are taken as given.
+    Edges join Gaussians to their nearest in the spread pose; stretch is their length in the pose over that at rest.
+    Only skinning weights feel it: points are taken as given.
 
     Args:
         model: of which the template is read once; every call evaluates its weights as they are then.
-        skeleton: whose joints are turned.
-        seed: of the poses; with the step it gives the pose, so that a resumed run draws the same ones.
     """
 
-    def __init__(self, model: AvatarModel, skeleton: Skeleton, seed: int) -> None:
-        self._skeleton, self._seed, self._config = skeleton, seed, model.config
+    def __init__(self, model: AvatarModel) -> None:
         codes = model.codes.cpu().numpy()
         pairs = _between_bones(codes, torch.softmax(model.log_weights, dim=-1).cpu().numpy())
-        pairs = pairs[along_curve(codes[pairs[:, 0]])]
-        self._parts = [_part(model, part) for part in np.array_split(pairs, PARTS)]
-
-    def __call__(self, model: AvatarModel, points: Tensor, step: int) -> DrawnSkin:
-        """A part of the skin with ``points`` [N, 3] m of the rest pose, in a pose that ``step`` gives."""
-        rng = np.random.default_rng((self._seed, step))
-        pose = drawn_pose(self._skeleton, self._config, rng).to(points.device)
-        return _drawn(model, points, pose, self._parts[step % PARTS])
+        gaussians, ends = np.unique(pairs, return_inverse=True)
+        known = model.interpolate.neighbours.cpu().numpy()[gaussians]
+        nodes, local = np.unique(known, return_inverse=True)
+        shares = model.interpolate.weights.cpu()[torch.as_tensor(gaussians)]
+        device = model.points.device
+        self._interpolate = NodeInterpolation(
+            torch.as_tensor(local.reshape(known.shape)), shares, len(nodes)
+        ).to(device)
+        self._first, self._second, self._gaussians, rows = (
+            torch.as_tensor(x).to(device) for x in (*ends.reshape(-1, 2).T, gaussians, nodes)
+        )
+        self._encoded = model.encoded_nodes()[rows]
+        self._log_template = model.log_weights[self._gaussians]
 
     def stretch(self, model: AvatarModel, points: Tensor, pose: PoseInput) -> Tensor:
-        """Of all edges [E] in ``pose``."""
-        return torch.cat([_drawn(model, points, pose, part).stretch for part in self._parts])
-
-
-@dataclass
-class _Part:
-    """Edges of a part of the body: their ends [E] among its Gaussians [G], and the nodes that these read, encoded."""
-
-    first: Tensor
-    second: Tensor
-    gaussians: Tensor
-    log_template: Tensor
-    encoded: Tensor
-    interpolate: NodeInterpolation
-
-
-def _part(model: AvatarModel, pairs: NDArray[np.int64]) -> _Part:
-    gaussians, ends = np.unique(pairs, return_inverse=True)
-    known = model.interpolate.neighbours.cpu().numpy()[gaussians]
-    nodes, local = np.unique(known, return_inverse=True)
-    shares = model.interpolate.weights.cpu()[torch.as_tensor(gaussians)]
-    interpolate = NodeInterpolation(torch.as_tensor(local.reshape(known.shape)), shares, len(nodes))
-    device = model.points.device
-    first, second, rows, node_rows = (
-        torch.as_tensor(x).to(device) for x in (*ends.reshape(-1, 2).T, gaussians, nodes)
-    )
-    encoded = model.encoded_nodes()[node_rows]
-    return _Part(first, second, rows, model.log_weights[rows], encoded, interpolate.to(device))
-
-
-def _drawn(model: AvatarModel, points: Tensor, pose: PoseInput, part: _Part) -> DrawnSkin:
-    logits = part.interpolate(model.skinning(part.encoded, pose.window, pose.velocity))
-    weights = torch.softmax(part.log_template + logits, dim=-1)
-    rest = points[part.gaussians].detach()
-    posed = transform_points(blend_transforms(weights, pose.bones), rest)
-    long, short = ((p[part.first] - p[part.second]).norm(dim=-1) for p in (posed, rest))
-    return DrawnSkin(long / short.clamp(min=LEAST_LENGTH), weights, part.log_template)
+        """Of every edge [E] in ``pose``, with ``points`` [N, 3] m of the rest pose."""
+        logits = self._interpolate(model.skinning(self._encoded, pose.window, pose.velocity))
+        weights = torch.softmax(self._log_template + logits, dim=-1)
+        rest = points[self._gaussians].detach()
+        posed = transform_points(blend_transforms(weights, pose.bones), rest)
+        long, short = ((p[self._first] - p[self._second]).norm(dim=-1) for p in (posed, rest))
+        return long / short.clamp(min=LEAST_LENGTH)
 
 
 def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:

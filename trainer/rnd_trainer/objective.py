@@ -13,7 +13,6 @@ from rnd_runtime.camera import Camera
 from .config import TrainConfig
 from .consistency import POINTS, consistency_loss, covisible, project, virtual_camera
 from .data import View
-from .edges import EdgeLengths
 from .light import LightProbe, Texels, all_texels, draw_texels
 from .losses import (
     geometry_prior,
@@ -22,7 +21,6 @@ from .losses import (
     linear_to_srgb,
     skinning_divergence,
     sky_prior,
-    stretch_penalty,
 )
 from .model import AvatarModel, Posed, PoseInput
 from .perceptual import Perceptual
@@ -42,7 +40,6 @@ class Objective:
         fixed_light: [32, 64, 3] a known light to use instead, or None.
         perceptual: feature network of the LPIPS and consistency terms; without one both are off, and the
             structural term looks at several scales instead.
-        edges: skin in drawn poses, for the edge-length term, or None.
         generator: of all random draws, but those of the drawn poses.
     """
 
@@ -52,11 +49,10 @@ class Objective:
         probe: LightProbe,
         fixed_light: Tensor | None,
         perceptual: Perceptual | None,
-        edges: EdgeLengths | None,
         generator: torch.Generator,
     ) -> None:
         self.config, self.probe, self.fixed_light = config, probe, fixed_light
-        self.perceptual, self.edges, self.generator = perceptual, edges, generator
+        self.perceptual, self.generator = perceptual, generator
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
@@ -73,10 +69,6 @@ class Objective:
             "skinning": like_template * skinning_divergence(posed.weights, model.log_weights),
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
-        if self.edges is not None:
-            skin = self.edges(model, posed.attributes.points, step)
-            kept = like_template * skinning_divergence(skin.weights, skin.log_template)
-            terms["edges"] = config.weight_edges * stretch_penalty(skin.stretch) + kept
         if config.model.visibility == "pose":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)

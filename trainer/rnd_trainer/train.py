@@ -1,4 +1,4 @@
-"""The training loop: two stages, one picture a step. Read it top to bottom."""
+"""The training loop: two stages of one picture a step, and a short third without. Read it top to bottom."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from rnd_runtime.motion import Motion, save_motion
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, from_dict, to_dict
 from .data import View, load_views, pose_input
-from .edges import EdgeLengths
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .light_start import start_light
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
@@ -34,6 +33,7 @@ from .objective import Objective, noisy
 from .perceptual import Perceptual
 from .pose_refinement import PoseRefinement
 from .template import sample_template
+from .unseen import UnseenPoses
 
 STATE_SCHEMA = "rnd-training/1"
 MAX_BAD_STEPS = 10
@@ -78,11 +78,10 @@ class Training:
         self.model = AvatarModel(config.model, template).to(self.device)
         self.probe = LightProbe(config.probe_channels).to(self.device)
         fixed_light = self._capture_light() if config.light == "capture" else None
-        felt = config.model.dynamic_skinning and config.weight_edges > 0
-        edges = EdgeLengths(self.model, capture.body.skeleton, config.seed) if felt else None
-        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, edges, self.generator)
+        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.generator)
         self.poses = [self._pose(view) for view in self.views]
         self.refinement = self._refinement() if config.refine_poses else None
+        self.unseen: UnseenPoses | None = None  # from the third stage on
         self.optimizer = self._optimizer()
         self.step_index = 0
         self.bad_steps = 0
@@ -94,19 +93,14 @@ class Training:
         """Optimise on the next picture. Raises :class:`InputError` after ten non-finite steps in a row."""
         started = time.perf_counter()
         stage = self.stage
-        if self.step_index == self.stage1_steps:
+        if stage == 2 and self.step_index == self.stage1_steps:
             self._start_albedo_from_colour()
             self._start_light()
         self._set_rates()
         view_index = self._next_view()
         view, pose = self.views[view_index], self.poses[view_index]
         pose = noisy(pose, self.config.pose_noise, self.generator)
-        refinement = self.refinement if self.step_index >= self._refine_from else None
-        if refinement is not None:
-            pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
-        terms = self.objective(self.model, view, pose, self.step_index, stage)
-        if refinement is not None:
-            terms["poses"] = self.config.weight_poses * refinement.prior(view.frame.frame)
+        terms = self._picture_terms(view, pose, stage) if stage < 3 else self._unseen_terms(pose)
         total = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(total))
@@ -128,6 +122,19 @@ class Training:
         self.seconds += time.perf_counter() - started
         return done
 
+    def _picture_terms(self, view: View, pose: PoseInput, stage: int) -> dict[str, Tensor]:
+        refinement = self.refinement if self.step_index >= self._refine_from else None
+        if refinement is None:
+            return self.objective(self.model, view, pose, self.step_index, stage)
+        pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
+        terms = self.objective(self.model, view, pose, self.step_index, stage)
+        return {**terms, "poses": self.config.weight_poses * refinement.prior(view.frame.frame)}
+
+    def _unseen_terms(self, pose: PoseInput) -> dict[str, Tensor]:
+        if self.unseen is None:
+            self.unseen = self._unseen()
+        return self.unseen(self.model, pose, self.step_index)
+
     # -- schedule ------------------------------------------------------------------------------------------
 
     @property
@@ -138,12 +145,20 @@ class Training:
         return round(self.config.stage1_fraction * self.config.steps)
 
     @property
+    def total_steps(self) -> int:
+        """Of all stages; ``config.steps`` are those with a picture."""
+        unseen = self.config.unseen_fraction if self.config.model.dynamic_skinning else 0
+        return self.config.steps + round(unseen * self.config.steps)
+
+    @property
     def _refine_from(self) -> float:
         return self.config.refine_after * self.config.steps
 
     @property
     def stage(self) -> int:
-        """Of the next step: 1 geometry under plain colours, 2 the light."""
+        """Of the next step: 1 geometry under plain colours, 2 the light, 3 skinning in poses that nobody filmed."""
+        if self.step_index >= self.config.steps:
+            return 3
         return 1 if self.step_index < self.stage1_steps else 2
 
     def light(self) -> Tensor:
@@ -157,8 +172,11 @@ class Training:
         )
 
     def _decay(self) -> float:
-        """1 at the start, 0.1 at the end, exponential."""
-        return 0.1 ** (self.step_index / self.config.steps)
+        """1 at the start, 0.1 at the last picture, exponential; and once more in the third stage."""
+        steps = self.config.steps
+        if self.stage < 3:
+            return 0.1 ** (self.step_index / steps)
+        return 0.1 ** ((self.step_index - steps) / (self.total_steps - steps))
 
     def _set_rates(self) -> None:
         for group in self.optimizer.param_groups:
@@ -216,6 +234,9 @@ class Training:
         frames = [view.frame.frame for view in self.views]
         return PoseRefinement(self.capture.motion, self.capture.body.skeleton, frames).to(self.device)
 
+    def _unseen(self) -> UnseenPoses:
+        return UnseenPoses(self.model, self.capture.body.skeleton, self.config)
+
     def _capture_light(self) -> Tensor:
         names = {view.frame.light or "unknown" for view in self.views}
         if len(names) != 1:
@@ -234,6 +255,9 @@ class Training:
         if self.refinement is not None:
             tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
             save_motion(folder / "refined_motion.npz", self.motion())
+        if self.unseen is not None:
+            taught = self.unseen.taught.state_dict()
+            tensors |= {f"taught.{k}": v.cpu().contiguous() for k, v in taught.items()}
         for index, values in self.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{k}": torch.as_tensor(v).cpu().contiguous() for k, v in values.items()}
         tensors["generator"] = self.generator.get_state()
@@ -256,11 +280,16 @@ class Training:
         )
 
     def resume(self, path: Path) -> None:
-        """Continue from a saved state as if never stopped; the configuration must be the same."""
+        """Continue from a saved state as if never stopped.
+
+        The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
+        """
         tensors, header = read_tensors(path, STATE_SCHEMA)
+        taught = _strip(tensors, "taught.")
         before, now = to_dict(_trained_with(header, path)), to_dict(self.config)
-        if before != now:
-            wrong = sorted(name for name, value in now.items() if before[name] != value)
+        free = set() if taught else {"unseen_fraction", "weight_edges"}
+        wrong = sorted(name for name, value in now.items() if before[name] != value and name not in free)
+        if wrong:
             raise InputError(
                 "--resume", expected="the configuration it was started with", got=f"other {wrong}", file=path
             )
@@ -274,6 +303,9 @@ class Training:
             self.probe.load_state_dict(_strip(tensors, "probe."))
             if self.refinement is not None:
                 self.refinement.load_state_dict(_strip(tensors, "poses."))
+            if taught:
+                self.unseen = self._unseen()
+                self.unseen.taught.load_state_dict(taught)
             moments: dict[int, dict[str, Tensor]] = {}
             for name, value in _strip(tensors, "adam.").items():
                 index, key = name.split(".")
@@ -314,7 +346,7 @@ def run(
         _keep_until(folder / "metrics.jsonl", training.step_index) as log,
         _deferred_interrupt() as interrupted,
     ):
-        while training.step_index < config.steps and not interrupted():
+        while training.step_index < training.total_steps and not interrupted():
             step = training.step()
             row = {
                 "step": step.index,
@@ -327,7 +359,7 @@ def run(
             if training.step_index % config.save_every == 0:
                 log.flush()
                 training.save(folder)
-            if training.step_index % config.preview_every == 0 or training.step_index == config.steps:
+            if training.step_index % config.preview_every == 0 or training.step_index == training.total_steps:
                 on_preview()
         training.save(folder)
         return interrupted()
