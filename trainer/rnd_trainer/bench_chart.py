@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
 USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
 MARKERS = {"full": "o", "coarse": "s", "static": "^"}
+CEILING_DB = 60.0
+"""points above it are drawn on it with their figure beside them: a picture that is the reference's has a hundred"""
+LEAST_SPAN = 4.0
+"""a panel's greatest milliseconds over its least, at least: two times that are the same should look the same"""
+COLUMNS, WIDE = 5, 3
+"""panels side by side, and how many of them the overview is as wide as"""
 
 
 def draw_chart(rows: list[Row], files: list[Path]) -> None:
@@ -25,40 +32,49 @@ def draw_chart(rows: list[Row], files: list[Path]) -> None:
     if not rows:
         raise InputError("chart", expected="at least one measured point", got="none")
     stages = list(dict.fromkeys(name for row in rows for name in row["stages"]))
-    columns = 3
-    below = -(-len(stages) // columns)
-    with chart(files, (11, 5.2 + 2.5 * below)) as figure:
-        grid = figure.add_gridspec(1 + below, columns, height_ratios=[2.2, *[1] * below])
-        _overview(figure.add_subplot(grid[0, :]), rows)
+    below = -(-len(stages) // COLUMNS)
+    with chart(files, (13, 5.4 + 2.5 * below)) as figure:
+        grid = figure.add_gridspec(1 + below, COLUMNS, height_ratios=[2.2, *[1] * below])
+        whole, words = figure.add_subplot(grid[0, :WIDE]), figure.add_subplot(grid[0, WIDE:])
+        _overview(whole, words, rows)
         for k, stage in enumerate(stages):
-            _stage(figure.add_subplot(grid[1 + k // columns, k % columns]), rows, stage)
+            axes = figure.add_subplot(grid[1 + k // COLUMNS, k % COLUMNS], sharey=whole)
+            _stage(axes, rows, stage)
+            if k % COLUMNS == 0:
+                axes.set_ylabel("dB")
+            else:
+                axes.tick_params(labelleft=False)
 
 
-def _overview(axes: Any, rows: list[Row]) -> None:
-    """All points; the front is drawn for pictures of one size, since smaller ones are always faster."""
+def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
+    """All points, and what they are in ``words`` beside them.
+
+    The front is drawn for pictures of one size, since smaller ones are always faster.
+    """
     size = rows[0]["size"]
     front = list(pareto([row for row in rows if row["size"] == size]))
-    axes.plot([r["ms_median"] for r in front], [r["psnr_db"] for r in front], color="#777", lw=1, zorder=1)
+    axes.plot([r["ms_median"] for r in front], [_shown_db(r) for r in front], color="#777", lw=1, zorder=1)
     axes.axvline(BUDGET_MS, color="#999", lw=0.8, ls="--")
     axes.axhline(BUDGET_DB, color="#999", lw=0.8, ls="--")
     _points(axes, rows, "ms_median")
     named = [f"front at {size}²:"]
     for number, row in enumerate(front, 1):
         axes.annotate(
-            str(number), (row["ms_median"], row["psnr_db"]), xytext=(0, 6), textcoords="offset points",
+            str(number), (row["ms_median"], _shown_db(row)), xytext=(0, 6), textcoords="offset points",
             fontsize=8, ha="center", weight="bold",
         )  # fmt: skip
         named.append(f"{number}  {_label(row)}: {row['ms_median']:.1f} ms, {row['psnr_db']:.1f} dB")
-    axes.text(1.01, 1.0, "\n".join(named), transform=axes.transAxes, fontsize=8, va="top", linespacing=1.5)
+    words.axis("off")
+    words.text(0, 1, "\n".join(named), transform=words.transAxes, fontsize=8, va="top", linespacing=1.5)
     axes.set_xlabel("ms per frame, pose to pixels (median); dashed: 60 frames a second")
-    axes.set_ylabel("PSNR to the full reference, dB; dashed: 45")
+    axes.set_ylabel(f"PSNR to the full reference, dB; dashed: 45; cut at {CEILING_DB:g}")
     axes.set_title(f"Speed against accuracy: {len(rows)} points on {rows[0]['machine']}", loc="left")
     handles = [axes.scatter([], [], color=colour, label=f"{n:,} Gaussians".replace(",", " "))
                for n, colour in COLOURS.items() if any(row["n"] == n for row in rows)]  # fmt: skip
     handles += [
         axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()
     ]
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8, frameon=False)
+    words.legend(handles=handles, loc="lower left", fontsize=8, frameon=False, borderaxespad=0)
 
 
 def _stage(axes: Any, rows: list[Row], stage: str) -> None:
@@ -66,7 +82,13 @@ def _stage(axes: Any, rows: list[Row], stage: str) -> None:
     _points(axes, had, "stage_ms")
     axes.set_title(stage, loc="left", fontsize=9)
     axes.set_xlabel("ms")
-    axes.set_ylabel("dB")
+    least, most = axes.get_xlim()
+    short = max(0.5 * (math.log(LEAST_SPAN) - math.log(most / least)), 0)
+    axes.set_xlim(least * math.exp(-short), most * math.exp(short))
+
+
+def _shown_db(row: Row) -> float:
+    return min(float(row["psnr_db"]), CEILING_DB)
 
 
 def _points(axes: Any, rows: list[Row], cost: str) -> None:
@@ -74,9 +96,14 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
 
     for row in rows:
         axes.scatter(
-            row[cost], row["psnr_db"], color=COLOURS.get(row["n"], "#333"), marker=MARKERS[row["encoder"]],
+            row[cost], _shown_db(row), color=COLOURS.get(row["n"], "#333"), marker=MARKERS[row["encoder"]],
             s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, edgecolor="white", zorder=2,
         )  # fmt: skip
+        if row["psnr_db"] > CEILING_DB:
+            axes.annotate(
+                f"{row['psnr_db']:.0f}", (row[cost], CEILING_DB), xytext=(-6, 0), textcoords="offset points",
+                fontsize=7, ha="right", va="center",
+            )  # fmt: skip
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
