@@ -188,7 +188,7 @@ def test_the_same_code_trains_on_cuda(tiny_capture, tiny_config) -> None:
     assert first[1]["image"] == pytest.approx(
         first[0]["image"], rel=1e-2
     )  # gsplat differs where alpha is clamped
-    assert not any(on_gpu.step().skipped for _ in range(11))
+    assert not any(on_gpu.step().skipped for _ in range(13))
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:

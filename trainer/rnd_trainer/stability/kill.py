@@ -171,11 +171,14 @@ def _decode(path: Path) -> None:
 
 
 def _off(whole: Path, resumed: Path) -> float:
-    """Largest difference of two metrics logs; infinite when rows are missing or doubled."""
-    curves = [
+    """Largest difference of any term in two metrics logs; infinite when rows are missing or doubled."""
+    logs = [
         [json.loads(line) for line in (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
         for folder in (whole, resumed)
     ]
-    if [row["step"] for row in curves[0]] != [row["step"] for row in curves[1]]:
+    curves = [
+        {(row["step"], name): row[name] for row in log for name in row if name != "seconds"} for log in logs
+    ]
+    if len(logs[0]) != len(logs[1]) or curves[0].keys() != curves[1].keys():
         return float("inf")
-    return max(abs(a["image"] - b["image"]) for a, b in zip(*curves))
+    return float(max(abs(value - curves[1][key]) for key, value in curves[0].items()))
