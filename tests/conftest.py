@@ -18,7 +18,7 @@ def tiny_capture(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tiny_config():
-    """A training of seconds: 600 Gaussians, 150 nodes, 12 steps in both stages."""
+    """A training of seconds: 600 Gaussians, 150 nodes, 12 steps in the two stages of pictures, 2 in the third."""
     from rnd_trainer.config import ModelConfig, TrainConfig
 
     model = ModelConfig(gaussians=600, nodes=150, width=32, attribute_width=32, window_poses=4)
@@ -39,7 +39,7 @@ def tiny_run(tiny_capture, tiny_config, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_checkpoint(tmp_path_factory) -> Path:
-    """avatar.ckpt of an untrained model with random weights: every network says something, unlike after 12 steps."""
+    """avatar.ckpt of an untrained model with random weights: every network says something, unlike after 14 steps."""
     import torch
 
     from rnd_trainer.checkpoint import save_checkpoint
