@@ -33,6 +33,19 @@ def test_broken_files_are_refused_or_read(reader, honest):
     assert [figure for figure in figures if not figure.passes] == []
 
 
+def test_batches_that_were_fed_are_not_fed_again(honest, monkeypatch):
+    from rnd_trainer.stability import fuzz as module
+
+    monkeypatch.setattr(module, "BATCH", 6)
+    fed, batch = [], module._batch
+    monkeypatch.setattr(module, "_batch", lambda *words: fed.append(words) or batch(*words))
+    first = fuzz(honest, 12, ("hdr",))[1]
+    again = fuzz(honest, 20, ("hdr",))[1]
+    assert [(seed, size) for _, _, seed, size in fed] == [(0, 6), (1, 6), (2, 6), (3, 2)]
+    assert first["hdr"]["inputs"] == 12 and again["hdr"]["inputs"] == 20
+    assert again["hdr"]["refused"] >= first["hdr"]["refused"]
+
+
 _WRITER = """
 import itertools, sys
 from pathlib import Path

@@ -43,7 +43,7 @@ class StabilityOptions:
     size: int = 512
     """side of the pictures in pixels"""
     fuzz: int = 0
-    """broken inputs for every reader"""
+    """broken inputs for every reader; resumes in WORK"""
     soak: int = 0
     """frames of playback, and a tenth as many steps of training; resumes"""
     kill: int = 0
@@ -118,22 +118,33 @@ def _subject(options: StabilityOptions, work: Path) -> Subject:
     )
 
 
+def _fuzz(options: StabilityOptions, subject: Subject) -> Sequence[Figure]:
+    """Figures of --fuzz; with --work a run that was stopped goes on."""
+    from rich.console import Console
+    from rich.progress import Progress, TimeRemainingColumn
+
+    from .stability.commands import EXPORT, run_commands
+    from .stability.fuzz import READERS, batches, fuzz, prepare
+    from .stability.trainings import studio, train_small
+
+    folder = subject.work / "fuzz"
+    if not (folder / "files/light.hdr").exists():  # which is written last
+        capture = studio(subject)
+        small = train_small(folder / "run", capture, 12, 200)
+        run_commands(folder, [(EXPORT, [str(small), "--out", str(folder / "small.onnx")])])
+        prepare(folder / "files", folder / "small.onnx", small, capture.folder)
+    columns = (*Progress.get_default_columns()[:-1], TimeRemainingColumn(elapsed_when_finished=True))
+    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=600) as progress:
+        task = progress.add_task("broken files", total=len(READERS) * batches(options.fuzz))
+        figures, record = fuzz(folder / "files", options.fuzz, on_batch=lambda: progress.advance(task))
+    write_json(options.json.with_name("stability_fuzz.json"), record)
+    return figures
+
+
 def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[str, str, Sequence[Figure]]]:
     """What is asked for by --fuzz, --soak, --kill and --determinism."""
     if options.fuzz:
-        from .stability.fuzz import fuzz, prepare
-        from .stability.trainings import studio, train_small
-
-        folder = subject.work / "fuzz"
-        capture = studio(subject)
-        small = train_small(folder / "run", capture, 12, 200)
-        from .stability.commands import EXPORT, run_commands
-
-        run_commands(folder, [(EXPORT, [str(small), "--out", str(folder / "small.onnx")])])
-        prepare(folder / "files", folder / "small.onnx", small, capture.folder)
-        figures, record = fuzz(folder / "files", options.fuzz)
-        write_json(options.json.with_name("stability_fuzz.json"), record)
-        yield "F", "hostile files", figures
+        yield "F", "hostile files", _fuzz(options, subject)
     if options.soak:
         from .stability.soak import soak_playback, soak_training
 

@@ -11,17 +11,20 @@ import io
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import write_json
 
 from .commands import environment
 from .figures import Figure, at_most, holds
@@ -187,8 +190,6 @@ def _safetensors_damage(honest: bytes, draw: Any) -> bytes:
 
 def prepare(folder: Path, avatar: Path, checkpoint: Path, capture: Path) -> None:
     """Small honest files of every kind in ``folder``; the capture's pictures are linked, not copied."""
-    import shutil
-
     import OpenImageIO as oiio
 
     from rnd_runtime.images import write_image
@@ -306,43 +307,22 @@ def _watch(folder: Path, seen: list[str]) -> None:
     sys.addaudithook(hook)
 
 
-def fuzz(folder: Path, count: int, only: tuple[str, ...] = ()) -> tuple[list[Figure], dict[str, Any]]:
-    """Feed ``count`` inputs to every reader, batch by batch, each in a process of its own; figures and the record."""
-    record: dict[str, Any] = {}
+def fuzz(
+    folder: Path, count: int, only: tuple[str, ...] = (), on_batch: Callable[[], object] = lambda: None
+) -> tuple[list[Figure], dict[str, Any]]:
+    """Feed ``count`` inputs to every reader; figures and the record.
+
+    Readers run side by side, as many as there are cores, each on its own copy of ``folder``, and their inputs batch by
+    batch, each in a process of its own. What a batch found is kept beside its files: a run that was stopped goes on.
+    ``on_batch`` is called after each.
+    """
+    names = only or READERS
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        totals = list(
+            pool.map(lambda name: _all_batches(_own_copy(folder, name), name, count, on_batch), names)
+        )
     figures = []
-    for name in only or READERS:
-        total: dict[str, Any] = {
-            "inputs": 0,
-            "refused": 0,
-            "read": 0,
-            "died": [],
-            "escaped": {},
-            "audit": [],
-            "memory": 0.0,
-        }
-        for seed in range(-(-count // BATCH)):
-            size = min(BATCH, count - seed * BATCH)
-            command = [
-                sys.executable,
-                "-m",
-                "rnd_trainer.stability.fuzz",
-                name,
-                str(size),
-                str(seed),
-                str(folder),
-            ]
-            code, lines, said = _run(command, folder)
-            if code != 0 or not lines:
-                total["died"].append({"seed": seed, "code": code, "said": said[-300:]})
-                _keep_killer(folder, name, seed)
-                continue
-            batch = json.loads(lines[-1])
-            for key in ("inputs", "refused", "read"):
-                total[key] += batch[key]
-            total["escaped"] |= batch["escaped"]
-            total["audit"] += batch["audit"]
-            total["memory"] = max(total["memory"], batch["peak_bytes"] / batch["honest_bytes"])
-        record[name] = total
+    for name, total in zip(names, totals):
         faults = [f"{len(total['died'])} processes died"] * bool(total["died"])
         faults += list(total["escaped"]) + total["audit"]
         figures += [
@@ -352,7 +332,55 @@ def fuzz(folder: Path, count: int, only: tuple[str, ...] = ()) -> tuple[list[Fig
             ),
             at_most(f"{name}: peak memory over that of the honest file", total["memory"], MEMORY_FACTOR, "×"),
         ]
-    return figures, record
+    return figures, dict(zip(names, totals))
+
+
+def batches(count: int) -> int:
+    """How many a reader's ``count`` inputs are fed in."""
+    return -(-count // BATCH)
+
+
+def _own_copy(folder: Path, name: str) -> Path:
+    own = folder / "readers" / name
+    if not own.exists():
+        half = own.with_name(f".{name}")
+        shutil.rmtree(half, ignore_errors=True)
+        shutil.copytree(folder, half, ignore=shutil.ignore_patterns("readers"))
+        half.rename(own)
+    return own
+
+
+def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], object]) -> dict[str, Any]:
+    total: dict[str, Any] = {
+        "inputs": 0, "refused": 0, "read": 0, "died": [], "escaped": {}, "audit": [], "memory": 0.0,
+    }  # fmt: skip
+    for seed in range(batches(count)):
+        size = min(BATCH, count - seed * BATCH)
+        kept = folder / f"batch_{seed}_{size}.json"
+        if not kept.exists():
+            write_json(kept, _batch(folder, name, seed, size))
+        batch = json.loads(kept.read_text(encoding="utf-8"))
+        on_batch()
+        if "died" in batch:
+            total["died"].append(batch["died"])
+            continue
+        for key in ("inputs", "refused", "read"):
+            total[key] += batch[key]
+        total["escaped"] |= batch["escaped"]
+        total["audit"] += batch["audit"]
+        total["memory"] = max(total["memory"], batch["peak_bytes"] / batch["honest_bytes"])
+    return total
+
+
+def _batch(folder: Path, name: str, seed: int, size: int) -> dict[str, Any]:
+    """What :func:`fuzz_here` reports from a process of its own, or how that died."""
+    words = [name, str(size), str(seed), str(folder)]
+    code, lines, said = _run([sys.executable, "-m", "rnd_trainer.stability.fuzz", *words], folder)
+    if code != 0 or not lines:
+        _keep_killer(folder, name, seed)
+        return {"died": {"seed": seed, "code": code, "said": said[-300:]}}
+    report: dict[str, Any] = json.loads(lines[-1])
+    return report
 
 
 def _run(command: list[str], folder: Path) -> tuple[int | str, list[str], str]:
