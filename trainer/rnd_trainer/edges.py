@@ -75,7 +75,7 @@ class EdgeLengths:
 
 
 def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
-    """A few joints turned far about any axis, and a window in which they come there from up to half-way."""
+    """Ten joints turned far about any axis, and a window in which they come there from up to half-way."""
     joints = len(skeleton)
     turned = 1 + rng.permutation(joints - 1)[:TURNED_JOINTS]
     axes = rng.standard_normal((len(turned), 3))
