@@ -219,6 +219,7 @@ def test_the_shared_capture():
         (("frames", 0, "image"), "..\\a.png", ["relative path"]),
         (("frames", 0, "image"), "", ["relative path"]),
         (("frames", 0, "mask"), "masks/none.png", ["frame 0", "none.png", "not found"]),
+        *(((part,), "x" * 10_000, ["not found", "File name too long"]) for part in ("body", "motion")),
         (("body",), "../body.npz", ["relative path"]),
         (("body",), "none.npz", ["none.npz", "not found"]),
         (("lights", "sky", "file"), "/sky.exr", ["relative path"]),

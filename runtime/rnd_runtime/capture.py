@@ -17,7 +17,7 @@ from .capture_format import CaptureLight as CaptureLight
 from .capture_format import Frame as Frame
 from .capture_format import Split as Split
 from .errors import InputError
-from .files import atomic_path, existing_file
+from .files import atomic_path, existing_file, is_folder
 from .light import Light
 from .motion import Motion, load_motion, save_motion
 
@@ -124,7 +124,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
         InputError: naming file, field or frame, and both values.
     """
     path = Path(path)
-    file = existing_file(path / "capture.json" if path.is_dir() else path, what="capture")
+    file = existing_file(path / "capture.json" if is_folder(path) else path, what="capture")
     folder = file.parent
     record = read_record(file)
     cameras = {}

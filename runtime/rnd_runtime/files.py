@@ -53,6 +53,11 @@ def output_folder(path: str | Path) -> Path:
     return path
 
 
+def is_folder(path: str | Path) -> bool:
+    """Whether ``path`` is a folder; where ``Path.is_dir`` raises (a name that is too long), it is none."""
+    return os.path.isdir(path)  # noqa: PTH112
+
+
 def existing_file(path: str | Path, *, what: str) -> Path:
     """Return ``path`` if it is a file, else raise :class:`InputError` naming ``what`` it should have been."""
     path = Path(path)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .files import is_folder
 from .motion_names import NAMES_BY_COUNT
 from .motion_names import SMPL_REST_ROOT as SMPL_REST_ROOT
 from .motion_names import SMPLH_NAMES as SMPLH_NAMES
@@ -79,7 +80,7 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
-    if Path(path).is_dir() or Path(path).suffix.lower() in PICKLE_SUFFIXES:
+    if is_folder(path) or Path(path).suffix.lower() in PICKLE_SUFFIXES:
         track = read_track(path)
         return _read(track.members, joint_names, track.rest_root, list(track.notes))
     with Npz(path, what="motion") as archive:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+from .files import is_folder
 from .motion_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .npz import Members
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
@@ -64,7 +65,7 @@ def read_track(path: str | Path) -> Track:
     Raises:
         InputError: when it is none of them.
     """
-    if Path(path).is_dir():
+    if is_folder(path):
         return _easymocap(read_easymocap_folder(Path(path)), path)
     content = read_pickle(path, what="motion")
     if not isinstance(content, Mapping) or not content:

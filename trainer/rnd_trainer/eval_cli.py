@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, run_command
-from rnd_runtime.files import write_json
+from rnd_runtime.files import is_folder, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -105,7 +105,7 @@ def evaluate_run(options: EvalOptions) -> None:
     from .checkpoint import load_checkpoint
     from .held_out import score
 
-    path = options.run / "avatar.ckpt" if options.run.is_dir() else options.run
+    path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
     capture = load_capture(options.capture, motion_file=options.motion)
     exported = path.with_suffix(".onnx")
