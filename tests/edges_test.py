@@ -124,9 +124,8 @@ def test_what_is_kept_is_where_the_nodes_were(model) -> None:
 
 def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_filmed(model) -> None:
     filmed, far = _poses(6, seed=5), _poses(24, seed=6)
-    filmed = [
-        dataclasses.replace(pose, window=pose.window.roll(1, 1)) for pose in filmed
-    ]  # not what is drawn
+    # not what is drawn
+    filmed = [dataclasses.replace(pose, window=pose.window.roll(1, 1)) for pose in filmed]
     lengths = EdgeLengths(model)
     config = dataclasses.replace(TrainConfig(model=CONFIG), weight_edges=1e5)
     unseen = UnseenPoses(model, body().skeleton, config)
@@ -145,6 +144,5 @@ def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_
         optimizer.zero_grad()
     with torch.no_grad():
         moved = np.mean([float(unseen(model, pose, 0)["kept"]) for pose in filmed])
-    print(torn(), before, moved)
     assert torn() < 0.7 * before
     assert moved < 5**2  # mm²

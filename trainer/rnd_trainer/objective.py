@@ -40,7 +40,7 @@ class Objective:
         fixed_light: [32, 64, 3] a known light to use instead, or None.
         perceptual: feature network of the LPIPS and consistency terms; without one both are off, and the
             structural term looks at several scales instead.
-        generator: of all random draws, but those of the drawn poses.
+        generator: of all random draws.
     """
 
     def __init__(

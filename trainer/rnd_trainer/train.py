@@ -124,11 +124,12 @@ class Training:
 
     def _picture_terms(self, view: View, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         refinement = self.refinement if self.step_index >= self._refine_from else None
-        if refinement is None:
-            return self.objective(self.model, view, pose, self.step_index, stage)
-        pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
+        if refinement is not None:
+            pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
         terms = self.objective(self.model, view, pose, self.step_index, stage)
-        return {**terms, "poses": self.config.weight_poses * refinement.prior(view.frame.frame)}
+        if refinement is not None:
+            terms["poses"] = self.config.weight_poses * refinement.prior(view.frame.frame)
+        return terms
 
     def _unseen_terms(self, pose: PoseInput) -> dict[str, Tensor]:
         if self.unseen is None:
