@@ -8,6 +8,7 @@ import onnx
 import pytest
 
 from rnd_runtime.avatar import METADATA_KEY, Avatar
+from rnd_runtime.brdf import LARGEST_ALBEDO
 from rnd_runtime.errors import InputError
 from tiny import body, motion
 
@@ -75,6 +76,19 @@ def test_a_file_cut_short_is_refused(tiny_avatar, tmp_path, share) -> None:
     path.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(InputError, match=r"cut\.onnx: not a"):
         Avatar.load(path)
+
+
+def test_an_albedo_that_would_give_back_more_than_it_gets_is_capped(tiny_avatar, tmp_path) -> None:
+    def whiten(model) -> None:
+        tensor = next(t for t in model.graph.initializer if t.name == "rest/albedo")
+        albedo = onnx.numpy_helper.to_array(tensor).copy()
+        albedo[0] = [1.0, 0.95, 0.5]
+        tensor.CopyFrom(onnx.numpy_helper.from_array(albedo, tensor.name))
+
+    white = _changed(tiny_avatar, tmp_path / "white.onnx", whiten)
+    played, given = (Avatar.load(file).pose(motion(body()), 0.1).albedo for file in (white, tiny_avatar))
+    assert played[0] == pytest.approx([LARGEST_ALBEDO, LARGEST_ALBEDO, 0.5])
+    assert np.array_equal(played[1:], given[1:])  # none that was trained is
 
 
 def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
-from rnd_trainer import bench_frame, bench_grid, bench_peers, bench_shards
+from rnd_trainer import bench_cli, bench_frame, bench_grid, bench_peers, bench_shards
 from rnd_trainer.bench_avatars import Encoders, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
@@ -132,6 +133,16 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     assert {json.dumps(row, sort_keys=True) for row in read_rows(out)} == {
         json.dumps(row, sort_keys=True) for row in rows
     }
+
+
+@pytest.mark.parametrize("words", [["--quick"], ["grid", "--quick"]])
+def test_the_grid_is_what_rnd_bench_does_unless_told_otherwise(words, tmp_path, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(bench_cli, "_grid", asked.append)
+    monkeypatch.setattr(sys, "argv", ["rnd-bench", *words, "--json", str(tmp_path / "grid.json")])
+    with pytest.raises(SystemExit) as ended:
+        bench_cli.main()
+    assert not ended.value.code and asked[0].quick and asked[0].json == tmp_path / "grid.json"
 
 
 def test_the_front_is_what_nothing_beats() -> None:

@@ -1,10 +1,12 @@
 """One line that names what, expected, got, file and frame; and the exit codes of commands."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 
 
 @pytest.mark.parametrize(
@@ -45,6 +47,37 @@ def test_commands_report_in_one_line_and_by_exit_code(capsys):
     assert run_command("rnd-x", lambda: None) == 0
     assert run_command("rnd-x", lambda: 7) == 7
     assert capsys.readouterr() == ("", "")
+
+
+@dataclass
+class Options:
+    size: int = 3
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--siez", "5"], "unrecognized options: --siez, 5 (perhaps --size; see rnd-x y --help)"),
+        (["--size"], "missing value for argument '--size'. Expected 1 values (see rnd-x y --help)"),
+        (
+            ["--size", "5x"],
+            "error parsing --size: invalid literal for int() with base 10: '5x' (see rnd-x y --help)",
+        ),
+    ],
+)
+def test_what_tyro_has_against_a_command_line_is_one_line(words, line, capsys):
+    def command() -> None:
+        parse_options(lambda: tyro.cli(Options, prog="rnd-x y", args=words))
+
+    assert run_command("rnd-x", command) == 2
+    assert capsys.readouterr() == ("", f"rnd-x: {line}\n")
+
+
+def test_options_that_are_right_and_help_pass(capsys):
+    assert parse_options(lambda: tyro.cli(Options, args=["--size", "5"])) == Options(5)
+    with pytest.raises(SystemExit) as leaving:
+        parse_options(lambda: tyro.cli(Options, args=["--help"]))
+    assert not leaving.value.code and "--size" in capsys.readouterr().out
 
 
 def test_our_own_mistakes_keep_their_traceback():

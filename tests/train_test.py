@@ -15,7 +15,10 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
+from rnd_trainer.objective import Objective
 from rnd_trainer.train import MAX_BAD_STEPS, STATE_SCHEMA, Training, run
+
+_objective = Objective.__call__
 
 
 def _nothing(*_: object) -> None:
@@ -46,6 +49,21 @@ def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     assert "grey" in rows[11] and "grey" not in rows[0]
     assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges"}
     assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
+
+
+def test_a_rehearsal_takes_every_term_and_changes_nothing(
+    tiny_capture, tiny_config, one_thread, monkeypatch
+) -> None:
+    plain, rehearsed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
+    asked = []
+    monkeypatch.setattr(
+        Objective, "__call__", lambda *a: asked.append(_objective(*a)) or asked[-1], raising=True
+    )
+    rehearsed.rehearse()
+    monkeypatch.undo()
+    assert {"image", "mask", "visibility", "grey", "sky"} <= set(asked[0])
+    assert rehearsed.step_index == 0 and rehearsed.seconds > 0
+    assert [plain.step().terms for _ in range(8)] == [rehearsed.step().terms for _ in range(8)]
 
 
 def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, one_thread) -> None:

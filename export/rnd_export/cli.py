@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from rnd_runtime.avatar import EncoderKind, Precision
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.motion import Motion
 
 
@@ -50,8 +50,11 @@ class Options:
 
 def main() -> None:
     """Entry point of ``rnd-export``."""
-    options = tyro.cli(Options, prog="rnd-export")
-    sys.exit(run_command("rnd-export", lambda: _export(options)))
+
+    def command() -> None:
+        _export(parse_options(lambda: tyro.cli(Options, prog="rnd-export")))
+
+    sys.exit(run_command("rnd-export", command))
 
 
 def _export(options: Options) -> None:

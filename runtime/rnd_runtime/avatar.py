@@ -37,6 +37,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike, NDArray
 
+from .brdf import LARGEST_ALBEDO
 from .errors import InputError
 from .files import existing_file
 from .gaussians import Gaussians
@@ -148,7 +149,8 @@ class Avatar:
         self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
         self._rest: RestPose | None = None
-        self._opacities, self._albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
+        self._opacities, albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
+        self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
         if not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys():
             self._rest = self._rest_pose()
             self._node_outputs = (*NODE_OUTPUTS, *({NODE_LOGITS} & file.outputs.keys()))

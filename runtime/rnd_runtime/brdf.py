@@ -28,6 +28,9 @@ import numpy as np
 F0 = 0.04
 ROUGHNESS_RANGE = (0.09, 0.99)  # GGX's D overflows half floats below 0.089
 COSINE_FLOOR = 1e-4
+LARGEST_ALBEDO = 1 - F0 - (1 - F0) / 21
+"""of what gives back no more than it gets, whatever its roughness: a smooth surface's gloss gives back the mean of F
+over all views, ∫ F(μ) 2μ dμ = F0 + (1 − F0)/21, and a rough one's less"""
 _HALF_FLOOR = 1e-8  # |l + v|² where light and camera are opposite and h does not exist
 
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
+
+Parsed = TypeVar("Parsed")
 
 
 class InputError(Exception):
@@ -67,3 +73,33 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)  # noqa: T201
         return 130
+
+
+def parse_options(parse: Callable[[], Parsed]) -> Parsed:
+    """What ``parse``, a call of tyro's, makes of the command line.
+
+    Raises:
+        InputError: what tyro has against it, a page with a frame around it, in one line.
+    """
+    page = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(page):
+            options = parse()
+    except SystemExit as leaving:
+        if not leaving.code:  # --help
+            raise
+        raise _refusal(page.getvalue()) from None
+    sys.stderr.write(page.getvalue())
+    return options
+
+
+def _refusal(page: str) -> InputError:
+    """A page of tyro's: a title, what is wrong, perhaps what was meant, where to read more, with rules between them."""
+    lines = [line.strip(" │╭╮╰╯") for line in page.splitlines()][1:]
+    parts = re.split(r"^[-─]+$", "\n".join(lines), flags=re.MULTILINE)
+    parts = [part.strip() for part in parts if part.strip()] or [page]
+    what = parts[0].split("\n\n")[0].removesuffix(".")
+    meant = next((part.splitlines()[1].split()[0] for part in parts if part.startswith("Perhaps")), None)
+    hint = [f"perhaps {meant.rstrip(',')}"] if meant else []
+    hint += [f"see {command}" for command in re.findall(r"[\w-]+(?: \w+)* --help", parts[-1])]
+    return InputError(what[:1].lower() + what[1:], hint="; ".join(hint) or None)

@@ -9,10 +9,13 @@ from typing import Any
 
 import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.files import write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
+
+_DESCRIPTION = """Time and error of the same calls. Without the name of a command it is grid: rnd-bench --quick is the
+small grid. --stability runs the stability list."""
 
 
 def main() -> None:
@@ -30,13 +33,20 @@ def main() -> None:
         "step": (Step, _step),
     }
     kinds = {name: kind for name, (kind, _) in commands.items()}
-    options = tyro.extras.subcommand_cli_from_dict(
-        kinds,
-        prog="rnd-bench",
-        description="Time and error of the same calls. --stability runs the stability list.",
-    )
-    run = next(run for kind, run in commands.values() if isinstance(options, kind))
-    sys.exit(run_command("rnd-bench", lambda: run(options)))
+    words = sys.argv[1:]
+    if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
+        words = ["grid", *words]
+
+    def command() -> None:
+        options = parse_options(
+            lambda: tyro.extras.subcommand_cli_from_dict(
+                kinds, prog="rnd-bench", args=words, description=_DESCRIPTION
+            )
+        )
+        run = next(run for kind, run in commands.values() if isinstance(options, kind))
+        run(options)
+
+    sys.exit(run_command("rnd-bench", command))
 
 
 def _raster(options: Raster) -> None:

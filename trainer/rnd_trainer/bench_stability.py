@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.files import atomic_path, write_json
 
 from .eval_cli import need_extra
@@ -58,7 +58,7 @@ def stability_main(argv: Sequence[str]) -> int:
     """Run ``rnd-bench --stability`` with ``argv``; the exit code is 0 whatever the rows say, 2 for bad options."""
 
     def command() -> None:
-        _stability(tyro.cli(StabilityOptions, prog="rnd-bench --stability", args=argv))
+        _stability(parse_options(lambda: tyro.cli(StabilityOptions, prog="rnd-bench --stability", args=argv)))
 
     return run_command("rnd-bench", command)
 

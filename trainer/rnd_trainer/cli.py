@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.files import output_folder, write_json
 
 from .eval_cli import EvalOptions, evaluate_run, need_extra
@@ -70,8 +70,11 @@ class TrainOptions:
 
 def main() -> None:
     """Entry point of ``rnd-train``."""
-    options = tyro.cli(TrainOptions, prog="rnd-train")
-    sys.exit(run_command("rnd-train", lambda: _train(options)))
+
+    def command() -> None:
+        _train(parse_options(lambda: tyro.cli(TrainOptions, prog="rnd-train")))
+
+    sys.exit(run_command("rnd-train", command))
 
 
 def _train(options: TrainOptions) -> None:

@@ -4,36 +4,35 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from functools import partial, wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from rnd_runtime.errors import run_command
+from rnd_runtime.errors import parse_options, run_command
 
 from .eval_cli import need_extra
 from .importing.options import ImportOptions
 from .motion_cli import motion
 
 
-@dataclass(frozen=True)
-class ImportCommand:
-    """Turn what you have into a capture: a data set, or a video with body poses. What it is is found out, and told."""
+def import_source(
+    source: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.Positional],
+    reading: Annotated[ImportOptions, tyro.conf.arg(name="")] = ImportOptions(),  # noqa: B008  # frozen
+) -> int:
+    """Turn what you have into a capture: a data set, or a video with body poses. What it is is found out, and told.
 
-    source: Annotated[Path, tyro.conf.Positional]
-    """a data set's folder for one subject, a video, or a folder of frames"""
-    out: Annotated[Path, tyro.conf.Positional]
-    """folder for the capture"""
-    reading: tyro.conf.OmitArgPrefixes[ImportOptions] = field(default_factory=ImportOptions)
-
-
-def import_source(command: ImportCommand) -> int:
-    """Run the import, then the check."""
+    Args:
+        source: a data set's folder for one subject, a video, or a folder of frames
+        out: folder for the capture
+        reading: how it is to be understood
+    """
     need_extra()
     from .importing.report import import_and_report
 
-    return import_and_report(command.source, command.out, command.reading)
+    return import_and_report(source, out, reading)
 
 
 def check(capture: Annotated[Path, tyro.conf.Positional], out: Path | None = None) -> int:
@@ -70,19 +69,31 @@ def convert_body(
 
 
 COMMANDS: dict[str, Callable[..., Any]] = {
-    "import": ImportCommand,
+    "import": import_source,
     "check": check,
     "convert-body": convert_body,
     "motion": motion,
 }
 
 
+def _not_yet(command: Callable[..., Any]) -> Callable[..., Any]:
+    """``command`` as tyro sees it, but what it does when called is left to the call of what it returns."""
+
+    @wraps(command)
+    def chosen(*args: Any, **options: Any) -> Callable[[], Any]:
+        return partial(command, *args, **options)
+
+    return chosen
+
+
 def main() -> None:
     """Entry point of ``rnd-data``."""
 
+    later = {name: _not_yet(function) for name, function in COMMANDS.items()}
+
     def command() -> int | None:
-        chosen = tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="rnd-data")
-        result: int | None = import_source(chosen) if isinstance(chosen, ImportCommand) else chosen
+        chosen = parse_options(lambda: tyro.extras.subcommand_cli_from_dict(later, prog="rnd-data"))
+        result: int | None = chosen()
         return result
 
     sys.exit(run_command("rnd-data", command))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.files import is_folder, write_json
 
 if TYPE_CHECKING:
@@ -79,10 +79,12 @@ class EvalOptions:
 
 def main() -> None:
     """Entry point of ``rnd-eval``."""
-    options = tyro.cli(EvalOptions, prog="rnd-eval")
-    sys.exit(
-        run_command("rnd-eval", lambda: ablate_run(options) if options.ablate else evaluate_run(options))
-    )
+
+    def command() -> None:
+        options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
+        ablate_run(options) if options.ablate else evaluate_run(options)
+
+    sys.exit(run_command("rnd-eval", command))
 
 
 def need_extra() -> None:

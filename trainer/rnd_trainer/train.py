@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import signal
 import threading
 import time
@@ -88,6 +89,23 @@ class Training:
         self.seconds = 0.0
 
     # -- one step ------------------------------------------------------------------------------------------
+
+    def rehearse(self) -> None:
+        """Take the dearest kind of step, one of the last with a picture, for nothing: nothing changes by it.
+
+        Kernels are compiled, and what memory a step can need is asked for, now and not when hours have gone by.
+        """
+        started = time.perf_counter()
+        draws = self.generator.get_state()
+        config = self.config
+        period = math.lcm(config.lpips_every, config.consistency_every)
+        dearest = (config.steps - 1) // period * period  # all terms are due in it
+        stage = 1 if config.light == "none" else 2
+        terms = self.objective(self.model, self.views[0], self.poses[0], dearest, stage)
+        torch.stack(list(terms.values())).sum().backward()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.generator.set_state(draws)
+        self.seconds += time.perf_counter() - started
 
     def step(self) -> Step:
         """Optimise on the next picture. Raises :class:`InputError` after ten non-finite steps in a row."""
@@ -338,11 +356,13 @@ class Training:
 def run(
     training: Training, folder: Path, *, on_step: Callable[[Step], None], on_preview: Callable[[], None]
 ) -> bool:
-    """Train to the last step, saving every ``save_every`` steps and at the end.
+    """Train to the last step after a rehearsal, saving every ``save_every`` steps and at the end.
 
     Ctrl-C finishes the step in hand, saves, and returns True: resuming continues the very same curve.
     """
     config = training.config
+    if training.step_index < config.steps:
+        training.rehearse()
     with (
         _keep_until(folder / "metrics.jsonl", training.step_index) as log,
         _deferred_interrupt() as interrupted,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from rnd_runtime.errors import run_command
+from rnd_runtime.errors import parse_options, run_command
 
 from .options import PlayOptions
 
@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
 
     def command() -> int:
-        options = tyro.cli(PlayOptions, prog="rnd-play", args=arguments)
+        options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
         if options.doctor:
             return _doctor()
         from .play import play  # here, so that --help and --doctor work where a library does not load

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import run_command
+from rnd_runtime.errors import parse_options, run_command
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
@@ -88,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rnd-convert`` with ``arguments`` (the process's own when None) and return its exit code."""
 
     def command() -> int:
-        options: Options = tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="rnd-convert", args=arguments)
+        options: Options = parse_options(
+            lambda: tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="rnd-convert", args=arguments)
+        )
         from .convert import convert  # here, so that --help needs no heavy library
         from .report import say
 

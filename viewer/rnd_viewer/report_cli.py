@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rnd-report`` with ``arguments`` (the process's own when None) and return its exit code."""
 
     def command() -> int:
-        options = tyro.cli(ReportOptions, prog="rnd-report", args=arguments)
+        options = parse_options(lambda: tyro.cli(ReportOptions, prog="rnd-report", args=arguments))
         if options.pictures < 0:
             raise InputError("--pictures", expected="0 or more", got=options.pictures)
         from .report import say

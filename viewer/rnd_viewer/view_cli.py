@@ -10,7 +10,7 @@ import numba
 import tyro
 from rich.console import Console
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 
 from .view_options import ViewOptions
 
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rnd-view`` with ``arguments`` (the process's own when None) until Ctrl-C; 2 for unusable input."""
 
     def command() -> int:
-        options = tyro.cli(ViewOptions, prog="rnd-view", args=arguments)
+        options = parse_options(lambda: tyro.cli(ViewOptions, prog="rnd-view", args=arguments))
         return view(options)
 
     return run_command("rnd-view", command)

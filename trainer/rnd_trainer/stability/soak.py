@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -17,7 +20,7 @@ import numpy as np
 from rnd_runtime.files import atomic_path
 from rnd_runtime.raster_cpu import rasterize
 
-from .figures import Figure, at_most, below
+from .figures import Figure, at_most, below, stated
 from .subject import Subject
 from .trainings import studio, tiny_config
 
@@ -27,7 +30,7 @@ WARM = 200
 EVERY = 20
 """frames or steps between two readings"""
 PACE = 1.2
-"""median of the last tenth over that of the first"""
+"""median of the last tenth over that of the first, among frames or steps of one kind"""
 
 
 def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
@@ -46,20 +49,32 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
 
 
 def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
-    """Train for ``steps`` steps in one go (a resumed training is R11's)."""
+    """Train for ``steps`` steps in one go (a resumed training is R11's), after a rehearsal as every training has.
+
+    Steps are of three kinds: plain colours, drawn texels, the whole light. The last does twice the first's work by
+    design, so the pace is looked at within each kind.
+    """
     from rnd_trainer.train import Training
 
-    training = Training(studio(subject), tiny_config(steps=steps + 1, gaussians=subject.few(400, 4000)))
+    config = tiny_config(steps=steps + 1, gaussians=subject.few(400, 4000))
+    training = Training(studio(subject), config)
+    training.rehearse()
 
     def step(number: int) -> str:
         training.step()
         return ""
 
-    return _soak("training", step, steps, state, same=0)
+    borders = [training.stage1_steps, math.ceil(config.steps * (1 - config.full_light_fraction)), steps]
+    return _soak("training", step, steps, state, same=0, borders=borders)
 
 
-def _soak(name: str, work: Callable[[int], str], total: int, state: Path, *, same: int) -> list[Figure]:
-    """``same``: after how many frames the same bits must come back; 0 where nothing repeats."""
+def _soak(
+    name: str, work: Callable[[int], str], total: int, state: Path, *, same: int, borders: Sequence[int] = ()
+) -> list[Figure]:
+    """``same``: after how many frames the same bits must come back; 0 where nothing repeats.
+
+    ``borders``: where each kind of frame or step ends; by default all are of one kind.
+    """
     record: dict[str, Any] = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {}
     segments = record.setdefault(name, [])
     done = sum(segment["frames"] for segment in segments) if same else 0
@@ -84,21 +99,24 @@ def _soak(name: str, work: Callable[[int], str], total: int, state: Path, *, sam
         if number % 500 == 499:
             _save(state, record)
     _save(state, record)
-    return _figures(name, segments, bool(same))
+    return _figures(name, segments, bool(same), borders)
 
 
-def _figures(name: str, segments: list[dict[str, Any]], same: bool) -> list[Figure]:
+def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Sequence[int]) -> list[Figure]:
     slopes = [_slope(s["memory"]) for s in segments if len(s["memory"]) > 10]
-    paces = [_pace(s["seconds"]) for s in segments if len(s["seconds"]) > 10 * WARM // 2]
+    long = [s["seconds"] for s in segments if len(s["seconds"]) > 10 * WARM // 2]
+    paces = [_pace(part) for seconds in long for part in _split(seconds, borders)]
     frames = sum(segment["frames"] for segment in segments)
     figures = [
         below(f"{name}, {frames}: memory a frame", max(slopes, default=float("nan")), SLOPE_BYTES, "bytes")
     ]
     if paces:
-        from dataclasses import replace
-
-        pace = below(f"{name}, {frames}: pace of the end over the start", max(paces), PACE, "×")
+        within = "of each kind of step, " if borders else ""
+        pace = below(f"{name}, {frames}: pace {within}end over start", max(paces), PACE, "×")
         figures.append(replace(pace, timing=True))
+    if paces and borders:
+        whole = max(_pace(seconds) for seconds in long)
+        figures.append(stated(f"{name}, {frames}: pace of the last tenth of all over the first", whole, "×"))
     if same:
         wrong = sum(segment["wrong"] for segment in segments)
         figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
@@ -110,9 +128,15 @@ def _slope(readings: list[int]) -> float:
     return float(np.polyfit(EVERY * np.arange(len(readings)), readings, 1)[0])
 
 
+def _split(seconds: list[float], borders: Sequence[int]) -> list[list[float]]:
+    """The parts between ``borders``."""
+    edges = [0, *borders] if borders else [0, len(seconds)]
+    return [seconds[start:end] for start, end in pairwise(edges)]
+
+
 def _pace(seconds: list[float]) -> float:
-    tenth = max(1, len(seconds) // 10)
-    return float(np.median(seconds[-tenth:]) / np.median(seconds[WARM // 4 : WARM // 4 + tenth]))
+    tenth, cold = max(1, len(seconds) // 10), min(WARM // 4, len(seconds) // 10)
+    return float(np.median(seconds[-tenth:]) / np.median(seconds[cold : cold + tenth]))
 
 
 def _resident() -> int:

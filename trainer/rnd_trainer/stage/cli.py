@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from rnd_runtime.errors import InputError, run_command
+from rnd_runtime.errors import InputError, parse_options, run_command
 from rnd_runtime.files import output_folder, write_json
 from rnd_runtime.images import to_bytes, write_image
 
@@ -79,15 +79,17 @@ class Benchmark:
 
 def main() -> None:
     """Entry point of ``rnd-stage``: ``rnd-stage OUT``, ``rnd-stage agreement JSON``, ``rnd-stage benchmark OUT``."""
-    words = sys.argv[1:]
-    if words[:1] == ["agreement"]:
-        study = tyro.cli(Agreement, prog="rnd-stage agreement", args=words[1:])
-        sys.exit(run_command("rnd-stage", lambda: _agreement(study)))
-    if words[:1] == ["benchmark"]:
-        benchmark = tyro.cli(Benchmark, prog="rnd-stage benchmark", args=words[1:])
-        sys.exit(run_command("rnd-stage", lambda: _benchmark(benchmark)))
-    options = tyro.cli(StageOptions, prog="rnd-stage", description=_DESCRIPTION)
-    sys.exit(run_command("rnd-stage", lambda: _stage(options)))
+    name, words = "rnd-stage", sys.argv[1:]
+
+    def command() -> None:
+        if words[:1] == ["agreement"]:
+            _agreement(parse_options(lambda: tyro.cli(Agreement, prog=f"{name} agreement", args=words[1:])))
+        elif words[:1] == ["benchmark"]:
+            _benchmark(parse_options(lambda: tyro.cli(Benchmark, prog=f"{name} benchmark", args=words[1:])))
+        else:
+            _stage(parse_options(lambda: tyro.cli(StageOptions, prog=name, description=_DESCRIPTION)))
+
+    sys.exit(run_command(name, command))
 
 
 def _stage(options: StageOptions) -> None:

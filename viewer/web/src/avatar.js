@@ -1,6 +1,7 @@
 // avatar.onnx: its metadata, its skeleton, and posing it with onnxruntime (rnd_runtime/avatar.py, skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
+import { LARGEST_ALBEDO } from "./brdf.js";
 import { motionWindow, poseAt } from "./motion.js";
 import { multiply, rotate } from "./rotations.js";
 
@@ -37,6 +38,7 @@ export class Avatar {
     const bones = Float32Array.from({ length: joints * 12 }, (_, k) => (k % 12 % 5 === 0 ? 1 : 0));
     const still = await this.run(window, new Float32Array(3 * others), bones, CONSTANT);
     [this.opacities, this.albedo, this.roughness] = CONSTANT.map((name) => still[name].data.slice());
+    this.albedo.forEach((value, k) => { this.albedo[k] = Math.min(value, LARGEST_ALBEDO); });
   }
 
   async run(window, velocity, bones, outputs) {

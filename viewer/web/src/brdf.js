@@ -2,6 +2,7 @@
 
 export const ROUGHNESS_LOW = 0.09, ROUGHNESS_HIGH = 0.99;
 const F0 = 0.04, COSINE_FLOOR = 1e-4;
+export const LARGEST_ALBEDO = 1 - F0 - (1 - F0) / 21;
 
 export const clampRoughness = (roughness) => Math.min(Math.max(roughness, ROUGHNESS_LOW), ROUGHNESS_HIGH);
 
