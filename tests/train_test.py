@@ -15,10 +15,7 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
-from rnd_trainer.objective import Objective
 from rnd_trainer.train import MAX_BAD_STEPS, STATE_SCHEMA, Training, run
-
-_objective = Objective.__call__
 
 
 def _nothing(*_: object) -> None:
@@ -56,9 +53,13 @@ def test_a_rehearsal_takes_every_term_and_changes_nothing(
 ) -> None:
     plain, rehearsed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
     asked = []
-    monkeypatch.setattr(
-        Objective, "__call__", lambda *a: asked.append(_objective(*a)) or asked[-1], raising=True
-    )
+
+    def spy(*given):
+        asked.append(rehearsed_objective(*given))
+        return asked[-1]
+
+    rehearsed_objective = rehearsed.objective
+    monkeypatch.setattr(rehearsed, "objective", spy)
     rehearsed.rehearse()
     monkeypatch.undo()
     assert {"image", "mask", "visibility", "grey", "sky"} <= set(asked[0])

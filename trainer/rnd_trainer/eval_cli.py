@@ -82,7 +82,7 @@ def main() -> None:
 
     def command() -> None:
         options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
-        ablate_run(options) if options.ablate else evaluate_run(options)
+        (ablate_run if options.ablate else evaluate_run)(options)
 
     sys.exit(run_command("rnd-eval", command))
 

@@ -53,8 +53,8 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
 def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
     """Train for ``steps`` steps in one go (a resumed training is R11's), after a rehearsal as every training has.
 
-    Steps are of three kinds: plain colours, drawn texels, the whole light. The last does twice the first's work by
-    design, so the pace is looked at within each kind.
+    Steps are of three kinds: plain colours, drawn texels, the whole light. The last does several times the first's
+    work by design, so the pace is looked at within each kind.
     """
     from rnd_trainer.train import Training
 
