@@ -22,7 +22,7 @@ import numpy as np
 from rnd_runtime.files import atomic_path
 from rnd_runtime.raster_cpu import rasterize
 
-from .figures import Figure, at_most, below, stated
+from .figures import Figure, at_most, below
 from .subject import Subject
 from .trainings import studio, tiny_config
 
@@ -32,7 +32,7 @@ WARM = 200
 EVERY = 20
 """frames or steps between two readings"""
 PACE = 1.2
-"""median of the last tenth over that of the first, among frames or steps of one kind"""
+"""median of the last tenth over that of the first, of all and among steps of one kind"""
 
 
 def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
@@ -54,7 +54,7 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
     """Train for ``steps`` steps in one go (a resumed training is R11's), after a rehearsal as every training has.
 
     Steps are of three kinds: plain colours, drawn texels, the whole light. The last does several times the first's
-    work by design, so the pace is looked at within each kind.
+    work by design, so the pace is looked at within each kind too.
     """
     from rnd_trainer.train import Training
 
@@ -107,18 +107,16 @@ def _soak(
 def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Sequence[int]) -> list[Figure]:
     slopes = [_slope(s["memory"]) for s in segments if len(s["memory"]) > 10]
     long = [s["seconds"] for s in segments if len(s["seconds"]) > 10 * WARM // 2]
-    paces = [_pace(part) for seconds in long for part in _split(seconds, borders)]
     frames = sum(segment["frames"] for segment in segments)
     figures = [
         below(f"{name}, {frames}: memory a frame", max(slopes, default=float("nan")), SLOPE_BYTES, "bytes")
     ]
-    if paces:
-        within = "of each kind of step, " if borders else ""
-        pace = below(f"{name}, {frames}: pace {within}end over start", max(paces), PACE, "×")
-        figures.append(replace(pace, timing=True))
-    if paces and borders:
-        whole = max(_pace(seconds) for seconds in long)
-        figures.append(stated(f"{name}, {frames}: pace of the last tenth of all over the first", whole, "×"))
+    paces: list[tuple[str, list[tuple[int, int | None]]]] = [("end over start", [(0, None)])]
+    if borders:
+        paces.append(("of each kind of step, end over start", list(pairwise((0, *borders)))))
+    for what, parts in paces if long else ():
+        slowest = max(_pace(seconds[start:end]) for seconds in long for start, end in parts)
+        figures.append(replace(below(f"{name}, {frames}: pace {what}", slowest, PACE, "×"), timing=True))
     if same:
         wrong = sum(segment["wrong"] for segment in segments)
         figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
@@ -128,12 +126,6 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
 def _slope(readings: list[int]) -> float:
     """Bytes a frame, least squares over the readings."""
     return float(np.polyfit(EVERY * np.arange(len(readings)), readings, 1)[0])
-
-
-def _split(seconds: list[float], borders: Sequence[int]) -> list[list[float]]:
-    """The parts between ``borders``."""
-    edges = [0, *borders] if borders else [0, len(seconds)]
-    return [seconds[start:end] for start, end in pairwise(edges)]
 
 
 def _pace(seconds: list[float]) -> float:
