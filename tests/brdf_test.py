@@ -56,7 +56,7 @@ def textbook_specular(roughness, light, view):
         return (np.sqrt(1 + alpha**2 * (1 / cosine**2 - 1)) - 1) / 2
 
     d = distribution(alpha, half[2])
-    g = 1 / (1 + smith_lambda(light[2]) + smith_lambda(view[2]))
+    g = 1 / ((1 + smith_lambda(light[2])) * (1 + smith_lambda(view[2])))
     f = F0 + (1 - F0) * (1 - view @ half) ** 5
     return d * f * g / (4 * light[2] * view[2])
 
@@ -84,7 +84,7 @@ def test_normal_distribution_projects_to_one(roughness):
     tangent = alpha * np.sqrt(((edges[1:] + edges[:-1]) / 2) / (1 - (edges[1:] + edges[:-1]) / 2))
     cosine = np.cos(np.arctan(tangent))
     value = specular(np.float64(roughness), cosine, cosine, np.ones_like(cosine))
-    smith = 0.25 / (cosine * np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2))
+    smith = 1 / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)) ** 2
     d = value / (F0 * smith)
     area = np.diff(np.cos(np.arctan(alpha * np.sqrt(edges[:-1] / (1 - edges[:-1])))) ** 2)
     integral = np.sum(d[:-1] * np.pi * -area)  # ∫ D cosθ dω = π ∫ D d(sin²θ)

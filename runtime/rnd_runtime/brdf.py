@@ -5,14 +5,15 @@
 with the half vector h = (l + v)/|l + v|, α = γ² (γ the perceptual roughness, clamped to [0.09, 0.99]) and
 
     D = α² / (π (sin²θ_h + α² cos²θ_h)²)                              Walter et al. 2007, eq. 33
-    G = 1 / (1 + Λ(n·l) + Λ(n·v)),  Λ(μ) = (√(1 + α²(1/μ² − 1)) − 1)/2   Heitz 2014, eq. 72 and 99
+    G = G1(n·l) G1(n·v),  G1(μ) = 2μ / (μ + √(α² + (1 − α²)μ²))       Walter et al. 2007, eq. 23 and 34
     F = F0 + (1 − F0)(1 − v·h)⁵,  F0 = 0.04                            Schlick 1994
 
-G is Smith's height-correlated one and is exact, not the k = (γ+1)²/8 shortcut, which loses 17–23 % of the
-energy. G / (4 n·l n·v) is evaluated as ½ / (n·l √(α² + (1−α²)(n·v)²) + n·v √(α² + (1−α²)(n·l)²)), which is
-the same number and has no 0/0. Cosines below 1e-4 count as 1e-4 in it: a Gaussian that faces slightly away
-from the camera keeps the shading of its silhouette. Below the light's horizon the caller's max(n·l, 0) makes
-all zero.
+That is Disney's lobe (Burley 2012, which the paper names) without its remapping of α, and what Mitsuba and the data
+rendered by it have. Smith's G is exact, not the k = (γ+1)²/8 shortcut, which loses 17–23 % of the energy. With masking
+and shadowing correlated by height (Heitz 2014, eq. 99) G is larger where light and view both graze, 1.4 times at
+cosines of 0.2 and γ = 0.8: a sun behind the person then draws too bright a rim. G / (4 n·l n·v) is evaluated as one
+fraction, which has no 0/0. Cosines below 1e-4 count as 1e-4 in it: a Gaussian that faces slightly away from the camera
+keeps the shading of its silhouette. Below the light's horizon the caller's max(n·l, 0) makes all zero.
 
 Directions l (to the light), v (to the camera) and n are unit vectors in one frame.
 """
@@ -57,16 +58,16 @@ def ggx(alpha: Any, n_dot_l: Any, n_dot_v: Any, sine_squared: Any, half_squared:
     alpha_squared = alpha * alpha
     lobe = sine_squared + alpha_squared * (1 - sine_squared)
     n_dot_l, n_dot_v = n_dot_l.clip(min=COSINE_FLOOR), n_dot_v.clip(min=COSINE_FLOOR)
-    masking = n_dot_l * (alpha_squared + (1 - alpha_squared) * n_dot_v * n_dot_v) ** 0.5
-    shadowing = n_dot_v * (alpha_squared + (1 - alpha_squared) * n_dot_l * n_dot_l) ** 0.5
+    shadowing = n_dot_l + (alpha_squared + (1 - alpha_squared) * n_dot_l * n_dot_l) ** 0.5
+    masking = n_dot_v + (alpha_squared + (1 - alpha_squared) * n_dot_v * n_dot_v) ** 0.5
     grazing = (1 - 0.5 * half_squared**0.5).clip(min=0)  # 1 − v·h = 1 − |l + v|/2
     grazing_squared = grazing * grazing  # numpy's x**5 costs more than all the rest
     fresnel = F0 + (1 - F0) * grazing_squared * grazing_squared * grazing
-    return (0.5 / pi) * alpha_squared * fresnel / (lobe * lobe * (masking + shadowing))
+    return (1 / pi) * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
 
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
-_F0, _COSINE_FLOOR, _HALF_OVER_PI = np.float32(F0), np.float32(COSINE_FLOOR), np.float32(0.5 / pi)
+_F0, _COSINE_FLOOR, _ONE_OVER_PI = np.float32(F0), np.float32(COSINE_FLOOR), np.float32(1 / pi)
 
 
 @numba.njit(inline="always", error_model="numpy")
@@ -74,9 +75,9 @@ def ggx32(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type:
     """``ggx`` for float32 scalars inside kernels; Python's own constants would make float64 of it there."""
     lobe = sine_squared + alpha_squared * (_ONE - sine_squared)
     n_dot_l, n_dot_v = max(n_dot_l, _COSINE_FLOOR), max(n_dot_v, _COSINE_FLOOR)
-    masking = n_dot_l * np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_v * n_dot_v)
-    shadowing = n_dot_v * np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_l * n_dot_l)
+    shadowing = n_dot_l + np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_l * n_dot_l)
+    masking = n_dot_v + np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_v * n_dot_v)
     grazing = max(_ONE - _HALF * np.sqrt(half_squared), _ZERO)
     grazing_squared = grazing * grazing
     fresnel = _F0 + (_ONE - _F0) * grazing_squared * grazing_squared * grazing
-    return _HALF_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (masking + shadowing))
+    return _ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))

@@ -71,26 +71,25 @@ def _specular(alpha_squared, n_dot_l, n_dot_v, half_squared):
     rest = one - alpha_squared
     root_view = np.sqrt(alpha_squared + rest * view * view)
     root_light = np.sqrt(alpha_squared + rest * light * light)
-    denominator = light * root_view + view * root_light
+    shadowing, masking = light + root_light, view + root_view
     grazing = max(one - np.float32(0.5) * np.sqrt(half_squared), zero)
     fresnel = np.float32(F0) + np.float32(1 - F0) * grazing * grazing * grazing * grazing * grazing
-    value = np.float32(0.5 / np.pi) * alpha_squared * fresnel / (lobe * lobe * denominator)
+    value = np.float32(1 / np.pi) * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
 
     by_sine = -two * rest / lobe
     sine_by_cosine = -two * n_dot_h / half_squared if sine_squared > zero else zero
     by_alpha = (
         one / alpha_squared
         - two * (one - sine_squared) / lobe
-        - np.float32(0.5)
-        * (light * (one - view * view) / root_view + view * (one - light * light) / root_light)
-        / denominator
+        - np.float32(0.5) * (one - light * light) / (root_light * shadowing)
+        - np.float32(0.5) * (one - view * view) / (root_view * masking)
     )
     by_light = by_sine * sine_by_cosine
     by_view = by_light
     if n_dot_l > floor:
-        by_light -= (root_view + view * rest * light / root_light) / denominator
+        by_light -= (one + rest * light / root_light) / shadowing
     if n_dot_v > floor:
-        by_view -= (root_light + light * rest * view / root_view) / denominator
+        by_view -= (one + rest * view / root_view) / masking
     return value, by_alpha, by_light, by_view
 
 

@@ -1,9 +1,9 @@
 """Path tracing a posed surface with Mitsuba 3, in this project's conventions.
 
 The material is the project's own model written down independently: Lambert plus a rough dielectric's first reflection,
-GGX with F0 = 0.04 and no transmission. :mod:`rnd_runtime.brdf` has Schlick's Fresnel term and height-correlated masking
-where Mitsuba has the exact Fresnel equations and separable masking: 0.9 % of a grey ball's energy. Mitsuba has no
-sum of two materials, only their blend, so both parts are scaled up by the share they get.
+GGX with F0 = 0.04 and no transmission. :mod:`rnd_runtime.brdf` has Schlick's Fresnel term where Mitsuba has the exact
+Fresnel equations. Mitsuba has no sum of two materials, only their blend, so both parts are scaled up by the share they
+get.
 """
 
 from __future__ import annotations
