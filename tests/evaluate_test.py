@@ -29,7 +29,7 @@ from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
 from rnd_trainer.judge import Rendered
 from rnd_trainer.metrics import psnr, ssim_map
-from rnd_trainer.scores import frame_scores, normal_picture, to_srgb8
+from rnd_trainer.scores import EDGE, frame_scores, normal_picture, silhouette, to_srgb8
 
 CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
 
@@ -86,6 +86,17 @@ def test_normal_pictures_are_black_where_nothing_is() -> None:
     normals = torch.tensor([[[0.0, 0.0, -0.5], [0.0, 0.0, -2.0]]])
     picture = normal_picture(normals, torch.tensor([[0.01, 0.5]]))
     assert torch.equal(picture, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
+
+
+def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
+    mask = torch.zeros(40, 40)
+    mask[12:28, 12:28] = 1
+    mask[12:28, 28] = 0.4  # less than half: still outside
+    band = silhouette(mask)[..., 0]
+    outside, inside = torch.zeros(40, 40), torch.zeros(40, 40)
+    outside[12 - EDGE : 28 + EDGE, 12 - EDGE : 28 + EDGE] = 1
+    inside[12 + EDGE : 28 - EDGE, 12 + EDGE : 28 - EDGE] = 1
+    assert torch.equal(band, (outside - inside) > 0)
 
 
 def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_path) -> None:

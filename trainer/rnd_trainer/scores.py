@@ -15,6 +15,8 @@ from .perceptual import Perceptual
 
 BOX_MARGIN = 8
 """pixels around the mask's box in which the second figure of each pair is computed"""
+EDGE = 4
+"""pixels on either side of the silhouette that are the truth's own in `lpips_inner`"""
 COVERED = 0.05
 """coverage below which a pixel has no normal, in the truth as in ours"""
 
@@ -39,6 +41,7 @@ def frame_scores(
     }
     if perceptual is not None:
         scores["lpips"] = float(perceptual(image, target))
+        scores["lpips_inner"] = float(perceptual(torch.where(silhouette(mask), target, image), target))
         if min(image[box].shape[:2]) >= perceptual.smallest:
             scores["lpips_box"] = float(perceptual(image[box], target[box]))
     inside = (mask > 0.5) & (rendered.alpha > 0.5)
@@ -58,6 +61,16 @@ def frame_scores(
         expected = torch.from_numpy(truth.albedo_srgb).float()
         scores["psnr_albedo"] = psnr(to_srgb8(albedo), expected, inside)
     return scores
+
+
+def silhouette(mask: Tensor) -> Tensor:
+    """Pixels [H, W, 1] within ``EDGE`` of where coverage [H, W] passes a half."""
+    covered = (mask > 0.5).float()[None]
+    near_person, near_nothing = (
+        torch.nn.functional.max_pool2d(side, 2 * EDGE + 1, stride=1, padding=EDGE)
+        for side in (covered, 1 - covered)
+    )
+    return (near_person * near_nothing)[0, ..., None] > 0
 
 
 def normal_picture(normals: Tensor, coverage: Tensor) -> Tensor:

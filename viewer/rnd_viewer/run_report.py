@@ -30,7 +30,8 @@ METRICS = {
     "split": ("split", "{}"), "frames": ("pictures", "{}"),
     "psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}"),
     "psnr_box": ("PSNR in the box", "{:.2f}"), "ssim_box": ("SSIM in the box", "{:.4f}"),
-    "lpips_box": ("LPIPS in the box", "{:.4f}"), "psnr_n": ("PSNR of normals", "{:.2f}"),
+    "lpips_box": ("LPIPS in the box", "{:.4f}"), "lpips_inner": ("LPIPS but for the outline", "{:.4f}"),
+    "psnr_n": ("PSNR of normals", "{:.2f}"),
     "ssim_n": ("SSIM of normals", "{:.4f}"), "normal_deg": ("normals °", "{:.1f}"),
     "psnr_albedo": ("PSNR of albedo", "{:.2f}"),
 }  # fmt: skip
