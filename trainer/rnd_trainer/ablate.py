@@ -76,7 +76,7 @@ VARIANTS = (
         "static skinning", "the template's weights, no L_gc", "ours", {"dynamic_skinning": False}, _NO_GC
     ),
     Variant("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
-    Variant("+ unseen poses", "the third stage: edge lengths", "ours", {}, {"unseen_fraction": 0.15}),
+    Variant("+ unseen poses", "the third stage: edge lengths", "ours", {}, {"unseen_fraction": 0.3}),
     Variant("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
     *(_window(d) for d in (2, 5, 20, 30)),
     Variant("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),
