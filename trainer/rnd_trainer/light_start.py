@@ -134,6 +134,15 @@ def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseI
     )
 
 
+def rehearse() -> None:
+    """Fit a sky to a made-up body: what linear algebra asks for once, and keeps, is then there."""
+    draw = np.random.default_rng(0)
+    transport = draw.random((8 * POINTS, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
+    colour, who = 0.1 + draw.random((len(transport), 3)), np.arange(len(transport)) % POINTS
+    seen = Sightings(who, colour, np.zeros(len(who), np.int64), [], 0.0)
+    _quadratic(seen, transport, _by_brightness(seen)).fit(range(SKY_LOBES))
+
+
 def _sight(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> Sightings:
     """Colours of the first nodes wherever they are seen well: inside the mask, in front, not clipped."""
     nodes = min(POINTS, model.config.nodes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import math
 import signal
@@ -24,11 +25,11 @@ from rnd_runtime.files import atomic_path
 from rnd_runtime.light import texel_directions
 from rnd_runtime.motion import Motion, save_motion
 
+from . import light_start
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, from_dict, to_dict
 from .data import View, load_views, pose_input
 from .light import PROBE_SHAPE, LightProbe, as_probe
-from .light_start import start_light
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
 from .perceptual import Perceptual
@@ -93,7 +94,8 @@ class Training:
     def rehearse(self) -> None:
         """Take the dearest kind of step, one of the last with a picture, for nothing: nothing changes by it.
 
-        Kernels are compiled, and what memory a step can need is asked for, now and not when hours have gone by.
+        Kernels are compiled, and what memory a step or the light's search can need is asked for, now and not when
+        hours have gone by. What compilers leave behind is cleared away.
         """
         started = time.perf_counter()
         draws = self.generator.get_state()
@@ -105,6 +107,9 @@ class Training:
         torch.stack(list(terms.values())).sum().backward()
         self.optimizer.zero_grad(set_to_none=True)
         self.generator.set_state(draws)
+        if self._searches_light:
+            light_start.rehearse()
+        gc.collect()
         self.seconds += time.perf_counter() - started
 
     def step(self) -> Step:
@@ -221,11 +226,17 @@ class Training:
 
     def _start_light(self) -> None:
         """Search the pictures for a sky and suns, now that there is a shape that can cast shadows."""
-        if self.objective.fixed_light is None and self.config.light_search:
+        if self._searches_light:
             motion = self.motion()
-            found = start_light(self.model, self.views, [self._pose(view, motion) for view in self.views])
+            found = light_start.start_light(
+                self.model, self.views, [self._pose(view, motion) for view in self.views]
+            )
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
+
+    @property
+    def _searches_light(self) -> bool:
+        return self.config.light == "learn" and self.config.light_search
 
     def _parameters(self) -> list[Tensor]:
         return [p for group in self.optimizer.param_groups for p in group["params"]]
