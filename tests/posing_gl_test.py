@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import gl_devices
+from gl_devices import BACKENDS
 from posing_test import _scene
 from raster_scenes import off_centre_camera, random_scene
 from rnd_runtime._raster_project import view_of
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.gaussians import Gaussians
-from rnd_runtime.gl_context import create_context
 from rnd_runtime.posing import Unposed
 from rnd_runtime.posing_gl import GlPosing
 from rnd_runtime.posing_reference import pose_reference
@@ -23,7 +24,6 @@ from rnd_runtime.raster_gl import sorted_ellipses
 from rnd_runtime.shading import shadow_radii
 from rnd_runtime.surfaces_gl import SurfaceUpload
 
-BACKENDS = ("egl", "osmesa")
 ROUNDING = (
     1e-5  # float32 against float64, relative to the largest entry: products of three 3×3 matrices, GPU's exp
 )
@@ -32,26 +32,7 @@ SHAPE = 2e-3  # relative: Σxx − Σxy²/Σyy of needles cancels two digits or 
 EDGE = 0.01  # share of Gaussians whose ellipse just reaches or just misses a pixel's centre
 
 
-class Device:
-    def __init__(self, backend: str) -> None:
-        self.context = create_context(backend)
-        with self.context:
-            self.posing, self.upload = GlPosing(self.context), SurfaceUpload(self.context)
-            self.projection = GlProjection(self.context)
-
-    def close(self) -> None:
-        with self.context:
-            for part in (self.posing, self.upload, self.projection):
-                part.release()
-        self.context.release()
-
-
-@pytest.fixture(scope="module")
-def devices():
-    made = {backend: Device(backend) for backend in BACKENDS}
-    yield made
-    for device in made.values():
-        device.close()
+devices = gl_devices.devices(posing=GlPosing, upload=SurfaceUpload, projection=GlProjection)
 
 
 @pytest.fixture(params=BACKENDS)

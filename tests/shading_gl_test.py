@@ -6,13 +6,15 @@ EGL and OSMesa must be installed here (scripts/test does it): a missing one fail
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import gl_devices
+from gl_devices import BACKENDS
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.gl_context import create_context
 from rnd_runtime.gl_passes import GaussianTexture
 from rnd_runtime.light import Light, load_light, texel_directions
 from rnd_runtime.motion import load_motion
@@ -22,7 +24,6 @@ from rnd_runtime.surfaces_gl import SurfaceUpload
 from shading_test import ball, probe
 
 ASSETS = Path(__file__).parent.parent / "assets"
-BACKENDS = ("egl", "osmesa")
 MODES = ("ao", "table", "table+sun", "lights:64", "brute")
 CAMERA = np.array([0.5, 0.4, 4.0])  # of the ball
 EYE = np.array([0.5, 1.2, 3.2])  # of the walking body
@@ -33,43 +34,26 @@ RADIANCE = 1e-4
 FLIPPED = 2e-3
 
 
-class Device:
-    """What shades on one context."""
-
-    def __init__(self, backend: str) -> None:
-        self.context = create_context(backend)
-        self.shading, self.upload = GlShading(self.context), SurfaceUpload(self.context)
-        self.order = GaussianTexture(self.context, 1, dtype="i4")
-
-    def shade(self, shader, gaussians, camera=CAMERA, order=None):
-        """Radiance [len(order), 3]; by default of all Gaussians in their own order."""
-        order = np.arange(len(gaussians.means)) if order is None else order
-        with self.context:
-            surfaces = self.upload.write(gaussians)
-            ranks = self.order.write(order[:, None].astype(np.int32))
-            texture = self.shading.shade(shader, surfaces, ranks, len(order), camera, gaussians.root_rotation)
-            radiance = np.frombuffer(texture.read(), np.float32).reshape(-1, 4)[: len(order), :3]
-            assert self.context.error == "GL_NO_ERROR"
-        return radiance
-
-    def close(self) -> None:
-        with self.context:
-            for part in (self.shading, self.upload, self.order):
-                part.release()
-        self.context.release()
-
-
-@pytest.fixture(scope="module")
-def devices():
-    made = {backend: Device(backend) for backend in BACKENDS}
-    yield made
-    for device in made.values():
-        device.close()
+devices = gl_devices.devices(
+    shading=GlShading, upload=SurfaceUpload, order=partial(GaussianTexture, components=1, dtype="i4")
+)
 
 
 @pytest.fixture(params=BACKENDS)
 def device(request, devices):
     return devices[request.param]
+
+
+def _shade(device, shader, gaussians, camera=CAMERA, order=None):
+    """Radiance [len(order), 3]; by default of all Gaussians in their own order."""
+    order = np.arange(len(gaussians.means)) if order is None else order
+    with device.context:
+        surfaces = device.upload.write(gaussians)
+        ranks = device.order.write(order[:, None].astype(np.int32))
+        texture = device.shading.shade(shader, surfaces, ranks, len(order), camera, gaussians.root_rotation)
+        radiance = np.frombuffer(texture.read(), np.float32).reshape(-1, 4)[: len(order), :3]
+        assert device.context.error == "GL_NO_ERROR"
+    return radiance
 
 
 def _differences(got, expected):
@@ -85,7 +69,7 @@ def test_every_mode_is_the_kernels(device, mode, yaw, up, roughness):
     gaussians = ball(1500, roughness=roughness)
     shader = Shader(probe(height=64, sun=4000, yaw=yaw, up=up), mode)
     assert bool(shader.suns) == (mode == "table+sun")
-    got, expected = device.shade(shader, gaussians), shader.shade(gaussians, CAMERA)
+    got, expected = _shade(device, shader, gaussians), shader.shade(gaussians, CAMERA)
     assert _differences(got, expected).max() < RADIANCE
 
 
@@ -102,7 +86,7 @@ def test_two_suns_cast_two_shadows(device, walker):
         radiance[directions @ (towards / np.linalg.norm(towards)) > np.cos(np.radians(3))] = colour
     shader = Shader(Light(radiance))
     assert len(shader.suns) == 2
-    got, expected = device.shade(shader, walker, EYE), shader.shade(walker, EYE)
+    got, expected = _shade(device, shader, walker, EYE), shader.shade(walker, EYE)
     assert (_differences(got, expected) > RADIANCE).mean() < FLIPPED
 
 
@@ -113,11 +97,11 @@ def test_shadows_of_a_body_are_the_kernels(device, walker, yaw):
     shadowless = replace(
         walker, opacities=np.zeros_like(walker.opacities)
     )  # what is transparent casts nothing
-    got, expected = device.shade(shader, walker, EYE), shader.shade(walker, EYE)
+    got, expected = _shade(device, shader, walker, EYE), shader.shade(walker, EYE)
     open_sky = shader.shade(shadowless, EYE)
     assert (_differences(open_sky, expected) > 0.1).mean() > 0.02  # a body does shadow itself
     assert (_differences(got, expected) > RADIANCE).mean() < FLIPPED
-    assert _differences(device.shade(shader, shadowless, EYE), open_sky).max() < RADIANCE
+    assert _differences(_shade(device, shader, shadowless, EYE), open_sky).max() < RADIANCE
 
 
 def test_ranks_choose_and_order_what_is_shaded(devices):
@@ -125,7 +109,7 @@ def test_ranks_choose_and_order_what_is_shaded(devices):
     order = np.random.default_rng(0).permutation(1500)[:1100]
     device = devices["egl"]
     np.testing.assert_array_equal(
-        device.shade(shader, gaussians, order=order), device.shade(shader, gaussians)[order]
+        _shade(device, shader, gaussians, order=order), _shade(device, shader, gaussians)[order]
     )
 
 
@@ -133,22 +117,22 @@ def test_turning_and_relighting_leave_nothing_behind(devices):
     device, gaussians = devices["egl"], ball(300)
     shaders = [Shader(probe(height=64, sun=4000), mode) for mode in MODES]
     turned = [shader.turned(1.1) for shader in shaders]
-    first = [device.shade(shader, gaussians) for shader in (*shaders, *turned)]
+    first = [_shade(device, shader, gaussians) for shader in (*shaders, *turned)]
     for k in (0, 5, 7, 2, 1, 6, 9, 4, 3, 8, 0):
-        np.testing.assert_array_equal(device.shade([*shaders, *turned][k], gaussians), first[k])
+        np.testing.assert_array_equal(_shade(device, [*shaders, *turned][k], gaussians), first[k])
     assert (first[1] != first[6]).any()
 
 
 def test_turning_uploads_no_table(devices, monkeypatch):
     device, gaussians, shader = devices["egl"], ball(300), Shader(probe(height=64, sun=4000))
-    device.shade(shader, gaussians)
+    _shade(device, shader, gaussians)
     uploads = []
     upload = device.shading._constant
     monkeypatch.setattr(device.shading, "_constant", lambda values: (uploads.append(1), upload(values))[1])
     for yaw in (0.1, 0.2, 0.3):
-        device.shade(shader.turned(yaw), gaussians)
+        _shade(device, shader.turned(yaw), gaussians)
     assert not uploads
-    device.shade(Shader(probe(height=64, sun=3000)), gaussians)
+    _shade(device, Shader(probe(height=64, sun=3000)), gaussians)
     assert len(uploads) == 2
 
 
@@ -157,13 +141,13 @@ def test_any_number_of_gaussians_in_any_order_of_calls(devices):
     for count in (1, 1023, 1024, 1025, 5000, 3):
         gaussians = ball(count)
         expected = shader.shade(gaussians, CAMERA)
-        assert (_differences(device.shade(shader, gaussians), expected) > RADIANCE).mean() <= FLIPPED
+        assert (_differences(_shade(device, shader, gaussians), expected) > RADIANCE).mean() <= FLIPPED
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_egl_and_osmesa_give_the_same_bits(devices, mode):
     gaussians, shader = ball(1500), Shader(probe(height=64, sun=4000), mode)
-    egl, osmesa = (devices[backend].shade(shader, gaussians) for backend in BACKENDS)
+    egl, osmesa = (_shade(devices[backend], shader, gaussians) for backend in BACKENDS)
     np.testing.assert_array_equal(egl, osmesa)
 
 
@@ -176,8 +160,8 @@ def test_extreme_lights_and_broken_normals_stay_finite(devices, mode, peak):
     normals, means = gaussians.normals.copy(), gaussians.means.copy()
     normals[0], normals[1] = 0, 3 * normals[1]
     for camera in (CAMERA, means[2]):
-        shaded = devices["egl"].shade(
-            Shader(Light(radiance), mode), replace(gaussians, normals=normals), camera
+        shaded = _shade(
+            devices["egl"], Shader(Light(radiance), mode), replace(gaussians, normals=normals), camera
         )
         assert np.isfinite(shaded).all() and (shaded >= 0).all()
         assert peak > 0 or (shaded == 0).all()
@@ -189,5 +173,5 @@ def test_what_is_no_number_shadows_nobody(device, walker):
     means, normals = walker.means.copy(), walker.normals.copy()
     means[0, 0], means[1, 1], normals[2, 2], normals[3, 0] = np.nan, np.inf, np.nan, -np.inf
     broken = replace(walker, means=means, normals=normals)
-    got, expected = device.shade(shader, broken, EYE)[whole], shader.shade(broken, EYE)[whole]
+    got, expected = _shade(device, shader, broken, EYE)[whole], shader.shade(broken, EYE)[whole]
     assert (_differences(got, expected) > RADIANCE).mean() < FLIPPED
