@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -9,6 +11,7 @@ from scipy.spatial import cKDTree
 from rnd_export.bake import BakedAvatar, bake
 from rnd_export.budget import LADDERS, Bound, Plan, given_up, search
 from rnd_export.candidates import Measured, Recipe, Scene, Workbench
+from rnd_export.cli import main
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
 from rnd_export.stopwatch import Stopwatch
@@ -43,6 +46,31 @@ def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
     assert found.measured.ms < 0.9 * whole.ms and whole.psnr > 100
     seen, held_out = ({shot.time for shot in shots} for shots in (bench.seen, bench.held_out))
     assert not seen & held_out
+
+
+def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
+    tiny_checkpoint, tiny_avatar, tmp_path, monkeypatch, capsys
+) -> None:
+    def run(*options: str) -> int:
+        given = [str(tiny_checkpoint), "--size", "48", "--frames", "30", *options]
+        monkeypatch.setattr("sys.argv", ["rnd-export", *given, "--out", str(tmp_path / "small.onnx")])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return int(end.value.code)
+
+    rows = tmp_path / "bounds.json"
+    most = 0.7 * tiny_avatar.stat().st_size / 1e6
+    for value in (2 * most, most):
+        assert run("--max-mb", f"{value:.3f}", "--json", str(rows)) == 0
+    first, second = json.loads(rows.read_text())
+    assert (
+        first["given_up"] == "nothing" and first["steps"] == 0 and second["bound"] == f"--max-mb {most:.3f}"
+    )
+    assert (tmp_path / "small.onnx").stat().st_size / 1e6 == pytest.approx(second["mb"], rel=1e-3)
+    assert second["mb"] <= most and second["given_up"] in capsys.readouterr().out.replace("\n", "")
+    rows.write_text('[{"fps": 60}]')
+    assert run("--max-mb", "1", "--json", str(rows)) == 2
+    assert "rows of an earlier search" in capsys.readouterr().err
 
 
 class _Formula:

@@ -11,7 +11,6 @@ import tyro
 
 from rnd_runtime.avatar import EncoderKind, Precision
 from rnd_runtime.errors import InputError, parse_options, run_command
-from rnd_runtime.motion import Motion
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,8 @@ class Options:
     """picture side of that search"""
     hdr: Path | None = None
     """light of that search; by default the one that was learned"""
+    json: Path | None = None
+    """add what that search found to the rows of this file, in place of an earlier one of the same bound"""
 
 
 def main() -> None:
@@ -80,7 +81,9 @@ def _export(options: Options) -> None:
     bounds = {"ms": options.target_ms, "psnr": options.min_psnr, "mb": options.max_mb}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     if given:
-        _search(options, out, motion, given)
+        from .bounded import export_bounded
+
+        export_bounded(options, out, motion, given)
         return
     variant = Variant(
         options.encoder, options.precision, options.nodes, options.window_poses, options.visibility_degree
@@ -92,42 +95,3 @@ def _export(options: Options) -> None:
         f"99 % within {1e3 * drift.position_p99_m:.4f} mm, "
         f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}"
     )
-
-
-def _search(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:
-    """Write the cheapest file that keeps the bound, and say what it gave up."""
-    import onnx
-    from rich.console import Console
-
-    from rnd_runtime.files import atomic_path
-    from rnd_runtime.light import Light, load_light
-    from rnd_trainer.checkpoint import load_checkpoint
-
-    from .budget import Bound, Found, given_up, search
-    from .candidates import Scene, Workbench
-
-    if len(given) > 1:
-        raise InputError("bounds", expected="one of --target-ms, --min-psnr, --max-mb", got=f"{len(given)}")
-    ((kind, value),) = given.items()
-    if not value > 0:
-        raise InputError("bound", expected="more than 0", got=value)
-    probe = load_checkpoint(options.checkpoint).probe.numpy()
-    light = Light(probe) if options.hdr is None else load_light(options.hdr)
-    bench = Workbench(options.checkpoint, Scene(motion, light, options.size))
-    console = Console()
-
-    def show(found: Found) -> None:
-        what = found.measured
-        line = f"{what.ms:7.2f} ms {what.mb:6.2f} MB {what.psnr:6.1f} dB  {', '.join(given_up(bench, found.plan))}"
-        console.print(line, highlight=False, soft_wrap=True)
-
-    found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
-    with atomic_path(out) as temporary:
-        onnx.save_model(found.model, str(temporary))
-    assert found.held_out is not None
-    held = found.held_out
-    console.print(
-        f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen. "
-        f"Given up: {'; '.join(given_up(bench, found.plan))}",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip

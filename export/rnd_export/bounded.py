@@ -1,0 +1,84 @@
+"""rnd-export with a bound: the search is shown step by step, its file written, and what was found recorded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import onnx
+from rich.console import Console
+
+from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import atomic_path, write_json
+from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import Motion
+from rnd_trainer.checkpoint import load_checkpoint
+
+from .budget import Bound, Found, given_up, search
+from .candidates import Scene, Workbench
+
+if TYPE_CHECKING:
+    from .cli import Options
+
+FLAGS = {"ms": "--target-ms", "psnr": "--min-psnr", "mb": "--max-mb"}
+
+
+def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:
+    """Write the cheapest file that keeps the bound ``given`` {kind: value}, and say what it gave up.
+
+    Raises :class:`InputError` for several bounds, one that is not positive, or one that no file keeps.
+    """
+    if len(given) > 1:
+        raise InputError("bounds", expected=f"one of {', '.join(FLAGS.values())}", got=f"{len(given)}")
+    ((kind, value),) = given.items()
+    if not value > 0:
+        raise InputError("bound", expected="more than 0", got=value)
+    rows = [] if options.json is None else _read_rows(options.json)
+    started = perf_counter()
+    probe = load_checkpoint(options.checkpoint).probe.numpy()
+    light = Light(probe) if options.hdr is None else load_light(options.hdr)
+    scene = Scene(motion, light, options.size)
+    bench = Workbench(options.checkpoint, scene)
+    console, steps = Console(), []
+
+    def show(found: Found) -> None:
+        steps.append(found)
+        what = found.measured
+        line = f"{what.ms:7.2f} ms {what.mb:6.2f} MB {what.psnr:6.1f} dB  {', '.join(given_up(bench, found.plan))}"
+        console.print(line, highlight=False, soft_wrap=True)
+
+    found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
+    with atomic_path(out) as temporary:
+        onnx.save_model(found.model, str(temporary))
+    assert found.held_out is not None
+    held, lost = found.held_out, "; ".join(given_up(bench, found.plan))
+    console.print(
+        f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen. "
+        f"Given up: {lost}",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    if options.json is not None:
+        row = {
+            "bound": f"{FLAGS[kind]} {value:g}", "ms": held.ms, "mb": held.mb, "psnr_db": held.psnr, "given_up": lost,
+            "whole_ms": steps[0].measured.ms, "whole_mb": steps[0].measured.mb, "steps": len(steps) - 1,
+            "minutes": (perf_counter() - started) / 60, "gaussians": bench.config.gaussians, "size": options.size,
+            "shade": scene.shade, "machine": machine(),
+        }  # fmt: skip
+        write_json(options.json, [*(old for old in rows if old["bound"] != row["bound"]), row])
+
+
+def _read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of earlier searches; none where there is no file yet."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))
+        assert all("bound" in row for row in rows)
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, AssertionError) as error:
+        raise InputError(
+            "--json", expected="rows of an earlier search", got="another file", file=path
+        ) from error
+    return list(rows)
