@@ -23,7 +23,13 @@ def tiny_config():
 
     model = ModelConfig(gaussians=600, nodes=150, width=32, attribute_width=32, window_poses=4)
     return dataclasses.replace(
-        TrainConfig(), model=model, steps=12, stage1_fraction=0.5, light_texels=32, visibility_directions=4
+        TrainConfig(),
+        model=model,
+        steps=12,
+        stage1_fraction=0.5,
+        unseen_fraction=0.15,
+        light_texels=32,
+        visibility_directions=4,
     )
 
 

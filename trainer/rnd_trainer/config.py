@@ -101,7 +101,8 @@ class TrainConfig:
     weight_offset: float = 2.0
     """of the mean square of Δx in units of its bound"""
     weight_residual: float = 0.02
-    """of the mean square of the geometric residuals: an unseen Gaussian follows its neighbours"""
+    """of the mean square of the geometric residuals: an unseen Gaussian follows its neighbours. Ten times as much gains
+    0.1 dB in novel views and loses 0.2 under other lights"""
     weight_visibility: float = 0.2
     """of the traced visibility's square error"""
     weight_light_grey: float = 0.02
