@@ -74,11 +74,10 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
     """Rows of earlier searches; none where there is no file yet."""
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))
-        assert all("bound" in row for row in rows)
     except FileNotFoundError:
         return []
-    except (OSError, ValueError, TypeError, AssertionError) as error:
-        raise InputError(
-            "--json", expected="rows of an earlier search", got="another file", file=path
-        ) from error
-    return list(rows)
+    except (OSError, ValueError):
+        rows = None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and "bound" in row for row in rows):
+        raise InputError("--json", expected="rows of an earlier search", got="another file", file=path)
+    return rows
