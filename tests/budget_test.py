@@ -73,6 +73,31 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
     assert "rows of an earlier search" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("options", "refused"),
+    [
+        (["--json", "bounds.json"], "--json: expected the default, got bounds.json (needs --target-ms"),
+        (["--size", "64"], "--size: expected the default, got 64 (needs --target-ms"),
+        (
+            ["--max-mb", "4", "--precision", "int8"],
+            "--precision: expected the default, got int8 (a bound finds",
+        ),
+        (
+            ["--max-mb", "4", "--window-poses", "5"],
+            "--window-poses: expected the default, got 5 (a bound finds",
+        ),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    options, refused, tiny_checkpoint, tmp_path, monkeypatch, capsys
+) -> None:
+    out = tmp_path / "small.onnx"
+    monkeypatch.setattr("sys.argv", ["rnd-export", str(tiny_checkpoint), *options, "--out", str(out)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2 and refused in capsys.readouterr().err and not out.exists()
+
+
 class _Formula:
     """A workbench whose files are their recipes and whose measures follow from them."""
 

@@ -18,6 +18,7 @@ from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.tone import tone_map
 from shading_test import ball
+from ties import off_pixels
 
 ASSETS = Path(__file__).parent.parent / "assets"
 BACKENDS = ("gl-egl", "gl-osmesa")
@@ -25,9 +26,7 @@ MODES = ("ao", "table", "table+sun", "lights:32", "brute")
 CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
 AGREEMENT_DB = 50.0  # of 8-bit pictures, as every pair of our rasterisers
 MAX_CODES = 2  # of 255: FAILURES G10
-# Posing on the device and on the CPU differ by 1e-7 m. Where two Gaussians are as near in depth they may be blended the
-# other way round: at one moment in ten, in one or two pixels of 12 288, by up to 9 codes.
-TIES, TIE_CODES = 2, 12
+LEFT_OUT = 0.01  # of alpha: 3DGS draws no Gaussian after which T is below 1e-4, and α is at most 0.99
 MOMENTS = (0.0, 0.3, 0.4)
 
 
@@ -52,12 +51,12 @@ def rasterizer(request):
         yield made
 
 
-def _assert_same_picture(got, expected, ties=0):
+def _assert_same_picture(got, expected, off=None):
+    """``off`` [H, W]: pixels that stay beyond MAX_CODES; by default all that are."""
     assert expected.max() > 100
-    difference = np.abs(got.astype(int) - expected)
-    assert (difference.max(axis=-1) > MAX_CODES).sum() <= ties
-    assert difference.max() <= (TIE_CODES if ties else MAX_CODES)
-    assert difference.any() == 0 or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
+    difference = got.astype(int) - expected
+    assert not (np.abs(difference).max(axis=-1) > MAX_CODES if off is None else off).any()
+    assert not difference.any() or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -73,15 +72,21 @@ def test_gaussians_posed_on_the_cpu_give_its_picture(avatar, motion, sky, raster
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("mode", MODES)
 def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
-    frames = []
-    for raster in ("cpu", backend):
-        renderer = FrameRenderer(avatar, sky, CAMERA, shade=mode, raster=raster)
+    renderers = [FrameRenderer(avatar, sky, CAMERA, shade=mode, raster=raster) for raster in ("cpu", backend)]
+    for renderer in renderers:
         renderer.turn(0.8)
-        frames.append([renderer.render(motion, time) for time in MOMENTS])
+    for time in MOMENTS:
+        cpu, gl = (renderer.render(motion, time) for renderer in renderers)
+        # measured: at one moment in ten a pixel or two of 12 288 have another order at one depth, up to 9 codes off
+        off = off_pixels(gl.image, cpu.image, lambda t=time: renderers[0].render(motion, t).image, MAX_CODES)
+        behind = np.abs(
+            gl.alpha - cpu.alpha
+        )  # is drawn by GL's blending, and left out where T falls below 1e-4
+        assert behind.max() < LEFT_OUT
+        drawn = np.abs(gl.image.astype(int) - cpu.image).max(-1) <= MAX_CODES + np.ceil(255 * behind)
+        _assert_same_picture(gl.image, cpu.image, off & ~drawn)
+    for renderer in renderers:
         renderer.close()
-    for cpu, gl in zip(*frames):
-        _assert_same_picture(gl.image, cpu.image, TIES)
-        np.testing.assert_allclose(gl.alpha, cpu.alpha, atol=0.01)  # GL's blending does not stop at T < 1e-4
     stages = {"motion", "encoders", "posing", "projection+sort", "shading", "raster", "read-back", "tone map"}
     assert gl.stage_seconds.keys() == stages
     assert min(gl.stage_seconds.values()) > 0

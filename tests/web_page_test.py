@@ -27,14 +27,13 @@ from rnd_viewer.cli import main as play
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene
 from rnd_viewer.view_state import ViewState
+from ties import off_pixels
 
 ROOT = Path(__file__).parent.parent
 ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
 SIZE, FRAME = 192, 20
 
 TOLERANCE = 3  # of 255; measured 1
-TIES = 4  # pixels of a state that may be off by more: the last bit of a place decides which of two Gaussians at one
-# depth is in front, or which texel of the sun's map a disc covers; measured 3 in two of 17 states
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
 pytestmark = [
@@ -140,13 +139,6 @@ def loaded(page, site) -> Page:
     return page
 
 
-def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
-    assert got.shape == expected.shape
-    error = np.abs(got.astype(int) - expected)
-    off = int((error.max(-1) > TOLERANCE).sum())
-    assert off <= TIES and error.mean() < MEAN_TOLERANCE, (off, error.max(), error.mean())
-
-
 def _scene(site: Path, motion: str = "walk.npz") -> Scene:
     lights = (site / "sky.exr", site / "window.hdr", site / "broken.exr")
     return Scene(ViewOptions(site / "avatar.onnx", site / motion, lights, size=SIZE, raster="cpu"))
@@ -157,6 +149,18 @@ def _python_picture(page: Page, scene: Scene) -> np.ndarray:
     return scene.render(msgspec.convert(page.run("rnd.state"), ViewState)).srgb
 
 
+def _assert_agreed(page: Page, got: np.ndarray, scene: Scene) -> None:
+    """The page's picture ``got`` is rnd-view's; measured: in 2 of 17 states 3 pixels have another order."""
+    expected = _python_picture(page, scene)
+
+    def again() -> np.ndarray:
+        scene._posed = None  # which it would keep from the picture before
+        return _python_picture(page, scene)
+
+    assert not off_pixels(got, expected, again, TOLERANCE).any()
+    assert np.abs(got.astype(int) - expected).mean() < MEAN_TOLERANCE
+
+
 def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     inputs = [str(site / "avatar.onnx"), "--motion", str(site / "walk.npz"), "--hdr", str(site / "sky.exr")]
     options = ["--size", str(SIZE), "--frames", f"{FRAME}:{FRAME + 1}", "--format", "png", "--raster", "cpu"]
@@ -165,7 +169,7 @@ def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1}
     got = _picture(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
     expected = read_image(tmp_path / f"frames/{FRAME:06d}.png")
-    _assert_close(got, expected)
+    assert np.abs(got.astype(int) - expected).max() <= TOLERANCE
     # were the light not turned, or the frame its neighbour, hundreds of pixels would be off
     assert (np.abs(_picture(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
 
@@ -200,7 +204,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
     seen = set()
     for changes in states:
         got = _picture(loaded, **(straight | changes))
-        _assert_close(got, _python_picture(loaded, scene))
+        _assert_agreed(loaded, got, scene)
         seen.add(got.tobytes())
     assert len(seen) == len(states)
     scene.close()
@@ -231,7 +235,7 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
         assert view[name] == pytest.approx(value, abs=1e-9), name
     got = _picture(loaded, time=0.1, yaw=1.0)
     assert got.any()
-    _assert_close(got, _python_picture(loaded, scene))
+    _assert_agreed(loaded, got, scene)
     scene.close()
     _drop(loaded, "walk.npz")
 

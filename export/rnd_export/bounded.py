@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import onnx
 from rich.console import Console
@@ -19,11 +19,7 @@ from rnd_trainer.checkpoint import load_checkpoint
 
 from .budget import Bound, Found, given_up, search
 from .candidates import Scene, Workbench
-
-if TYPE_CHECKING:
-    from .cli import Options
-
-FLAGS = {"ms": "--target-ms", "psnr": "--min-psnr", "mb": "--max-mb"}
+from .cli import BOUNDS, Options, flag
 
 
 def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:
@@ -32,7 +28,9 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
     Raises :class:`InputError` for several bounds, one that is not positive, or one that no file keeps.
     """
     if len(given) > 1:
-        raise InputError("bounds", expected=f"one of {', '.join(FLAGS.values())}", got=f"{len(given)}")
+        raise InputError(
+            "bounds", expected=f"one of {', '.join(map(flag, BOUNDS.values()))}", got=f"{len(given)}"
+        )
     ((kind, value),) = given.items()
     if not value > 0:
         raise InputError("bound", expected="more than 0", got=value)
@@ -62,7 +60,8 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
     )  # fmt: skip
     if options.json is not None:
         row = {
-            "bound": f"{FLAGS[kind]} {value:g}", "ms": held.ms, "mb": held.mb, "psnr_db": held.psnr, "given_up": lost,
+            "bound": f"{flag(BOUNDS[kind])} {value:g}", "given_up": lost,
+            "ms": held.ms, "mb": held.mb, "psnr_db": held.psnr,
             "whole_ms": steps[0].measured.ms, "whole_mb": steps[0].measured.mb, "steps": len(steps) - 1,
             "minutes": (perf_counter() - started) / 60, "gaussians": bench.config.gaussians, "size": options.size,
             "shade": scene.shade, "machine": machine(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -49,6 +49,13 @@ class Options:
     """add what that search found to the rows of this file, in place of an earlier one of the same bound"""
 
 
+BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
+SEARCHES = ("size", "hdr", "json")
+"""options that say how a bound's search goes"""
+CHOICES = ("encoder", "precision", "nodes", "window_poses", "visibility_degree")
+"""options that say what a file leaves out, which a search finds by itself"""
+
+
 def main() -> None:
     """Entry point of ``rnd-export``."""
 
@@ -73,13 +80,14 @@ def _export(options: Options) -> None:
     out = options.out or options.checkpoint.with_suffix(".onnx")
     if options.frames < 1:
         raise InputError("--frames", expected="at least 1", got=options.frames)
+    bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
+    given = {kind: value for kind, value in bounds.items() if value is not None}
+    _refuse_idle(options, bounded=bool(given))
     skeleton = load_checkpoint(options.checkpoint).skeleton
     if options.motion is not None:
         motion = load_motion(options.motion, skeleton)
     else:
         motion = random_motion(skeleton, frames=options.frames, seed=0)
-    bounds = {"ms": options.target_ms, "psnr": options.min_psnr, "mb": options.max_mb}
-    given = {kind: value for kind, value in bounds.items() if value is not None}
     if given:
         from .bounded import export_bounded
 
@@ -95,3 +103,18 @@ def _export(options: Options) -> None:
         f"99 % within {1e3 * drift.position_p99_m:.4f} mm, "
         f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}"
     )
+
+
+def _refuse_idle(options: Options, *, bounded: bool) -> None:
+    """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
+    bounds = " or ".join(flag(name) for name in BOUNDS.values())
+    why = "a bound finds this by itself" if bounded else f"needs {bounds}"
+    defaults = {field.name: field.default for field in fields(options)}
+    for name in CHOICES if bounded else SEARCHES:
+        if (got := getattr(options, name)) != defaults[name]:
+            raise InputError(flag(name), expected="the default", got=got, hint=why)
+
+
+def flag(name: str) -> str:
+    """How an option is written on the command line."""
+    return "--" + name.replace("_", "-")
