@@ -17,8 +17,9 @@ COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d354
 MARKERS = {"full": "o", "coarse": "s", "static": "^"}
 CEILING_DB = 60.0
 """points above it are drawn on it with their figure beside them: a picture that is the reference's has a hundred"""
-LEAST_SPAN = 4.0
-"""a panel's greatest milliseconds over its least, at least: two times that are the same should look the same"""
+LEAST_SPAN = 5.0
+"""a panel's greatest milliseconds over its least, at least: equal times should look equal, and two of the ticks
+1, 2, 5, 10 … have room"""
 COLUMNS, WIDE = 5, 3
 """panels side by side, and how many of them the overview is as wide as"""
 
