@@ -38,8 +38,6 @@ from .template import sample_template
 from .unseen import UnseenPoses
 
 STATE_SCHEMA = "rnd-training/1"
-OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges"}
-"""fields of the configuration that the pictures' steps know nothing of"""
 MAX_BAD_STEPS = 10
 """non-finite steps in a row after which training stops: it will not recover"""
 
@@ -86,7 +84,6 @@ class Training:
         self.poses = [self._pose(view) for view in self.views]
         self.refinement = self._refinement() if config.refine_poses else None
         self.unseen: UnseenPoses | None = None  # from the third stage on
-        self.picture_seconds = 0.0  # spent until then
         self.optimizer = self._optimizer()
         self.step_index = 0
         self.bad_steps = 0
@@ -159,8 +156,7 @@ class Training:
 
     def _unseen_terms(self, pose: PoseInput) -> dict[str, Tensor]:
         if self.unseen is None:
-            self._start_unseen()
-        assert self.unseen is not None
+            self.unseen = self._unseen()
         return self.unseen(self.model, pose, self.step_index)
 
     # -- schedule ------------------------------------------------------------------------------------------
@@ -268,14 +264,6 @@ class Training:
         frames = [view.frame.frame for view in self.views]
         return PoseRefinement(self.capture.motion, self.capture.body.skeleton, frames).to(self.device)
 
-    def _start_unseen(self) -> None:
-        """Begin the third stage, which depends on what the pictures have left and on the configuration alone."""
-        self.unseen = self._unseen()
-        self.picture_seconds = self.seconds
-        self.generator.manual_seed(self.config.seed)
-        for parameter in self.model.skinning.parameters():
-            self.optimizer.state.pop(parameter, None)
-
     def _unseen(self) -> UnseenPoses:
         return UnseenPoses(self.model, self.capture.body.skeleton, self.config)
 
@@ -308,7 +296,6 @@ class Training:
             "config": to_dict(self.config),
             "step": self.step_index,
             "seconds": self.seconds,
-            "picture_seconds": self.picture_seconds,
             "bad_steps": self.bad_steps,
             "perceptual_sha256": self._perceptual_sha256(),
         }
@@ -325,14 +312,14 @@ class Training:
     def resume(self, path: Path) -> None:
         """Continue from a saved state as if never stopped.
 
-        The configuration must be the same; but where what concerns the third stage alone differs, that stage begins
-        anew from what the pictures had left.
+        The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
         """
         tensors, header = read_tensors(path, STATE_SCHEMA)
         taught = _strip(tensors, "taught.")
         before, now = to_dict(_trained_with(header, path)), to_dict(self.config)
-        differ = {name for name, value in now.items() if before[name] != value}
-        if wrong := sorted(differ - OF_THE_THIRD_STAGE):
+        free = set() if taught else {"unseen_fraction", "weight_edges"}
+        wrong = sorted(name for name, value in now.items() if before[name] != value and name not in free)
+        if wrong:
             raise InputError(
                 "--resume", expected="the configuration it was started with", got=f"other {wrong}", file=path
             )
@@ -356,11 +343,7 @@ class Training:
             self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
             self.generator.set_state(tensors["generator"])
             self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
-            self.picture_seconds = float(header.get("picture_seconds", self.seconds))
             self.bad_steps = int(header["bad_steps"])
-            if taught and differ:
-                self.model.skinning.load_state_dict(taught)
-                self.unseen, self.step_index, self.seconds = None, self.config.steps, self.picture_seconds
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
