@@ -79,9 +79,8 @@ def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
         cpu, gl = (renderer.render(motion, time) for renderer in renderers)
         # measured: at one moment in ten a pixel or two of 12 288 have another order at one depth, up to 9 codes off
         off = off_pixels(gl.image, cpu.image, lambda t=time: renderers[0].render(motion, t).image, MAX_CODES)
-        behind = np.abs(
-            gl.alpha - cpu.alpha
-        )  # is drawn by GL's blending, and left out where T falls below 1e-4
+        # what GL's blending draws, and the CPU leaves out because T has fallen below 1e-4
+        behind = np.abs(gl.alpha - cpu.alpha)
         assert behind.max() < LEFT_OUT
         drawn = np.abs(gl.image.astype(int) - cpu.image).max(-1) <= MAX_CODES + np.ceil(255 * behind)
         _assert_same_picture(gl.image, cpu.image, off & ~drawn)
