@@ -18,7 +18,7 @@ from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.tone import tone_map
 from shading_test import ball
-from ties import off_pixels
+from ties import assert_only_ties
 
 ASSETS = Path(__file__).parent.parent / "assets"
 BACKENDS = ("gl-egl", "gl-osmesa")
@@ -26,7 +26,9 @@ MODES = ("ao", "table", "table+sun", "lights:32", "brute")
 CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
 AGREEMENT_DB = 50.0  # of 8-bit pictures, as every pair of our rasterisers
 MAX_CODES = 2  # of 255: FAILURES G10
-LEFT_OUT = 0.01  # of alpha: 3DGS draws no Gaussian after which T is below 1e-4, and α is at most 0.99
+# Posing on the device and on the CPU differ by 1e-7 m. Where two Gaussians are as near in depth they may be blended the
+# other way round: at one moment in ten, in one or two pixels of 12 288, by up to 9 codes.
+TIES, TIE_CODES = 2, 12
 MOMENTS = (0.0, 0.3, 0.4)
 
 
@@ -51,12 +53,12 @@ def rasterizer(request):
         yield made
 
 
-def _assert_same_picture(got, expected, off=None):
-    """``off`` [H, W]: pixels that stay beyond MAX_CODES; by default all that are."""
+def _assert_same_picture(got, expected, ties=0):
     assert expected.max() > 100
-    difference = got.astype(int) - expected
-    assert not (np.abs(difference).max(axis=-1) > MAX_CODES if off is None else off).any()
-    assert not difference.any() or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
+    difference = np.abs(got.astype(int) - expected)
+    assert (difference.max(axis=-1) > MAX_CODES).sum() <= ties
+    assert difference.max() <= (TIE_CODES if ties else MAX_CODES)
+    assert difference.any() == 0 or 10 * np.log10(255**2 / np.mean(difference**2)) > AGREEMENT_DB
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -77,13 +79,12 @@ def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
         renderer.turn(0.8)
     for time in MOMENTS:
         cpu, gl = (renderer.render(motion, time) for renderer in renderers)
-        # measured: at one moment in ten a pixel or two of 12 288 have another order at one depth, up to 9 codes off
-        off = off_pixels(gl.image, cpu.image, lambda t=time: renderers[0].render(motion, t).image, MAX_CODES)
-        # what GL's blending draws, and the CPU leaves out because T has fallen below 1e-4
-        behind = np.abs(gl.alpha - cpu.alpha)
-        assert behind.max() < LEFT_OUT
-        drawn = np.abs(gl.image.astype(int) - cpu.image).max(-1) <= MAX_CODES + np.ceil(255 * behind)
-        _assert_same_picture(gl.image, cpu.image, off & ~drawn)
+        _assert_same_picture(gl.image, cpu.image, TIES)
+        np.testing.assert_allclose(gl.alpha, cpu.alpha, atol=0.01)  # GL's blending does not stop at T < 1e-4
+        left_out = 255 * np.abs(gl.alpha - cpu.alpha)  # by the CPU, which does
+        assert_only_ties(
+            gl.image, cpu.image, lambda t=time: renderers[0].render(motion, t).image, MAX_CODES + left_out
+        )
     for renderer in renderers:
         renderer.close()
     stages = {"motion", "encoders", "posing", "projection+sort", "shading", "raster", "read-back", "tone map"}

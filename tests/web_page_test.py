@@ -27,13 +27,15 @@ from rnd_viewer.cli import main as play
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene
 from rnd_viewer.view_state import ViewState
-from ties import off_pixels
+from ties import assert_only_ties
 
 ROOT = Path(__file__).parent.parent
 ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
 SIZE, FRAME = 192, 20
 
 TOLERANCE = 3  # of 255; measured 1
+TIES = 4  # pixels of a state that may be off by more: the last bit of a place decides which of two Gaussians at one
+# depth is in front, or which texel of the sun's map a disc covers; measured 3 in two of 17 states
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
 pytestmark = [
@@ -139,6 +141,13 @@ def loaded(page, site) -> Page:
     return page
 
 
+def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
+    assert got.shape == expected.shape
+    error = np.abs(got.astype(int) - expected)
+    off = int((error.max(-1) > TOLERANCE).sum())
+    assert off <= TIES and error.mean() < MEAN_TOLERANCE, (off, error.max(), error.mean())
+
+
 def _scene(site: Path, motion: str = "walk.npz") -> Scene:
     lights = (site / "sky.exr", site / "window.hdr", site / "broken.exr")
     return Scene(ViewOptions(site / "avatar.onnx", site / motion, lights, size=SIZE, raster="cpu"))
@@ -150,15 +159,15 @@ def _python_picture(page: Page, scene: Scene) -> np.ndarray:
 
 
 def _assert_agreed(page: Page, got: np.ndarray, scene: Scene) -> None:
-    """The page's picture ``got`` is rnd-view's; measured: in 2 of 17 states 3 pixels have another order."""
+    """The page's picture ``got`` is rnd-view's, and what is off is shown to be a tie."""
     expected = _python_picture(page, scene)
 
     def again() -> np.ndarray:
         scene._posed = None  # which it would keep from the picture before
         return _python_picture(page, scene)
 
-    assert not off_pixels(got, expected, again, TOLERANCE).any()
-    assert np.abs(got.astype(int) - expected).mean() < MEAN_TOLERANCE
+    _assert_close(got, expected)
+    assert_only_ties(got, expected, again, TOLERANCE)
 
 
 def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
@@ -169,7 +178,7 @@ def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1}
     got = _picture(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
     expected = read_image(tmp_path / f"frames/{FRAME:06d}.png")
-    assert np.abs(got.astype(int) - expected).max() <= TOLERANCE
+    _assert_close(got, expected)
     # were the light not turned, or the frame its neighbour, hundreds of pixels would be off
     assert (np.abs(_picture(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
 
