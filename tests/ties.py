@@ -27,8 +27,8 @@ TRIES = 24
 def assert_only_ties(got: Image, expected: Image, again: Callable[[], Image], tolerance: ArrayLike) -> None:
     """No pixel of ``got`` is farther than ``tolerance`` from ``expected`` and from all that ``again`` draws.
 
-    ``tolerance`` (of 255) is one for all or [H, W]. ``again`` draws ``expected`` once more; places posed on the CPU then
-    differ in their last bits.
+    ``tolerance`` (of 255) is one for all or [H, W]. ``again`` draws ``expected`` once more; places that are posed on
+    the CPU then differ in their last bits.
     """
     assert got.shape == expected.shape
     off = _error(got, expected) > tolerance
