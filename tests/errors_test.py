@@ -1,5 +1,8 @@
 """One line that names what, expected, got, file and frame; and the exit codes of commands."""
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,3 +86,20 @@ def test_options_that_are_right_and_help_pass(capsys):
 def test_our_own_mistakes_keep_their_traceback():
     with pytest.raises(ZeroDivisionError):
         run_command("rnd-x", lambda: 1 // 0)
+
+
+@pytest.mark.parametrize("lines", [1, 100_000])  # less than a pipe holds, and more
+@pytest.mark.parametrize("ending", ["", "; raise SystemExit(0)"])
+def test_a_reader_who_has_gone_ends_the_command_in_silence(lines, ending):
+    program = (
+        "import sys; from rnd_runtime.errors import run_command\n"
+        f"def main():\n    print('line\\n' * {lines}){ending}\n"
+        "sys.exit(run_command('rnd-x', main))"
+    )
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", program], stdout=writing, stderr=subprocess.PIPE, text=True, timeout=60
+    )
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
 import sys
 from collections.abc import Callable
@@ -63,16 +64,24 @@ class InputError(Exception):
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 
-    2 for an :class:`InputError` (one line on stderr), 130 for Ctrl-C, otherwise what ``main`` returns.
+    2 for an :class:`InputError` (one line on stderr), 130 for Ctrl-C, 141 in silence where nobody reads the output to
+    its end (``rnd-play --help | head``), otherwise what ``main`` returns.
     """
     try:
-        return main() or 0
+        try:
+            return main() or 0
+        finally:
+            sys.stdout.flush()  # not only when Python ends, who would complain of a closed pipe
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)  # noqa: T201
         return 130
+    except BrokenPipeError:
+        with contextlib.suppress(io.UnsupportedOperation):  # a test's stdout is no file
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left in it
+        return 128 + 13  # as a shell reports SIGPIPE
 
 
 def parse_options(parse: Callable[[], Parsed]) -> Parsed:
