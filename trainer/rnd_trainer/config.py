@@ -103,6 +103,12 @@ class TrainConfig:
     weight_residual: float = 0.02
     """of the mean square of the geometric residuals: an unseen Gaussian follows its neighbours. Ten times as much gains
     0.1 dB in novel views and loses 0.2 under other lights"""
+    weight_repulsion: float = 0.02
+    """of pairs of Gaussians that lie nearer than ``least_distance``"""
+    least_distance: float = 0.5
+    """spacings between two Gaussians below which they repel one another"""
+    repulsion_every: int = 8
+    """steps between evaluations of the repulsion: finding the pairs takes a k-d tree"""
     weight_visibility: float = 0.2
     """of the traced visibility's square error"""
     weight_light_grey: float = 0.02
@@ -167,11 +173,10 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     """Rebuild a configuration; an unknown field is an error.
 
     A missing one has the value it has today: a checkpoint from before a switch existed was trained without it. So the
-    third stage, which is on today, is off there.
+    third stage and the repulsion, which are on today, are off there.
     """
-    return _build(
-        TrainConfig, {"unseen_fraction": 0.0, **values, "model": _build(ModelConfig, values.get("model", {}))}
-    )
+    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0}
+    return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
 
 
 def _build(kind: Any, values: dict[str, Any]) -> Any:

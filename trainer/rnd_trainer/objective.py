@@ -25,6 +25,7 @@ from .losses import (
 from .model import AvatarModel, Posed, PoseInput
 from .perceptual import Perceptual
 from .render import Splat, shade_visible, splat
+from .repulsion import repulsion
 from .shading import sh_basis, traced_visibility
 
 LEAST_MATCHES = 16
@@ -69,6 +70,9 @@ class Objective:
             "skinning": like_template * skinning_divergence(posed.weights, model.log_weights),
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
+        if _due(step, config.weight_repulsion, config.repulsion_every):
+            crowded = repulsion(posed.attributes.points, config.least_distance * float(model.spacing))
+            terms["repulsion"] = config.repulsion_every * config.weight_repulsion * crowded
         if config.model.visibility == "pose":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)
@@ -87,7 +91,8 @@ class Objective:
         normals = view.normals()
         if normals is not None:
             terms["normal"] = config.weight_normal * (picture.normals - normals.to(device)).abs().mean()
-        if texels is not None and self._due(step, config.weight_consistency, config.consistency_every):
+        due = _due(step, config.weight_consistency, config.consistency_every)
+        if due and texels is not None and self.perceptual is not None:
             agreement = self._consistency(model, posed, pose, texels, view.camera, image_srgb, background)
             if agreement is not None:
                 terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
@@ -107,14 +112,10 @@ class Objective:
         config = self.config
         scales = 1 if self.perceptual is not None else config.dssim_scales
         terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
-        if self.perceptual is not None and self._due(step, config.weight_lpips, config.lpips_every):
+        if self.perceptual is not None and _due(step, config.weight_lpips, config.lpips_every):
             distance = self.perceptual(image_srgb.clamp(max=1), target_srgb)
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance
         return terms
-
-    def _due(self, step: int, weight: float, every: int) -> bool:
-        """Whether a term that is computed every so many steps is due; it then counts that many times."""
-        return self.perceptual is not None and weight > 0 and step % every == 0
 
     def _texels(self, step: int) -> Texels:
         config = self.config
@@ -158,6 +159,11 @@ class Objective:
         above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
         predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3].detach()).T
         return (above * (predicted - truth).square()).mean()
+
+
+def _due(step: int, weight: float, every: int) -> bool:
+    """Whether a term that is computed every so many steps is due; it then counts that many times."""
+    return weight > 0 and step % every == 0
 
 
 def noisy(pose: PoseInput, sigma: float, generator: torch.Generator) -> PoseInput:
