@@ -206,6 +206,13 @@ def test_peers_say_the_same_and_growth_is_measured(tiny_checkpoint, tiny_avatar,
     rows = bench_peers.encoders(tiny_checkpoint, tiny_avatar, 1)
     assert [row["peer"] for row in rows] == ["onnxruntime", "torch eager", "torch.compile"]
     assert all(row["ms_median"] > 0 and row["nodes"] == 200 for row in rows)
+    orders = bench_peers.depth_order(600, 48, 1)
+    assert [(row["stage"], row["peer"]) for row in orders] == [
+        (f"projection+sort, {backend}", peer)
+        for backend in ("egl", "osmesa")
+        for peer in ("the CPU", "compute shaders")
+    ]
+    assert all(row["ms_median"] > 0 and "llvmpipe" in row["renderer"] for row in orders)
     amounts = bench_peers.Amounts((300, 600, 1200), (16, 32), (5, 24), (2, 4))
     grown = bench_peers.growth(amounts, 32, 1)
     assert {(row["stage"], row["of"]) for row in grown} == {

@@ -85,8 +85,26 @@ def test_this_machines_osmesa_is_software():
     context.release()
 
 
-def _broken():
+def _broken(version):
     raise OSError("out of order")
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_where_there_is_no_newer_opengl_an_older_one_does(monkeypatch, backend):
+    asked, loader = [], gl_context._LOADERS[backend]
+
+    def old(version):
+        asked.append(version)
+        if version > 330:
+            raise OSError("too new")
+        return loader(version)
+
+    monkeypatch.setitem(gl_context._LOADERS, backend, old)
+    context = create_context(backend)
+    assert asked == [430, 330]
+    with context:
+        assert _filled(context, 0.5) == 0.5
+    context.release()
 
 
 def test_auto_takes_egl_then_osmesa(monkeypatch):

@@ -1,6 +1,6 @@
 """Frames on an OpenGL device: posed, projected, shaded and splatted there.
 
-What the networks say goes up and the picture comes back. In between only means cross, for their order (see
+What the networks say goes up and the picture comes back. In between nothing crosses where the device can sort (see
 ``projection_gl``).
 """
 
@@ -16,7 +16,7 @@ from .gaussians import Gaussians, Raster
 from .gl_passes import Pass
 from .posing import Unposed
 from .posing_gl import GlPosing
-from .projection_gl import GlProjection
+from .projection_gl import GlProjection, Sorting
 from .raster_gl import GlRasterizer, splat_pass
 from .shading import Shader
 from .shading_gl import GlShading
@@ -30,10 +30,11 @@ class GlRenderer:
 
     Args:
         rasterizer: whose context and targets are drawn with; to be closed after this.
+        sorting: see :class:`rnd_runtime.projection_gl.GlProjection`.
     """
 
-    def __init__(self, rasterizer: GlRasterizer) -> None:
-        self._rasterizer = rasterizer
+    def __init__(self, rasterizer: GlRasterizer, sorting: Sorting = "auto") -> None:
+        self._rasterizer, self._sorting = rasterizer, sorting
         self._passes: _Passes | None = None
 
     def draw(
@@ -55,7 +56,7 @@ class GlRenderer:
         self._rasterizer.check_limits(len(body.opacities), camera)
         with self._rasterizer.context as context:
             if self._passes is None:
-                self._passes = _Passes(context)
+                self._passes = _Passes(context, self._sorting)
             seconds = self._draw(context, self._passes, body, shader, camera, cull)
             started = perf_counter()
             (picture,) = self._rasterizer.read(RADIANCE, camera)
@@ -112,9 +113,9 @@ class GlRenderer:
 class _Passes:
     """All that is kept on the device."""
 
-    def __init__(self, context: moderngl.Context) -> None:
+    def __init__(self, context: moderngl.Context, sorting: Sorting) -> None:
         self.posing, self.upload = GlPosing(context), SurfaceUpload(context)
-        self.projection, self.shading = GlProjection(context), GlShading(context)
+        self.projection, self.shading = GlProjection(context, sorting), GlShading(context)
         self.splat: Pass = splat_pass(context, RADIANCE, lit=True)
 
     def release(self) -> None:

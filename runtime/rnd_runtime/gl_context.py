@@ -1,4 +1,4 @@
-"""OpenGL 3.3 contexts without a display: EGL first, then OSMesa, then a hidden window.
+"""OpenGL contexts without a display: EGL first, then OSMesa, then a hidden window; 4.3 where there is, else 3.3.
 
 A context is current inside ``with context:`` and only there, releases of its objects included; outside none is. So
 several live in one process, on EGL and OSMesa side by side: these two share Mesa's one "current" slot of the thread
@@ -26,7 +26,8 @@ INSTALL = {
     "osmesa": "apt-get install libosmesa6",
 }
 OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
-GL_VERSION = 330  # core; all that the rasteriser needs
+GL_VERSION = 330  # core; all that drawing needs
+COMPUTE_VERSION = 430  # has compute shaders, which order Gaussians where they lie
 SOFTWARE_RENDERERS = re.compile(
     r"llvmpipe|softpipe|swrast|swiftshader|software render|software raster|basic render", re.I
 )
@@ -53,7 +54,7 @@ class Platform:
 
 
 def create_context(backend: Backend = "auto") -> moderngl.Context:
-    """Make a headless OpenGL 3.3 core context.
+    """Make a headless OpenGL core context: of 4.3 or newer, or of 3.3 where there is no other.
 
     Args:
         backend: "egl" (GPUs and Mesa's llvmpipe), "osmesa" (software, Mesa before 25.1), "window" (X11, Windows,
@@ -67,10 +68,12 @@ def create_context(backend: Backend = "auto") -> moderngl.Context:
     failures = []
     for name, open_loader in _LOADERS.items():
         if backend in ("auto", name):
-            try:
-                return _context_of(name, open_loader())
-            except Exception as error:  # glcontext, moderngl and ctypes raise nothing more precise
-                failures.append(f"{name}: {error}")
+            for version in (COMPUTE_VERSION, GL_VERSION):
+                try:
+                    return _context_of(name, open_loader(version), version)
+                except Exception as error:  # glcontext, moderngl and ctypes raise nothing more precise
+                    failure = f"{name}: {error}"
+            failures.append(failure)
     hint = INSTALL.get(backend, f"{INSTALL['egl']}, or {INSTALL['osmesa']}")
     raise InputError("no OpenGL 3.3 context", got="; ".join(failures), hint=hint)
 
@@ -85,11 +88,11 @@ def renderer(context: moderngl.Context) -> str:
     return str(context.info["GL_RENDERER"])
 
 
-def _context_of(backend: str, loader: Loader) -> moderngl.Context:
+def _context_of(backend: str, loader: Loader, version: int) -> moderngl.Context:
     with loader:  # leaving it undoes that a new context becomes current at once
         try:
             settings: dict[str, Any] = {"context": loader}
-            context = moderngl.create_context(require=GL_VERSION, standalone=True, **settings)
+            context = moderngl.create_context(require=version, standalone=True, **settings)
         except Exception:
             loader.release()
             raise
@@ -99,39 +102,43 @@ def _context_of(backend: str, loader: Loader) -> moderngl.Context:
     return context
 
 
-def _open_egl() -> Loader:
+def _open_egl(version: int) -> Loader:
     if sys.platform != "linux":
         raise OSError(f"not on {sys.platform}")
     # EGL hands out GL's functions itself, so that libGL need not be installed
     loader: Loader = glcontext.get_backend_by_name("egl")(
-        mode="standalone", glversion=GL_VERSION, libgl="libEGL.so.1", libegl="libEGL.so.1"
+        mode="standalone", glversion=version, libgl="libEGL.so.1", libegl="libEGL.so.1"
     )
     return loader
 
 
-def _open_osmesa() -> Loader:
-    return OSMesa()
+def _open_osmesa(version: int) -> Loader:
+    return OSMesa(version)
 
 
-def _open_window() -> Loader:
-    loader: Loader = glcontext.default_backend()(mode="standalone", glversion=GL_VERSION)
+def _open_window(version: int) -> Loader:
+    loader: Loader = glcontext.default_backend()(mode="standalone", glversion=version)
     return loader
 
 
-_LOADERS: dict[str, Callable[[], Loader]] = {"egl": _open_egl, "osmesa": _open_osmesa, "window": _open_window}
+_LOADERS: dict[str, Callable[[int], Loader]] = {
+    "egl": _open_egl,
+    "osmesa": _open_osmesa,
+    "window": _open_window,
+}
 
 
 class OSMesa:
     """Mesa's off-screen context (GL/osmesa.h) in the form that moderngl takes as ``context=``."""
 
     _UNSIGNED_BYTE = 0x1401
-    _ATTRIBUTES = (
-        (0x33, 0x34),  # OSMESA_PROFILE, OSMESA_CORE_PROFILE
-        (0x36, GL_VERSION // 100),  # OSMESA_CONTEXT_MAJOR_VERSION
-        (0x37, GL_VERSION // 10 % 10),  # OSMESA_CONTEXT_MINOR_VERSION
-    )
 
-    def __init__(self) -> None:
+    def __init__(self, version: int = GL_VERSION) -> None:
+        asked = (
+            (0x33, 0x34),  # OSMESA_PROFILE, OSMESA_CORE_PROFILE
+            (0x36, version // 100),  # OSMESA_CONTEXT_MAJOR_VERSION
+            (0x37, version // 10 % 10),  # OSMESA_CONTEXT_MINOR_VERSION
+        )
         self._library = _first_library(*OSMESA_LIBRARIES)
         pointer = ctypes.c_void_p
         self._library.OSMesaCreateContextAttribs.restype = pointer
@@ -141,7 +148,7 @@ class OSMesa:
         self._library.OSMesaDestroyContext.argtypes = [pointer]
         self._library.OSMesaGetProcAddress.restype = pointer
         self._library.OSMesaGetProcAddress.argtypes = [ctypes.c_char_p]
-        flat = [number for pair in self._ATTRIBUTES for number in pair]
+        flat = [number for pair in asked for number in pair]
         attributes = (ctypes.c_int * (len(flat) + 1))(*flat, 0)
         self._handle = self._library.OSMesaCreateContextAttribs(attributes, None)
         if not self._handle:

@@ -115,7 +115,7 @@ class Pass:
     ) -> None:
         head = shader_head({"ROW_GAUSSIANS": ROW_GAUSSIANS, "ROW_WIDE": ROW_WIDE, **(macros or {})})
         self._program = context.program(
-            vertex_shader=head + _source(vertex), fragment_shader=head + _source(fragment)
+            vertex_shader=head + shader_source(vertex), fragment_shader=head + shader_source(fragment)
         )
         self._vertices = context.vertex_array(self._program, [])
         self._uniforms: dict[str, Any] = {name: self._program[name] for name in self._program}
@@ -151,11 +151,14 @@ class Pass:
         self._program.release()
 
 
-def shader_head(macros: Mapping[str, object]) -> str:
+def shader_head(macros: Mapping[str, object], *, version: int = 330) -> str:
     """GLSL's version and the macros that the shaders ask for."""
-    return "#version 330 core\n" + "".join(f"#define {name} {value}\n" for name, value in macros.items())
+    return f"#version {version} core\n" + "".join(
+        f"#define {name} {value}\n" for name, value in macros.items()
+    )
 
 
-def _source(names: tuple[str, ...]) -> str:
+def shader_source(names: tuple[str, ...]) -> str:
+    """The files of ``shaders`` by these names, one after the other."""
     folder = resources.files(__package__) / "shaders"
     return "\n".join((folder / name).read_text("utf-8") for name in names)

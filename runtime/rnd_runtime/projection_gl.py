@@ -1,14 +1,14 @@
 """Projection, culling and depth order of Gaussians that lie on an OpenGL device.
 
-A fragment for each Gaussian projects it, in float32. Their order is the CPU's radix sort of depths in float64 (in
-float32 neighbours change places), so means are what crosses: 16 bytes a Gaussian come back, 4 go up again, and the
-device waits for them. A bitonic sort in fragment
-passes would keep them there; for 32 768 Gaussians it is 120 passes, each a call from Python, so it is not what is done.
+A fragment for each Gaussian projects it, in float32. Their order is that of depths in float64 (in float32 neighbours
+change places): compute shaders sort them where they lie (``sort_gl``). Where there are none (OpenGL before 4.3, so all
+of macOS), and where OpenGL runs on the CPU anyway, the CPU's radix sort does it: 16 bytes of each Gaussian come back, 4
+go up again, and the device waits for them. Both give the same order.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import moderngl
 import numpy as np
@@ -17,19 +17,24 @@ from numba import njit
 from ._raster_project import view_of
 from ._raster_tiles import _front_to_back
 from .camera import Camera
+from .errors import InputError
+from .gl_context import is_software
 from .gl_passes import GaussianTargets, GaussianTexture, Pass
+from .sort_gl import DepthSort, can_sort
 from .surfaces_gl import Surfaces
+
+Sorting = Literal["auto", "cpu", "device"]
 
 _EVERYTHING = -2.0  # least n·v where nothing is culled
 
 
 class Projected(NamedTuple):
-    """What splat.vert reads of V drawn Gaussians among N."""
+    """What splat.vert reads of N Gaussians."""
 
-    order: moderngl.Texture  # of each rank, back to front
+    order: moderngl.Texture  # of each rank, back to front; −1 where there is none
     places: moderngl.Texture  # by Gaussian
     shapes: moderngl.Texture
-    ranks: int  # V
+    ranks: int  # at least as many as are drawn
 
     def textures(self) -> dict[str, moderngl.Texture]:
         """By the names of their samplers."""
@@ -37,18 +42,32 @@ class Projected(NamedTuple):
 
 
 class GlProjection:
-    """Projects Gaussians for a camera; the context must be current."""
+    """Projects Gaussians for a camera; the context must be current.
 
-    def __init__(self, context: moderngl.Context) -> None:
+    Args:
+        context: where.
+        sorting: by the "cpu", by the "device", or by the device unless it is the CPU or lacks compute shaders ("auto").
+
+    Raises:
+        InputError: the device shall sort and cannot.
+    """
+
+    def __init__(self, context: moderngl.Context, sorting: Sorting = "auto") -> None:
+        if sorting not in get_args(Sorting):
+            raise InputError("sorting", expected=" | ".join(get_args(Sorting)), got=repr(sorting))
         self._context = context
         self._targets = GaussianTargets(context, (4, 4, 4))
-        self._order = GaussianTexture(context, 1, dtype="i4")
         self._pass = Pass(context, ("fill.vert",), ("project.frag",))
+        by_device = sorting == "device" or (
+            sorting == "auto" and can_sort(context) and not is_software(context)
+        )
+        self._sort = DepthSort(context) if by_device else None
+        self._order = None if by_device else GaussianTexture(context, 1, dtype="i4")
 
     def project(self, surfaces: Surfaces, camera: Camera, cull: float | None) -> Projected:
         """All of ``surfaces`` that can be seen, but those whose n·v is below ``cull``."""
         count = surfaces.gaussians
-        (places, shapes, _), target = self._targets.reserve(count)
+        (places, shapes, drawn), target = self._targets.reserve(count)
         view = view_of(camera)
         self._pass.bind(
             surfaces.textures(),
@@ -63,14 +82,18 @@ class GlProjection:
         )
         self._context.enable_only(moderngl.NOTHING)
         self._pass.fill()
-        drawn = np.empty((*target.viewport[2:][::-1], 4), np.float32)
-        target.read_into(drawn, viewport=target.viewport, components=4, attachment=2, dtype="f4")
-        order = _back_to_front(drawn.reshape(-1, 4)[:count], view.rotation[2])
+        if self._sort is not None:
+            return Projected(self._sort.order(drawn, count, view.rotation[2]), places, shapes, count)
+        assert self._order is not None
+        means = np.empty((*target.viewport[2:][::-1], 4), np.float32)
+        target.read_into(means, viewport=target.viewport, components=4, attachment=2, dtype="f4")
+        order = _back_to_front(means.reshape(-1, 4)[:count], view.rotation[2])
         return Projected(self._order.write(order), places, shapes, len(order))
 
     def release(self) -> None:
-        for part in (self._targets, self._order, self._pass):
-            part.release()
+        for part in (self._targets, self._pass, self._sort, self._order):
+            if part is not None:
+                part.release()
 
 
 @njit(error_model="numpy", nogil=True, cache=True)

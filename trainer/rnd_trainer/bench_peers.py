@@ -1,6 +1,7 @@
 """The same work done by others, side by side, and how time grows with what there is of it.
 
-**Peers**: our CPU kernel, our OpenGL, a plain-torch tile rasteriser; the encoders in onnxruntime, in torch as the
+**Peers**: our CPU kernel, our OpenGL, a plain-torch tile rasteriser; the depth order of Gaussians that lie on an OpenGL
+device by its compute shaders, and by the CPU with the way there and back; the encoders in onnxruntime, in torch as the
 trainer runs them, and through torch.compile where a compiler is found.
 
 **Growth**: the exponent p of time ~ amount^p, by least squares over logarithms, and the floor at the largest amount:
@@ -10,23 +11,29 @@ whichever is longer. A stage far above its floor spends its time on something el
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import moderngl
 import numba
 import numpy as np
 import torch
 
 from rnd_runtime import raster_cpu
 from rnd_runtime.avatar import NODE_LOGITS, NODE_OUTPUTS, Avatar
+from rnd_runtime.camera import Camera
 from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError
 from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.gl_context import Backend, create_context, renderer
 from rnd_runtime.light import Light
 from rnd_runtime.posing import RestPose
+from rnd_runtime.projection_gl import GlProjection, Sorting
 from rnd_runtime.shading import Shader
+from rnd_runtime.surfaces_gl import SurfaceUpload
 
 from .bench_raster import Row, Scene, bench_raster, body_camera, body_scene
 from .checkpoint import load_checkpoint
@@ -54,7 +61,45 @@ def bench_peers(checkpoint: Path, avatar: Path, n: int, size: int, threads: int)
     for row in bench_raster(n, size, repeats=REPEATS, threads=threads):
         if row["pass"] == "forward":
             rows.append({"stage": "raster", "peer": row["kernel"], **row})
-    return rows + encoders(checkpoint, avatar, threads)
+    return rows + depth_order(n, size, threads) + encoders(checkpoint, avatar, threads)
+
+
+def depth_order(n: int, size: int, threads: int) -> list[Row]:
+    """Projecting and ordering the Gaussians of :func:`body_scene` on every OpenGL backend of this machine."""
+    gaussians, camera, rows = _gaussians(body_scene(n)), body_camera(size), []
+    backends: tuple[Backend, ...] = ("egl", "osmesa")
+    for backend in backends:
+        try:
+            context = create_context(backend)
+        except InputError:
+            continue
+        with context:
+            known = {"n": n, "threads": threads, "renderer": renderer(context), "machine": machine()}
+            for peer, measured in _orders(context, gaussians, camera):
+                rows.append({"stage": f"projection+sort, {backend}", "peer": peer, **measured, **known})
+        context.release()
+    return rows
+
+
+def _orders(context: moderngl.Context, gaussians: Gaussians, camera: Camera) -> Iterator[tuple[str, Row]]:
+    """By the CPU, and by compute shaders where there are any."""
+    upload = SurfaceUpload(context)
+    surfaces = upload.write(gaussians)
+    sorters: tuple[tuple[str, Sorting], ...] = (("the CPU", "cpu"), ("compute shaders", "device"))
+    for peer, sorting in sorters:
+        try:
+            projection = GlProjection(context, sorting)
+        except InputError as error:
+            yield peer, {"failed": str(error)}
+            continue
+
+        def order(projection: GlProjection = projection) -> None:
+            projection.project(surfaces, camera, None)
+            context.finish()
+
+        yield peer, _times(order)
+        projection.release()
+    upload.release()
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 // Before these lines the program states GLSL's version, ATTRIBUTES, ROW_GAUSSIANS and either TEXELS or LIT.
 
 #ifdef LIT
-uniform isampler2D order;    // the Gaussian of each rank, back to front
+uniform isampler2D order;    // the Gaussian of each rank, back to front; −1 where none is drawn, which has no radiance
 uniform sampler2D places;    // by Gaussian: as below
 uniform sampler2D shapes;
 uniform sampler2D radiance;  // by rank
@@ -23,12 +23,12 @@ void main() {
     int rank = gl_VertexID / 3, corner = gl_VertexID % 3;
 #ifdef LIT
     ivec2 texel = ivec2(rank % ROW_GAUSSIANS, rank / ROW_GAUSSIANS);
-    int gaussian = texelFetch(order, texel, 0).r;
+    int gaussian = max(texelFetch(order, texel, 0).r, 0);
     attributes[0] = texelFetch(radiance, texel, 0);
     texel = ivec2(gaussian % ROW_GAUSSIANS, gaussian / ROW_GAUSSIANS);
     vec4 place = texelFetch(places, texel, 0);
     vec3 shape = texelFetch(shapes, texel, 0).xyz;
-    if (attributes[0].w < 0.5) place.z = 0.0;  // radiance that is no number is not drawn
+    if (attributes[0].w < 0.5) place.z = 0.0;  // nor is radiance that is no number
 #else
     ivec2 texel = ivec2(rank % ROW_GAUSSIANS * TEXELS, rank / ROW_GAUSSIANS);
     vec4 place = texelFetch(records, texel, 0);                // centre x, y px; reach in u, v; peak

@@ -179,5 +179,5 @@ def no_display(subject: Subject) -> Result:
     return Result((holds("machines without a display that are not met", wrong),))
 
 
-def _broken() -> gl_context.Loader:
+def _broken(version: int) -> gl_context.Loader:
     raise OSError("not there")
