@@ -1,6 +1,8 @@
 """Soak: hours of playback and of training, watched for memory, pace and bits.
 
-Resumable: every process adds its segment to ``soak.json`` in the work folder; slopes are taken within segments.
+Resumable: every process adds its segment to ``soak.json`` in the work folder; slopes are taken within segments. Pace is
+given as it was, and over that of a fixed load, timed after each frame: on a machine whose own pace changes by half
+within the hour the second tells more.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
         raster = rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera)
         return hashlib.sha256(raster.image.tobytes()).hexdigest()
 
-    return _soak("playback", frame, frames, state, same=count)
+    return _soak("playback", frame, _fixed_load(subject), frames, state, same=count)
 
 
 def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
@@ -67,13 +69,28 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
         return ""
 
     borders = [training.stage1_steps, math.ceil(config.steps * (1 - config.full_light_fraction)), steps]
-    return _soak("training", step, steps, state, same=0, borders=borders)
+    return _soak("training", step, _fixed_load(subject), steps, state, same=0, borders=borders)
+
+
+def _fixed_load(subject: Subject) -> Callable[[], object]:
+    """One picture, always the same: how fast the machine is just now."""
+    rest, camera = subject.rest, subject.camera()
+    return lambda: rasterize(rest.means, rest.covariances, rest.opacities, rest.albedo, camera)
 
 
 def _soak(
-    name: str, work: Callable[[int], str], total: int, state: Path, *, same: int, borders: Sequence[int] = ()
+    name: str,
+    work: Callable[[int], str],
+    load: Callable[[], object],
+    total: int,
+    state: Path,
+    *,
+    same: int,
+    borders: Sequence[int] = (),
 ) -> list[Figure]:
-    """``same``: after how many frames the same bits must come back; 0 where nothing repeats.
+    """``load``: timed after each frame or step, since a machine that others use has a pace of its own.
+
+    ``same``: after how many frames the same bits must come back; 0 where nothing repeats.
 
     ``borders``: where each kind of frame or step ends; by default all are of one kind.
     """
@@ -85,13 +102,17 @@ def _soak(
     first = record.setdefault(f"{name}_bits", {})
     memory: list[int] = []
     seconds: list[float] = []
+    loads: list[float] = []
     wrong = 0
-    segment: dict[str, Any] = {"frames": 0, "memory": memory, "seconds": seconds, "wrong": 0}
+    segment: dict[str, Any] = {"frames": 0, "memory": memory, "seconds": seconds, "loads": loads, "wrong": 0}
     segments.append(segment)
     for number in range(done, total):
         started = perf_counter()
         bits = work(number)
-        seconds.append(perf_counter() - started)
+        worked = perf_counter()
+        load()
+        seconds.append(worked - started)
+        loads.append(perf_counter() - worked)
         if same and number % same % 30 == 0:  # every second's first frame is remembered
             wrong += first.setdefault(str(number % same), bits) != bits
         if len(seconds) > WARM and number % EVERY == 0:
@@ -106,7 +127,7 @@ def _soak(
 
 def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Sequence[int]) -> list[Figure]:
     slopes = [_slope(s["memory"]) for s in segments if len(s["memory"]) > 10]
-    long = [s["seconds"] for s in segments if len(s["seconds"]) > 10 * WARM // 2]
+    long = [(s["seconds"], s["loads"]) for s in segments if len(s["seconds"]) > 10 * WARM // 2]
     frames = sum(segment["frames"] for segment in segments)
     figures = [
         below(f"{name}, {frames}: memory a frame", max(slopes, default=float("nan")), SLOPE_BYTES, "bytes")
@@ -115,8 +136,13 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
     if borders:
         paces.append(("of each kind of step, end over start", list(pairwise((0, *borders)))))
     for what, parts in paces if long else ():
-        slowest = max(_pace(seconds[start:end]) for seconds in long for start, end in parts)
+        slowest = max(_pace(seconds[start:end]) for seconds, _ in long for start, end in parts)
         figures.append(replace(below(f"{name}, {frames}: pace {what}", slowest, PACE, "×"), timing=True))
+    if long:
+        by_load = [[taken / beside for taken, beside in zip(*times)] for times in long]
+        slowest = max(_pace(ratios[start:end]) for ratios in by_load for start, end in paces[-1][1])
+        what = f"{name}, {frames}: pace {paces[-1][0]}, over that of a fixed load beside it"
+        figures.append(replace(below(what, slowest, PACE, "×"), timing=True))
     if same:
         wrong = sum(segment["wrong"] for segment in segments)
         figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
