@@ -36,9 +36,10 @@ need_python_packages() {
     }
     # shellcheck disable=SC1091
     source .venv/bin/activate
-    local stamp
+    local stamp whole
     stamp=".venv/installed-$1-$(sha256sum pyproject.toml | cut -c1-16)"
-    [ -e "$stamp" ] && return
+    whole=${stamp/installed-$1-/installed-dev-} # has every other extra too
+    [ -e "$stamp" ] || [ -e "$whole" ] && return
     # torch first and by version: the plain name would bring gigabytes of CUDA to a machine without a GPU
     python -c 'import torch' 2>/dev/null || install_cpu_torch
     pip install --quiet --editable ".[$1]"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import cv2
@@ -154,6 +155,23 @@ def test_sky_has_its_sun_where_it_should_be() -> None:
     assert np.degrees(np.arctan2(mean[2], mean[0])) == pytest.approx(48.0, abs=0.3)  # from +X towards +Z
     assert np.degrees(np.arcsin(mean[1] / np.linalg.norm(mean))) == pytest.approx(42.0, abs=0.3)
     assert 0.005 < (luminance > 100).mean() * 256 * 128 / 100 < 0.5  # a disc of a few texels
+
+
+def test_the_scripts_make_what_is_here(tmp_path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(str(ASSETS.parent))
+    make = importlib.import_module("assets.make.__main__")
+    monkeypatch.setattr(make, "ASSETS", tmp_path)
+    make.main(["body", "walk", "sky"])
+    for name in ("body.npz", "walk.npz"):
+        with np.load(tmp_path / name) as made, np.load(ASSETS / name) as kept:
+            assert set(made) == set(kept)
+            for key in made:
+                if made[key].dtype.kind == "f":
+                    np.testing.assert_allclose(made[key], kept[key], atol=1e-6, err_msg=f"{name}: {key}")
+                else:
+                    np.testing.assert_array_equal(made[key], kept[key], err_msg=f"{name}: {key}")
+    made, kept = (load_light(folder / "sky.exr").radiance for folder in (tmp_path, ASSETS))
+    np.testing.assert_allclose(made, kept, rtol=1e-6)
 
 
 def test_assets_stay_small() -> None:

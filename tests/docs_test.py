@@ -1,9 +1,7 @@
 """The documentation is true: its commands run, their options exist, its errors are raised, its figures are the files'.
 
-A fenced ``sh`` block is run line by line in a folder that has ``assets``; blocks of one page share it. Above a block
-that takes too long or needs what a test machine lacks stands ``<!-- not run: reason -->``; above one that is run with
-fewer steps, ``<!-- tested with COMMAND OPTIONS -->``. A ``python`` block that starts with ``# file: NAME`` is written
-to NAME.
+A fenced ``sh`` block is run line by line (``doc_commands``) in a folder that has ``assets``; blocks of one page
+share it. A ``python`` block that starts with ``# file: NAME`` is written to NAME.
 """
 
 from __future__ import annotations
@@ -11,30 +9,21 @@ from __future__ import annotations
 import importlib
 import re
 import runpy
-import shlex
 import sys
-import tomllib
-import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from doc_commands import FENCED, ROOT, SCRIPTS, blocks, copy_assets, run
+from perceptual_test import write_alexnet
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from tiny import ASSETS
-from view_process import running
 
-ROOT = ASSETS.parent
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 FRONT_PAGES = [ROOT / name for name in ("README.md", "viewer/web/README.md", "assets/README.md")]
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-BLOCK = re.compile(
-    r"(?:<!-- (?:not run: (?P<reason>.+?)|tested with (?P<command>\S+) (?P<added>.+?)) -->\n)?"
-    r"```(?P<kind>\w+)\n(?P<body>.*?)```",
-    re.DOTALL,
-)
 LOOKS_LIKE_A_COMMAND = re.compile(
     r"^ +(?:rnd-\w+|python|pip|npm|\./scripts/\w+) .*|^ +\./scripts/\w+$", re.MULTILINE
 )
@@ -45,26 +34,6 @@ def _page(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def _run(words: list[str], monkeypatch) -> None:
-    """One command of a page, in this process: starting Python for each would take most of the time."""
-    if words[0] == "rnd-view":
-        with running(*words[1:]) as address, urllib.request.urlopen(address) as answer:
-            assert answer.status == 200 and b"RnD-Avatar" in answer.read()
-        return
-    monkeypatch.setattr(sys, "argv", words)
-    if words[0] == "python":
-        monkeypatch.setattr(sys, "argv", words[1:])
-        runpy.run_path(words[1], run_name="__main__")
-        return
-    assert words[0] in SCRIPTS, f"{words}: no command of ours; mark the block <!-- not run: reason -->"
-    module, function = SCRIPTS[words[0]].split(":")
-    try:
-        code = getattr(importlib.import_module(module), function)()
-    except SystemExit as leaving:
-        code = leaving.code
-    assert not code, words
-
-
 # own-video.md needs a video and poses: tests/own_video_test.py makes them and runs its commands
 @pytest.mark.parametrize(
     "page",
@@ -72,24 +41,35 @@ def _run(words: list[str], monkeypatch) -> None:
     ids=lambda page: str(page.relative_to(ROOT)),
 )
 def test_commands_run(page, tmp_path, monkeypatch):
-    (tmp_path / "assets").symlink_to(ASSETS)
+    copy_assets(tmp_path)
+    write_alexnet(tmp_path / "alexnet.safetensors")
     monkeypatch.chdir(tmp_path)
-    for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
-        lines = block["body"].replace("\\\n", " ").splitlines()
-        if block["kind"] == "python" and lines[0].startswith("# file: "):
-            Path(lines[0].removeprefix("# file: ")).write_text(block["body"], encoding="utf-8")
-        elif block["kind"] == "sh" and block["reason"] is None:
-            for line in lines:
-                words = shlex.split(line, comments=True)
-                _run(
-                    [*words, *block["added"].split()] if words[0] == block["command"] else words, monkeypatch
-                )
+    for block in blocks(page):
+        if block.kind == "python" and block.body.startswith("# file: "):
+            name = block.body.splitlines()[0].removeprefix("# file: ")
+            Path(name).write_text(block.body, encoding="utf-8")
+        elif block.kind == "sh" and block.reason is None:
+            for words in block.commands():
+                run(words, monkeypatch)
+
+
+@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_is_not_run_installs_or_names_the_test_that_runs_it(page):
+    for block in blocks(page):
+        if block.kind != "sh" or block.reason is None:
+            continue
+        named = re.search(r"(?:^|\W)((?:tests|scripts)/[\w./-]*\w|\.ci/run)", block.reason)
+        assert named and (ROOT / named[1]).is_file(), (page.name, block.reason)
+        where = (ROOT / named[1]).read_text(encoding="utf-8")
+        for words in block.commands():
+            name = next(word for word in words if word not in ("python", "-m")).removeprefix("./")
+            assert name in where, (page.name, words, named[1])
 
 
 @pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_command_stands_in_a_block_that_is_run(page):
     """None is merely indented, where :func:`test_commands_run` would not see it."""
-    outside = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    outside = FENCED.sub("", page.read_text(encoding="utf-8"))
     assert not LOOKS_LIKE_A_COMMAND.findall(outside)
 
 
@@ -107,14 +87,15 @@ def test_options_exist(capsys, monkeypatch):
     wanted: dict[str, set[str]] = {}
     for page in [*PAGES, ROOT / "README.md"]:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ").replace("-->", "")
-        for name, rest in re.findall(r"\b(rnd-[a-z]+)((?: +[^\s`|]+)*)", text):
+        for name, rest in re.findall(r"\b(rnd-[a-z]+)((?: +[^\s`|;]+)*)", text):
             if name not in SCRIPTS:
                 continue
             words = rest.split()
             grouped = name in ("rnd-convert", "rnd-bench", "rnd-data", "rnd-stage")
-            command = (
-                f"{name} {words[0]}" if grouped and words and words[0].replace("-", "").isalpha() else name
-            )
+            grouped = grouped and bool(words) and words[0].replace("-", "").isalpha()
+            if grouped and name == "rnd-stage" and words[0].startswith("--"):
+                grouped = False  # filming, which has no name of its own
+            command = f"{name} {words[0]}" if grouped else name
             options = {word.strip("(),.;:") for word in words if word.startswith("--")}
             wanted.setdefault(command, set()).update(options - {"--help"})
     assert len(wanted) > 5
@@ -166,11 +147,10 @@ def test_links_lead_somewhere():
 
 
 def test_the_example_without_our_code_poses_as_we_do(tmp_path, monkeypatch):
-    block = next(
-        b for b in BLOCK.finditer(_page("docs/avatar-onnx.md")) if b["body"].startswith("# file: pose.py")
-    )
-    assert len(block["body"].splitlines()) <= 60 and "rnd_" not in block["body"].replace('"rnd_avatar"', "")
-    (tmp_path / "pose.py").write_text(block["body"], encoding="utf-8")
+    page = blocks(ROOT / "docs/avatar-onnx.md")
+    body = next(block.body for block in page if block.body.startswith("# file: pose.py"))
+    assert len(body.splitlines()) <= 60 and "rnd_" not in body.replace('"rnd_avatar"', "")
+    (tmp_path / "pose.py").write_text(body, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["pose.py", str(ASSETS / "avatar.onnx")])
     theirs = runpy.run_path("pose.py")

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import layouts
+from doc_commands import blocks
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
 from pose_files_test import write_wham
 from rnd_runtime.capture import load_capture
 from rnd_runtime.images import to_bytes, write_image
-from rnd_trainer import data_cli
+from rnd_trainer import cli, data_cli
 
-PAGE = Path(__file__).parent.parent / "docs" / "own-video.md"
+ROOT = Path(__file__).parent.parent
 COMMANDS = [
-    line
-    for block in re.findall(
-        r"(?<!-->\n)```sh\n(.*?)```", PAGE.read_text(), re.S
-    )  # but for those marked "not run"
-    for line in block.splitlines()
+    words
+    for block in blocks(ROOT / "docs" / "own-video.md")
+    if block.kind == "sh" and block.reason is None
+    for words in block.commands()
 ]
+SHORT = ("--steps", "10", "--gaussians", "300")
 
 
-def _run(line: str, monkeypatch) -> int:
-    words = shlex.split(line)
-    assert words[0] == "rnd-data"
+def _run(words: list[str], monkeypatch) -> int:
+    assert words[0] in ("rnd-data", "rnd-train")
     monkeypatch.setattr("sys.argv", words)
     with pytest.raises(SystemExit) as ended:
-        data_cli.main()
+        raise SystemExit(data_cli.main() if words[0] == "rnd-data" else cli.main())
     return int(ended.value.code or 0)
 
 
@@ -64,12 +64,9 @@ def place(tmp_path_factory) -> Path:
 
 def test_every_command_of_the_page_runs(place, monkeypatch, capsys) -> None:
     monkeypatch.chdir(place)
-    assert [command.split()[1] for command in COMMANDS] == [
-        "convert-body",
-        "import",
-        "import",
-        "import",
-        "check",
+    assert [words[:2] for words in COMMANDS] == [
+        *(["rnd-data", name] for name in ("convert-body", "import", "import", "import", "check")),
+        ["rnd-train", "me"],
     ]
     for command in COMMANDS:
         assert _run(command, monkeypatch) == 0, (command, capsys.readouterr())
@@ -83,6 +80,19 @@ def test_every_command_of_the_page_runs(place, monkeypatch, capsys) -> None:
     assert len(load_capture(place / "me").frames) == FRAMES
     splits = {(frame.camera, frame.split) for frame in load_capture(place / "zju377").frames}
     assert splits == {("Camera_B1", "train"), ("Camera_B1", "novel_pose"), ("Camera_B2", "novel_view")}
+
+
+def test_every_command_of_the_readme_runs(place, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(place)
+    shutil.copyfile("SMPL_NEUTRAL.npz", "smpl.npz")
+    shutil.rmtree("runs", ignore_errors=True)  # the page's
+    page = blocks(ROOT / "README.md")
+    (block,) = (b for b in page if b.reason and b.reason.startswith("tests/own_video_test.py"))
+    assert [words[0] for words in block.commands()] == ["rnd-data", "rnd-data", "rnd-train"]
+    for words in block.commands():
+        more = SHORT if words[0] == "rnd-train" else ()
+        assert _run([*words, *more], monkeypatch) == 0, (words, capsys.readouterr())
+    assert (place / "runs" / "me" / "avatar.ckpt").is_file()
 
 
 def test_a_capture_is_not_overwritten(place, monkeypatch, capsys) -> None:
@@ -105,6 +115,6 @@ def test_a_poor_root_is_named_and_mended_by_the_flag_it_names(place, monkeypatch
     for k in range(FRAMES):
         mask = view_of(layouts.video_camera(77.0), k).mask
         write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * mask).astype(np.uint8))
-    assert _run("rnd-data " + words % "wrong", monkeypatch) == 1
+    assert _run(["rnd-data", *shlex.split(words % "wrong")], monkeypatch) == 1
     assert "EasyMocap's Rh/Th; try --as easymocap" in capsys.readouterr().out
-    assert _run("rnd-data " + words % "right" + " --as easymocap", monkeypatch) == 0
+    assert _run(["rnd-data", *shlex.split(words % "right"), "--as", "easymocap"], monkeypatch) == 0

@@ -89,6 +89,13 @@ def _tensors(net: nn.Sequential, name: str, layers: int, heads: bool = True) -> 
     return state
 
 
+def write_alexnet(path: Path) -> None:
+    """A whole AlexNet with LPIPS heads and random weights."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        save_file(_tensors(nn.Sequential(*_alexnet()), "alexnet", len(TAPS["alexnet"])), path)
+
+
 @pytest.fixture(scope="module")
 def nets() -> dict[str, nn.Sequential]:
     """The three networks as torch.nn modules with random weights."""
