@@ -1,8 +1,9 @@
 """Soak: hours of playback and of training, watched for memory, pace and bits.
 
-Resumable: every process adds its segment to ``soak.json`` in the work folder; slopes are taken within segments. Pace is
-given as it was, and over that of a fixed load, timed after each frame: on a machine whose own pace changes by half
-within the hour the second tells more.
+Resumable: every process adds its segment to ``soak_NAME.json`` in the work folder (a file for playback and one for
+training: writing the other's twenty thousand numbers would be seen in this one's memory); slopes are taken within
+segments. Pace is given as it was, and over that of a fixed load, timed after each frame: on a machine whose own pace
+changes by half within the hour the second tells more.
 """
 
 from __future__ import annotations
@@ -94,12 +95,13 @@ def _soak(
 
     ``borders``: where each kind of frame or step ends; by default all are of one kind.
     """
+    state = state.with_stem(f"{state.stem}_{name}")
     record: dict[str, Any] = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {}
-    segments = record.setdefault(name, [])
+    segments = record.setdefault("segments", [])
     done = sum(segment["frames"] for segment in segments) if same else 0
     if not same:
         segments.clear()
-    first = record.setdefault(f"{name}_bits", {})
+    first = record.setdefault("bits", {})
     memory: list[int] = []
     seconds: list[float] = []
     loads: list[float] = []
