@@ -150,12 +150,12 @@ class AvatarModel(nn.Module):
         smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
         residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
         part = _by_name(smooth + residual, columns)
-        place, stray = _by_name(smooth, columns)["offset"], _by_name(residual, columns)["offset"]
+        place = _by_name(smooth, columns)["offset"]
         tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0
         normals = nn.functional.normalize(self.rest_normals + tilt, dim=-1)
         tangents, across = part["scale"].split([2, 1], dim=-1)
         scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
-        offset = self.config.max_static_offset * torch.tanh(place) + self.spacing * torch.tanh(stray)
+        offset = self.config.max_static_offset * torch.tanh(place) + self.strays()
         low, high = ALBEDO_RANGE
         glossy, rough = ROUGHNESS_RANGE
         return Attributes(
@@ -169,6 +169,10 @@ class AvatarModel(nn.Module):
             roughness=glossy + (rough - glossy) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
             raw_geometry_residual=self.geometry_residual,
         )
+
+    def strays(self) -> Tensor:
+        """How far each Gaussian's own residual takes it from the surface [N, 3] m."""
+        return self.spacing * torch.tanh(_by_name(self.geometry_residual, GEOMETRY_COLUMNS)["offset"])
 
     def forward(self, pose: PoseInput) -> Posed:
         """Pose the avatar; see :class:`Posed`."""

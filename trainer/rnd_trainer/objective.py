@@ -71,8 +71,9 @@ class Objective:
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
         if _due(step, config.weight_repulsion, config.repulsion_every):
-            crowded = repulsion(posed.attributes.points, config.least_distance * float(model.spacing))
-            terms["repulsion"] = config.repulsion_every * config.weight_repulsion * crowded
+            terms["repulsion"] = (
+                config.repulsion_every * config.weight_repulsion * self._crowding(model, posed)
+            )
         if config.model.visibility == "pose":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)
@@ -147,6 +148,13 @@ class Objective:
         points = posed.means[drawn].detach()
         pixels = project(points, camera), project(points, virtual)
         return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, self.perceptual)
+
+    def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
+        """Repulsion of the points, which moves each by its own residual alone: through the network that all of them
+        share it would bend the surface, and albedo with it."""
+        strays = model.strays()
+        points = posed.attributes.points.detach() + strays - strays.detach()
+        return repulsion(points, self.config.least_distance * float(model.spacing))
 
     def _visibility_loss(self, model: AvatarModel, posed: Posed, pose: PoseInput) -> Tensor:
         """Square error of the harmonics against shadow-mapped visibility at the nodes, in random directions."""
