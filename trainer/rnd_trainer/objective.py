@@ -150,8 +150,8 @@ class Objective:
         return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, self.perceptual)
 
     def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
-        """Repulsion of the points, which moves each by its own residual alone: through the network that all of them
-        share it would bend the surface, and albedo with it."""
+        """Repulsion of the points, which moves each by its own residual alone: where it also moved the network that
+        all of them share, light was baked into a small avatar's albedo."""
         strays = model.strays()
         points = posed.attributes.points.detach() + strays - strays.detach()
         return repulsion(points, self.config.least_distance * float(model.spacing))
