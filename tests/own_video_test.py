@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 import layouts
-from doc_commands import blocks
+from doc_commands import blocks, exit_code
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
 from pose_files_test import write_wham
 from rnd_runtime.capture import load_capture
 from rnd_runtime.images import to_bytes, write_image
-from rnd_trainer import cli, data_cli
 
 ROOT = Path(__file__).parent.parent
 COMMANDS = [
@@ -25,14 +24,6 @@ COMMANDS = [
     for words in block.commands()
 ]
 SHORT = ("--steps", "10", "--gaussians", "300")
-
-
-def _run(words: list[str], monkeypatch) -> int:
-    assert words[0] in ("rnd-data", "rnd-train")
-    monkeypatch.setattr("sys.argv", words)
-    with pytest.raises(SystemExit) as ended:
-        raise SystemExit(data_cli.main() if words[0] == "rnd-data" else cli.main())
-    return int(ended.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +60,7 @@ def test_every_command_of_the_page_runs(place, monkeypatch, capsys) -> None:
         ["rnd-train", "me"],
     ]
     for command in COMMANDS:
-        assert _run(command, monkeypatch) == 0, (command, capsys.readouterr())
+        assert exit_code(command, monkeypatch) == 0, (command, capsys.readouterr())
     printed = capsys.readouterr().out
     expected = (
         "SMPL, 2340 vertices", "found video: a video", "found video: a folder of frames", "found zju: annots.npy",
@@ -91,7 +82,7 @@ def test_every_command_of_the_readme_runs(place, monkeypatch, capsys) -> None:
     assert [words[0] for words in block.commands()] == ["rnd-data", "rnd-data", "rnd-train"]
     for words in block.commands():
         more = SHORT if words[0] == "rnd-train" else ()
-        assert _run([*words, *more], monkeypatch) == 0, (words, capsys.readouterr())
+        assert exit_code([*words, *more], monkeypatch) == 0, (words, capsys.readouterr())
     assert (place / "runs" / "me" / "avatar.ckpt").is_file()
 
 
@@ -100,7 +91,7 @@ def test_a_capture_is_not_overwritten(place, monkeypatch, capsys) -> None:
     if not (place / "me" / "capture.json").exists():
         (place / "me").mkdir(exist_ok=True)
         (place / "me" / "capture.json").write_text("{}")
-    assert _run(COMMANDS[1], monkeypatch) == 2
+    assert exit_code(COMMANDS[1], monkeypatch) == 2
     line = capsys.readouterr().err.strip().splitlines()[-1]
     assert line.startswith("rnd-data: me: holds a capture already")
 
@@ -115,6 +106,6 @@ def test_a_poor_root_is_named_and_mended_by_the_flag_it_names(place, monkeypatch
     for k in range(FRAMES):
         mask = view_of(layouts.video_camera(77.0), k).mask
         write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * mask).astype(np.uint8))
-    assert _run(["rnd-data", *shlex.split(words % "wrong")], monkeypatch) == 1
+    assert exit_code(["rnd-data", *shlex.split(words % "wrong")], monkeypatch) == 1
     assert "EasyMocap's Rh/Th; try --as easymocap" in capsys.readouterr().out
-    assert _run(["rnd-data", *shlex.split(words % "right"), "--as", "easymocap"], monkeypatch) == 0
+    assert exit_code(["rnd-data", *shlex.split(words % "right"), "--as", "easymocap"], monkeypatch) == 0

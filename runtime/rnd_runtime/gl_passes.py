@@ -14,6 +14,8 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from .gl_context import GL_VERSION
+
 ROW_GAUSSIANS = 1024  # Gaussians in a row of a texture
 ROW_WIDE = 256  # Gaussians, or nodes, of many texels in a row: GL promises no more than 1024 and gives 16384
 
@@ -151,7 +153,7 @@ class Pass:
         self._program.release()
 
 
-def shader_head(macros: Mapping[str, object], *, version: int = 330) -> str:
+def shader_head(macros: Mapping[str, object], *, version: int = GL_VERSION) -> str:
     """GLSL's version and the macros that the shaders ask for."""
     return f"#version {version} core\n" + "".join(
         f"#define {name} {value}\n" for name, value in macros.items()

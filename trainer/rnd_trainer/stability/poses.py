@@ -60,9 +60,8 @@ def _stretch(subject: Subject, pose: Callable[[Motion, float], Gaussians]) -> tu
 
     apart = np.maximum(lengths(APART), 1e-4)
     ratios = [lengths(angles) / apart for angles in EXTREMES.values()]
-    return max(float(np.percentile(ratio, 99.9)) for ratio in ratios), max(
-        float(ratio.max()) for ratio in ratios
-    )
+    stretch = max(float(np.percentile(ratio, 99.9)) for ratio in ratios)
+    return stretch, max(float(ratio.max()) for ratio in ratios)
 
 
 def _holes(subject: Subject, posed: Gaussians, motion: Motion) -> float:
