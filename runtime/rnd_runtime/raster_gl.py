@@ -30,7 +30,7 @@ from .gl_context import Backend, create_context
 from .gl_passes import ROW_GAUSSIANS, Pass
 
 LOG2_255 = float(np.log2(255.0))
-GEOMETRY_TEXELS = 2  # centre, reach, peak; √fall_x, √fall_y, shear, –
+GEOMETRY_TEXELS = 2  # centre from the picture's middle, reach, peak; √fall_x, √fall_y, shear, –
 PER_TARGET = 3  # attributes of a target; its fourth component is α
 FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
 
@@ -135,7 +135,7 @@ class GlRasterizer:
     def _draw(self, splats: Ellipses, first: int, attributes: int, camera: Camera) -> None:
         """Draw attributes ``first`` … ``first + attributes`` of all splats into this pass's targets."""
         count = len(splats.order)
-        records = self._upload(_records(splats, first, attributes)) if count else None
+        records = self._upload(_records(splats, first, attributes, camera)) if count else None
         if attributes not in self._programs:
             self._programs[attributes] = splat_pass(self.context, attributes)
         self.blend(
@@ -253,22 +253,24 @@ def _project_and_sort(means, covariances, opacities, features, view):  # type: i
     return _front_to_back(depths, starts), centers, shapes, attributes
 
 
-def _records(splats: Ellipses, first: int, attributes: int) -> Floats32:
+def _records(splats: Ellipses, first: int, attributes: int, camera: Camera) -> Floats32:
     """The texture the shaders read, back to front: [rows, ROW_GAUSSIANS · texels, 4]."""
     texels = GEOMETRY_TEXELS + -(-attributes // 4)
     rows = -(-len(splats.order) // ROW_GAUSSIANS)
     records = np.empty((rows * ROW_GAUSSIANS, 4 * texels), np.float32)
-    _fill_records(records, splats.order, splats.centers, splats.shapes, splats.attributes, first, attributes)
+    middle = camera.width / 2, camera.height / 2
+    drawn = splats.order, splats.centers, splats.shapes, splats.attributes
+    _fill_records(records, *drawn, middle, first, attributes)
     return records.reshape(rows, ROW_GAUSSIANS * texels, 4)
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _fill_records(records, order, centers, shapes, values, first, attributes):  # type: ignore[no-untyped-def]
+def _fill_records(records, order, centers, shapes, values, middle, first, attributes):  # type: ignore[no-untyped-def]
     count = order.size
     for k in range(count):
         i = order[count - 1 - k]
         shear, fall_y, fall_x, peak = shapes[i, 0], shapes[i, 1], shapes[i, 2], shapes[i, 3]
-        records[k, 0], records[k, 1] = centers[i, 0], centers[i, 1]
+        records[k, 0], records[k, 1] = centers[i, 0] - middle[0], centers[i, 1] - middle[1]
         records[k, 2], records[k, 3] = np.sqrt(max(peak + LOG2_255, 0.0)), peak
         records[k, 4], records[k, 5], records[k, 6], records[k, 7] = (
             np.sqrt(fall_x),

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rnd_runtime.camera import Camera
+from rnd_runtime.images import srgb_to_linear
 
 from .config import TrainConfig
 from .consistency import POINTS, consistency_loss, covisible, project, virtual_camera
@@ -83,7 +84,7 @@ class Objective:
             terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
         picture = self._picture(model, posed, pose, texels, view.camera)
         device = posed.means.device
-        background = torch.rand(3, generator=self.generator)
+        background = self._background()
         target, mask = (x.to(device) for x in view.target(background))
         background = background.to(device)
         image_srgb, target_srgb = _over(picture, background), linear_to_srgb(target)
@@ -98,6 +99,13 @@ class Objective:
             if agreement is not None:
                 terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
         return terms
+
+    def _background(self) -> Tensor:
+        """Linear [3]: black, as pictures are judged, or any colour that sRGB codes, each as likely as the others."""
+        drawn = torch.rand(4, generator=self.generator)
+        if drawn[3] < self.config.black_backgrounds:
+            return torch.zeros(3)
+        return torch.from_numpy(srgb_to_linear(drawn[:3].numpy()))
 
     def _picture(
         self, model: AvatarModel, posed: Posed, pose: PoseInput, texels: Texels | None, camera: Camera

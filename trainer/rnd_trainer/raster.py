@@ -10,7 +10,7 @@ from torch import Tensor
 from rnd_runtime import raster_cpu
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
-from rnd_runtime.raster_oracle import NEAR
+from rnd_runtime.raster_oracle import DILATION, NEAR
 
 
 def rasterize(
@@ -86,6 +86,7 @@ def _rasterize_cuda(
         width=camera.width,
         height=camera.height,
         near_plane=NEAR,
+        eps2d=DILATION,
         render_mode="RGB+D" if depth else "RGB",
         packed=False,
         covars=covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),

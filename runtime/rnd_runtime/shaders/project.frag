@@ -13,12 +13,12 @@ uniform vec4 slopes;        // limits of x/z, y/z where the Jacobian is taken: l
 uniform vec2 size;          // px
 uniform float facing;       // n·v below which nothing is drawn
 
-layout(location = 0) out vec4 place;   // centre px; reach in units of the ellipse; log2 of the opacity
+layout(location = 0) out vec4 place;   // centre from the picture's middle px; reach in units of the ellipse; log2 of the opacity
 layout(location = 1) out vec4 shape;   // √fall_x, √fall_y, shear, –
 layout(location = 2) out vec4 drawn;   // mean m; 1, or −1 where nothing is drawn
 
 const float NEAR = 0.1;       // m
-const float DILATION = 0.3;   // px²
+const float DILATION = 0.1;   // px²
 const float LOG2_255 = 7.9943534368588578;
 const float HALF_LOG2_E = 0.72134752044448170;
 const float HUGE = 1e30;
@@ -52,7 +52,7 @@ void main() {
     float conditional = max(xx - xy * shear, DILATION);  // no less, were there no rounding
     if (!(xx > 0.0 && xx < HUGE && yy > 0.0 && yy < HUGE && conditional < HUGE)) return;
 
-    vec2 centre = pinhole.xy * p.xy / p.z + pinhole.zw;
+    vec2 along = pinhole.xy * p.xy / p.z, centre = along + pinhole.zw;
     float peak = log2(opacity);
     float reach = max(peak + LOG2_255, 0.0);
     vec2 reach_px = sqrt(reach / HALF_LOG2_E * vec2(xx, yy));
@@ -60,7 +60,7 @@ void main() {
     if (!(all(lessThan(low, size)) && all(greaterThanEqual(high, vec2(0.0))))) return;
     if (any(greaterThan(floor(low), floor(high)))) return;  // between two pixels' centres
 
-    place = vec4(centre, sqrt(reach), peak);
+    place = vec4(along + (pinhole.zw - 0.5 * size), sqrt(reach), peak);
     shape = vec4(sqrt(HALF_LOG2_E / conditional), sqrt(HALF_LOG2_E / yy), shear, 0.0);
     drawn.w = 1.0;
 }

@@ -11,9 +11,8 @@ uniform sampler2D records;   // TEXELS texels for each Gaussian, back to front; 
 #endif
 uniform vec2 size;           // px
 
-// u, v with log2 α = peak − u² − v²; peak. Not `noperspective`, though w is 1: Mesa 22 clips such varyings wrongly when an
-// edge lies on the border (α 0.01 instead of 0.9).
-out vec3 whitened;
+flat out vec3 centre;   // centre from the picture's middle px; log2 of the opacity
+flat out vec3 ellipse;  // u = ellipse.x (dx − ellipse.z dy), v = ellipse.y dy with log2 α = peak − u² − v²
 flat out vec4 attributes[(ATTRIBUTES + 3) / 4];
 
 const vec2 CORNERS[3] = vec2[3](vec2(0.0, 2.0), vec2(-1.7320508, -1.0), vec2(1.7320508, -1.0));
@@ -31,8 +30,8 @@ void main() {
     if (attributes[0].w < 0.5) place.z = 0.0;  // nor is radiance that is no number
 #else
     ivec2 texel = ivec2(rank % ROW_GAUSSIANS * TEXELS, rank / ROW_GAUSSIANS);
-    vec4 place = texelFetch(records, texel, 0);                // centre x, y px; reach in u, v; peak
-    vec3 shape = texelFetch(records, texel + ivec2(1, 0), 0).xyz;  // u = shape.x (dx − shape.z dy), v = shape.y dy
+    vec4 place = texelFetch(records, texel, 0);                // centre x, y; reach in u, v; peak
+    vec3 shape = texelFetch(records, texel + ivec2(1, 0), 0).xyz;  // √fall_x, √fall_y, shear
     for (int k = 0; k < (ATTRIBUTES + 3) / 4; k++)
         attributes[k] = texelFetch(records, texel + ivec2(2 + k, 0), 0);
 #endif
@@ -42,11 +41,9 @@ void main() {
     vec2 position = place.xy + vec2(uv.x / shape.x + shape.z * dy, dy);
     // Around an ellipse much larger than the picture clipping would lose precision: cover the picture instead.
     float extent = 2.0 * place.z * ((1.0 + abs(shape.z)) / shape.y + 1.0 / shape.x);
-    if (!(extent < 8.0 * max(size.x, size.y))) {
-        position = vec2(corner == 1 ? 2.0 * size.x : 0.0, corner == 2 ? 2.0 * size.y : 0.0);
-        vec2 d = position - place.xy;
-        uv = vec2(shape.x * (d.x - shape.z * d.y), shape.y * d.y);
-    }
-    whitened = vec3(uv, place.w);
-    gl_Position = vec4(2.0 * position / size - 1.0, 0.0, 1.0);
+    if (!(extent < 8.0 * max(size.x, size.y)))
+        position = size * (vec2(corner == 1 ? 2.0 : 0.0, corner == 2 ? 2.0 : 0.0) - 0.5);
+    centre = vec3(place.xy, place.w);
+    ellipse = shape;
+    gl_Position = vec4(2.0 * position / size, 0.0, 1.0);
 }
