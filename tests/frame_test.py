@@ -47,6 +47,19 @@ def _taken(motion, place, moved):
     return Motion(rotations, translations, motion.fps, motion.joint_names)
 
 
+@pytest.mark.parametrize(
+    ("side", "stouter"), [(256, 0.02), (128, 0.06)]
+)  # with 3DGS's dilation 0.06 and 0.17
+def test_a_person_is_not_stouter_in_a_small_picture(avatar, motion, side, stouter):
+    gaussians = avatar.pose(motion, 0.3)
+    covered = []
+    for size in (1024, side):
+        camera = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=size, height=size, fov_y=0.65)
+        geometry = gaussians.means, gaussians.covariances, gaussians.opacities
+        covered.append(rasterize(*geometry, gaussians.albedo, camera, depth=False).alpha.mean())
+    assert covered[1] < (1 + stouter) * covered[0]
+
+
 def test_a_frame_is_its_parts(avatar, motion, sky):
     frame = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3)
     encoded = avatar.encode(motion, 0.3)

@@ -15,6 +15,9 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
+from rnd_trainer.light import LightProbe
+from rnd_trainer.losses import linear_to_srgb
+from rnd_trainer.objective import Objective
 from rnd_trainer.train import MAX_BAD_STEPS, STATE_SCHEMA, Training, run
 
 
@@ -37,6 +40,15 @@ def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
     first, stage1, end = (np.mean(part) for part in (losses[:6], losses[54:60], losses[-6:]))
     assert stage1 < 0.6 * first
     assert end < 0.6 * first  # shaded: the light is learned from white in sixty steps
+
+
+def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_config) -> None:
+    objective = Objective(tiny_config, LightProbe(), None, None, torch.Generator().manual_seed(0))
+    drawn = torch.stack([objective._background() for _ in range(400)])
+    black = (drawn == 0).all(dim=1)
+    assert 0.4 < black.float().mean() < 0.6
+    deciles = linear_to_srgb(drawn[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
+    torch.testing.assert_close(deciles, torch.linspace(0.1, 0.9, 9), atol=0.06, rtol=0)
 
 
 def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:

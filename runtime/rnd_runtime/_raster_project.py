@@ -20,7 +20,7 @@ from .camera import Camera
 TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT  # pixels; a multiple of the 4×4 block that fills sixteen lanes
 NEAR = 0.1  # m, see raster_oracle
-DILATION = 0.1  # px², see raster_oracle
+DILATION = 0.05  # px², see raster_oracle
 FIELD_OF_VIEW_MARGIN = 0.3  # of half the field of view: gsplat's limit for x/z and y/z in the Jacobian
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)

@@ -60,9 +60,9 @@ class Raster:
 class Rasterizer(Protocol):
     """What every rasteriser of ours looks like: the oracle, the CPU kernel, GL.
 
-    The rule is 3DGS's (Kerbl et al. 2023) with a dilation of 0.1 px² instead of 0.3: EWA projection, α = min(0.99,
-    o·exp(−½ dᵀΣ⁻¹d)), α < 1/255 skipped, blending front to back by the camera depth of the means (ties by index), stop
-    before the Gaussian that would take the transmittance below 1e-4.
+    The rule is 3DGS's (Kerbl et al. 2023) with a dilation of 0.05 px² instead of 0.3: EWA projection,
+    α = min(0.99, o·exp(−½ dᵀΣ⁻¹d)), α < 1/255 skipped, blending front to back by the camera depth of the means
+    (ties by index), stop before the Gaussian that would take the transmittance below 1e-4.
     """
 
     def __call__(

@@ -18,9 +18,10 @@ Floats = NDArray[np.float64]
 # m: what lies nearer is not drawn. At 1 cm a Gaussian of 8 mm filled the picture; at 5 cm one of a sparse avatar still
 # covered half of it (the stability suite's G3); 3DGS draws nothing within 20 cm
 NEAR = 0.1
-# px² added to both variances: a pixel's low-pass filter. A pixel is a box of variance 1/12, for which Mip-Splatting (Yu
-# et al. 2024) takes 0.1. With 3DGS's 0.3 outlines are wider than a camera's, whatever is learned (docs/performance.md)
-DILATION = 0.1
+# px² added to both variances, so that little falls between pixels' centres. 3DGS has 0.3, Mip-Splatting (Yu et al.
+# 2024) 0.1, a pixel's box 1/12. It makes an opaque body wider, the more the smaller the picture is, whatever was
+# learned: docs/performance.md
+DILATION = 0.05
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 # 1e-4, less a hair: two Gaussians clamped at 0.99 leave 1e-4 exactly, which rounding must not decide
@@ -67,7 +68,7 @@ def projection_jacobians(points: Floats, camera: Camera) -> Floats:
 
 
 def image_covariances(means: ArrayLike, covariances: ArrayLike, camera: Camera) -> Floats:
-    """Σ' = J W Σ Wᵀ Jᵀ + 0.1·I, [N, 2, 2] px² (eq. 5 of Kerbl et al., with Mip-Splatting's dilation)."""
+    """Σ' = J W Σ Wᵀ Jᵀ + 0.05·I, [N, 2, 2] px² (eq. 5 of Kerbl et al., with our dilation)."""
     to_image = projection_jacobians(camera_points(means, camera), camera) @ camera.world_to_camera[:3, :3]
     return to_image @ symmetric(covariances) @ to_image.transpose(0, 2, 1) + DILATION * np.eye(2)
 

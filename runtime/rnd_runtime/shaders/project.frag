@@ -18,7 +18,7 @@ layout(location = 1) out vec4 shape;   // √fall_x, √fall_y, shear, –
 layout(location = 2) out vec4 drawn;   // mean m; 1, or −1 where nothing is drawn
 
 const float NEAR = 0.1;       // m
-const float DILATION = 0.1;   // px²
+const float DILATION = 0.05;  // px²
 const float LOG2_255 = 7.9943534368588578;
 const float HALF_LOG2_E = 0.72134752044448170;
 const float HUGE = 1e30;

@@ -3,7 +3,7 @@
 export const ROW_GAUSSIANS = 512, ROW_PAIRS = 2048, TILE = 4;
 export const TEXELS = 3;  // whole and broken part of the centre less ½; shear, fall_y, fall_x, peak; three attributes
 
-const NEAR = 0.1, DILATION = 0.1, MARGIN = 0.3, HALF_LOG2_E = 0.5 * Math.LOG2E, LOG2_255 = Math.log2(255);
+const NEAR = 0.1, DILATION = 0.05, MARGIN = 0.3, HALF_LOG2_E = 0.5 * Math.LOG2E, LOG2_255 = Math.log2(255);
 const HALF = 0.5 * (TILE - 1), LEAST = -LOG2_255 - 1e-3;  // no tile is lost to rounding
 const RADIX = 11, DIGITS = 1 << RADIX;
 
