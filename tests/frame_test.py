@@ -47,9 +47,8 @@ def _taken(motion, place, moved):
     return Motion(rotations, translations, motion.fps, motion.joint_names)
 
 
-@pytest.mark.parametrize(
-    ("side", "stouter"), [(256, 0.02), (128, 0.06)]
-)  # with 3DGS's dilation 0.06 and 0.17
+# with 3DGS's dilation 0.06 and 0.17
+@pytest.mark.parametrize(("side", "stouter"), [(256, 0.02), (128, 0.06)])
 def test_a_person_is_not_stouter_in_a_small_picture(avatar, motion, side, stouter):
     gaussians = avatar.pose(motion, 0.3)
     covered = []

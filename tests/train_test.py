@@ -15,6 +15,7 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
+from rnd_trainer.config import from_dict
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
@@ -49,6 +50,7 @@ def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_con
     assert 0.4 < black.float().mean() < 0.6
     deciles = linear_to_srgb(drawn[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
     torch.testing.assert_close(deciles, torch.linspace(0.1, 0.9, 9), atol=0.06, rtol=0)
+    assert from_dict({}).black_backgrounds == 0  # a configuration from before
 
 
 def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:

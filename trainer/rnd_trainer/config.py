@@ -177,9 +177,9 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     """Rebuild a configuration; an unknown field is an error.
 
     A missing one has the value it has today: a checkpoint from before a switch existed was trained without it. So the
-    third stage and the repulsion, which are on today, are off there.
+    third stage, the repulsion and the black backgrounds, which are on today, are off there.
     """
-    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0}
+    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0}
     return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
 
 

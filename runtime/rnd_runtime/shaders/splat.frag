@@ -4,7 +4,7 @@
 
 // Not u and v themselves: interpolated over a picture of 4096 pixels they lose a ten thousandth of a pixel, and Mesa 22 clips
 // `noperspective` varyings wrongly where an edge lies on the border (α 0.01 instead of 0.9).
-uniform vec2 size;  // px
+uniform vec2 size;     // px
 flat in vec3 centre;   // from the picture's middle px; log2 of the opacity
 flat in vec3 ellipse;  // see splat.vert
 flat in vec4 attributes[(ATTRIBUTES + 3) / 4];
