@@ -119,7 +119,7 @@ class TrainConfig:
 
     black_backgrounds: float = 0.5
     """share of the steps over black, where an outline drawn too wide shows most; the rest over random colours, which
-    what is opaque must hide. None: LPIPS 4 % higher, everything else within the spread of the seeds"""
+    what is opaque must hide. None: LPIPS 2 % higher, everything else within the spread of the seeds"""
 
     light_texels: int = 128
     """texels of the probe drawn for a step, by luminance × solid angle"""
