@@ -27,6 +27,14 @@ def test_unknown_rows_are_refused(capsys):
     assert "--rows: expected some of P1,P2" in capsys.readouterr().err
 
 
+def test_another_file_is_refused_before_anything_is_measured(tmp_path, capsys):
+    kept = tmp_path / "rows.json"
+    kept.write_text('[{"fps": 60}]')
+    assert stability_main(["--rows", "P1", "--json", str(kept)]) == 2
+    assert "--json: expected rows of rnd-bench --stability, got another file" in capsys.readouterr().err
+    assert kept.read_text() == '[{"fps": 60}]'
+
+
 def test_the_table_keeps_other_rows_and_replaces_its_own(tmp_path):
     options = StabilityOptions(json=tmp_path / "table.json")
     picture = np.full((4, 6, 3), 9, np.uint8)

@@ -19,7 +19,7 @@ from rnd_trainer import bench_cli, bench_frame, bench_grid, bench_peers, bench_s
 from rnd_trainer.bench_avatars import Encoders, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
-from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, read_rows, settings
+from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.checkpoint import load_checkpoint
 from tiny import ASSETS
@@ -118,7 +118,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     seen: list[bool] = []
     with pytest.raises(KeyboardInterrupt):
         grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
-    assert len(read_rows(out)) == 3 == len(seen)
+    assert len(json.loads(out.read_text())) == 3 == len(seen)
     calls.clear()
     monkeypatch.setattr(
         bench_grid, "measured", lambda s, i, **k: pretend(s, i) if calls.clear() is None else {}
@@ -130,7 +130,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     (tmp_path / "work" / "old_lit.npz").touch()
     grid(inputs, out, quick=True, fresh=True, on_row=lambda row, new: seen.append(new))
     assert all(seen) and len(seen) == len(settings(True)) and not [*(tmp_path / "work").glob("*.npz")]
-    assert {json.dumps(row, sort_keys=True) for row in read_rows(out)} == {
+    assert {json.dumps(row, sort_keys=True) for row in json.loads(out.read_text())} == {
         json.dumps(row, sort_keys=True) for row in rows
     }
 

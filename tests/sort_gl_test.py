@@ -188,3 +188,14 @@ def test_what_cannot_sort_says_so(context, monkeypatch):
         GlProjection(context, "device")
     with context, pytest.raises(InputError, match=r"sorting: expected auto \| cpu \| device, got 'gpu'"):
         GlProjection(context, "gpu")
+
+
+def test_a_driver_that_refuses_the_shaders_leaves_it_to_the_cpu(context, monkeypatch):
+    monkeypatch.setattr(projection_gl, "is_software", lambda _: False)
+    monkeypatch.setattr(sort_gl, "shader_source", lambda names: "no GLSL")
+    refused = r"sorting on the device: expected a driver that compiles depth_range\.comp, got \S"
+    with context, pytest.raises(InputError, match=refused) as caught:
+        GlProjection(context, "device")
+    assert "\n" not in str(caught.value)
+    with context:
+        GlProjection(context, "auto").release()

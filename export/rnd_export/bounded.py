@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import onnx
 from rich.console import Console
 
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, write_json
+from rnd_runtime.files import atomic_path, read_rows, write_json
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion
 from rnd_trainer.checkpoint import load_checkpoint
@@ -34,7 +32,11 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
     ((kind, value),) = given.items()
     if not value > 0:
         raise InputError("bound", expected="more than 0", got=value)
-    rows = [] if options.json is None else _read_rows(options.json)
+    rows = (
+        []
+        if options.json is None
+        else read_rows(options.json, what="rows of an earlier search", names=("bound",))
+    )
     started = perf_counter()
     probe = load_checkpoint(options.checkpoint).probe.numpy()
     light = Light(probe) if options.hdr is None else load_light(options.hdr)
@@ -67,16 +69,3 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
             "shade": scene.shade, "machine": machine(),
         }  # fmt: skip
         write_json(options.json, [*(old for old in rows if old["bound"] != row["bound"]), row])
-
-
-def _read_rows(path: Path) -> list[dict[str, Any]]:
-    """Rows of earlier searches; none where there is no file yet."""
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return []
-    except (OSError, ValueError):
-        rows = None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) and "bound" in row for row in rows):
-        raise InputError("--json", expected="rows of an earlier search", got="another file", file=path)
-    return rows

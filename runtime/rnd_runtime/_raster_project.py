@@ -16,12 +16,10 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from .camera import Camera
+from .raster_oracle import DILATION, FIELD_OF_VIEW_MARGIN, NEAR
 
 TILE_SHIFT = 4
 TILE = 1 << TILE_SHIFT  # pixels; a multiple of the 4×4 block that fills sixteen lanes
-NEAR = 0.1  # m, see raster_oracle
-DILATION = 0.05  # px², see raster_oracle
-FIELD_OF_VIEW_MARGIN = 0.3  # of half the field of view: gsplat's limit for x/z and y/z in the Jacobian
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
 LOG2_ALPHA_MIN = -math.log2(255.0)

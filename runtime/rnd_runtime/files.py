@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from .errors import InputError
 
@@ -39,6 +40,22 @@ def write_json(path: str | Path, value: object) -> None:
     """Write ``value`` under ``path``, indented, UTF-8."""
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def read_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows that an earlier run wrote by :func:`write_json`, to add more; none where there is no file yet.
+
+    Raises :class:`InputError` where the file is not ``what``: a list of objects that have all of ``names``.
+    """
+    try:
+        rows = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError):
+        rows = None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and {*names} <= set(row) for row in rows):
+        raise InputError("--json", expected=what, got="another file", file=path)
+    return rows
 
 
 def output_folder(path: str | Path) -> Path:

@@ -20,6 +20,7 @@ from .camera import Camera
 from .errors import InputError
 from .gl_context import is_software
 from .gl_passes import GaussianTargets, GaussianTexture, Pass
+from .raster_oracle import DILATION, NEAR
 from .sort_gl import DepthSort, can_sort
 from .surfaces_gl import Surfaces
 
@@ -46,7 +47,8 @@ class GlProjection:
 
     Args:
         context: where.
-        sorting: by the "cpu", by the "device", or by the device unless it is the CPU or lacks compute shaders ("auto").
+        sorting: by the "cpu", by the "device", or by the device unless it is the CPU or has no compute shaders that
+            its driver compiles ("auto").
 
     Raises:
         InputError: the device shall sort and cannot.
@@ -57,12 +59,9 @@ class GlProjection:
             raise InputError("sorting", expected=" | ".join(get_args(Sorting)), got=repr(sorting))
         self._context = context
         self._targets = GaussianTargets(context, (4, 4, 4))
-        self._pass = Pass(context, ("fill.vert",), ("project.frag",))
-        by_device = sorting == "device" or (
-            sorting == "auto" and can_sort(context) and not is_software(context)
-        )
-        self._sort = DepthSort(context) if by_device else None
-        self._order = None if by_device else GaussianTexture(context, 1, dtype="i4")
+        self._pass = Pass(context, ("fill.vert",), ("project.frag",), {"NEAR": NEAR, "DILATION": DILATION})
+        self._sort = _device_sort(context, sorting)
+        self._order = GaussianTexture(context, 1, dtype="i4") if self._sort is None else None
 
     def project(self, surfaces: Surfaces, camera: Camera, cull: float | None) -> Projected:
         """All of ``surfaces`` that can be seen, but those whose n·v is below ``cull``."""
@@ -94,6 +93,18 @@ class GlProjection:
         for part in (self._targets, self._pass, self._sort, self._order):
             if part is not None:
                 part.release()
+
+
+def _device_sort(context: moderngl.Context, sorting: Sorting) -> DepthSort | None:
+    """Compute shaders that sort, where they are asked for, or are there and worth it; None: the CPU sorts."""
+    if sorting == "cpu" or (sorting == "auto" and (is_software(context) or not can_sort(context))):
+        return None
+    try:
+        return DepthSort(context)
+    except InputError:  # the driver promises compute shaders and does not compile these
+        if sorting == "device":
+            raise
+        return None
 
 
 @njit(error_model="numpy", nogil=True, cache=True)

@@ -92,7 +92,7 @@ def drawn(
 ) -> NDArray[np.bool_]:
     """Which Gaussians are drawn at all [N].
 
-    All numbers finite, at least 0.05 m in front of the camera, opacity at least 1/255, a covariance that is
+    All numbers finite, at least NEAR in front of the camera, opacity at least 1/255, a covariance that is
     not zero and whose projection is positive definite.
     """
     rows = [np.asarray(array, np.float64) for array in (means, covariances, features)]

@@ -30,7 +30,7 @@ class DepthSort:
     """Orders Gaussians back to front; the context must be current whenever it is used.
 
     Raises:
-        InputError: the context has no compute shaders.
+        InputError: the context has no compute shaders, or its driver does not compile ours.
     """
 
     def __init__(self, context: moderngl.Context) -> None:
@@ -121,4 +121,11 @@ def _program(
     head = shader_head(
         {"ROW_GAUSSIANS": ROW_GAUSSIANS, "BLOCK": _BLOCK, **(macros or {})}, version=COMPUTE_VERSION
     )
-    return context.compute_shader(head + shader_source(names))
+    try:
+        return context.compute_shader(head + shader_source(names))
+    except moderngl.Error as error:
+        raise InputError(
+            "sorting on the device",
+            expected=f"a driver that compiles {names[-1]}",
+            got=" ".join(str(error).split()),
+        ) from error

@@ -6,7 +6,6 @@ interrupted run goes on where it stopped.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -16,7 +15,7 @@ from typing import Any
 from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import existing_file, output_folder, write_json
+from rnd_runtime.files import existing_file, output_folder, read_rows, write_json
 
 from .bench_avatars import Encoders, exported, seeded_checkpoint
 from .bench_frame import Point, measure
@@ -143,7 +142,8 @@ def grid(
     if fresh:
         for kept in inputs.work.glob("*.npz"):  # references
             kept.unlink()
-    wanted, rows = settings(quick), read_rows(out) if out.exists() and not fresh else []
+    rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("n", "machine"))
+    wanted = settings(quick)
     here = {_key(row): row for row in rows if row["machine"] == machine()}
     done: list[Row] = []
     for setting in wanted:
@@ -158,15 +158,6 @@ def grid(
         on_row(row, new)
         write_json(out, [*{_key(r): r for r in (*rows, *done)}.values()])
     return done
-
-
-def read_rows(file: Path) -> list[Row]:
-    """Rows of an earlier run."""
-    try:
-        rows = json.loads(file.read_text("utf-8"))
-        return [row for row in rows if {"n", "machine"} <= set(row)]
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError("not rows of rnd-bench", got=error, file=file) from error
 
 
 def pareto(rows: list[Row], cost: str = "ms_median", worth: str = "psnr_db") -> Iterator[Row]:

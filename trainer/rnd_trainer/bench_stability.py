@@ -5,7 +5,6 @@ Rows that were measured before stay in the file until they are measured again, s
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, run_command
-from rnd_runtime.files import atomic_path, write_json
+from rnd_runtime.files import atomic_path, read_rows, write_json
 
 from .eval_cli import need_extra
 
@@ -77,6 +76,7 @@ def _stability(options: StabilityOptions) -> None:
     wanted = known if options.rows == "all" else [] if options.rows == "none" else options.rows.split(",")
     if unknown := set(wanted) - set(known):
         raise InputError("--rows", expected=f"some of {','.join(known)}", got=",".join(sorted(unknown)))
+    _rows(options)  # before hours go by, not after the first row
     console = Console()
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
@@ -161,16 +161,17 @@ def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[st
         yield "D", "determinism", same_bytes(subject).figures
 
 
+def _rows(options: StabilityOptions) -> list[dict[str, Any]]:
+    return read_rows(options.json, what="rows of rnd-bench --stability", names=("id", "what"))
+
+
 def _keep(
     options: StabilityOptions, name: str, failure: str, figures: Sequence[Figure], result: Result | None
 ) -> None:
     """Replace the row's figures in the JSON, write the table again, and the pictures."""
     from rnd_runtime.images import write_image
 
-    rows: list[dict[str, Any]] = []
-    if options.json.exists():
-        rows = json.loads(options.json.read_text(encoding="utf-8"))
-    rows = [row for row in rows if row["id"] != name]
+    rows = [row for row in _rows(options) if row["id"] != name]
     rows += [
         {
             "id": name, "failure": failure, "what": figure.what, "measured": figure.measured, "unit": figure.unit,

@@ -1,4 +1,5 @@
-// _raster_project.py in float32: the ellipse of one Gaussian in the picture, as splat.vert reads it.
+// _raster_project.py in float32: the ellipse of one Gaussian in the picture, as splat.vert reads it. NEAR m and
+// DILATION px² come from raster_oracle.py.
 
 uniform sampler2D points;         // mean m, world; –
 uniform sampler2D normals;        // unit, world; opacity
@@ -17,8 +18,6 @@ layout(location = 0) out vec4 place;   // centre from the picture's middle px; r
 layout(location = 1) out vec4 shape;   // √fall_x, √fall_y, shear, –
 layout(location = 2) out vec4 drawn;   // mean m; 1, or −1 where nothing is drawn
 
-const float NEAR = 0.1;       // m
-const float DILATION = 0.05;  // px²
 const float LOG2_255 = 7.9943534368588578;
 const float HALF_LOG2_E = 0.72134752044448170;
 const float HUGE = 1e30;
