@@ -417,6 +417,10 @@ def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
             "--sh-degree: expected 0 for visionary, got 1",
         ),
         (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--camera", "above"], "--camera"),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--exposure", "2000"],
+            "--exposure: expected -30 to 30, got 2000",
+        ),
         (["splats", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz: not a readable ONNX model"),
         (["mesh", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz"),
         (["motion", "none.onnx", "--motion", WALK, "--out", "OUT"], "none.onnx: avatar or body not found"),

@@ -545,6 +545,7 @@ def test_a_joint_map_renames_named_arrays_too(tmp_path):
 
 
 BROKEN_BVH = {
+    "cut in channels": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 3 Xrotation Yrotation",
     "empty": "", "no motion": "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\n",
     "text": "HIERARCHY\nROOT a\n{\nOFFSET x 0 0\n", "other": "hello world",
     "short": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 3 Frame Time: 0.03 1 2",
@@ -639,6 +640,20 @@ def test_acclaim_is_the_same_motion(tmp_path):
     assert_allclose(motion.rotations, MATRICES, atol=TEXT)
     assert_allclose(np.diff(motion.translations, axis=0), np.diff(PELVIS, axis=0), atol=METRES)
     assert load_motion(tmp_path / "02_01.amc", SKELETON, fps=60).notes == ()
+
+
+def test_acclaim_bones_keep_their_lengths(tmp_path):
+    file = _acclaim(tmp_path)
+    skeleton = tmp_path / "02.asf"
+    before = skeleton.read_text()
+    at = before.index("name lfemur")
+    skeleton.write_text(before[:at] + before[at:].replace("dof rx ry rz", "dof rx ry rz l", 1))
+    lines = [line + " 1.5" if line.startswith("lfemur ") else line for line in file.read_text().splitlines()]
+    file.write_text("\n".join(lines) + "\n")
+    assert_allclose(load_motion(file, SKELETON).rotations, MATRICES, atol=TEXT)
+    skeleton.write_text(before[:at] + before[at:].replace("dof rx ry rz", "dof rx ry rq", 1))
+    with pytest.raises(InputError, match=r"02\.asf: skeleton: .* freedom rq of lfemur"):
+        load_motion(file, SKELETON)
 
 
 def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):

@@ -169,6 +169,13 @@ def test_a_curve_goes_through_the_points():
         ("config.json", None, "config.json: config.json of rnd-train not found"),
         ("eval.json", "{", "eval.json: not JSON"),
         ("metrics.jsonl", '{"step": 0', "metrics.jsonl: not JSON lines"),
+        ("metrics.jsonl", "3", "metrics.jsonl: expected a step in every line"),
+        ("config.json", "[]", "config.json of rnd-train: expected an object"),
+        (
+            "eval.json",
+            '{"summary": [], "rows": []}',
+            "eval.json: expected rows of rnd-eval",
+        ),  # of an ablation
         ("avatar.onnx", "onnx", "avatar.onnx: not a readable ONNX model"),
     ],
 )

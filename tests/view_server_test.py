@@ -21,12 +21,15 @@ from websockets.sync.client import connect
 
 import rnd_viewer.view_scene
 from play_fakes import FakeAvatar, fake_motion
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_viewer.background import Background
 from rnd_viewer.cameras import View, frame_motion, front_path
@@ -34,13 +37,14 @@ from rnd_viewer.options import frame_count
 from rnd_viewer.player import Player
 from rnd_viewer.view_cli import main
 from rnd_viewer.view_options import ViewOptions
-from rnd_viewer.view_scene import Scene
+from rnd_viewer.view_scene import Scene, _fewer
 from rnd_viewer.view_server import serve
 from tiny import ASSETS
 from view_process import running
 
 SIZE = 64
 FRAMES = 6
+LEAST_OVERLAP = 0.85  # of a body's outline with that of an eighth of its Gaussians: limbs grow stouter
 # JPEG of quality 90 halves the chroma: dark and light neighbours of different colours differ by this many levels.
 JPEG_MEAN_ERROR = 4
 
@@ -152,6 +156,23 @@ def test_every_output_fewer_gaussians_and_jpeg(options):
         assert half.any() and (half != pictures["lit"]).any()
         smooth = visitor.picture(encoding="jpeg")
         assert np.abs(smooth.astype(int) - pictures["lit"]).mean() < JPEG_MEAN_ERROR
+
+
+def test_fewer_gaussians_are_of_the_whole_body():
+    avatar = Avatar.load(ASSETS / "avatar.onnx")
+    posed = avatar.pose(load_motion(ASSETS / "walk.npz", avatar.skeleton), 0.3)
+    low, high = posed.means.min(0), posed.means.max(0)
+    camera = Camera.look_at((low + high) / 2 + [0, 0, 3], (low + high) / 2, width=96, height=128, fov_y=0.75)
+
+    def covered(gaussians):
+        colour = np.ones((len(gaussians.means), 1), np.float32)
+        return (
+            rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, colour, camera).alpha > 0.5
+        )
+
+    whole, few = covered(posed), covered(_fewer(posed, len(posed.means) // 8))
+    assert whole.sum() > 500 and (whole & few).sum() / (whole | few).sum() > LEAST_OVERLAP
+    assert _fewer(posed, None) is posed
 
 
 def test_the_clip_has_every_frame(options):

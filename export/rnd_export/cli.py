@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from rnd_runtime.avatar import EncoderKind, Precision
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, run_command
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,7 @@ def _export(options: Options) -> None:
     from rnd_trainer.checkpoint import load_checkpoint
 
     out = options.out or options.checkpoint.with_suffix(".onnx")
-    if options.frames < 1:
-        raise InputError("--frames", expected="at least 1", got=options.frames)
+    check_option(options.frames >= 2, "--frames", "at least 2", options.frames)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     _refuse_idle(options, bounded=bool(given))

@@ -61,6 +61,12 @@ class InputError(Exception):
         )
 
 
+def check_option(good: bool, name: str, expected: str, got: object) -> None:
+    """Raise :class:`InputError` for the option ``name`` unless it is ``good``."""
+    if not good:
+        raise InputError(name, expected=expected, got=got)
+
+
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write ``value`` under ``path``, indented, UTF-8."""
+    """Write ``value`` under ``path``, indented, UTF-8; what is no number in JSON (NaN, infinity) as null."""
+    text = json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _finite(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -76,11 +86,13 @@ def is_folder(path: str | Path) -> bool:
 
 
 def existing_file(path: str | Path, *, what: str) -> Path:
-    """Return ``path`` if it is a file, else raise :class:`InputError` naming ``what`` it should have been."""
+    """``path`` if it is a file that may be read; else an :class:`InputError` names ``what`` it should have been."""
     path = Path(path)
     try:
         if not path.is_file():
             raise InputError(f"{what} not found", got="a folder" if path.is_dir() else None, file=path)
     except OSError as error:  # a name that is too long, a folder that may not be entered
         raise InputError(f"{what} not found", got=error.strerror, file=str(path)[:200]) from error
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{what} cannot be read", got="no permission", file=path)
     return path

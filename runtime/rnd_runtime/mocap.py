@@ -133,7 +133,8 @@ def _bvh_hierarchy(words: Iterator[str]) -> list[_Joint]:
             else:
                 joints[open_joints[-2]].tip = offset
         elif word == "CHANNELS" and open_joints:
-            names = tuple(next(words).capitalize() for _ in range(int(next(words))))
+            # a list first: in a generator the end of the file would be another error
+            names = tuple([next(words).capitalize() for _ in range(int(next(words)))])
             known = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
             if not set(names) <= known:
                 raise InputError("channels", expected=", ".join(sorted(known)), got=", ".join(names))
@@ -186,6 +187,8 @@ def read_acclaim(path: str | Path) -> MocapTree:
         values = np.array([frame.get(bone.name, [0.0] * len(bone.freedoms)) for frame in frames])
         turn = np.tile(np.eye(3), (len(frames), 1, 1))
         for column, freedom in enumerate(bone.freedoms):
+            if freedom == "l":  # bones keep their lengths
+                continue
             axis = "xyz".index(freedom[1])
             if freedom[0] == "r":
                 angle = np.radians(values[:, column]) if degrees else values[:, column]
@@ -224,6 +227,9 @@ def _asf_beside(path: Path) -> Path:
     raise InputError("skeleton of the AMC", expected=f"{path.stem}.asf beside it", got=got, file=path)
 
 
+_FREEDOMS = {"rx", "ry", "rz", "tx", "ty", "tz", "l"}
+
+
 def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
     """Bones with parents first, and whether angles are in degrees."""
     sections: dict[str, list[list[str]]] = {}
@@ -253,6 +259,9 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
             bone.axes = _axes([float(word) for word in rest[:3]], rest[3], degrees)
         elif key == "dof":
             bone.freedoms = tuple(word.lower() for word in rest)
+    for bone in bones.values():
+        if wrong := set(bone.freedoms) - _FREEDOMS:
+            raise ValueError(f"freedom {min(wrong)} of {bone.name}")
     ordered = [root]
     for words in sections["hierarchy"]:
         if words and words[0] in bones and words[0] not in ("begin", "end"):

@@ -1,4 +1,4 @@
-"""The array layouts motions come in, read into one record in the file's own axes (FORMATS.md section 3.9)."""
+"""The array layouts motions come in, read into one record in the file's own axes."""
 
 from __future__ import annotations
 

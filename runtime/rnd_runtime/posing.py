@@ -80,7 +80,8 @@ class RestPose:
         points: [N, 3] m, x_c.
         factors: [N, 9] m, R S row by row.
         normals: [N, 3] unit.
-        limbs: [N, 7] the limb's axis (unit), the lever from it to the point (m), and the share of a limb (0…1).
+        limbs: [N, 7] the limb's axis (unit), the lever from it to the point (m, times the share), and the
+            share of a limb (0…1).
         max_offset: m. floor: m², added to variances. fallback: share of A_R in a normal.
     """
 

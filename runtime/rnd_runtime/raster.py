@@ -60,8 +60,8 @@ class ChosenRasterizer:
 def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> ChosenRasterizer:
     """Make the rasteriser ``kind``.
 
-    "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too, which
-    takes three times as long there. "gl-egl" and "gl-osmesa" name the backend, "gl" leaves it to ``gl_backend``.
+    "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too,
+    five to seven times as slowly. "gl-egl" and "gl-osmesa" name the backend, "gl" leaves it to ``gl_backend``.
 
     Raises:
         InputError: "gl" and no OpenGL, or no such kind.

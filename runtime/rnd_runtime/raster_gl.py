@@ -224,7 +224,7 @@ def splat_pass(context: moderngl.Context, attributes: int, *, lit: bool = False)
 
 
 class Ellipses(NamedTuple):
-    """Projected Gaussians; see :class:`rnd_runtime._raster_project.Splats` for the rows."""
+    """Projected Gaussians; see :class:`rnd_runtime._raster_tiles.Splats` for the rows."""
 
     order: NDArray[np.int32]  # [V] of those drawn, front to back
     centers: NDArray[np.float64]

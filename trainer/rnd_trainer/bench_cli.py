@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, run_command
 from rnd_runtime.files import write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
@@ -95,7 +95,9 @@ def _grid(options: Grid) -> None:
 
     from .bench_chart import draw_chart
     from .bench_grid import grid
+    from .charts import check_chart
 
+    check_chart(*options.chart)
     console = Console()
 
     def show(row: dict[str, Any], new: bool) -> None:
@@ -200,6 +202,12 @@ def _prepare(options: Any, *counts: str) -> None:
     for name in counts:
         if getattr(options, name) < 1:
             raise InputError(f"--{name}", expected="at least 1", got=getattr(options, name))
+    threads = getattr(options, "threads", None)
+    if threads is not None:
+        import numba
+
+        most = numba.config.NUMBA_NUM_THREADS
+        check_option(1 <= threads <= most, "--threads", f"1 to {most}", threads)
 
 
 def _inputs(files: Files) -> Any:

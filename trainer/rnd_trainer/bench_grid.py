@@ -142,7 +142,7 @@ def grid(
     if fresh:
         for kept in inputs.work.glob("*.npz"):  # references
             kept.unlink()
-    rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("n", "machine"))
+    rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
     wanted = settings(quick)
     here = {_key(row): row for row in rows if row["machine"] == machine()}
     done: list[Row] = []

@@ -13,6 +13,13 @@ from rnd_runtime.files import atomic_path
 Row = dict[str, Any]
 
 
+def check_chart(*files: Path) -> None:
+    """Raise :class:`InputError` unless all ``files`` are charts by their suffix."""
+    for file in files:
+        if file.suffix not in (".svg", ".png"):
+            raise InputError("--chart", expected=".svg or .png", got=file.name)
+
+
 @contextmanager
 def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
     """A matplotlib figure of ``size`` inches, written to every file, SVG or PNG by its suffix, when the block ends.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, run_command
 from rnd_runtime.files import output_folder, write_json
 
 from .eval_cli import EvalOptions, evaluate_run, need_extra
@@ -81,7 +81,7 @@ def _train(options: TrainOptions) -> None:
     need_extra()
     from rnd_runtime.capture import load_capture
 
-    from .config import preset, resized, to_dict
+    from .config import check_sizes, preset, resized, to_dict
     from .live_view import live_view
     from .perceptual import load_perceptual
     from .train import Training, run
@@ -100,10 +100,9 @@ def _train(options: TrainOptions) -> None:
         image_scale=config.image_scale if options.image_scale is None else options.image_scale,
         save_every=config.save_every if options.save_every is None else options.save_every,
     )
-    _check(config.steps >= 1, "--steps", "at least 1", config.steps)
-    _check(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
-    _check(0 < config.image_scale <= 1, "--image-scale", "more than 0, at most 1", config.image_scale)
-    _check(64 <= model.gaussians <= 1_000_000, "--gaussians", "64 to 1000000", model.gaussians)
+    check_option(options.seed >= 0, "--seed", "at least 0", options.seed)
+    check_sizes(config)
+    check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
 
     capture = load_capture(options.capture, motion_file=options.motion)
     folder = output_folder(options.out)
@@ -203,8 +202,3 @@ def _score_after_training(training: Training, folder: Path, options: TrainOption
     if any(training.capture.split(split) for split in HELD_OUT):
         scoring = EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
         evaluate_run(dataclasses.replace(scoring, perceptual_weights=options.perceptual_weights))
-
-
-def _check(good: bool, what: str, expected: str, got: object) -> None:
-    if not good:
-        raise InputError(what, expected=expected, got=got)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, check_option
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,14 @@ def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> Tr
     if gaussians is not None:
         model = dataclasses.replace(model, gaussians=gaussians, nodes=max(16, gaussians // 4))
     return dataclasses.replace(config, model=model, steps=config.steps if steps is None else steps)
+
+
+def check_sizes(config: TrainConfig) -> None:
+    """Raise :class:`InputError`, naming the option, where a training cannot be of that size."""
+    gaussians, scale = config.model.gaussians, config.image_scale
+    check_option(config.steps >= 1, "--steps", "at least 1", config.steps)
+    check_option(0 < scale <= 1, "--image-scale", "more than 0, at most 1", scale)
+    check_option(64 <= gaussians <= 1_000_000, "--gaussians", "64 to 1000000", gaussians)
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:

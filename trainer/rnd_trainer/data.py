@@ -18,7 +18,7 @@ from rnd_runtime.skeleton import Skeleton, bone_transforms
 from rnd_runtime.window import motion_window
 
 from .config import ModelConfig
-from .metrics import mask_box
+from .metrics import SSIM_WINDOW, mask_box
 from .model import PoseInput
 
 CROP_MARGIN = 16
@@ -78,6 +78,11 @@ def load_views(
             continue
         normal = data.normal_gt if true_normals else data.normal
         camera = capture.cameras[frame.camera]
+        if min(camera.width, camera.height) * scale < SSIM_WINDOW:
+            raise InputError(
+                "training pictures", expected=f"at least {SSIM_WINDOW} pixels wide and high",
+                got=f"{camera.width} x {camera.height}, times {scale:g}", file=capture.folder, frame=frame.frame,
+            )  # fmt: skip
         views.append(_crop(frame, camera, data.image_srgb, data.mask, normal, scale))
     if len(bad) > MAX_BAD_MASKS * len(frames):
         raise InputError(
@@ -91,10 +96,7 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
     if scale != 1.0:
         image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
     rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
-    rows, columns = (
-        slice(rows.start, min(rows.stop, camera.height)),
-        slice(columns.start, min(columns.stop, camera.width)),
-    )
+    rows, columns = _widened(rows, camera.height), _widened(columns, camera.width)
     K = camera.K.copy()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
@@ -106,6 +108,12 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
         np.round(mask[rows, columns] * 255).astype(np.uint8),
         None if normal is None else np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8),
     )
+
+
+def _widened(span: slice, size: int) -> slice:
+    """``span`` within 0 … ``size``, and as wide as the structural term's window: of a person there may be a sliver."""
+    start = max(min(span.start, size - SSIM_WINDOW), 0)
+    return slice(start, min(max(span.stop, start + SSIM_WINDOW), size))
 
 
 def _shrink(image, mask, normal, camera: Camera, scale: float):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, run_command
 from rnd_runtime.files import is_folder, write_json
 
 if TYPE_CHECKING:
@@ -161,12 +161,16 @@ def ablate_run(options: EvalOptions) -> None:
     from rnd_runtime.capture import load_capture
 
     from .ablate import STUDIES, ablate, chosen, summarise, time_encoders
-    from .charts import draw_lengths
-    from .config import preset, resized
+    from .charts import check_chart, draw_lengths
+    from .config import check_sizes, preset, resized
 
     variants = chosen(STUDIES[options.study], options.variants)
     config = resized(preset(options.preset), options.gaussians, options.steps)
     config = dataclasses.replace(config, image_scale=options.image_scale)
+    if options.chart is not None:
+        check_chart(options.chart)
+    check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
+    check_sizes(config)
     capture = load_capture(options.capture, motion_file=options.motion)
     perceptual = _perceptual(options.perceptual_weights)
     console = Console(stderr=True)

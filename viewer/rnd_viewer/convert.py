@@ -24,7 +24,7 @@ from rnd_runtime.skeleton import Skeleton
 from .cameras import CameraPath, View, file_path, frame_motion, front_path
 from .convert_cli import MeshOptions, MotionOptions, Options, SplatOptions
 from .mesh_files import posed_vertices, write_obj, write_rigged_glb
-from .options import parse_frames
+from .options import parse_frames, refuse_outside
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
 from .splats import Splats, fixed_colour, make_splats, stored_colours, turned_over, view_dependent_colour
 from .visionary import check_clip, write_visionary
@@ -144,6 +144,7 @@ def _motion(options: MotionOptions) -> Iterator[str]:
 
 
 def _light(options: SplatOptions, avatar: Avatar) -> Light:
+    refuse_outside(options, {"exposure": (-30, 30), "hdr_yaw": (-1e6, 1e6)})
     yaw = math.radians(options.hdr_yaw)
     if options.hdr is None:
         return Light(avatar.trained_light).scaled(2.0**options.exposure).turned(yaw)

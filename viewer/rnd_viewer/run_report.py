@@ -61,7 +61,11 @@ def write_run_report(
         InputError: ``run`` holds no training, or a file of it is damaged.
     """
     config = _json(existing_file(run / "config.json", what="config.json of rnd-train"))
-    rows = _json(run / "eval.json") if (run / "eval.json").is_file() else []
+    if not isinstance(config, dict):
+        raise InputError(
+            "config.json of rnd-train", expected="an object", got="another", file=run / "config.json"
+        )
+    rows = _rows(run / "eval.json", "rows of rnd-eval", "split") if (run / "eval.json").is_file() else []
     name = run.resolve().name
     read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(run / "metrics.jsonl", config)]
     read += [
@@ -180,7 +184,8 @@ def _bench(folder: Path | None) -> str:
     parts = [f'<img class="chart" alt="{escape(name)}" src="{chart}">' for name, chart in charts]
     stability = folder / "stability.json"
     if stability.is_file():
-        parts.append("<h3>Stability</h3>" + rows_table(_json(stability)))
+        rows = _rows(stability, "rows of rnd-bench --stability", "id", "what")
+        parts.append("<h3>Stability</h3>" + rows_table(rows))
     if not parts:
         return _missing("Speed, accuracy, stability", f"neither *.svg nor stability.json in {folder}")
     return "<h2>Speed, accuracy, stability</h2>" + "".join(parts)
@@ -206,8 +211,19 @@ def _json(path: Path) -> Any:
         raise InputError("not JSON", got=error, file=path) from error
 
 
+def _rows(path: Path, what: str, *names: str) -> list[dict[str, Any]]:
+    return _checked(_json(path), path, what, *names)
+
+
 def _json_lines(path: Path) -> list[dict[str, Any]]:
     try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError("not JSON lines", got=error, file=path) from error
+    return _checked(rows, path, "a step in every line", "step")
+
+
+def _checked(rows: Any, path: Path, what: str, *names: str) -> list[dict[str, Any]]:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and {*names} <= set(row) for row in rows):
+        raise InputError(path.name, expected=what, got="something else", file=path)
+    return rows

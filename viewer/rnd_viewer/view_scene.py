@@ -243,18 +243,19 @@ class Scene:
 
 
 def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
-    """The first ``count``, which lie evenly over the body (farthest first), grown to cover the same area."""
+    """``count`` at even steps through the file, whose neighbours are the body's, grown to cover the same area."""
     total = len(gaussians.means)
     if count is None or count >= total:
         return gaussians
+    kept = np.arange(count) * total // count
     return Gaussians(
-        gaussians.means[:count],
-        gaussians.covariances[:count] * np.float32(total / count),
-        gaussians.opacities[:count],
-        gaussians.normals[:count],
-        gaussians.albedo[:count],
-        gaussians.roughness[:count],
-        gaussians.visibility[:count],
+        gaussians.means[kept],
+        gaussians.covariances[kept] * np.float32(total / count),
+        gaussians.opacities[kept],
+        gaussians.normals[kept],
+        gaussians.albedo[kept],
+        gaussians.roughness[kept],
+        gaussians.visibility[kept],
         gaussians.root_rotation,
     )
 

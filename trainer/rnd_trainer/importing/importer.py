@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, check_option
 
 from . import (
     arah,
@@ -102,6 +103,7 @@ def import_source(
     Raises:
         InputError: with the file and, where there is one, the frame.
     """
+    _check_numbers(options)
     layout, found = find_layout(source, options.layout)
     on_found(f"{layout}: {found}")
     if (out / "capture.json").exists():
@@ -129,6 +131,14 @@ def import_source(
     )  # fmt: skip
     write_capture(out, recording, scene, shots, on_shot, normal_axes=axes)
     return scene
+
+
+def _check_numbers(options: ImportOptions) -> None:
+    choice = options.choice
+    check_option(choice.every >= 1, "--every", "at least 1", choice.every)
+    check_option(choice.held_out_every >= 1, "--held-out-every", "at least 1", choice.held_out_every)
+    if options.fps is not None:
+        check_option(0 < options.fps < math.inf, "--fps", "more than 0", options.fps)
 
 
 def _refuse_unused(layout: str, options: ImportOptions) -> None:

@@ -50,7 +50,10 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     names: dict[bytes, str] = {}
     seen: dict[str, int] = {}
     shots = []
-    for entry in record["frames"]:
+    entries = record["frames"]
+    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise InputError("frames", expected="a list of at least one frame", got=repr(entries)[:60], file=file)
+    for entry in entries:
         picture = _picture(file.parent, entry.get("file_path"), file)
         lens, key = _lens({**record, **entry}, picture, file)
         name = names.setdefault(key, f"{len(names):04d}")
@@ -60,7 +63,7 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
         mask = entry.get("mask_path")
         read_it = partial(read_mask, file.parent / mask) if mask else _alpha(picture)
         shots.append(Shot(name, number, partial(read_rgb, picture), read_it))
-    if len(names) == len(shots) > 1 and not any("time_index" in e or "frame" in e for e in record["frames"]):
+    if len(names) == len(shots) > 1 and not any("time_index" in e or "frame" in e for e in entries):
         shots = [Shot(s.camera, k, s.image, s.mask) for k, s in enumerate(shots)]  # one camera that moves
     pose_file = poses or next((file.parent / name for name in _POSES if (file.parent / name).is_file()), None)
     if pose_file is None:

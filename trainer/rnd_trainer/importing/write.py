@@ -133,7 +133,8 @@ def write_capture(
 ) -> None:
     """Write ``shots`` of a straightened ``recording``, placed as ``scene``, as a capture into ``folder``.
 
-    ``normal_axes`` [3, 3] is how the user's normals were turned; :func:`check.check_capture` reasons from there.
+    ``normal_axes`` [3, 3] is how the user's normals were turned, from where
+    :func:`rnd_trainer.checking.check.check_capture` reasons.
     """
     output_folder(folder)
     first = int(recording.poses.frames[0])

@@ -39,6 +39,8 @@ def read(source: Path) -> Recording:
     if not isinstance(annots, dict) or not {"cams", "ims"} <= annots.keys():
         raise InputError("annots.npy", expected="a dict with cams and ims", file=source / "annots.npy")
     cams = annots["cams"]
+    if not isinstance(cams, dict) or not set("KRTD") <= cams.keys():
+        raise InputError("annots.npy", expected="cams with K, R, T and D", file=source / "annots.npy")
     params = _params_folder(source)
     rows = [[str(name) for name in row["ims"]] for row in annots["ims"]]
     names = [_camera_name(name) for name in rows[0]]

@@ -63,6 +63,8 @@ class Recipe:
             if getattr(self, name) < least:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}", expected=f"at least {least}", got=getattr(self, name))
+        if self.estimate_seed < 0:
+            raise InputError("--estimate-seed", expected="at least 0", got=self.estimate_seed)
         if self.step is not None and not 1e-3 <= self.step <= 0.03:
             raise InputError("--step", expected="0.001 to 0.03 m", got=self.step)
         if not 0 <= self.estimate_strength <= 10:

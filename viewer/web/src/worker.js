@@ -56,7 +56,7 @@ async function render({ number, state }) {
   if (!posed || posed.time !== state.time) posed = { time: state.time, gaussians: await avatar.pose(motion, state.time) };
   clock("encoders");
   const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
-  const grown = avatar.gaussians / count, { gaussians } = posed, beside = inFrame(camera, gaussians.root);
+  const grown = avatar.gaussians / count, gaussians = fewer(posed.gaussians, count), beside = inFrame(camera, gaussians.root);
   const features = state.output === "lit" || state.output === "light"
     ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
@@ -68,6 +68,20 @@ async function render({ number, state }) {
   const joints = projectJoints(gaussians.joints, camera);
   const answer = { kind: "picture", number, width: state.width, height: state.height, image, joints, times: clock.times };
   postMessage(answer, [image]);
+}
+
+/** `count` Gaussians at even steps through the file, whose neighbours are the body's. */
+function fewer(gaussians, count) {
+  const total = gaussians.count, kept = { ...gaussians, count };
+  if (count === total) return gaussians;
+  for (const name of ["means", "covariances", "normals", "visibility", "opacities", "albedo", "roughness"]) {
+    const all = gaussians[name], width = all.length / total, some = kept[name] = new Float32Array(width * count);
+    for (let i = 0; i < count; i++) {
+      const from = width * Math.floor(i * total / count);
+      some.set(all.subarray(from, from + width), width * i);
+    }
+  }
+  return kept;
 }
 
 function radianceOf(state, gaussians, count, eye, grown) {

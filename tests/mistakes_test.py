@@ -1,0 +1,107 @@
+"""Options and files that a command cannot use: one line that names them, exit code 2, and nothing is begun."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rnd_export.cli
+import rnd_trainer.bench_cli
+import rnd_trainer.cli
+import rnd_trainer.data_cli
+import rnd_trainer.eval_cli
+import rnd_trainer.stage.cli
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import existing_file, write_json
+from rnd_trainer.data import load_views
+
+ASSETS = Path(__file__).parent.parent / "assets"
+CAPTURE = str(ASSETS / "capture")
+COMMANDS = {
+    "rnd-train": rnd_trainer.cli.main,
+    "rnd-eval": rnd_trainer.eval_cli.main,
+    "rnd-export": rnd_export.cli.main,
+    "rnd-bench": rnd_trainer.bench_cli.main,
+    "rnd-data": rnd_trainer.data_cli.main,
+    "rnd-stage": rnd_trainer.stage.cli.main,
+}
+IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (f"rnd-train {CAPTURE} --out OUT --seed -1", "--seed: expected at least 0, got -1"),
+        (f"rnd-train {CAPTURE} --out OUT --steps 0", "--steps: expected at least 1, got 0"),
+        (
+            f"rnd-train {CAPTURE} --out OUT --image-scale 0",
+            "--image-scale: expected more than 0, at most 1, got 0",
+        ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 0", "--seeds: expected at least 1, got 0"),
+        (
+            f"rnd-eval OUT {CAPTURE} --ablate --image-scale 2",
+            "--image-scale: expected more than 0, at most 1",
+        ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8", "--gaussians: expected 64 to 1000000, got 8"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --chart x.txt", "--chart: expected .svg or .png, got x.txt"),
+        ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
+        ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
+        ("rnd-bench peers --threads 999", "--threads: expected 1 to "),
+        (
+            "rnd-bench --quick --json OUT/grid.json --chart chart.pdf",
+            "--chart: expected .svg or .png, got chart.pdf",
+        ),
+        (f"{IMPORT} --every 0", "--every: expected at least 1, got 0"),
+        (f"{IMPORT} --held-out-every 0", "--held-out-every: expected at least 1, got 0"),
+        (f"{IMPORT} --fps 0", "--fps: expected more than 0, got 0"),
+        ("rnd-stage OUT --estimate-seed -1", "--estimate-seed: expected at least 0, got -1"),
+    ],
+)
+def test_numbers_that_no_command_can_use(line, message, tmp_path, monkeypatch, capsys) -> None:
+    command, *words = line.replace("OUT", str(tmp_path / "out")).split()
+    monkeypatch.setattr("sys.argv", [command, *words])
+    with pytest.raises(SystemExit) as ended:
+        COMMANDS[command]()
+    error = capsys.readouterr().err.lstrip()  # where a progress bar had begun, it has ended its line
+    assert ended.value.code == 2 and error.startswith(command) and message in error, error
+    assert error.count("\n") == 1 and not any(tmp_path.rglob("*.*"))
+
+
+def test_rows_of_another_bench_are_not_added_to(tmp_path, monkeypatch, capsys) -> None:
+    rows = tmp_path / "raster.json"
+    rows.write_text(json.dumps([{"n": 3, "machine": "this one"}]))
+    monkeypatch.setattr("sys.argv", ["rnd-bench", "--quick", "--json", str(rows)])
+    with pytest.raises(SystemExit) as ended:
+        rnd_trainer.bench_cli.main()
+    assert ended.value.code == 2 and "expected rows of rnd-bench, got another file" in capsys.readouterr().err
+
+
+def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch) -> None:
+    file = tmp_path / "avatar.onnx"
+    file.write_bytes(b"secret")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # whoever runs the tests
+    with pytest.raises(InputError, match=r"avatar\.onnx: avatar cannot be read: got no permission"):
+        existing_file(file, what="avatar")
+
+
+def test_json_has_no_nan(tmp_path) -> None:
+    write_json(tmp_path / "a.json", {"a": [float("nan"), (1.5, float("inf"))], "b": np.float64(np.nan)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, [1.5, None]], "b": None}
+
+
+def test_pictures_too_small_for_the_losses_are_refused(tiny_capture) -> None:
+    with pytest.raises(
+        InputError, match=r"training pictures: expected at least 11 pixels wide and high, got \d+ x"
+    ):
+        load_views(tiny_capture, "train", 0.1)
+
+
+def test_slivers_of_a_person_keep_the_losses_window(tiny_capture) -> None:
+    """Where little of a person is in the picture, the crop is as wide as the structural term's window."""
+    camera = next(iter(tiny_capture.cameras.values()))
+    views, _ = load_views(tiny_capture, "train", 11.5 / min(camera.width, camera.height))
+    assert min(min(view.camera.width, view.camera.height) for view in views) >= 11
