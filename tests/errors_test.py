@@ -1,5 +1,6 @@
 """One line that names what, expected, got, file and frame; and the exit codes of commands."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -83,9 +84,19 @@ def test_options_that_are_right_and_help_pass(capsys):
     assert not leaving.value.code and "--size" in capsys.readouterr().out
 
 
+def test_what_the_machine_withholds_is_one_line(capsys):
+    full = OSError(errno.ENOSPC, "No space left on device", "out/a.png")
+    assert run_command("rnd-x", lambda: _raise(full)) == 2
+    assert capsys.readouterr().err == "rnd-x: out/a.png: No space left on device\n"
+    assert run_command("rnd-x", lambda: _raise(PermissionError(errno.EACCES, "Permission denied"))) == 2
+    assert capsys.readouterr().err == "rnd-x: Permission denied\n"
+
+
 def test_our_own_mistakes_keep_their_traceback():
     with pytest.raises(ZeroDivisionError):
         run_command("rnd-x", lambda: 1 // 0)
+    with pytest.raises(FileNotFoundError):
+        run_command("rnd-x", lambda: open("no such file"))  # noqa: PTH123, SIM115
 
 
 @pytest.mark.parametrize("lines", [1, 100_000])  # less than a pipe holds, and more

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import re
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import TypeVar
 
 Parsed = TypeVar("Parsed")
+# No permission, a file system that is read-only, full, or full for this user: nobody's mistake in the program.
+_OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT}
 
 
 class InputError(Exception):
@@ -70,8 +73,8 @@ def check_option(good: bool, name: str, expected: str, got: object) -> None:
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 
-    2 for an :class:`InputError` (one line on stderr), 130 for Ctrl-C, 141 in silence where nobody reads the output to
-    its end (``rnd-play --help | head``), otherwise what ``main`` returns.
+    2 for an :class:`InputError` and for a file that the machine withholds (one line on stderr), 130 for Ctrl-C, 141 in
+    silence where nobody reads the output to its end (``rnd-play --help | head``), otherwise what ``main`` returns.
     """
     try:
         try:
@@ -88,6 +91,12 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
         with contextlib.suppress(io.UnsupportedOperation):  # a test's stdout is no file
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left in it
         return 128 + 13  # as a shell reports SIGPIPE
+    except OSError as error:
+        if error.errno not in _OF_THE_MACHINE:
+            raise
+        place = "" if error.filename is None else f"{error.filename}: "
+        print(f"{name}: {place}{error.strerror}", file=sys.stderr)  # noqa: T201
+        return 2
 
 
 def parse_options(parse: Callable[[], Parsed]) -> Parsed:
