@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from .errors import InputError
 
@@ -63,9 +63,14 @@ def read_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict
         return []
     except (OSError, ValueError):
         rows = None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) and {*names} <= set(row) for row in rows):
+    if not are_rows(rows, names):
         raise InputError("--json", expected=what, got="another file", file=path)
     return rows
+
+
+def are_rows(value: object, names: Sequence[str]) -> TypeGuard[list[dict[str, Any]]]:
+    """Whether ``value`` is a list of objects that have all of ``names``."""
+    return isinstance(value, list) and all(isinstance(row, dict) and {*names} <= set(row) for row in value)
 
 
 def output_folder(path: str | Path) -> Path:

@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, parse_options, run_command
+from rnd_runtime.errors import check_option, parse_options, run_command
 from rnd_runtime.files import write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
@@ -200,14 +200,11 @@ def _prepare(options: Any, *counts: str) -> None:
 
     need_extra()
     for name in counts:
-        if getattr(options, name) < 1:
-            raise InputError(f"--{name}", expected="at least 1", got=getattr(options, name))
-    threads = getattr(options, "threads", None)
-    if threads is not None:
-        import numba
+        check_option(getattr(options, name) >= 1, f"--{name}", "at least 1", getattr(options, name))
+    if getattr(options, "threads", None) is not None:
+        from rnd_runtime.threads import check_threads
 
-        most = numba.config.NUMBA_NUM_THREADS
-        check_option(1 <= threads <= most, "--threads", f"1 to {most}", threads)
+        check_threads(options.threads)
 
 
 def _inputs(files: Files) -> Any:

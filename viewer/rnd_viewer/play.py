@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 
-import numba
 import numpy as np
 
 from rnd_runtime import __version__
@@ -18,6 +17,7 @@ from rnd_runtime.files import output_folder
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
+from rnd_runtime.threads import set_threads
 
 from .aov import parse_aovs
 from .background import Background
@@ -50,7 +50,7 @@ def play(options: PlayOptions) -> int:
     avatar_file, motion_file, out = _required(options)
     background, aovs = Background.parse(options.background), parse_aovs(options.aov)
     formats, size = parse_formats(options.format), parse_size(options.size)
-    _set_threads(options.threads)
+    set_threads(options.threads)
 
     times = StageTimes()
     with times.stage("load"):
@@ -151,15 +151,6 @@ def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
         )
     assert options.avatar and options.motion and options.out
     return options.avatar, options.motion, output_folder(options.out)
-
-
-def _set_threads(threads: int | None) -> None:
-    if threads is None:
-        return
-    most = numba.config.NUMBA_NUM_THREADS
-    if not 1 <= threads <= most:
-        raise InputError("--threads", expected=f"1 to {most}", got=threads)
-    numba.set_num_threads(threads)
 
 
 def _light(options: PlayOptions, avatar: Avatar) -> Light:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, existing_file
+from rnd_runtime.files import are_rows, atomic_path, existing_file
 from rnd_runtime.images import read_image
 
 from .html_parts import compare, curve, data_uri, figure, png, rows_table, table
@@ -224,6 +224,6 @@ def _json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def _checked(rows: Any, path: Path, what: str, *names: str) -> list[dict[str, Any]]:
-    if not isinstance(rows, list) or not all(isinstance(row, dict) and {*names} <= set(row) for row in rows):
+    if not are_rows(rows, names):
         raise InputError(path.name, expected=what, got="something else", file=path)
     return rows

@@ -6,11 +6,11 @@ import secrets
 import webbrowser
 from collections.abc import Sequence
 
-import numba
 import tyro
 from rich.console import Console
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.threads import set_threads
 
 from .view_options import ViewOptions
 
@@ -35,11 +35,7 @@ def view(options: ViewOptions) -> int:
     from .view_server import load_websockets, serve
 
     load_websockets()
-    if options.threads is not None:
-        most = numba.config.NUMBA_NUM_THREADS
-        if not 1 <= options.threads <= most:
-            raise InputError("--threads", expected=f"1 to {most}", got=options.threads)
-        numba.set_num_threads(options.threads)
+    set_threads(options.threads)
     console = Console(highlight=False)
     with console.status("loading; the first run compiles, up to a minute"):
         scene = Scene(options)

@@ -58,13 +58,11 @@ class Recipe:
         """Refuse what cannot be filmed."""
         for name, least in (
             ("frames", 5), ("cameras", 1), ("size", 16), ("samples", 1), ("max_depth", 2), ("held_out_every", 1),
-            ("relight_cameras", 1),
+            ("relight_cameras", 1), ("estimate_seed", 0),
         ):  # fmt: skip
             if getattr(self, name) < least:
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}", expected=f"at least {least}", got=getattr(self, name))
-        if self.estimate_seed < 0:
-            raise InputError("--estimate-seed", expected="at least 0", got=self.estimate_seed)
         if self.step is not None and not 1e-3 <= self.step <= 0.03:
             raise InputError("--step", expected="0.001 to 0.03 m", got=self.step)
         if not 0 <= self.estimate_strength <= 10:
