@@ -7,7 +7,8 @@ import numpy as np
 import onnx
 import pytest
 
-from rnd_runtime.avatar import METADATA_KEY, Avatar
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import METADATA_KEY
 from rnd_runtime.brdf import LARGEST_ALBEDO
 from rnd_runtime.errors import InputError
 from tiny import body, motion
@@ -89,6 +90,33 @@ def test_an_albedo_that_would_give_back_more_than_it_gets_is_capped(tiny_avatar,
     played, given = (Avatar.load(file).pose(motion(body()), 0.1).albedo for file in (white, tiny_avatar))
     assert played[0] == pytest.approx([LARGEST_ALBEDO, LARGEST_ALBEDO, 0.5])
     assert np.array_equal(played[1:], given[1:])  # none that was trained is
+
+
+@pytest.mark.parametrize("index", [10**4, -1])
+def test_a_node_that_is_not_there_is_refused(tiny_avatar, tmp_path, index) -> None:
+    """The compiled kernel would read whatever lies there."""
+
+    def point_outside(model) -> None:
+        tensor = next(t for t in model.graph.initializer if t.name == "rest/neighbours_packed")
+        neighbours = onnx.numpy_helper.to_array(tensor).astype(np.int32)
+        neighbours[3, 1] = index
+        tensor.CopyFrom(onnx.numpy_helper.from_array(neighbours, tensor.name))
+
+    file = _changed(tiny_avatar, tmp_path / "outside.onnx", point_outside)
+    with pytest.raises(
+        InputError, match=rf"outside.onnx: neighbours: expected .* nodes, from 0, got .*{index}"
+    ):
+        Avatar.load(file)
+
+
+@pytest.mark.parametrize("name", ["node_offsets", "rest_factors", "neighbour_weights"])
+def test_posing_arrays_of_another_shape_are_refused(tiny_avatar, tmp_path, name) -> None:
+    def widen(model) -> None:
+        output = next(value for value in model.graph.output if value.name == name)
+        output.type.tensor_type.shape.dim[0].dim_value += 1
+
+    with pytest.raises(InputError, match=r"wide\.onnx"):
+        Avatar.load(_changed(tiny_avatar, tmp_path / "wide.onnx", widen))
 
 
 def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:

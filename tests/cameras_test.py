@@ -142,6 +142,18 @@ def test_broken_camera_file_is_refused_in_one_line(tmp_path, document, message):
     assert "cameras.json" in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_name_is_refused_where_cameras_have_none(tmp_path):
+    for document in (_record(), {"cameras": [_record()]}):
+        with pytest.raises(InputError, match="its cameras have no names, got left"):
+            file_path(_write(tmp_path, document) + ":left", None)
+
+
+def test_a_folder_may_be_called_json(tmp_path):
+    (tmp_path / "shots.json.d").mkdir()
+    text = _write(tmp_path / "shots.json.d", _record(40, 20))
+    assert file_path(text, None)(3, 0.1).width == 40
+
+
 def test_missing_camera_file_and_other_aspect_are_refused(tmp_path):
     with pytest.raises(InputError, match="camera file not found"):
         file_path(str(tmp_path / "none.json"), None)

@@ -22,7 +22,8 @@ from rnd_export.export import (
 )
 from rnd_export.places import gaussians_by_place
 from rnd_export.variant import Variant, line_through
-from rnd_runtime.avatar import POSED_OUTPUTS, Avatar
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import POSED_OUTPUTS
 from rnd_runtime.errors import InputError
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import bone_transforms

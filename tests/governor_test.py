@@ -75,3 +75,12 @@ def test_less_quality_looks_like_more(quality, least):
     if quality.scale == 1:
         np.testing.assert_array_equal(less[0].radiance, whole[0].radiance)
     assert (less[1].radiance != whole[1].radiance).any()
+
+
+def test_after_a_frame_of_full_quality_nothing_older_is_used():
+    light = Light(np.linspace(2, 0, 16, dtype=np.float32)[:, None, None] * np.ones((16, 32, 3), np.float32))
+    player = Player(FakeAvatar(), light, Shader(light, "table"), rasterize)
+    for time, quality in ((0.0, Quality(4)), (0.3, FULL)):
+        player.draw(player.encode(MOTION, time), CAMERA, quality)
+    again = player.draw(player.encode(MOTION, 0.3), CAMERA, Quality(4))
+    np.testing.assert_array_equal(again.radiance, player.render(MOTION, 0.3, CAMERA).radiance)

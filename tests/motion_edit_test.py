@@ -1,5 +1,7 @@
 """Smoothing, speed, in place and loops: what they change, and what they must leave alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -109,6 +111,23 @@ def test_a_loop_has_no_seam():
     assert np.linalg.norm(np.diff(closed, axis=0), axis=1).max() < 0.02  # m a frame; the jump back was 2 m
     assert any("1.60 m" in note for note in after.notes)
     assert_allclose(angles[:90], _angles(motion)[30:120], atol=ROUND_OFF)  # all but the seam is as it was
+
+
+def test_a_loop_goes_round_without_end_or_beginning():
+    """At any time, before the start too, it is what the same frames written out three times are in their middle."""
+    t = np.arange(100) / FPS
+    once = looped(_motion(0.8 * np.sin(5 * t), np.stack([0 * t, np.cos(3 * t), 0 * t], -1)))
+    thrice = replace(
+        once,
+        rotations=np.tile(once.rotations, (3, 1, 1, 1)),
+        translations=np.tile(once.translations, (3, 1)),
+        closed=False,
+    )
+    times = np.linspace(-0.9, 1.9, 57) * once.duration
+    ours, written_out = once.at(times), thrice.at(times % once.duration + once.duration)
+    assert once.closed and once.duration == pytest.approx(once.frame_count / FPS)
+    assert_allclose(ours.rotations, written_out.rotations, atol=1e-9)
+    assert_allclose(ours.translations, written_out.translations, atol=1e-9)
 
 
 def test_a_periodic_motion_stays_as_it_is():

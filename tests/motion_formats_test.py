@@ -500,6 +500,28 @@ def test_a_recording_is_turned_to_the_front_and_a_reference_pose_left_out(tmp_pa
     assert_allclose(again.rotations[:, 1:], MATRICES[:, 1:], atol=TEXT)
 
 
+def test_hips_below_a_root_of_their_own_go_where_they_are_sent(tmp_path):
+    """The same motion, its hips moved and turned in the frame of a root that is itself moved and turned."""
+    file = _bvh(tmp_path / "a.bvh", NAMINGS["mixamo"], spread={})
+    head, _, frames = file.read_text().partition("MOTION\n")
+    above = "ROOT Reference\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation\n"
+    head = head.replace("ROOT", above + "JOINT", 1) + "}\n"
+    turn, place = Rotation.from_euler("Y", 70, degrees=True), np.array([1.0, 0.5, -2.0])
+    counts, lines = frames.splitlines()[:2], frames.splitlines()[2:]
+    for number, line in enumerate(lines):
+        values = np.array([float(word) for word in line.split()])
+        hips = Rotation.from_euler("ZXY", values[3:6], degrees=True)
+        values[:3] = turn.inv().apply(values[:3] - place)
+        values[3:6] = (turn.inv() * hips).as_euler("ZXY", degrees=True)
+        lines[number] = " ".join(f"{value:.8f}" for value in [*place, 70, 0, 0, *values])
+    below = tmp_path / "b.bvh"
+    below.write_text(head + "MOTION\n" + "\n".join([*counts, *lines]) + "\n")
+    plain, ours = load_motion(file, SKELETON), load_motion(below, SKELETON)
+    assert np.ptp(ours.translations, axis=0).max() > 0.1 and ours.notes == plain.notes
+    assert_allclose(ours.translations, plain.translations, atol=TEXT)
+    assert_allclose(ours.rotations, plain.rotations, atol=TEXT)
+
+
 @pytest.mark.parametrize("form", ["toml", "json"])
 def test_names_we_do_not_know_come_from_the_users_table(tmp_path, form):
     strange = {name: f"B{joint:02d}" for joint, name in enumerate(SMPL_NAMES)}
@@ -548,6 +570,8 @@ BROKEN_BVH = {
     "cut in channels": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 3 Xrotation Yrotation",
     "empty": "", "no motion": "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\n",
     "text": "HIERARCHY\nROOT a\n{\nOFFSET x 0 0\n", "other": "hello world",
+    "end site first": "HIERARCHY End Site { OFFSET 0 0 0 } MOTION",
+    "offset": "HIERARCHY ROOT a { OFFSET 0 nan 0 CHANNELS 0 } MOTION Frames: 1 Frame Time: 0.1",
     "short": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 3 Frame Time: 0.03 1 2",
     "time": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 1 Frame Time: 0 1",
     "channel": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Wrotation } MOTION Frames: 1 Frame Time: 0.1 1",

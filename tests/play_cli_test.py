@@ -168,6 +168,11 @@ def test_a_floor_that_no_machine_holds_lowers_the_quality_and_drops_no_frame(fil
     assert json.loads((tmp_path / "out/play.json").read_text())["notes"][0].startswith("2 of 6 frames")
 
 
+def test_a_floor_is_refused_beside_aovs_which_it_cannot_make_cheaper(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", fps_floor=30, aov="depth")) == 2
+    assert "--fps-floor: expected no --aov beside it, got depth" in capsys.readouterr().err
+
+
 def test_the_same_run_again_takes_nothing_away(files, tmp_path):
     assert main(_arguments(files, tmp_path / "out", frames=":2")) == 0
     assert main(_arguments(files, tmp_path / "out", frames="4:")) == 0
@@ -276,6 +281,55 @@ def test_avatar_out_of_view_is_an_error_that_says_so(files, tmp_path, capsys):
     assert main(_arguments(files, tmp_path / "out", camera=tmp_path / "camera.json", size=None)) == 2
     assert "frame 0: nothing of the avatar is in view in the first frame" in capsys.readouterr().err
     assert not _tree(tmp_path / "out")
+
+
+def _cameras_that_lose_the_body(folder: Path, seen: int, size: int = 48) -> Path:
+    """A camera file for all frames: the body is in view in the first ``seen`` and behind the camera afterwards."""
+    cameras = []
+    for frame in range(FRAMES):
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV: looking along −Z
+        pose[:3, 3] = [0, 1, 4 if frame < seen else -4]
+        intrinsics = [[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]]
+        record = {"width": size, "height": size, "K": intrinsics, "world_to_camera": pose.tolist()}
+        cameras.append(record)
+    file = folder / "walking.json"
+    file.write_text(json.dumps({"cameras": cameras}))
+    return file
+
+
+def test_a_run_that_fails_at_once_leaves_the_frames_of_the_last(files, tmp_path):
+    out = tmp_path / "out"
+    assert main(_arguments(files, out)) == 0
+    before = _tree(out)
+    away = _cameras_that_lose_the_body(tmp_path, seen=0)
+    assert main(_arguments(files, out, camera=away, size=None)) == 2
+    assert _tree(out) == before and len(before) == FRAMES + 1
+
+
+def test_a_part_without_the_body_is_no_mistake(files, tmp_path, capsys):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=2)
+    out = tmp_path / "out"
+    for part in ("0:2", f"2:{FRAMES}"):
+        assert main(_arguments(files, out, camera=walking, size=None, frames=part)) == 0
+    assert "nothing of the avatar is in view in any of these frames" in capsys.readouterr().err
+    assert len([name for name in _tree(out) if name.startswith("frames/")]) == FRAMES
+
+
+def test_another_camera_file_is_another_run(files, tmp_path):
+    out, walking = tmp_path / "out", _cameras_that_lose_the_body(tmp_path, seen=2)
+    assert main(_arguments(files, out, camera=walking, size=None, frames=f"0:{FRAMES - 1}")) == 0
+    _cameras_that_lose_the_body(tmp_path, seen=3)
+    assert main(_arguments(files, out, camera=walking, size=None, frames="0:1")) == 0
+    assert sorted(_tree(out)) == ["frames/000000.png", "play_000000-000001.json"]
+
+
+def test_mp4_of_cameras_of_several_sizes_is_refused(files, tmp_path, capsys):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    document = json.loads(walking.read_text())
+    document["cameras"][2] |= {"width": 64, "height": 64}
+    walking.write_text(json.dumps(document))
+    assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
+    assert "mp4: expected pictures of one size, 48x48, got 64x64" in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):

@@ -182,7 +182,13 @@ def test_options_parse():
     assert parse_frames(None, 9) == range(9) and parse_frames("2:", 9) == range(2, 9)
     assert parse_frames(":3", 9) == range(3) and parse_frames("2:5", 9) == range(2, 5)
     assert parse_aovs("") == () and parse_aovs("depth, albedo,albedo") == ("albedo", "depth")
-    assert frame_count(1.0, 30) == 31 and frame_count(0.0, 30) == 1 and frame_count(11 / 30, 30) == 12
+
+
+def test_frames_of_a_motion():
+    for frames, fps in ((31, 30), (1, 30), (12, 30), (11, 60)):
+        motion = fake_motion(frames, fps)
+        assert frame_count(motion, fps) == frames and frame_count(motion, 2 * fps) == 2 * frames - 1
+        assert frame_count(replace(motion, closed=True), 2 * fps) == 2 * frames
 
 
 @pytest.mark.parametrize("text", ["5:5", "6:5", "0:10", "9:", "a:b", "3", "-1:4", ""])

@@ -181,7 +181,7 @@ def test_the_clip_has_every_frame(options):
         seen = 0
         while header["kind"] == "progress":
             seen, header = header["done"], json.loads(visitor.socket.recv())
-        assert header["kind"] == "clip" and seen == frame_count(scene.motion.duration, 30) == FRAMES
+        assert header["kind"] == "clip" and seen == frame_count(scene.motion, 30) == FRAMES
         with av.open(BytesIO(visitor.socket.recv())) as container:
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert len(frames) == FRAMES and frames[0].shape == (SIZE, SIZE, 3)

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.avatar import EncoderKind, Precision
+from rnd_runtime.avatar_file import EncoderKind, Precision
 from rnd_runtime.errors import InputError, check_option, parse_options, run_command
 
 

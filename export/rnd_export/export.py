@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from rnd_runtime import __version__
-from rnd_runtime.avatar import (
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import (
     METADATA_KEY,
     SCHEMA,
-    Avatar,
     AvatarMetadata,
     Precision,
     SkeletonMetadata,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import onnx
 
-from rnd_runtime.avatar import Precision
+from rnd_runtime.avatar_file import Precision
 from rnd_runtime.sh import SH_COUNT
 
 from .bake import BakedAvatar

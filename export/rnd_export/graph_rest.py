@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from onnx import TensorProto
 
-from rnd_runtime.avatar import Precision
+from rnd_runtime.avatar_file import Precision
 from rnd_trainer.skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 
 from .bake import BakedAvatar

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.avatar import EncoderKind, Precision
+from rnd_runtime.avatar_file import EncoderKind, Precision
 from rnd_runtime.errors import InputError
 from rnd_runtime.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig

@@ -1,42 +1,28 @@
-"""avatar.onnx: its contract, its metadata, and running it.
-
-One self-contained ONNX file (opset 18, standard operators, static shapes). For d window poses, J joints,
-N Gaussians:
-
-======================  ============  ==============================================================
-input                   shape         meaning
-======================  ============  ==============================================================
-``pose_window``         [d, J−1, 6]   6D rotations of the joints but the root, oldest pose first
-``joint_velocity``      [J−1, 3]      rad/s, log(R_{t−δ}ᵀ R_t)/δ
-``bone_transforms``     [J, 3, 4]     rest pose → posed world, metres
-======================  ============  ==============================================================
-
-Outputs are ``means`` [N, 3], ``covariances`` [N, 6], ``normals`` [N, 3], ``visibility`` [N, 16] and
-``skinning_weights`` [N, J], and the constants ``opacities`` [N], ``albedo`` [N, 3] and ``roughness`` [N]; see
-:class:`rnd_runtime.gaussians.Gaussians` for units and frames. Metadata is JSON under ``rnd_avatar`` in the
-model's ``metadata_props``: :class:`AvatarMetadata`.
-
-That is the whole avatar for any ONNX runtime. For ours, which poses faster than a graph does, a file also names what
-stands between its networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
-is dynamic, ``node_logits`` [M, J], and the constants ``neighbours`` [N, K] (int32), ``neighbour_weights`` [N, K],
-``log_template`` [N, J], ``rest_points`` [N, 3], ``rest_factors`` [N, 9], ``rest_normals`` [N, 3], ``rest_limbs`` [N, 7]
-and ``posing_limits`` [3]; see :class:`rnd_runtime.posing.RestPose`. Without these the graph does all of the posing.
-"""
+"""An ``avatar.onnx`` at work: its networks in onnxruntime, the rest of its posing in our kernel."""
 
 from __future__ import annotations
 
-import base64
-import binascii
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import ArrayLike, NDArray
 
+from .avatar_file import (
+    CONSTANT_OUTPUTS,
+    NODE_LOGITS,
+    NODE_OUTPUTS,
+    POSED_OUTPUTS,
+    REST_OUTPUTS,
+    AvatarMetadata,
+    check_shapes,
+    decode_light,
+    first_line,
+    read_metadata,
+)
 from .brdf import LARGEST_ALBEDO
 from .errors import InputError
 from .files import existing_file
@@ -46,63 +32,6 @@ from .onnx_parts import OnnxFile
 from .posing import RestPose, Unposed
 from .skeleton import Skeleton, bone_transforms, taken_along
 from .window import described, recent_poses
-
-SCHEMA = "rnd-avatar/1"
-METADATA_KEY = "rnd_avatar"
-PROBE_SHAPE = (32, 64, 3)
-EncoderKind = Literal["full", "coarse", "static"]
-Precision = Literal["f32", "f16", "int8"]
-POSED_OUTPUTS = ("means", "covariances", "normals", "visibility")
-CONSTANT_OUTPUTS = ("opacities", "albedo", "roughness")
-NODE_OUTPUTS = ("node_offsets", "node_visibility")
-NODE_LOGITS = "node_logits"
-REST_OUTPUTS = (
-    "neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs",
-    "posing_limits",
-)  # fmt: skip
-
-
-class SkeletonMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Joint names, parents (−1 for the root, which comes first) and rest positions [J, 3] in metres."""
-
-    names: list[str]
-    parents: list[int]
-    rest_joints: list[tuple[float, float, float]]
-
-
-class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a file has left out for speed or size. The defaults are the whole avatar.
-
-    ``encoder``: networks at every node, at fewer (``coarse``), or the template's skinning (``static``).
-    ``precision``: how constants are stored. ``nodes``: where networks are evaluated, 0 when not stated.
-    ``dynamic_nodes``: those of them with dynamic skinning. ``visibility_degree``: of the harmonics that are kept.
-    """
-
-    encoder: EncoderKind = "full"
-    precision: Precision = "f32"
-    nodes: int = 0
-    dynamic_nodes: int = 0
-    visibility_degree: int = 3
-
-
-class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What an avatar.onnx says of itself. Unknown fields and schemas are refused.
-
-    ``trained_light``: base64 of the little-endian float32 probe [32, 64, 3] it was trained under.
-    """
-
-    schema: str
-    gaussians: int
-    spacing_m: float
-    window_poses: int
-    window_seconds: float
-    skeleton: SkeletonMetadata
-    trained_light: str
-    body_license: str
-    checkpoint_sha256: str
-    conventions: str
-    generator: str
-    variant: VariantMetadata = VariantMetadata()
 
 
 class Encoded(NamedTuple):
@@ -167,9 +96,9 @@ class Avatar:
         path = existing_file(path, what="avatar")
         try:
             file = OnnxFile(path.read_bytes())
-            metadata = _read_metadata(file)
-            _check_shapes(file, metadata)
-            return cls(file, metadata, _decode_light(metadata), threads)
+            metadata = read_metadata(file)
+            check_shapes(file, metadata)
+            return cls(file, metadata, decode_light(metadata), threads)
         except InputError as error:
             raise error.at(file=path) from error
 
@@ -224,7 +153,15 @@ class Avatar:
             for wanted in session.get_inputs()
         }
         results: list[NDArray[np.float32]] = session.run(list(outputs), values)
+        self._check_promised(outputs, results)
         return results
+
+    def _check_promised(self, outputs: Sequence[str], values: Sequence[NDArray[Any]]) -> None:
+        """The kernels that go over ``values`` check no bounds."""
+        for name, value in zip(outputs, values):
+            promised = self._file.outputs[name]
+            if promised and list(value.shape) != promised:  # integers' shapes are not read
+                raise InputError(name, expected=f"shape {promised}", got=list(value.shape))
 
     def _bones(
         self, rotations: NDArray[np.float64], translation: NDArray[np.float64]
@@ -238,6 +175,11 @@ class Avatar:
 
     def _rest_pose(self) -> RestPose:
         neighbours, weights, log_template, *rest, limits = self._constants(REST_OUTPUTS)
+        nodes = self._file.outputs[NODE_OUTPUTS[0]][0]
+        inside = neighbours.size and neighbours.min() >= 0 and neighbours.max() < nodes
+        if neighbours.shape != weights.shape or not inside:
+            expected = f"{list(weights.shape)} of {nodes} nodes, from 0"
+            raise InputError(REST_OUTPUTS[0], expected=expected, got=_range(neighbours))
         max_offset, floor, fallback = limits.tolist()
         points, factors, normals, limbs = rest
         return RestPose(
@@ -251,6 +193,7 @@ class Avatar:
             names = ", ".join(outputs)
             raise InputError("graph outputs", expected=f"{names}: constants", got="some that need a pose")
         results: list[NDArray[np.float32]] = session.run(list(outputs), {})
+        self._check_promised(outputs, results)
         return results
 
     def _session(self, outputs: tuple[str, ...]) -> ort.InferenceSession:
@@ -272,62 +215,8 @@ def _session(model: bytes, threads: int) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise InputError("not a readable ONNX model", got=_first_line(error)) from error
+        raise InputError("not a readable ONNX model", got=first_line(error)) from error
 
 
-def _read_metadata(file: OnnxFile) -> AvatarMetadata:
-    text = file.metadata.get(METADATA_KEY)
-    if text is None:
-        raise InputError("not an RnD avatar", expected=f"metadata {METADATA_KEY!r}", got="none")
-    try:
-        schema = msgspec.json.decode(text.encode(), type=_SchemaOnly).schema
-        if schema != SCHEMA:
-            raise InputError("schema", expected=SCHEMA, got=schema, hint="made by another version")
-        metadata = msgspec.json.decode(text.encode(), type=AvatarMetadata)
-    except msgspec.DecodeError as error:
-        raise InputError("metadata", got=_first_line(error)) from error
-    tree = metadata.skeleton
-    if not len(tree.names) == len(tree.parents) == len(tree.rest_joints) >= 2:
-        raise InputError("skeleton", expected="as many names, parents and rest joints")
-    return metadata
-
-
-class _SchemaOnly(msgspec.Struct):
-    schema: str
-
-
-def _check_shapes(file: OnnxFile, metadata: AvatarMetadata) -> None:
-    """The graph's inputs and outputs must be what the metadata promises."""
-    n, d, joints = metadata.gaussians, metadata.window_poses, len(metadata.skeleton.names)
-    inputs = {
-        "pose_window": [d, joints - 1, 6],
-        "joint_velocity": [joints - 1, 3],
-        "bone_transforms": [joints, 3, 4],
-    }
-    outputs = {
-        "means": [n, 3], "covariances": [n, 6], "normals": [n, 3], "visibility": [n, 16],
-        "skinning_weights": [n, joints], "opacities": [n], "albedo": [n, 3], "roughness": [n],
-    }  # fmt: skip
-    if file.inputs != inputs:
-        raise InputError("graph inputs", expected=inputs, got=file.inputs)
-    got = {name: shape for name, shape in file.outputs.items() if name in outputs}
-    if got != outputs:
-        raise InputError("graph outputs", expected=outputs, got=got)
-
-
-def _decode_light(metadata: AvatarMetadata) -> NDArray[np.float32]:
-    try:
-        values = np.frombuffer(base64.b64decode(metadata.trained_light, validate=True), "<f4")
-        return values.reshape(PROBE_SHAPE)
-    except (binascii.Error, ValueError) as error:
-        raise InputError("trained_light", expected=f"float32 of shape {PROBE_SHAPE}", got=error) from error
-
-
-def encode_light(radiance: NDArray[np.float32]) -> str:
-    """A probe [32, 64, 3] as the metadata stores it."""
-    assert radiance.shape == PROBE_SHAPE
-    return base64.b64encode(np.ascontiguousarray(radiance, "<f4").tobytes()).decode()
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:300] if str(error).strip() else type(error).__name__
+def _range(values: NDArray[Any]) -> str:
+    return f"{list(values.shape)} from {values.min()} to {values.max()}" if values.size else "none"

@@ -57,6 +57,15 @@ class MocapTree:
             positions[joint] = positions[parent] + self.offsets[joint]
         return positions
 
+    def path(self, joint: int, turned: Floats) -> Floats:
+        """[F, 3] where ``joint`` is in the file's world; ``turned``: :meth:`global_rotations`."""
+        path = self.root_positions
+        while joint:
+            parent = self.parents[joint]
+            path = path + turned[:, parent] @ self.offsets[joint]
+            joint = parent
+        return path
+
 
 @dataclass
 class _Joint:
@@ -93,7 +102,8 @@ def read_bvh(path: str | Path) -> MocapTree:
     if not finite.all():
         raise InputError("BVH motion", expected="finite numbers", file=path, frame=int(np.argmin(finite)))
     rotations = np.tile(np.eye(3), (frames, len(joints), 1, 1))
-    positions = np.zeros((frames, 3))
+    positions = np.tile([joint.offset for joint in joints], (frames, 1, 1))
+    positions[:, 0] = 0
     column = 0
     for number, joint in enumerate(joints):
         for channel in joint.channels:
@@ -101,12 +111,32 @@ def read_bvh(path: str | Path) -> MocapTree:
             if channel[1:] == "rotation":
                 turn = _about_axis(axis, np.radians(values[:, column]))
                 rotations[:, number] = rotations[:, number] @ turn
-            elif number == 0:
-                positions[:, axis] = values[:, column]
+            else:
+                positions[:, number, axis] = values[:, column]
             column += 1
-    moving = [joint.name for joint in joints[1:] if any(name.endswith("position") for name in joint.channels)]
+    path_of_root, trunk = _carried(joints, rotations, positions)
+    moving = [
+        joint.name
+        for number, joint in enumerate(joints)
+        if number not in trunk and any(name.endswith("position") for name in joint.channels)
+    ]
     notes = (f"positions of joints but the root are left out: {', '.join(moving[:3])}, …",) if moving else ()
-    return _tree(joints, rotations, positions, _whole(1 / seconds), notes, path)
+    return _tree(joints, rotations, path_of_root, _whole(1 / seconds), notes, path)
+
+
+def _carried(joints: list[_Joint], rotations: Floats, positions: Floats) -> tuple[Floats, list[int]]:
+    """The root's path [F, 3] with what the only child of the only child ... moves beside its parent; and who they are.
+
+    Many a tool writes the hips, and where they go, below a root of its own that stands still. ``positions``
+    [F, J, 3] are the joints' own, in the frame of the parent; they take the place of the offset.
+    """
+    joint, trunk, path, turned = 0, [0], positions[:, 0], rotations[:, 0]
+    while len(children := [k for k, child in enumerate(joints) if child.parent == joint]) == 1:
+        (joint,) = children
+        trunk.append(joint)
+        path = path + np.einsum("fij,fj->fi", turned, positions[:, joint] - joints[joint].offset)
+        turned = turned @ rotations[:, joint]
+    return path, trunk
 
 
 def _bvh_hierarchy(words: Iterator[str]) -> list[_Joint]:
@@ -122,12 +152,14 @@ def _bvh_hierarchy(words: Iterator[str]) -> list[_Joint]:
                 name += f" {more}"
             joints.append(_Joint(name, open_joints[-1] if open_joints else -1))
             open_joints.append(len(joints) - 1)
-        elif word == "End":
+        elif word == "End" and open_joints:
             while next(words) != "{":
                 pass
             open_joints.append(-1)
         elif word == "OFFSET" and open_joints:
             offset = np.array([float(next(words)) for _ in range(3)])
+            if not np.isfinite(offset).all():
+                raise InputError("OFFSET", expected="finite numbers", got=offset.tolist())
             if open_joints[-1] >= 0:
                 joints[open_joints[-1]].offset = offset
             else:

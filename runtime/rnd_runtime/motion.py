@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -41,6 +42,7 @@ class Motion:
         joint_names: J names.
         source: where it came from, for messages.
         notes: what the reader assumed or left out, one sentence each, for the user to see.
+        closed: whether the frame after the last is the first again.
     """
 
     rotations: Floats
@@ -49,6 +51,7 @@ class Motion:
     joint_names: tuple[str, ...]
     source: str = ""
     notes: tuple[str, ...] = ()
+    closed: bool = False
 
     def __post_init__(self) -> None:
         frames, joints = len(self.translations), len(self.joint_names)
@@ -64,18 +67,29 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first frame to the last."""
-        return (self.frame_count - 1) / self.fps
+        """Seconds from the first frame to the last; of a closed motion to its first frame's return."""
+        return (self.frame_count - (not self.closed)) / self.fps
 
     def at(self, times_s: ArrayLike) -> Motion:
-        """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames, the end poses beyond the ends.
+        """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames.
 
-        ``fps`` of the result is still that of the recording and says nothing about ``times_s``.
+        Beyond its ends a motion holds its end poses; a closed one goes round. ``fps`` of the result is still that of
+        the recording and says nothing about ``times_s``.
         """
-        place = np.clip(np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps, 0, self.frame_count - 1)
-        rotations = interpolate_rotations(self.rotations, place)
-        translations = interpolate_points(self.translations, place)
+        place = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
+        if self.closed:
+            place, path = 1 + place % self.frame_count, self._lap
+        else:
+            place, path = np.clip(place, 0, self.frame_count - 1), (self.rotations, self.translations)
+        rotations = interpolate_rotations(path[0], place)
+        translations = interpolate_points(path[1], place)
         return Motion(rotations, translations, self.fps, self.joint_names, self.source, self.notes)
+
+    @cached_property
+    def _lap(self) -> tuple[Floats, Floats]:
+        """Rotations and translations of one round, with the frame before it and the two after it: for their slopes."""
+        frames = np.arange(-1, self.frame_count + 2) % self.frame_count
+        return self.rotations[frames], self.translations[frames]
 
 
 def load_motion(

@@ -119,6 +119,7 @@ def looped(motion: Motion, seam_seconds: float = _SEAM_SECONDS) -> Motion:
         rotations=np.concatenate([motion.rotations[seam:length], tail]),
         translations=np.concatenate([translations[seam:length], path]),
         notes=motion.notes + note,
+        closed=True,
     )
 
 

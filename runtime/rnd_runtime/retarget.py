@@ -85,7 +85,7 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
     hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
-    hips = tree.root_positions + (recorded[:, 0] @ hips_theirs)
+    hips = tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root])
     pelvis = scale * hips @ world.T - turned[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)

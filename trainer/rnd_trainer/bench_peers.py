@@ -23,7 +23,8 @@ import numpy as np
 import torch
 
 from rnd_runtime import raster_cpu
-from rnd_runtime.avatar import NODE_LOGITS, NODE_OUTPUTS, Avatar
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import NODE_LOGITS, NODE_OUTPUTS
 from rnd_runtime.camera import Camera
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError

@@ -6,6 +6,7 @@ run can be rendered alone and gives the same pixels.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -156,9 +157,9 @@ def file_path(text: str, size: tuple[int, int | None] | None) -> CameraPath:
     one for each frame, or ``{"cameras": {name: ...}}`` as ``capture.json`` has. ``size`` (width, height) in
     pixels resamples the view; without a height, the width is that of the longer side.
     """
-    file_name, _, camera_name = text.partition(".json")
-    file = existing_file(f"{file_name}.json", what="camera file")
-    cameras = _read_cameras(file, camera_name.removeprefix(":"))
+    path, camera_name = split_camera(text)
+    file = existing_file(path, what="camera file")
+    cameras = _read_cameras(file, camera_name)
     if size is not None:
         cameras = [camera.resized(*_matching_size(camera, size)) for camera in cameras]
 
@@ -174,14 +175,28 @@ def file_path(text: str, size: tuple[int, int | None] | None) -> CameraPath:
     return at
 
 
+def split_camera(text: str) -> tuple[Path, str]:
+    """``FILE.json:NAME`` as file and name, which may be missing. Raises :class:`InputError` for anything else."""
+    match = re.fullmatch(r"(.+?\.json)(?::(.*))?", text)
+    if match is None:
+        raise InputError("--camera", expected="front, orbit, FILE.json or FILE.json:NAME", got=text)
+    return Path(match[1]), match[2] or ""
+
+
 def _read_cameras(file: Path, name: str) -> list[Camera]:
     data = file.read_bytes()
     try:
         document: dict[str, Any] = msgspec.json.decode(data, type=dict)
-        if "cameras" not in document:
-            return [msgspec.json.decode(data, type=_CameraRecord).camera(file)]
-        records = msgspec.json.decode(data, type=_CameraFile).cameras
+        records: list[_CameraRecord] | dict[str, _CameraRecord]
+        if "cameras" in document:
+            records = msgspec.json.decode(data, type=_CameraFile).cameras
+        else:
+            records = [msgspec.json.decode(data, type=_CameraRecord)]
         if isinstance(records, list):
+            if name:
+                raise InputError(
+                    "camera", expected="FILE.json: its cameras have no names", got=name, file=file
+                )
             chosen = records
         elif not name and len(records) == 1:
             chosen = list(records.values())

@@ -148,6 +148,9 @@ class PlayOptions(MotionOptions):
         refuse_outside(self, limits)
         if self.orbit_seconds == 0:
             raise InputError("--orbit-seconds", expected="not 0", got=0)
+        if self.fps_floor is not None and self.aov:
+            hint = "AOVs are drawn at full quality"
+            raise InputError("--fps-floor", expected="no --aov beside it", got=self.aov, hint=hint)
 
 
 def parse_size(text: str | None) -> tuple[int, int | None] | None:
@@ -170,6 +173,8 @@ def parse_frames(text: str | None, count: int) -> range:
     return range(start, end)
 
 
-def frame_count(duration_s: float, fps: float) -> int:
-    """How many frames at ``fps`` a motion of ``duration_s`` has, its first and last pose included."""
-    return math.floor(duration_s * fps + 1e-6) + 1
+def frame_count(motion: Motion, fps: float) -> int:
+    """How many frames at ``fps`` a motion has: its first and last pose included, of a closed one no pose twice."""
+    if motion.closed:
+        return max(1, math.ceil(motion.duration * fps - 1e-6))
+    return math.floor(motion.duration * fps + 1e-6) + 1

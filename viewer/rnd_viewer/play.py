@@ -21,7 +21,16 @@ from rnd_runtime.threads import set_threads
 
 from .aov import parse_aovs
 from .background import Background
-from .cameras import CameraPath, Framing, View, file_path, frame_motion, front_path, orbit_path
+from .cameras import (
+    CameraPath,
+    Framing,
+    View,
+    file_path,
+    frame_motion,
+    front_path,
+    orbit_path,
+    split_camera,
+)
 from .governor import FULL, Governor, Quality
 from .options import PlayOptions, frame_count, parse_frames, parse_size
 from .pipeline import run
@@ -38,6 +47,7 @@ OWN_TO_A_PROCESS = (
     "format",
     "pipeline",
 )  # options that do not tell one run from another
+OWN_CAMERAS = ("front", "orbit")
 DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 
@@ -62,7 +72,7 @@ def play(options: PlayOptions) -> int:
     player = Player(avatar, light, shader, rasterizer, background, aovs, times)
 
     fps = options.fps or motion.fps
-    frames = parse_frames(options.frames, frame_count(motion.duration, fps))
+    frames = parse_frames(options.frames, frame_count(motion, fps))
     framing = frame_motion(avatar.skeleton, motion)
     camera_at = _camera_path(options, size, framing)
     notes = [*motion.notes, *_light_notes(light)]
@@ -71,6 +81,7 @@ def play(options: PlayOptions) -> int:
 
     governor = Governor(options.fps_floor) if options.fps_floor else None
     qualities: list[Quality] = []
+    in_view = False
 
     def encode(number: int) -> tuple[float, float, Encoded]:
         started = perf_counter()
@@ -78,12 +89,14 @@ def play(options: PlayOptions) -> int:
         return started, perf_counter() - started, encoded
 
     def draw(number: int, turn: tuple[float, float, Encoded]) -> tuple[Frame, Camera]:
+        nonlocal in_view
         asked, encoding, encoded = turn
         started = perf_counter()
         camera = camera_at(number, number / fps)
         qualities.append(governor.quality if governor else FULL)
         frame = player.draw(encoded, camera, qualities[-1])
-        if number == frames.start and not frame.alpha.any():
+        in_view = in_view or bool(frame.alpha.any())
+        if number == 0 and not in_view:
             raise _out_of_view(framing, camera, number)
         with times.stage("tonemap"):
             tone_map_for(formats, frame)
@@ -93,14 +106,16 @@ def play(options: PlayOptions) -> int:
             governor.observe(encoding + now - started)
         return frame, camera
 
-    count = frame_count(motion.duration, fps)
+    count = frame_count(motion, fps)
     name = part_name("play", frames, count)
     common = {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
-    claim(out, common, (avatar_file, motion_file, options.hdr))
+    inputs = _inputs(options)
     with rasterizer, frame_writer(out, formats, name=name, fps=fps, times=times) as write:
         started = before = perf_counter()
 
         def put(number: int, drawn: tuple[Frame, Camera]) -> None:
+            if number == frames.start:  # not before: what fails at once leaves the folder as it was
+                claim(out, common, inputs)
             write(number, drawn[0], _reach(framing, drawn[1]))
 
         for _ in with_progress(frames, run(frames, encode, draw, put, overlap=options.pipeline)):
@@ -113,6 +128,9 @@ def play(options: PlayOptions) -> int:
         notes.append(
             f"{lowered} of {len(frames)} frames at less than full quality, for {options.fps_floor:g} frames/s"
         )
+        warn(notes[-1])
+    if not in_view:
+        notes.append("nothing of the avatar is in view in any of these frames")
         warn(notes[-1])
     camera = camera_at(frames.stop - 1, (frames.stop - 1) / fps)
     summary = times.summary()
@@ -153,6 +171,16 @@ def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
     return options.avatar, options.motion, output_folder(options.out)
 
 
+def _inputs(options: PlayOptions) -> list[Path]:
+    """Every file and folder that the pictures are made from."""
+    given = [options.avatar, options.motion, options.hdr, options.joint_map]
+    if options.motion and options.motion.suffix.lower() == ".amc":
+        given += options.motion.parent.glob("*.asf")
+    if options.camera not in OWN_CAMERAS:
+        given.append(split_camera(options.camera)[0])
+    return [path for path in given if path is not None]
+
+
 def _light(options: PlayOptions, avatar: Avatar) -> Light:
     """The light named by ``--hdr``, or the one that was learnt with the avatar."""
     yaw = math.radians(options.hdr_yaw)
@@ -173,9 +201,7 @@ def _light_notes(light: Light) -> list[str]:
 
 
 def _camera_path(options: PlayOptions, size: tuple[int, int | None] | None, framing: Framing) -> CameraPath:
-    if options.camera not in ("front", "orbit"):
-        if ".json" not in options.camera:
-            raise InputError("--camera", expected="front, orbit or FILE.json", got=options.camera)
+    if options.camera not in OWN_CAMERAS:
         return file_path(options.camera, size)
     width, height = size or (DEFAULT_SIZE, None)
     view = View(

@@ -105,6 +105,7 @@ class Player:
         """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
         if quality == FULL and not self.aovs:
             raster = draw_encoded(self.avatar, encoded, self.shader, camera, self.rasterizer)
+            self._kept = None  # by the next frame of less quality it would be out of date
         else:
             with self.times.stage("posing"):
                 gaussians = self.avatar.posed(encoded)

@@ -1,7 +1,7 @@
 """One folder for a run, also where several processes render parts of it.
 
 A run is known by its settings and inputs. The process that finds no mark of its run in the folder leaves one and takes
-away the frames of other runs, but none that is younger than the mark: those are of processes that render other parts of
+away what other runs left, but nothing that is younger than the mark: that is of processes that render other parts of
 the same run.
 """
 
@@ -13,15 +13,18 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from rnd_runtime.files import is_folder
+
 _MARK = ".run-"
 _FRAME = re.compile(
     r"\d{6,}\.(png|exr)"
 )  # a picture as writers.py names it, and nothing that a user put there
 _FOLDERS = ("frames", "frames_exr", "aov")
+_WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4)")  # beside them, see part_name
 
 
-def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path | None]) -> None:
-    """Make ``folder`` the folder of the run with ``settings`` on ``inputs``, and free of frames of any other run."""
+def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> None:
+    """Make ``folder`` the folder of the run with ``settings`` on ``inputs``, files and folders, and free of others'."""
     mark = folder / f"{_MARK}{_identity(settings, inputs)}"
     try:
         mark.touch(exist_ok=False)
@@ -31,10 +34,11 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path | 
         if other != mark:
             other.unlink(missing_ok=True)
     oldest = mark.stat().st_mtime_ns
-    for kind in _FOLDERS:
-        for file in (folder / kind).rglob("*"):
-            if _FRAME.fullmatch(file.name) and file.is_file() and file.stat().st_mtime_ns < oldest:
-                file.unlink(missing_ok=True)
+    frames = (file for kind in _FOLDERS for file in (folder / kind).rglob("*") if _FRAME.fullmatch(file.name))
+    whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
+    for file in [*frames, *whole]:
+        if file.is_file() and file.stat().st_mtime_ns < oldest:
+            file.unlink(missing_ok=True)
 
 
 def part_name(stem: str, frames: range, count: int) -> str:
@@ -43,12 +47,13 @@ def part_name(stem: str, frames: range, count: int) -> str:
     return stem if whole else f"{stem}_{frames.start:06d}-{frames.stop:06d}"
 
 
-def _identity(settings: Mapping[str, object], inputs: Iterable[Path | None]) -> str:
+def _identity(settings: Mapping[str, object], inputs: Iterable[Path]) -> str:
     """What two processes of one run agree on: settings, and name, size and time of every input."""
     files = []
     for path in inputs:
-        if path is not None and path.is_file():
-            status = path.stat()
-            files.append((str(path.resolve()), status.st_size, status.st_mtime_ns))
+        for file in sorted(path.rglob("*")) if is_folder(path) else [path]:
+            if file.is_file():
+                status = file.stat()
+                files.append((str(file.resolve()), status.st_size, status.st_mtime_ns))
     text = json.dumps([settings, files], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

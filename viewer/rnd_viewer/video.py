@@ -110,17 +110,22 @@ def mp4_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], No
 
         def write(image_srgb: Bytes) -> None:
             planes = rgb_to_yuv420(image_srgb)
+            height, width = planes.shape[0] * 2 // 3, planes.shape[1]
             if not stream.codec_context.is_open:
-                stream.width, stream.height = planes.shape[1], planes.shape[0] * 2 // 3
+                stream.width, stream.height = width, height
                 stream.pix_fmt = "yuv420p"
                 tag(stream.codec_context)
+            if (width, height) != (stream.width, stream.height):
+                expected = f"pictures of one size, {stream.width}x{stream.height}"
+                raise InputError("mp4", expected=expected, got=f"{width}x{height}", file=path)
             frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
             tag(frame)
             try:
                 container.mux(stream.encode(frame))
             except av.error.FFmpegError as error:
-                size = f"{planes.shape[1]}x{planes.shape[0] * 2 // 3}"
-                raise InputError(f"mp4 encoder refuses {size}", got=error.strerror, file=path) from error
+                raise InputError(
+                    f"mp4 encoder refuses {width}x{height}", got=error.strerror, file=path
+                ) from error
 
         yield write
         container.mux(stream.encode(None))

@@ -216,7 +216,7 @@ class _Visitor:
 
     def _clip(self, socket: Any, request: ClipRequest) -> None:
         motion, state = self._scene.motion, replace(request.state, truth=None)
-        frames = frame_count(motion.duration, request.fps)
+        frames = frame_count(motion, request.fps)
         if frames > MOST_CLIP_FRAMES:
             raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
         with TemporaryDirectory() as folder:
