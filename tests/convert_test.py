@@ -404,6 +404,30 @@ def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
     assert "left out: antenna" in capsys.readouterr().out
 
 
+def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):
+    """The options that the reader's own errors name, and its notes."""
+    with np.load(WALK) as archive:
+        arrays = {name: archive[name] for name in ("poses", "trans")}
+    strange = [f"B{joint}" for joint in range(arrays["poses"].shape[1] // 3)]
+    save_npz(tmp_path / "strange.npz", arrays | {"joint_names": np.array(strange)})
+    table = "\n".join(f'{ours} = "B{joint}"' for joint, ours in enumerate(body().skeleton.names))
+    (tmp_path / "names.toml").write_text(table)
+    line = [
+        "motion",
+        str(AVATAR),
+        "--motion",
+        str(tmp_path / "strange.npz"),
+        "--out",
+        str(tmp_path / "out.npz"),
+    ]
+    assert main(line) == 2
+    assert main([*line, "--joint-map", str(tmp_path / "names.toml")]) == 0
+    assert "note: no frame rate in the file" in capsys.readouterr().out
+    assert main([*line, "--joint-map", str(tmp_path / "names.toml"), "--motion-fps", "24"]) == 0
+    printed = capsys.readouterr().out
+    assert "at 24 per second" in printed and "note:" not in printed
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import threading
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import numba
 import numpy as np
 import pytest
 from PIL import Image
@@ -38,7 +41,7 @@ from rnd_viewer.player import Player
 from rnd_viewer.view_cli import main
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene, _fewer
-from rnd_viewer.view_server import serve
+from rnd_viewer.view_server import Access, serve
 from tiny import ASSETS
 from view_process import running
 
@@ -53,6 +56,15 @@ class CountedAvatar(FakeAvatar):
     """A fake that says how large it is."""
 
     gaussians = 24 * 120
+
+
+def has_ipv6_loopback() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6) as listener:
+            listener.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
 
 
 @pytest.fixture
@@ -244,6 +256,52 @@ def test_on_loopback_other_names_and_other_sites_are_refused(options):
         for origin in ("http://evil.example", "http://127.0.0.1:1", "null"):
             with pytest.raises(InvalidStatus, match="403"):
                 _knock(port, origin=origin)
+
+
+def test_on_the_port_of_http_browsers_name_no_port():
+    for host in ("127.0.0.1", "localhost", "127.0.0.1:80"):
+        assert Access.local("127.0.0.1", 80).refusal("/", {"Host": host}) is None
+    assert Access.local("127.0.0.1", 80).refusal("/", {"Host": "evil.example"}) is not None
+
+
+@pytest.mark.skipif(not has_ipv6_loopback(), reason="this machine has no ::1")
+def test_an_ipv6_address_serves(options):
+    with serve(Scene(options), "::1", 0, None) as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            assert url.startswith("http://[::1]:")
+            with urllib.request.urlopen(url, timeout=10) as page:
+                assert page.status == 200
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_threads_hold_for_every_visitor(options, monkeypatch):
+    counts = []
+    original = Scene.render
+    monkeypatch.setattr(
+        Scene, "render", lambda scene, state: counts.append(numba.get_num_threads()) or original(scene, state)
+    )
+    with _serving(replace(options, threads=1)) as (port, _):
+        for _ in range(2):
+            with _visiting(port) as visitor:
+                visitor.picture()
+    assert counts == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"motion_up": "z"}, "--motion-up: expected the default, got z"),
+        ({"joint_map": Path("t.toml")}, "--joint-map"),
+        ({"loop": True}, "--loop: expected the default, got True"),
+    ],
+)
+def test_options_of_a_motion_that_is_not_there_are_refused(changes, line):
+    with pytest.raises(InputError, match=line):
+        ViewOptions(Path("avatar.onnx"), **changes)
 
 
 def test_a_token_is_asked_for_everywhere(options):

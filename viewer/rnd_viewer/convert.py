@@ -17,12 +17,12 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, load_light
-from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
 from .cameras import CameraPath, View, file_path, frame_motion, front_path
-from .convert_cli import MeshOptions, MotionOptions, Options, SplatOptions
+from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
 from .mesh_files import posed_vertices, write_obj, write_rigged_glb
 from .options import parse_frames, refuse_outside
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
@@ -55,7 +55,8 @@ def _splats(options: SplatOptions) -> Iterator[str]:
         raise InputError("--sh-degree", expected="0 for visionary", got=options.sh_degree)
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
-    motion = load_motion(options.motion, avatar.skeleton)
+    motion = options.read_motion(options.motion, avatar.skeleton)
+    yield from _noted(motion)
     frames = parse_frames(options.frames, motion.frame_count)
     if "visionary" in formats:
         check_clip(len(frames), avatar.gaussians)
@@ -120,7 +121,8 @@ def _transformed(program: str, stem: Path, splats: Splats, formats: tuple[str, .
 def _mesh(options: MeshOptions) -> Iterator[str]:
     formats = _formats(options.format, MESH_FORMATS)
     body = Body.load(options.body)
-    motion = load_motion(options.motion, body.skeleton)
+    motion = options.read_motion(options.motion, body.skeleton)
+    yield from _noted(motion)
     frames = parse_frames(options.frames, motion.frame_count)
     out = output_folder(options.out)
     if "glb" in formats:
@@ -133,14 +135,20 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
         yield f"{len(frames)} posed meshes as obj in {out}"
 
 
-def _motion(options: MotionOptions) -> Iterator[str]:
+def _motion(options: AmassOptions) -> Iterator[str]:
     file = existing_file(options.skeleton, what="avatar or body")
     skeleton = Body.load(file).skeleton if file.suffix == ".npz" else Avatar.load(file).skeleton
-    motion = load_motion(options.motion, skeleton)
+    motion = options.read_motion(options.motion, skeleton)
+    yield from _noted(motion)
     lost = write_amass(options.out, motion, skeleton)
     if lost:
         yield f"joints that SMPL-H lacks were left out: {', '.join(lost)}"
     yield f"{options.out}: {motion.frame_count} frames at {motion.fps:g} per second"
+
+
+def _noted(motion: Motion) -> Iterator[str]:
+    """What the motion's reader assumed or left out."""
+    return (f"note: {note}" for note in motion.notes)
 
 
 def _light(options: SplatOptions, avatar: Avatar) -> Light:
@@ -154,8 +162,6 @@ def _light(options: SplatOptions, avatar: Avatar) -> Light:
 def _camera_path(text: str, skeleton: Skeleton, motion: Motion) -> CameraPath:
     if text == "front":
         return front_path(frame_motion(skeleton, motion), FRONT)
-    if ".json" not in text:
-        raise InputError("--camera", expected="front, FILE.json or FILE.json:NAME", got=text)
     return file_path(text, None)
 
 

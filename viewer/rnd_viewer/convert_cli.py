@@ -11,11 +11,13 @@ import tyro
 
 from rnd_runtime.errors import parse_options, run_command
 
+from .options import MotionOptions
+
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
-class SplatOptions:
+class SplatOptions(MotionOptions):
     """Posed, relit frames as plain 3D Gaussians: .ply and .glb, and .spz or .sog where splat-transform is installed."""
 
     avatar: Annotated[Path, tyro.conf.Positional]
@@ -49,7 +51,7 @@ class SplatOptions:
 
 
 @dataclass(frozen=True)
-class MeshOptions:
+class MeshOptions(MotionOptions):
     """The posed template: .obj for each frame, or one .glb with skeleton, weights and the motion as an animation."""
 
     body: Annotated[Path, tyro.conf.Positional]
@@ -65,7 +67,7 @@ class MeshOptions:
 
 
 @dataclass(frozen=True)
-class MotionOptions:
+class AmassOptions(MotionOptions):
     """A motion as an AMASS .npz (SMPL-H, Z up), which SMPL tools for Blender and others read."""
 
     skeleton: Annotated[Path, tyro.conf.Positional]
@@ -76,11 +78,11 @@ class MotionOptions:
     """the .npz to write"""
 
 
-Options = SplatOptions | MeshOptions | MotionOptions
+Options = SplatOptions | MeshOptions | AmassOptions
 _COMMANDS: dict[str, Callable[..., Options]] = {
     "splats": SplatOptions,
     "mesh": MeshOptions,
-    "motion": MotionOptions,
+    "motion": AmassOptions,
 }
 
 

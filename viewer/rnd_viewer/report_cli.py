@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,11 +12,13 @@ import tyro
 
 from rnd_runtime.errors import InputError, parse_options, run_command
 
+from .options import MotionOptions
+
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
-class ReportOptions:
+class ReportOptions(MotionOptions):
     """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options."""
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -43,10 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .run_report import write_run_report
 
         out = options.out or options.run / "report.html"
+        motion = None if options.motion is None else partial(options.read_motion, options.motion)
         write_run_report(
-            options.run, out, motion=options.motion, hdrs=options.hdr, bench=options.bench,
-            pictures=options.pictures,
-        )  # fmt: skip
+            options.run, out, motion=motion, hdrs=options.hdr, bench=options.bench, pictures=options.pictures
+        )
         say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
         return 0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.light import Light, load_light
-from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.motion import Motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
+from rnd_runtime.skeleton import Skeleton
 
 from .aov import aov_picture
 from .cameras import View, frame_motion, front_path, orbit_path
@@ -31,13 +32,13 @@ MODE = "table+sun"
 class Shots:
     """An avatar in one motion (the rest pose where none is given), ready to be filmed."""
 
-    def __init__(self, avatar_file: Path, motion_file: Path | None) -> None:
+    def __init__(self, avatar_file: Path, read_motion: Callable[[Skeleton], Motion] | None) -> None:
         self.avatar = Avatar.load(avatar_file)
         skeleton = self.avatar.skeleton
         self.motion = (
             Motion(np.tile(np.eye(3), (1, len(skeleton), 1, 1)), np.zeros((1, 3)), FPS, skeleton.names)
-            if motion_file is None
-            else load_motion(motion_file, skeleton)
+            if read_motion is None
+            else read_motion(skeleton)
         )
         view = View(SIDE, SIDE, math.radians(35), math.radians(5))
         framing = frame_motion(skeleton, self.motion)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import are_rows, atomic_path, existing_file
 from rnd_runtime.images import read_image
+from rnd_runtime.motion import Motion
+from rnd_runtime.skeleton import Skeleton
 
 from .html_parts import compare, curve, data_uri, figure, png, rows_table, table
 from .report_shots import Shots
@@ -46,7 +48,7 @@ def write_run_report(
     run: Path,
     out: Path,
     *,
-    motion: Path | None = None,
+    motion: Callable[[Skeleton], Motion] | None = None,
     hdrs: tuple[Path, ...] = (),
     bench: Path | None = None,
     pictures: int = 3,
@@ -54,8 +56,10 @@ def write_run_report(
     """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
 
     Args:
-        motion: played in the turntable. hdrs: relit under these. bench: a folder with the speed–accuracy
-            charts (\\*.svg) and ``stability.json``. pictures: shown of each held-out split.
+        motion: played in the turntable, read for the avatar's skeleton.
+        hdrs: relit under these.
+        bench: a folder with charts (``*.svg``) and ``stability.json``.
+        pictures: shown of each held-out split.
 
     Raises:
         InputError: ``run`` holds no training, or a file of it is damaged.
@@ -85,7 +89,9 @@ def _facts(rows: Sequence[dict[str, Any]]) -> str:
     return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
 
 
-def _turntable_and_relights(run: Path, motion: Path | None, hdrs: tuple[Path, ...]) -> str:
+def _turntable_and_relights(
+    run: Path, motion: Callable[[Skeleton], Motion] | None, hdrs: tuple[Path, ...]
+) -> str:
     avatar = run / "avatar.onnx"
     if not avatar.is_file():
         return _missing("The avatar", f"no avatar.onnx in the run: rnd-export {run / 'avatar.ckpt'} makes it")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import webbrowser
 from collections.abc import Sequence
+from threading import Thread
 
 import tyro
 from rich.console import Console
@@ -45,7 +46,7 @@ def view(options: ViewOptions) -> int:
         with serve(scene, options.host, options.port, token) as (server, url):
             console.print(f"rnd-view: {url}", soft_wrap=True, markup=False)
             if options.browser and options.local:
-                webbrowser.open(url)
+                Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
             server.serve_forever()
     finally:
         scene.close()

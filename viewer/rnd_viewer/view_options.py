@@ -11,7 +11,7 @@ import tyro
 
 from rnd_runtime.errors import InputError
 
-from .options import MotionOptions, option
+from .options import MotionOptions, option, refuse_changed
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,16 @@ class ViewOptions(MotionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.motion is None:
+            reading = ("motion_up", "motion_fps", "joint_map")
+            refuse_changed(
+                self, reading, MotionOptions, "needs --motion: the capture's own is read by its rules"
+            )
+        if self.motion is None and self.capture is None:
+            edits = ("smooth", "speed", "in_place", "loop")
+            refuse_changed(
+                self, edits, MotionOptions, "needs --motion or --capture: the pose at rest does not move"
+            )
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         if not 64 <= self.size <= 2048:

@@ -16,6 +16,7 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import existing_file
 from rnd_runtime.frame import as_seen_from, draw
 from rnd_runtime.gaussians import Gaussians, Raster
 from rnd_runtime.light import Light, load_light
@@ -65,7 +66,7 @@ class Scene:
         self.motion = self._motion(options)
         self._files = _probes(options.hdr)
         self.rasterizer = make_rasterizer(options.raster)
-        self.name, self.size = options.avatar.name, options.size
+        self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
         self._behind: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
@@ -131,7 +132,8 @@ class Scene:
 
     def truth_file(self, index: int) -> Path:
         """The capture's picture ``index``."""
-        return self._capture_frame(index)[0].folder / self._capture_frame(index)[1].image
+        capture, frame = self._capture_frame(index)
+        return existing_file(capture.folder / frame.image, what="picture of the capture")
 
     def close(self) -> None:
         self.rasterizer.close()

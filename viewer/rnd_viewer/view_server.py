@@ -20,6 +20,7 @@ from http.cookies import CookieError, SimpleCookie
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
+from socket import AF_INET, AF_INET6
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from types import ModuleType
@@ -30,6 +31,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from rnd_runtime.errors import InputError
+from rnd_runtime.threads import set_threads
 
 from .options import frame_count
 from .video import mp4_writer
@@ -39,6 +41,7 @@ from .view_state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, T
 INSTALL = "pip install 'rnd-avatar[view]'"
 COOKIE = "rnd_view_token"
 JPEG_QUALITY = 90
+HTTP_PORT = 80  # which browsers leave out of the host's name
 MOST_BYTES_IN = 1 << 16  # a request is a few hundred
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -71,7 +74,8 @@ class Access:
     def local(cls, host: str, port: int) -> Access:
         """For a loopback ``host``: no token, but nobody else's name for it."""
         names = {"localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host}
-        return cls(None, frozenset(f"{name}:{port}" for name in names))
+        called = {f"{name}:{port}" for name in names}
+        return cls(None, frozenset(called | names if port == HTTP_PORT else called))
 
     def refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
         """Why a request is not answered, or None if it is."""
@@ -131,6 +135,7 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
             max_size=MOST_BYTES_IN,
             server_header=None,
             logger=_quiet_logger(),
+            family=AF_INET6 if ":" in host else AF_INET,
         )
     except OSError as error:
         raise InputError(
@@ -182,6 +187,7 @@ class _Visitor:
         """Serve one websocket until it closes. A refused request is answered with its reason."""
         from websockets.exceptions import ConnectionClosed
 
+        set_threads(self._scene.threads)  # each visitor has a thread, and each thread a number of its own
         with suppress(ConnectionClosed):  # while a picture was on its way
             self._send(socket, {"kind": "scene", "scene": self._scene.description()})
             for message in socket:

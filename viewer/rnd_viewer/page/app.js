@@ -204,7 +204,8 @@ function clip() {
   $("clip").disabled = true;
   say("making a clip …");
   const turn = $("turntable").checked ? 2 * Math.PI : 0;
-  engine.clip({ ...state }, scene.motion.fps, turn, scene.motion.duration);
+  const fps = Math.min(Math.max(scene.motion.fps, 1), 240);
+  engine.clip({ ...state }, fps, turn, scene.motion.duration);
 }
 
 function slider(id, apply) {
