@@ -1,7 +1,7 @@
 """Sheets for the README from the strips of rnd-eval: python scripts/strip_pictures.py STRIPS OUT.png NAME NAME …
 
 STRIPS is a folder that ``rnd-eval --pictures`` wrote (truth, render, normals, albedo, error side by side); the named
-strips are cut to the person and laid out two to a row.
+strips are cut to the person and laid out two to a row; of an odd number, the last has black beside it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ SHOWN = (270, 150)
 def main(folder: Path, out: Path, names: list[str]) -> None:
     """Write the sheet."""
     strips = [_cut(read_image(folder / f"{name}.png")[..., :3]) for name in names]
+    if len(strips) > 1 and len(strips) % 2:
+        strips.append(np.zeros_like(strips[-1]))
     rows = [np.concatenate(strips[k : k + 2], axis=1) for k in range(0, len(strips), 2)]
     write_image(out, np.concatenate(rows, axis=0))
 

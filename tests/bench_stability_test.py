@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+import io
 import json
 
+import msgspec
 import numpy as np
+import pytest
+from rich.console import Console
 
-from rnd_trainer.bench_stability import StabilityOptions, _keep, stability_main
-from rnd_trainer.stability.figures import Result, above, below, holds, stated
+from rnd_runtime.capture import Capture
+from rnd_runtime.images import write_image
+from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, stability_main
+from rnd_trainer.stability import captures, materials, poses, relighting, soak
+from rnd_trainer.stability.figures import Figure, Result, above, below, holds, not_measured, stated
 from rnd_trainer.stability.rows import ROWS
+from rnd_trainer.stability.subject import Subject
 
 
 def test_every_row_of_the_list_is_there_once():
@@ -55,3 +64,97 @@ def test_a_number_that_is_none_never_passes():
     nan = float("nan")
     assert not below("x", nan, 1).passes and not above("x", nan, 1).passes and not stated("x", nan).passes
     assert holds("x", []).passes and not holds("x", ["one"]).passes
+
+
+def test_a_figure_that_is_missing_is_said_so_and_stops_no_later_row(tmp_path):
+    options, nan = StabilityOptions(json=tmp_path / "table.json"), float("nan")
+    figures = (
+        not_measured("scale"),
+        below("pace", nan, 1, "×", baseline=("plain", nan)),
+        stated("length", 2.0, "m"),
+    )
+    _keep(options, "L11", "scale", figures, None)
+    _keep(options, "P1", "poses", (stated("length", 2.0, "m"),), None)
+    rows = json.loads(options.json.read_text())
+    assert [(row["measured"], row["verdict"]) for row in rows] == [
+        (2.0, "reported"), (None, "not measured"), (None, "fail"), (2.0, "reported"),
+    ]  # fmt: skip
+    table = (tmp_path / "table.md").read_text()
+    assert "| L11 | scale | scale (not in this capture) | not measured |  |  |  |" in table
+    assert "| L11 | scale | pace | not measured | < 1 | **✗** | plain: not measured |" in table
+    shown = io.StringIO()
+    _show(Console(file=shown, width=120), "L11", figures)
+    assert [line.split(":", 1)[1].strip() for line in shown.getvalue().splitlines()] == [
+        "not measured", "not measured < 1  (plain: not measured)", "2 m",
+    ]  # fmt: skip
+
+
+def test_a_short_soak_has_no_slope_of_memory():
+    segment = {"frames": 300, "memory": [1, 2], "seconds": [1.0] * 300, "loads": [], "wrong": 0}
+    figures = soak._figures("playback", [segment], True, ())
+    assert figures[0].what == "playback, 300: memory a frame (too few in one go)" and not figures[0].line
+    assert np.isnan(figures[0].measured) and len(figures) == 2 and figures[1].passes
+
+
+@pytest.fixture(scope="module")
+def bare(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory) -> Subject:
+    """A capture of five pictures to train on: no other lights or poses, no albedo, no normals."""
+    frames = tuple(
+        msgspec.structs.replace(frame, normal=None) for frame in tiny_capture.frames if frame.frame < 5
+    )
+    return _with(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory.mktemp("bare"), frames)
+
+
+def _with(avatar, checkpoint, capture: Capture, work, frames) -> Subject:
+    return Subject(avatar, checkpoint, dataclasses.replace(capture, frames=frames), work, small=True, size=24)
+
+
+def _missing(figures: tuple[Figure, ...]) -> list[str]:
+    """What was not measured; the others are numbers."""
+    missing = [figure for figure in figures if np.isnan(figure.measured)]
+    assert all(not figure.line and not figure.passes and "this capture)" in figure.what for figure in missing)
+    return [figure.what.split(" (")[0] for figure in missing]
+
+
+def test_what_a_capture_lacks_is_not_measured(bare):
+    assert len(_missing(materials.relit_scale(bare).figures)) == 4
+    assert _missing(materials.baked_light(bare).figures) == ["|correlation| of albedo error and irradiance"]
+    assert _missing((materials._lost_to_exact(bare),)) == ["PSNR lost to exact visibility on held-out poses"]
+    assert _missing((poses._held_out(bare)[0],)) == ["PSNR over template LBS on held-out poses, mean"]
+    assert len(_missing(captures.broken_captures(bare).figures)) == 1
+    assert len(_missing(captures.bad_masks(bare).figures)) == 2
+
+
+def test_flipped_normals_are_of_captures_that_have_normals(bare, tiny_capture, tmp_path):
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, tiny_capture.frames)
+    assert relighting._flipped_capture(subject).passes
+    record = captures._record(tiny_capture.folder)
+    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"]]
+    (tmp_path / "plain").mkdir()
+    for part in ("images", "masks", "lights", "body.npz", "motion.npz"):
+        (tmp_path / "plain" / part).symlink_to(tiny_capture.folder / part)
+    captures._save(tmp_path / "plain", record)
+    plain = dataclasses.replace(tiny_capture, folder=tmp_path / "plain")
+    subject = _with(bare.avatar_file, bare.checkpoint, plain, tmp_path, plain.frames)
+    assert len(_missing((relighting._flipped_capture(subject),))) == 1
+
+
+def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture, tmp_path):
+    other = msgspec.structs.replace(tiny_capture.frames[0], split="relight")
+    frames = (*tiny_capture.frames[1:3], other)
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, frames)
+    figures = materials.relit_scale(subject).figures
+    assert [np.isnan(figure.measured) for figure in figures] == [False, True, False, True]
+
+
+def test_frames_without_light_or_person_are_passed_over(bare, tiny_capture, tmp_path):
+    camera = tiny_capture.cameras["front"]
+    write_image(tmp_path / "empty.png", np.zeros((camera.height, camera.width, 1), np.uint8))
+    train = msgspec.structs.replace(tiny_capture.frames[0], albedo=tiny_capture.frames[0].image, light=None)
+    empty = msgspec.structs.replace(
+        tiny_capture.frames[1], split="novel_pose", mask=str(tmp_path / "empty.png")
+    )
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, (train, empty))
+    assert len(_missing(materials.baked_light(subject).figures)) == 1
+    assert len(_missing((materials._lost_to_exact(subject),))) == 1
+    assert len(_missing((poses._held_out(subject)[0],))) == 1

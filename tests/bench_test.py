@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from rnd_runtime.avatar import Avatar
+from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
-from rnd_trainer import bench_cli, bench_frame, bench_grid, bench_peers, bench_shards
-from rnd_trainer.bench_avatars import Encoders, seeded_checkpoint
+from rnd_trainer import (
+    bench_avatars,
+    bench_cli,
+    bench_frame,
+    bench_grid,
+    bench_peers,
+    bench_reference,
+    bench_shards,
+)
+from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
@@ -25,6 +36,7 @@ from rnd_trainer.checkpoint import load_checkpoint
 from tiny import ASSETS
 
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
+HERE = {"machine": "this one", "ms_median": 1.0}
 BRUTE_DB = 65.0
 """the fastest exact path against the reference: float32 against float64, numba against numpy"""
 
@@ -127,12 +139,103 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     assert seen == [True] * 3 + [False] * 3 + [True] * (len(settings(True)) - 3)
     assert [row for row in rows if "failed" in row] == [next(r for r in rows if r["raster"] == "gl-egl")]
     seen.clear()
-    (tmp_path / "work" / "old_lit.npz").touch()
+    kept = (
+        "reference_0a_lit.npz",
+        "reference_0a_512.npz",
+        "seeded_8000_0a.ckpt",
+        "exported_0a_full_f32.onnx",
+    )
+    mine = ("walk.npz", "avatar.ckpt", "avatar.onnx")
+    for name in (*kept, *mine):
+        (tmp_path / "work" / name).touch()
     grid(inputs, out, quick=True, fresh=True, on_row=lambda row, new: seen.append(new))
-    assert all(seen) and len(seen) == len(settings(True)) and not [*(tmp_path / "work").glob("*.npz")]
+    assert all(seen) and len(seen) == len(settings(True))
+    assert {file.name for file in (tmp_path / "work").iterdir()} == set(mine)
     assert {json.dumps(row, sort_keys=True) for row in json.loads(out.read_text())} == {
         json.dumps(row, sort_keys=True) for row in rows
     }
+
+
+def test_rows_of_other_files_are_measured_again(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(
+        bench_grid, "measured", lambda setting, inputs, **_: dataclasses.asdict(setting) | HERE
+    )
+    monkeypatch.setattr(bench_grid, "machine", lambda: "this one")
+    body, out = tmp_path / "body.npz", tmp_path / "grid.json"
+    inputs = Inputs(body, WALK, SKY, tmp_path / "work")
+
+    def new_rows(given: Inputs = inputs) -> set[bool]:
+        seen: set[bool] = set()
+        grid(given, out, quick=True, on_row=lambda row, new: seen.add(new))
+        return seen
+
+    body.write_bytes(b"one")
+    assert [new_rows(), new_rows()] == [{True}, {False}]
+    body.write_bytes(b"another")
+    assert [new_rows(), new_rows()] == [{True}, {False}]
+    (tmp_path / "avatar.ckpt").write_bytes(b"trained")
+    trained = dataclasses.replace(inputs, checkpoint=tmp_path / "avatar.ckpt")
+    assert [new_rows(trained), new_rows(trained)] == [{True}, {False}]
+    with pytest.raises(InputError, match="checkpoint not found"):
+        new_rows(dataclasses.replace(inputs, checkpoint=tmp_path / "nowhere.ckpt"))
+
+
+def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, monkeypatch) -> None:
+    """Another body, motion, light, checkpoint or exporter under an old name is not taken for the old one."""
+    made: list[list[str]] = []
+
+    def pretend(line: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        made.append(line)
+        Path(line[line.index("--out") + 1]).touch()
+        return subprocess.CompletedProcess(line, 0)
+
+    monkeypatch.setattr(bench_avatars.subprocess, "run", pretend)
+    assert "export.py" in {file.name for file in bench_avatars._exporter()}
+    checkpoint, code = tmp_path / "avatar.ckpt", tmp_path / "export.py"
+    monkeypatch.setattr(bench_avatars, "_exporter", lambda: [code])
+    checkpoint.write_bytes(b"one")
+    code.write_bytes(b"old")
+    assert exported(checkpoint, Encoders(), tmp_path) == exported(checkpoint, Encoders(), tmp_path)
+    assert len(made) == 1
+    code.write_bytes(b"new")
+    exported(checkpoint, Encoders(), tmp_path)
+    monkeypatch.setattr(bench_avatars, "__version__", "9.9")
+    exported(checkpoint, Encoders(), tmp_path)
+    checkpoint.write_bytes(b"two")
+    exported(checkpoint, Encoders(), tmp_path)
+    assert len(made) == len({line[line.index("--out") + 1] for line in made}) == 4
+
+    lit: list[Path] = []
+
+    def shine(avatar: Path, motion: Path, hdr: Path) -> dict[str, np.ndarray]:
+        lit.append(motion)
+        return {"means": np.zeros((0, 0, 3))}
+
+    monkeypatch.setattr(bench_reference, "_lit", shine)
+    monkeypatch.setattr(bench_reference, "COMPARED", ())
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "walk.npz").write_text(folder)
+    for folder in ("a", "b", "a"):
+        reference(tiny_avatar, tmp_path / folder / "walk.npz", SKY, 8, tmp_path)
+    assert lit == [tmp_path / "a" / "walk.npz", tmp_path / "b" / "walk.npz"]
+
+
+def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:
+    body = Body.load(ASSETS / "body.npz")
+    body.save(tmp_path / "body.npz")
+    before = seeded_checkpoint(60, tmp_path / "body.npz", tmp_path)
+    assert seeded_checkpoint(60, tmp_path / "body.npz", tmp_path) == before
+    dataclasses.replace(body, vertices=1.5 * body.vertices).save(tmp_path / "body.npz")
+    after = seeded_checkpoint(60, tmp_path / "body.npz", tmp_path)
+    heights = [np.ptp(load_checkpoint(file).model.points.numpy()[:, 1]) for file in (before, after)]
+    assert heights[1] > 1.2 * heights[0]
+
+
+def test_a_point_that_takes_too_long_is_one_of_those_that_fail(tiny_avatar, monkeypatch) -> None:
+    monkeypatch.setattr(bench_frame, "DEADLINE_S", 0.05)
+    with pytest.raises(InputError, match=r"cpu, ao: expected an answer within 0\.05 s, got none"):
+        bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), size=16, shade="ao"))
 
 
 @pytest.mark.parametrize("words", [["--quick"], ["grid", "--quick"]])

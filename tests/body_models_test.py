@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle  # noqa: TID251  # writes what others' programs write
+import re
 import sys
 import types
 
@@ -16,6 +17,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import SMPL_NAMES
+from rnd_trainer.importing import body_models
 from rnd_trainer.importing.body_models import convert_body_model, load_body_model
 
 EXACT = 1e-5  # m: bone transforms and weights are float32
@@ -199,3 +201,17 @@ def test_a_converted_body_is_the_shaped_one(tmp_path) -> None:
     expected = published(smpl_arrays(), np.array([0.8, -0.5]), np.zeros((24, 3)), np.zeros(3))
     assert_allclose(body.vertices, expected, atol=EXACT)
     assert body.license == "mine"
+
+
+def test_betas_that_would_change_nothing_are_refused(tmp_path, monkeypatch) -> None:
+    coarse_body().save(tmp_path / "body.npz")
+    out = tmp_path / "out.npz"
+    said = re.escape(f"--betas: expected none, as {tmp_path / 'body.npz'} has one shape, got 0.5 -0.2")
+    with pytest.raises(InputError, match=said):
+        convert_body_model(tmp_path / "body.npz", out, (0.5, -0.2))
+    monkeypatch.setattr(body_models, "anny_body", coarse_body)
+    with pytest.raises(InputError, match="--betas: expected none, as anny has one shape, got 1"):
+        convert_body_model("anny", out, (1.0,))
+    assert not out.exists()
+    convert_body_model(tmp_path / "body.npz", out)
+    assert out.exists()

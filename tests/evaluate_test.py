@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
@@ -18,6 +19,7 @@ from rnd_trainer.ablate import (
     LENGTHS,
     VARIANTS,
     ablate,
+    check_needs,
     chosen,
     encoder_cost,
     summarise,
@@ -80,6 +82,30 @@ def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
     _, similarity = cv2.quality.QualitySSIM_compute(a, b)
     ours = ssim_map(first, second).numpy()
     assert np.abs(ours - similarity[5:-5, 5:-5, :3]).mean() < CV2_SSIM
+
+
+def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
+    judge, original = (
+        Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture),
+        type(tiny_capture).load_frame,
+    )
+    first = tiny_capture.split("novel_view")[0]
+
+    def with_mask(columns: slice):
+        def load(capture, frame):
+            images = original(capture, frame)
+            mask = np.zeros_like(images.mask)
+            mask[:, columns] = 1
+            return dataclasses.replace(images, mask=mask) if frame == first else images
+
+        return load
+
+    monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 2)))
+    scores = evaluate(judge, "novel_view")
+    assert scores.frames == len(tiny_capture.split("novel_view")) and "ssim_box" in scores.scores
+    assert not np.isnan(list(scores.scores.values())).any()
+    monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 0)))
+    assert evaluate(judge, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
 
 
 def test_normal_pictures_are_black_where_nothing_is() -> None:
@@ -150,6 +176,9 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     assert len(calls) == 6 and {row["seed"] for row in rows} == {0, 1}
     written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
     assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
+    config = dataclasses.replace(config, steps=5)
+    with pytest.raises(InputError, match="steps of a run done before: expected 5, got 4"):
+        go()
     timed = time_encoders(rows, tmp_path, VARIANTS[:3], 0)
     assert [row["encoder_gflop"] for row in timed] == [row["encoder_gflop"] for row in rows]
     table = summarise(timed, VARIANTS[:3])
@@ -165,6 +194,14 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     ssim = [r["ssim"] for r in rows if (r["method"], r["split"]) == ("static skinning", "novel_view")]
     assert cell["ssim"] == pytest.approx(sum(ssim) / 2) and "lpips" not in cell
     assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
+
+
+def test_what_a_study_needs_is_looked_for_before_it_begins(tiny_capture) -> None:
+    noisy, true_light = (next(v for v in CAUSES if v.name == name) for name in ("noisy poses", "true light"))
+    with pytest.raises(InputError, match="motion_noisy"):
+        check_needs([noisy], tiny_capture)
+    with pytest.raises(InputError, match="light: expected"):
+        check_needs([true_light], dataclasses.replace(tiny_capture, lights={}))
 
 
 def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:
@@ -193,6 +230,8 @@ def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_c
     from rnd_trainer.train import Training
 
     costs = {}
+    exact = tuple(structs.replace(frame, normal_gt=frame.normal) for frame in tiny_capture.frames)
+    tiny_capture = dataclasses.replace(tiny_capture, frames=exact)
     for variant in (*VARIANTS, *CAUSES[:5]):
         model = dataclasses.replace(tiny_config.model, **variant.model)
         config = dataclasses.replace(tiny_config, model=model, steps=2, **variant.train)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -38,7 +39,7 @@ def _imported(write: Callable[[Path], None], tmp_path: Path, **options: object) 
     source, out = tmp_path / "source", tmp_path / "capture"
     source.mkdir()
     write(source)
-    given = {"body": str(layouts.body_file(tmp_path)), "choice": EVERYTHING} | options
+    given = {"body": str(layouts.body_file(tmp_path))} | options
     import_source(source, out, ImportOptions(**given))
     return load_capture(out)
 
@@ -111,6 +112,8 @@ def _moving(camera: str, frame: int) -> str:
     return layouts.neuman_camera(frame)
 
 
+ONE_A_MOMENT = (_only, _moving)
+"""no other camera to hold out pictures of"""
 _prepared, _neuman, _easymocap = layouts.write_intrinsic_avatar, layouts.write_neuman, layouts.write_easymocap
 LAYOUTS: dict[str, tuple[str, Callable[[Path], None], Callable[[str, int], str], bool, float]] = {
     # layout, writer, the scene's camera, whether a lens is undone, fps
@@ -139,7 +142,8 @@ def test_every_layout_is_the_same_scene(tmp_path, name) -> None:
         pytest.importorskip("joblib")
     if name == "PeopleSnapshot":
         pytest.importorskip("h5py")
-    capture = _imported(write, tmp_path)
+    choice = Choice() if camera_of in ONE_A_MOMENT else EVERYTHING
+    capture = _imported(write, tmp_path, choice=choice)
     assert find_layout(tmp_path / "source")[0] == layout
     assert_the_scene(capture, camera_of, bent=bent, fps=fps)
     report = check_capture(tmp_path / "capture")
@@ -199,3 +203,79 @@ def test_poses_that_do_not_fill_a_split_are_refused(tmp_path) -> None:
     layouts.write_snapshot_split(source, range(0, 446, 4), range(446, 640, 4))
     with pytest.raises(InputError, match=r"expected 51 in the test split .*, got 49"):
         import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
+
+
+# ARAH's files, and what is chosen of several cameras
+
+
+def _arah(tmp_path: Path) -> tuple[Path, Callable[..., str]]:
+    """The layout's folder, and what its import is refused with."""
+    source = tmp_path / "source"
+    source.mkdir()
+    layouts.write_arah(source)
+    body = str(layouts.body_file(tmp_path))
+
+    def refusal(**options: object) -> str:
+        with pytest.raises(InputError) as caught:
+            import_source(source, tmp_path / "out", ImportOptions(body=body, **options))
+        return str(caught.value)
+
+    return source, refusal
+
+
+def test_an_arah_camera_without_jpegs_is_named(tmp_path) -> None:
+    source, refusal = _arah(tmp_path)
+    for picture in (source / "2").glob("*.jpg"):
+        picture.unlink()
+    assert refusal() == f"{source / '2'}: pictures: expected .jpg or .jpeg files, got none"
+
+
+@pytest.mark.parametrize("inner", ["models/shape.npz", "1/cover.jpg"])
+def test_an_arah_file_without_a_number_is_named(tmp_path, inner) -> None:
+    source, refusal = _arah(tmp_path)
+    file = source / inner
+    file.write_bytes(next(file.parent.glob(f"*{file.suffix}")).read_bytes())
+    assert refusal() == f"{file}: file name: expected a frame number, got {file.name}"
+
+
+def test_a_training_camera_without_pictures_in_range_is_refused(tmp_path) -> None:
+    source, refusal = _arah(tmp_path)
+    expected = "--train-camera: expected one with pictures in range: 1 or 2, got 3"
+    assert refusal(choice=Choice(camera="3")) == expected
+    for name, theirs in (("3", "1"), ("2", "2")):  # a third camera; the second missed the first frames
+        for picture in (source / theirs).glob("*"):
+            if name == "3":
+                (source / name).mkdir(exist_ok=True)
+                (source / name / picture.name).hardlink_to(picture)
+            elif picture.stem < "000002":
+                picture.unlink()
+    record = json.loads((source / "cam_params.json").read_text())
+    record["all_cam_names"].append("3")
+    (source / "cam_params.json").write_text(json.dumps(record | {"3": record["1"]}))
+    assert refusal(choice=Choice(camera="2", stop=2)) == (
+        "--train-camera: expected one with pictures in range: 1 or 3, got 2"
+    )
+
+
+@pytest.mark.parametrize("name", ["RANA", "NeuMan", "a split of its own"])
+def test_a_choice_between_cameras_where_there_is_none_is_refused(tmp_path, name) -> None:
+    source, why = tmp_path / "female-3-casual", "the pictures' splits are given"
+    source.mkdir()
+    if name == "a split of its own":
+        layouts.write_snapshot_split(source, *(range(a, b + 1, step) for a, b, step in SPLITS[source.name]))
+    elif name == "NeuMan":
+        pytest.importorskip("joblib")
+        layouts.write_neuman(source)
+    else:
+        layouts.write_rana(source)
+        why = "there is one picture a moment: the first 4/5 train, the rest are novel poses"
+    body = str(layouts.body_file(tmp_path))
+    camera = "00001" if name == "NeuMan" else "0"
+    for choice, said in (
+        (Choice(held_out_every=2), "--held-out-every: expected the default, got 2"),
+        (Choice(camera=camera), f"--train-camera: expected the default, got {camera}"),
+    ):
+        with pytest.raises(InputError) as caught:
+            import_source(source, tmp_path / "out", ImportOptions(body=body, choice=choice))
+        assert str(caught.value) == f"{said} ({why})"
+    assert not (tmp_path / "out").exists()

@@ -87,6 +87,21 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
     assert energy[near].sum() / energy.sum() == pytest.approx(6 / (6 + 4 * math.pi), rel=ROBUST)
 
 
+def test_pictures_that_are_all_alike_give_none(monkeypatch) -> None:
+    """Any light explains them: each point's irradiance is parallel to its colours whatever it is."""
+    ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 6.0)
+    first = ball.picture == 0
+    count = int(first.sum())
+    alike = Sightings(
+        np.tile(ball.who[first], 3), np.tile(ball.colour[first], (3, 1)), np.repeat([0, 1, 2], count),
+        [ball.posed[0]] * 3, ball.spacing,
+    )  # fmt: skip
+    once = Sightings(ball.who[first], ball.colour[first], ball.picture[first], ball.posed[:1], ball.spacing)
+    for seen in (alike, once):
+        monkeypatch.setattr(light_start, "_sight", lambda *_, seen=seen: seen)
+        assert start_light(None, [], []) is None  # type: ignore[arg-type]
+
+
 def test_too_few_sightings_give_none(monkeypatch) -> None:
     ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 0.0)
     few = Sightings(ball.who[:20], ball.colour[:20], ball.picture[:20], ball.posed, 0.1)

@@ -48,6 +48,18 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
         ),
         (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8", "--gaussians: expected 64 to 1000000, got 8"),
         (f"rnd-eval OUT {CAPTURE} --ablate --chart x.txt", "--chart: expected .svg or .png, got x.txt"),
+        (
+            f"rnd-eval OUT {CAPTURE} --ablate --chart x.svg",
+            "--chart: expected --study lengths beside it, got ablations",
+        ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --method me", "--method: expected the default, got me"),
+        (f"rnd-eval OUT {CAPTURE} --seeds 2", "--seeds: expected the default, got 2"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --study causes", "variant 'true normals': expected normal_gt"),
+        (
+            f"rnd-train {CAPTURE} --out OUT --device mps",
+            "--device: expected cpu, cuda or cuda:NUMBER, got mps",
+        ),
+        ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
         ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
         ("rnd-bench peers --threads 999", "--threads: expected 1 to "),

@@ -25,7 +25,7 @@ from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pose_files import read_poses
-from rnd_trainer.importing.recording import easymocap_poses, read_as, smpl_poses
+from rnd_trainer.importing.recording import Poses, easymocap_poses, read_as, smpl_poses
 from rnd_trainer.silhouette import overlap, posed_vertices
 
 PLACE = 2e-5  # m: float32 in the files and in bone transforms
@@ -244,6 +244,55 @@ def test_files_that_are_no_poses_are_refused_by_name(tmp_path) -> None:
     layouts._pickle(tmp_path / "c.pkl", {"nothing": 1})
     with pytest.raises(InputError, match=r"c\.pkl.*WHAM"):
         read_poses(tmp_path / "c.pkl")
+
+
+COUNTS = {
+    # members of 10 frames' poses of which one has another count, and what is said
+    "trans": (
+        {"poses": (10, 72), "trans": (9, 3)},
+        "trans: expected 10 × 3, as there are 10 poses, got 9 × 3",
+    ),
+    "more": (
+        {"poses": (10, 72), "trans": (12, 3)},
+        "trans: expected 10 × 3, as there are 10 poses, got 12 × 3",
+    ),
+    "flat": ({"poses": (10, 72), "transl": (31,)}, "transl: expected 10 × 3, as there are 10 poses, got 31"),
+    "Rh": (
+        {"poses": (10, 72), "Rh": (9, 3), "Th": (10, 3)},
+        "Rh: expected 10 × 3, as there are 10 poses, got 9 × 3",
+    ),
+    "Th": (
+        {"poses": (10, 72), "Rh": (10, 3), "Th": (1, 3)},
+        "Th: expected 10 × 3, as there are 10 poses, got 1 × 3",
+    ),
+    "root": ({"body_pose": (10, 69), "global_orient": (9, 3)}, "global_orient: expected 10 × 3, as"),
+    "columns": ({"poses": (10, 71)}, "joints of the body poses: expected 22, 24, 52, 55, got 10 × 71"),
+    "none": ({"poses": (0, 72)}, "poses: expected a row of numbers a frame, got [0, 72]"),
+}
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_members_of_other_counts_than_the_poses_are_refused(tmp_path, name) -> None:
+    shapes, said = COUNTS[name]
+    np.savez(tmp_path / "p.npz", **{member: np.zeros(shape) for member, shape in shapes.items()})
+    with pytest.raises(InputError) as caught:
+        read_poses(tmp_path / "p.npz")
+    assert str(caught.value).startswith(f"{tmp_path / 'p.npz'}: {said}")
+
+
+def test_poses_ask_where_the_root_is_once_and_check_it() -> None:
+    rotations, asked = np.tile(np.eye(3), (10, 24, 1, 1)), []
+
+    def poses(places: np.ndarray) -> Poses:
+        return Poses(np.arange(10), rotations, lambda rest: asked.append(rest) or places + rest)
+
+    poses(np.zeros((10, 3)))
+    assert len(asked) == 1
+    for count in (1, 9, 12):
+        with pytest.raises(InputError, match=rf"places of the root: expected 10 × 3, got {count} × 3"):
+            poses(np.zeros((count, 3)))
+    with pytest.raises(InputError, match="frame 4: body poses: expected finite numbers"):
+        poses(np.where(np.arange(10)[:, None] == 4, np.nan, np.zeros((10, 3))))
 
 
 # A plain video

@@ -141,6 +141,36 @@ def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, 
         other.resume(tiny_run / "training.state")
 
 
+def test_resuming_on_other_pictures_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
+    moved = dataclasses.replace(tiny_capture.motion, translations=tiny_capture.motion.translations + 0.01)
+    fewer = tuple(frame for frame in tiny_capture.frames if frame.frame != tiny_capture.frames[0].frame)
+    for other in ({"motion": moved}, {"frames": fewer}):
+        training = Training(dataclasses.replace(tiny_capture, **other), tiny_config)
+        with pytest.raises(
+            InputError, match="expected the pictures and poses it was started with, got others"
+        ):
+            training.resume(tiny_run / "training.state")
+
+
+def test_how_often_a_state_is_saved_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
+    config = dataclasses.replace(tiny_config, save_every=3, preview_every=5)
+    Training(tiny_capture, config).resume(tiny_run / "training.state")
+
+
+def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config) -> None:
+    """A limb at the picture's edge must not end a training of hours."""
+
+    class Demanding:
+        smallest = 10**4
+
+        def to(self, device):
+            return self
+
+    training = Training(tiny_capture, tiny_config, Demanding())
+    terms = training.objective(training.model, training.views[0], training.poses[0], 0, 1)
+    assert "image" in terms and "lpips" not in terms and "consistency" not in terms
+
+
 def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refused(
     tiny_run, tiny_capture, tiny_config, tmp_path
 ) -> None:
@@ -228,5 +258,5 @@ def test_a_device_that_is_not_there_is_refused() -> None:
     from rnd_trainer.cli import _device
 
     assert _device("cpu") == "cpu"
-    with pytest.raises(InputError, match="--device: expected cpu or cuda, got teapot"):
+    with pytest.raises(InputError, match="--device: expected cpu, cuda or cuda:NUMBER, got teapot"):
         _device("teapot")

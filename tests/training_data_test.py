@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb
@@ -51,6 +54,14 @@ def test_shrinking_keeps_light_and_view(tiny_capture) -> None:
     assert half.camera.K[0, 0] == pytest.approx(whole.camera.K[0, 0] / 2)
     total = [view.target(torch.zeros(3))[0].sum() for view in (whole, half)]
     assert float(total[1] * 4) == pytest.approx(float(total[0]), rel=0.01)  # rounding to bytes
+
+
+def test_true_normals_that_are_not_there_are_refused(tiny_capture) -> None:
+    without = tuple(replace(frame, normal_gt=None) for frame in tiny_capture.frames)
+    with pytest.raises(
+        InputError, match="--normals true: expected normal_gt of every training picture, got none"
+    ):
+        load_views(dataclasses.replace(tiny_capture, frames=without), "train", true_normals=True)
 
 
 def test_a_split_that_is_not_there_is_refused(tiny_capture) -> None:

@@ -6,6 +6,7 @@ import base64
 import http.server
 import json
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
@@ -14,6 +15,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import onnx
 import OpenImageIO as oiio
 import pytest
 from PIL import Image
@@ -89,7 +91,58 @@ def site(tmp_path_factory) -> Path:
     broken[41, 4] = -1
     write_image(folder / "broken.exr", broken)
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
+    _write_avatar(folder / "other.onnx", _raise_and_dim)
+    _write_avatar(folder / "stranger.onnx", _rename)
+    broken_trans = first.translations.copy()
+    broken_trans[7, 1] = np.nan
+    np.savez(folder / "nan.npz", poses=np.zeros((31, 72)), trans=broken_trans)
+    np.savez(folder / "nobodys.npz", poses=np.zeros((2, 9)), joint_names=["a", "b", "c"], fps=30)
+    _count_sessions(folder / "counted")
     return folder
+
+
+def _write_avatar(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """The embedded avatar with its metadata changed."""
+    model = onnx.load(ASSETS / "avatar.onnx")
+    entry = next(entry for entry in model.metadata_props if entry.key == "rnd_avatar")
+    about = json.loads(entry.value)
+    change(about)
+    entry.value = json.dumps(about)
+    onnx.save(model, path)
+
+
+def _raise_and_dim(about: dict[str, Any]) -> None:
+    skeleton = about["skeleton"]
+    skeleton["rest_joints"] = np.add(skeleton["rest_joints"], [0, 0.2, 0]).tolist()
+    light = np.frombuffer(base64.b64decode(about["trained_light"]), "<f4") / 4
+    about["trained_light"] = base64.b64encode(light.tobytes()).decode()
+
+
+def _rename(about: dict[str, Any]) -> None:
+    about["skeleton"]["names"] = [f"bone{k}" for k in range(len(about["skeleton"]["names"]))]
+
+
+def _count_sessions(folder: Path) -> None:
+    """The page again, telling on a channel when onnxruntime opens and releases a session."""
+    (folder / "ort").mkdir(parents=True)
+    for entry in [entry for entry in DIST.iterdir() if entry.name != "ort"]:
+        (folder / entry.name).symlink_to(entry)
+    for entry in (DIST / "ort").iterdir():
+        name = "real.mjs" if entry.name == "ort.wasm.min.mjs" else entry.name
+        (folder / "ort" / name).symlink_to(entry)
+    (folder / "ort/ort.wasm.min.mjs").write_text("""
+        import * as ort from "./real.mjs";
+        export * from "./real.mjs";
+        const channel = new BroadcastChannel("sessions");
+        export const InferenceSession = {
+            async create(...inputs) {
+                const session = await ort.InferenceSession.create(...inputs), release = session.release.bind(session);
+                session.release = () => release().then(() => channel.postMessage("released"));
+                channel.postMessage("opened");
+                return session;
+            },
+        };
+    """)
 
 
 def _write_hdr(path: Path, radiance: np.ndarray) -> None:
@@ -99,31 +152,59 @@ def _write_hdr(path: Path, radiance: np.ndarray) -> None:
 
 
 @pytest.fixture(scope="module")
-def page(site, tmp_path_factory):
-    """The page in a browser, nothing loaded."""
+def address(site):
+    """Where a static host serves the site."""
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(site))) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        with chromium(tmp_path_factory.mktemp("profile"), webgl=True) as browser:
-            browser.open(f"http://127.0.0.1:{server.server_port}/")
-            browser.wait("window.rnd && document.getElementById('message').textContent.includes('drop')")
-            yield browser
-            assert browser.messages == []
+        yield f"http://127.0.0.1:{server.server_port}/"
         server.shutdown()
         thread.join()
 
 
-def _drop(page: Page, *names: str) -> None:
-    """Drop files of the site on the page, as from a folder, and wait until they are in or refused."""
-    page.run(f"""(async () => {{
-        const data = new DataTransfer();
+def _open(browser: Page, address: str) -> None:
+    browser.open(address)
+    browser.wait("window.rnd && document.getElementById('message').textContent.includes('drop')")
+
+
+@pytest.fixture(scope="module")
+def page(address, tmp_path_factory):
+    """The page in a browser, nothing loaded."""
+    with chromium(tmp_path_factory.mktemp("profile"), webgl=True) as browser:
+        _open(browser, address)
+        yield browser
+        assert browser.messages == []
+
+
+@pytest.fixture
+def fresh(address, tmp_path):
+    """The page in a browser of its own, nothing loaded; ``sessions`` counts onnxruntime's."""
+    with chromium(tmp_path, webgl=True) as browser:
+        _open(browser, address + "counted/")
+        browser.run("""
+            window.sessions = { opened: 0, released: 0 };
+            new BroadcastChannel("sessions").onmessage = ({ data }) => { sessions[data] += 1; };
+        """)
+        yield browser
+        assert browser.messages == []
+
+
+def _drop(page: Page, *names: str) -> str:
+    """Drop files of the site on the page, as from a folder, and wait until they are in ("") or what it says of them."""
+    return page.run(f"""(async () => {{
+        const data = new DataTransfer(), message = document.getElementById("message"), before = rnd.scene();
         for (const name of {json.dumps(names)})
-            data.items.add(new File([await (await fetch(name)).blob()], name));
-        const before = rnd.scene();
+            data.items.add(new File([await (await fetch(`/${{name}}`)).blob()], name));
         document.getElementById("stage").dispatchEvent(new DragEvent("drop", {{ dataTransfer: data, bubbles: true }}));
-        const wrong = () => document.querySelector("#message.wrong");
-        while (rnd.scene() === before && !wrong()) await new Promise((done) => setTimeout(done, 20));
+        const asked = message.textContent;  // "reading …"
+        while (rnd.scene() === before && ["", asked].includes(message.textContent))  // a picture takes it away
+            await new Promise((done) => setTimeout(done, 20));
+        return rnd.scene() === before ? message.textContent : "";
     }})()""")
+
+
+def _is_refusal(page: Page) -> bool:
+    return page.run("document.getElementById('message').classList.contains('wrong')")
 
 
 def _picture(page: Page, **changes: Any) -> np.ndarray:
@@ -264,12 +345,62 @@ def test_the_clip_is_a_download(loaded, tmp_path):
     ("name", "reason"),
     [
         ("torn.onnx", "cut short"),
+        ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),
+        ("nobodys.npz", "expected some of the avatar's"),
         ("index.html", "expected .onnx, .npz, .hdr or .exr"),
     ],
 )
 def test_a_file_that_is_none_of_ours_is_refused_in_one_line(loaded, name, reason):
-    _drop(loaded, name)
-    message = loaded.run("document.getElementById('message').textContent")
-    assert reason in message and "\n" not in message
-    loaded.run("document.getElementById('message').className = ''")
+    message = _drop(loaded, name)
+    assert reason in message and "\n" not in message and _is_refusal(loaded)
     assert _picture(loaded).any()  # what was there still plays
+
+
+def test_a_motion_is_refused_before_there_is_an_avatar(fresh):
+    assert "frame 7: trans: expected finite numbers" in _drop(fresh, "nan.npz") and _is_refusal(fresh)
+    assert _drop(fresh, "avatar.onnx") == ""
+    assert fresh.run("rnd.scene().motion.name") == "at rest"
+
+
+def test_a_motion_that_does_not_fit_keeps_the_avatar_out_until_another_comes(fresh):
+    assert "drop an avatar" in _drop(fresh, "nobodys.npz")
+    assert "expected some of the avatar's" in _drop(fresh, "avatar.onnx") and _is_refusal(fresh)
+    assert "drop an avatar" in _drop(fresh, "window.hdr") and not _is_refusal(fresh)
+    fresh.wait("sessions.opened === 1 && sessions.released === 1")
+    assert _drop(fresh, "avatar.onnx", "walk.npz") == ""
+    assert fresh.run("rnd.scene().lights") == ["the avatar's own", "window.hdr"]
+    assert _picture(fresh, width=SIZE, height=SIZE).any()
+
+
+def test_a_refused_drop_changes_nothing(fresh):
+    _drop(fresh, "avatar.onnx", "walk.npz")
+    scene = fresh.run("rnd.scene()")
+    state = {"width": SIZE, "height": SIZE, "light": 0, "time": 0.3}
+    before = _picture(fresh, **state)
+    for names, reason in [
+        (("other.onnx", "nan.npz"), "expected finite numbers"),
+        (("window.hdr", "other.onnx", "torn.onnx"), "cut short"),
+        (("stranger.onnx",), "expected some of the avatar's"),
+        (("amass.npz", "index.html"), "expected .onnx, .npz, .hdr or .exr"),
+    ]:
+        assert reason in _drop(fresh, *names) and _is_refusal(fresh), names
+        assert (_picture(fresh, time=0.1) != before).any()  # and not a picture kept from before
+        assert (_picture(fresh, **state) == before).all(), names
+    fresh.wait("sessions.opened === sessions.released + 1")
+    assert _drop(fresh, "walk.npz") == ""
+    assert fresh.run("rnd.scene()") == scene
+
+
+def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released(fresh, site):
+    _drop(fresh, "avatar.onnx", "amass.npz")
+    _drop(fresh, "other.onnx")
+    fresh.wait("sessions.opened === 2 && sessions.released === 1")
+    assert fresh.run("[rnd.scene().avatar, rnd.scene().motion.name]") == ["other.onnx", "amass.npz"]
+    scene = Scene(ViewOptions(site / "other.onnx", site / "amass.npz", size=SIZE, raster="cpu"))
+    got = _picture(fresh, width=SIZE, height=SIZE, light=0, time=0.1)
+    _assert_agreed(fresh, got, scene)
+    scene.close()
+    _drop(
+        fresh, "avatar.onnx", "other.onnx", "stranger.onnx", "nobodys.npz", "avatar.onnx"
+    )  # the last one counts
+    fresh.wait("sessions.opened > 2 && sessions.opened === sessions.released + 1")

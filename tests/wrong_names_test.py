@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import layouts
-from importing_test import LAYOUTS, assert_the_scene
+from importing_test import LAYOUTS, ONE_A_MOMENT, assert_the_scene
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
 from rnd_runtime.capture import load_capture
 from rnd_runtime.images import to_bytes, write_image
@@ -29,7 +29,7 @@ def import_it(tmp_path, monkeypatch, capsys) -> Callable[..., tuple[int, str, Pa
 
     def run(source: Path, *options: object) -> tuple[int, str, Path]:
         out = tmp_path / f"capture{len(list(tmp_path.glob('capture*')))}"
-        words = ["import", source, out, "--body", body, "--held-out-every", 1, *options]
+        words = ["import", source, out, "--body", body, *options]
         monkeypatch.setattr("sys.argv", ["rnd-data", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
             data_cli.main()
@@ -55,7 +55,8 @@ def test_a_root_of_the_other_convention_is_named_and_mended(tmp_path, monkeypatc
     source.mkdir()
     _, write, camera_of, bent, fps = LAYOUTS[name]
     write(source)
-    code, printed, _ = import_it(source)
+    every = () if camera_of in ONE_A_MOMENT else ("--held-out-every", 1)
+    code, printed, _ = import_it(source, *every)
     assert code == 1
     told = "EasyMocap's Rh/Th; try --as easymocap" if smpl else "read as EasyMocap's Rh/Th; try --as smpl"
     found = re.search(
@@ -63,7 +64,7 @@ def test_a_root_of_the_other_convention_is_named_and_mended(tmp_path, monkeypatc
     )
     assert found and found[2].endswith(told), printed
     assert float(found[1]) < GOOD_OVERLAP
-    code, printed, out = import_it(source, "--as", told.split()[-1])
+    code, printed, out = import_it(source, *every, "--as", told.split()[-1])
     assert code == 0, printed
     assert_the_scene(load_capture(out), camera_of, bent=bent, fps=fps)
 
@@ -152,5 +153,11 @@ def test_options_that_would_change_nothing_are_refused(frames, import_it) -> Non
     assert "such as x,-y,-z" in refusal(frames / "rana", "--normal-axes=x,y")
     both = ("--mask-net", frames / "net.onnx")
     assert "--masks and --mask-net: expected one of them" in refusal(folder, *_of_frames(frames), *both)
+    for option in ("--held-out-every", 2), ("--train-camera", 0):
+        said = f"{option[0]}: expected the default, got {option[1]} (a video has one camera, and its last 1/5 are"
+        assert said in refusal(folder, *_of_frames(frames), *option)
+    assert "--count: expected the default, got 5 (of a video the sharpest pictures" in refusal(
+        frames / "rana", "--count", 5
+    )
     assert "--as: expected zju or" in refusal(frames / "rana", "--as", "rama")
     assert "layout: expected zju" in refusal(frames / "rana", "--as", "zju")

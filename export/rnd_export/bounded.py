@@ -9,7 +9,7 @@ import onnx
 from rich.console import Console
 
 from rnd_runtime.doctor import machine
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, flag
 from rnd_runtime.files import atomic_path, read_rows, write_json
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion
@@ -17,7 +17,7 @@ from rnd_trainer.checkpoint import load_checkpoint
 
 from .budget import Bound, Found, given_up, search
 from .candidates import Scene, Workbench
-from .cli import BOUNDS, Options, flag
+from .cli import BOUNDS, Options
 
 
 def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:

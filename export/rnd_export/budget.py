@@ -172,9 +172,8 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
     recipe, config = plan.recipe(bench.config), bench.config
     lines = []
     if recipe.gaussians is not None:
-        lines.append(
-            f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again"
-        )
+        left = max(recipe.gaussians, recipe.variant.nodes or config.nodes)  # nodes stay
+        lines.append(f"{left} of {config.gaussians} Gaussians, the others merged, colours fitted again")
     if recipe.variant.nodes is not None:
         lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
     if recipe.dynamic_mm == np.inf:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from rnd_runtime.avatar_file import EncoderKind, Precision
-from rnd_runtime.errors import InputError, check_option, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, flag, parse_options, refuse_changed, run_command
 
 
 @dataclass(frozen=True)
@@ -106,14 +106,9 @@ def _export(options: Options) -> None:
 
 def _refuse_idle(options: Options, *, bounded: bool) -> None:
     """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
-    bounds = " or ".join(flag(name) for name in BOUNDS.values())
-    why = "a bound finds this by itself" if bounded else f"needs {bounds}"
-    defaults = {field.name: field.default for field in fields(options)}
-    for name in CHOICES if bounded else SEARCHES:
-        if (got := getattr(options, name)) != defaults[name]:
-            raise InputError(flag(name), expected="the default", got=got, hint=why)
-
-
-def flag(name: str) -> str:
-    """How an option is written on the command line."""
-    return "--" + name.replace("_", "-")
+    if bounded:
+        refuse_changed(options, CHOICES, Options, "a bound finds this by itself")
+    else:
+        refuse_changed(options, SEARCHES, Options, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
+    if options.motion is not None:
+        refuse_changed(options, ("frames",), Options, "of random motion: --motion has frames of its own")

@@ -53,6 +53,7 @@ class Capture:
         body: the template.
         motion: poses of ``body.skeleton``; ``Frame.frame`` indexes it.
         frames: every picture, in file order.
+        file: what it was read from; None where it was made.
     """
 
     folder: Path
@@ -61,6 +62,7 @@ class Capture:
     body: Body
     motion: Motion
     frames: tuple[Frame, ...]
+    file: Path | None = None
 
     @property
     def fps(self) -> float:
@@ -149,7 +151,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
             expected = f"an index below the {motion.frame_count} frames of {motion.source}"
             raise InputError("frame", expected=expected, got=frame.frame, file=file, frame=frame.frame)
         check_pictures(frame, cameras[frame.camera], file)
-    return Capture(folder, cameras, record.lights, body, motion, tuple(record.frames))
+    return Capture(folder, cameras, record.lights, body, motion, tuple(record.frames), file)
 
 
 def save_capture(capture: Capture, **information: object) -> None:

@@ -8,9 +8,9 @@ import io
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 Parsed = TypeVar("Parsed")
 # No permission, a file system that is read-only, full, or full for this user: nobody's mistake in the program.
@@ -62,6 +62,19 @@ class InputError(Exception):
             frame=frame if self.frame is None else self.frame,
             hint=self.hint,
         )
+
+
+def refuse_changed(options: object, names: Iterable[str], declared_in: type[Any], hint: str) -> None:
+    """Raise :class:`InputError` for one of ``names`` that is not as ``declared_in`` has it: it would do nothing."""
+    for name in names:
+        value = getattr(options, name)
+        if value != getattr(declared_in, name):
+            raise InputError(flag(name), expected="the default", got=value, hint=hint)
+
+
+def flag(name: str) -> str:
+    """How an option is written on the command line."""
+    return "--" + name.replace("_", "-")
 
 
 def check_option(good: bool, name: str, expected: str, got: object) -> None:

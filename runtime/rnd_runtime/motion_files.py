@@ -159,7 +159,7 @@ def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
         return []
     sides = ("pose_hand",) if "pose_hand" in archive.names else ("left_hand_pose", "right_hand_pose")
     poses = [archive.numbers(side) for side in sides]
-    if sum(pose[0].size for pose in poses if len(pose) == len(body)) != 90:
+    if any(pose.ndim < 2 or len(pose) != len(body) or pose[0].size != 90 // len(sides) for pose in poses):
         notes.append("hands stay at rest: they are not given as 15 joints each")
         return []
     return [np.concatenate([pose.reshape(len(body), -1, 3) for pose in poses], 1)]

@@ -141,19 +141,57 @@ def ablate(
     for done, (variant, seed) in enumerate(jobs):
         on_run(variant.name, seed, done, len(jobs))
         place = _place(folder, variant, seed)
+        model = dataclasses.replace(base.model, **variant.model)
+        steps = round(base.steps * variant.length)
+        changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
+        config = dataclasses.replace(base, model=model, seed=seed, **changed)
         if not (place / "rows.json").exists():
-            model = dataclasses.replace(base.model, **variant.model)
-            steps = round(base.steps * variant.length)
-            changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
-            config = dataclasses.replace(base, model=model, seed=seed, **changed)
-            seen = load_capture(capture.folder, motion_file=NOISY_MOTION) if variant.noisy else capture
+            seen = _noisy(capture) if variant.noisy else capture
             extra = _train(seen, config, place, perceptual, capture)
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
             write_json(place / "rows.json", [row | cost | extra for row in scored])
-        rows += json.loads((place / "rows.json").read_text(encoding="utf-8"))
+        found = json.loads((place / "rows.json").read_text(encoding="utf-8"))
+        _check_same(found, place / "rows.json", config, capture, perceptual, mode)
+        rows += found
     return rows
+
+
+def check_needs(variants: Iterable[Variant], capture: Capture) -> None:
+    """Raise :class:`InputError` where ``capture`` lacks what one of ``variants`` learns from."""
+    train = capture.split("train")
+    for variant in variants:
+        if variant.noisy:
+            _noisy(capture)
+        if variant.train.get("light") == "capture":
+            for name in {frame.light or "unknown" for frame in train}:
+                capture.load_light(name)
+        if variant.train.get("normals") == "true" and any(frame.normal_gt is None for frame in train):
+            expected = "normal_gt of every training picture"
+            raise InputError(f"variant {variant.name!r}", expected=expected, got="none", file=capture.folder)
+
+
+def _noisy(capture: Capture) -> Capture:
+    return load_capture(capture.file or capture.folder, motion_file=NOISY_MOTION)
+
+
+def _check_same(
+    rows: list[dict[str, Any]], file: Path, config: TrainConfig, capture: Capture, perceptual: Perceptual | None,
+    mode: str,
+) -> None:  # fmt: skip
+    """Rows of another training in the same folder would be compared as if they were of this."""
+    expected = {
+        "capture": capture.folder.name, "steps": config.steps, "gaussians": config.model.gaussians,
+        "image_scale": config.image_scale, "shade": mode,
+        "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+    }  # fmt: skip
+    for name, value in expected.items():
+        if rows[0].get(name) != value:
+            hint = "another folder for RUN, or delete this one"
+            raise InputError(
+                f"{name} of a run done before", expected=value, got=rows[0].get(name), file=file, hint=hint
+            )
 
 
 def time_encoders(

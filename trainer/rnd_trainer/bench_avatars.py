@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.util
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rnd_runtime import __version__
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 
@@ -25,6 +27,8 @@ SEED = 7
 # out layers of the networks, as multiples of their usual start: set by eye on trained ones
 LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
 OPACITY = 2.5  # raw: 0.99 after the sigmoid of model.py, as trained avatars come out
+KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz")
+"""what rnd-bench keeps between runs; the key of its inputs (:func:`content_key`) is in every name"""
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,26 @@ class Encoders:
         return words + (["--window-poses", str(self.window)] if self.window else [])
 
 
+def content_key(*parts: Path | str) -> str:
+    """16 hexadecimal digits for the content of files, for strings, their order and the package's version."""
+    digest = hashlib.sha256(__version__.encode())
+    for part in parts:
+        content = part.read_bytes() if isinstance(part, Path) else part.encode()
+        digest.update(hashlib.sha256(content).digest())
+    return digest.hexdigest()[:16]
+
+
+def forget(folder: Path) -> None:
+    """Delete what rnd-bench keeps in ``folder``, and nothing else: it may hold files of the user's."""
+    for pattern in KEPT:
+        for kept in folder.glob(pattern):
+            kept.unlink()
+
+
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
-    """avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless it is there already."""
-    stem = hashlib.sha256(checkpoint.read_bytes()).hexdigest()[:8]
-    name = "_".join([stem, *(w for w in encoders.words() if not w.startswith("--"))])
+    """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless this exporter has made it."""
+    key = content_key(checkpoint, *_exporter())
+    name = "_".join(["exported", key, *(w for w in encoders.words() if not w.startswith("--"))])
     out = folder / f"{name}.onnx"
     if not out.exists():
         code = "from rnd_export.cli import main; main()"
@@ -65,9 +85,16 @@ def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
     return out
 
 
+def _exporter() -> list[Path]:
+    """The source files of ``rnd_export``, found without importing it; none where it is not installed."""
+    found = importlib.util.find_spec("rnd_export")
+    folders = () if found is None else found.submodule_search_locations or ()
+    return sorted(file for folder in folders for file in Path(folder).glob("*.py"))
+
+
 def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
-    """avatar.ckpt of the seeded avatar with ``count`` Gaussians, made once."""
-    out = folder / f"seeded_{count}.ckpt"
+    """avatar.ckpt of the seeded avatar with ``count`` Gaussians on the body of ``body_file``, made once."""
+    out = folder / f"seeded_{count}_{content_key(body_file)}.ckpt"
     if out.exists():
         return out
     import torch

@@ -68,12 +68,16 @@ def measure(point: Point) -> Drawn:
         (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
         code = "import sys; from rnd_trainer.bench_frame import draw; draw(sys.argv[1], float(sys.argv[2]))"
         line = [sys.executable, "-c", code, folder, repr(time.monotonic())]
-        done = subprocess.run(
-            line, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE_S
-        )
+        what = f"{point.raster}, {point.shade}"
+        try:
+            done = subprocess.run(
+                line, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+            )
+        except subprocess.TimeoutExpired as error:
+            raise InputError(what, expected=f"an answer within {DEADLINE_S:g} s", got="none") from error
         if done.returncode:
             why = (done.stderr.strip().splitlines() or ["no answer"])[-1]
-            raise InputError(f"{point.raster}, {point.shade}", got=why[:200])
+            raise InputError(what, got=why[:200])
         row = json.loads((out / "row.json").read_text("utf-8"))
         with np.load(out / "drawn.npz") as drawn:
             return Drawn(row, drawn["radiance"], drawn["means"])

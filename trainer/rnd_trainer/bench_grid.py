@@ -1,7 +1,7 @@
 """The grid of the speed–accuracy chart: one factor at a time around the usual case, and a crossed core.
 
-Every point is one row of JSON. Rows that are there already, measured on this machine, are not measured again: an
-interrupted run goes on where it stopped.
+Every point is one row of JSON. Rows that are there already, measured on this machine, of the same files and by the same
+version, are not measured again: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file, output_folder, read_rows, write_json
 
-from .bench_avatars import Encoders, exported, seeded_checkpoint
+from .bench_avatars import Encoders, content_key, exported, forget, seeded_checkpoint
 from .bench_frame import Point, measure
 from .bench_reference import errors, reference
 
@@ -53,8 +53,15 @@ class Inputs:
         """Refuse missing files before minutes are spent."""
         for what, file in (("body", self.body), ("motion", self.motion), ("light", self.hdr)):
             existing_file(file, what=what)
+        if self.checkpoint is not None:
+            existing_file(self.checkpoint, what="checkpoint")
         output_folder(self.work)
         return self
+
+    def key(self) -> str:
+        """What tells rows of these files, by this version, from rows of others."""
+        own = "none" if self.checkpoint is None else self.checkpoint
+        return content_key(self.body, self.motion, self.hdr, own)
 
     def source(self, n: int) -> tuple[Path, str]:
         """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
@@ -140,11 +147,10 @@ def grid(
     """
     inputs.checked()
     if fresh:
-        for kept in inputs.work.glob("*.npz"):  # references
-            kept.unlink()
+        forget(inputs.work)
     rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
-    wanted = settings(quick)
-    here = {_key(row): row for row in rows if row["machine"] == machine()}
+    wanted, key = settings(quick), inputs.key()
+    here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
     done: list[Row] = []
     for setting in wanted:
         row = here.get(_key(asdict(setting)))
@@ -154,6 +160,7 @@ def grid(
                 row = measured(setting, inputs, seconds=2.0 if quick else 4.0, full_n=wanted[0].n)
             except InputError as error:  # no such rasteriser here: say so and go on
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
+            row["inputs"] = key
         done.append(row)
         on_row(row, new)
         write_json(out, [*{_key(r): r for r in (*rows, *done)}.values()])

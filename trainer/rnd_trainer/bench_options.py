@@ -75,9 +75,10 @@ class Grid:
     quick: bool = False
     """the small grid, in two minutes"""
     json: Path = Path("assets/bench/grid.json")
-    """rows; those measured on this machine are not measured again"""
+    """rows; those measured on this machine, of the same files, are not measured again"""
     fresh: bool = False
-    """measure all again, references too: after a change of the code, or on another machine of the same name"""
+    """measure all again, kept avatars and references too: after a change of the code, or on another machine of the same
+    name"""
     chart: tuple[Path, ...] = (Path("assets/bench/grid.svg"), Path("assets/bench/grid.png"))
     """the chart, SVG or PNG by suffix"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime import raster_oracle
-from rnd_runtime.avatar import NODE_LOGITS, NODE_OUTPUTS, REST_OUTPUTS, Avatar
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import NODE_LOGITS, NODE_OUTPUTS, REST_OUTPUTS
 from rnd_runtime.files import atomic_path
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.images import linear_to_srgb
@@ -26,6 +27,7 @@ from rnd_runtime.shading_reference import shade_reference
 from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 
+from .bench_avatars import content_key
 from .bench_frame import COMPARED, STEP_S, TURN, Drawn, bench_camera
 
 MOST_DB = 120.0  # of two equal pictures
@@ -40,8 +42,8 @@ class Reference(NamedTuple):
 
 
 def reference(avatar_file: Path, motion_file: Path, hdr: Path, size: int, folder: Path) -> Reference:
-    """The reference of a whole avatar; what is slow about it is kept in ``folder``, by the files' names."""
-    stem = f"{avatar_file.stem}_{motion_file.stem}_{hdr.stem}"
+    """The reference of a whole avatar; what is slow about it is kept in ``folder``, by what the files hold."""
+    stem = f"reference_{content_key(avatar_file, motion_file, hdr)}"
     lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, motion_file, hdr))
 
     def drawn() -> dict[str, Any]:

@@ -5,6 +5,7 @@ Rows that were measured before stay in the file until they are measured again, s
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -198,7 +199,7 @@ def _place(name: str) -> tuple[int, int]:
 
 def _verdict(figure: Figure) -> str:
     if not figure.line:
-        return "reported"
+        return "reported" if math.isfinite(figure.measured) else "not measured"
     return "pass" if figure.passes else "fail"
 
 
@@ -209,21 +210,30 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        baseline = (
-            "" if row["baseline"] is None else f"{row['baseline_name']}: {row['baseline']:.4g} {row['unit']}"
-        )
-        mark = {"pass": "✓", "fail": "**✗**", "reported": ""}[row["verdict"]]
+        baseline, unit = "", row["unit"]
+        if row["baseline_name"]:
+            baseline = f"{row['baseline_name']}: {_amount(row['baseline'], unit)}"
+        mark = {"pass": "✓", "fail": "**✗**"}.get(row["verdict"], "")
         what = row["what"].replace("|", "\\|").replace("\n", " ")
         lines.append(
-            f"| {row['id']} | {row['failure']} | {what} | {row['measured']:.4g} {row['unit']} | {row['line']} | {mark} "
+            f"| {row['id']} | {row['failure']} | {what} | {_amount(row['measured'], unit)} | {row['line']} | {mark} "
             f"| {baseline} |"
         )
     return "\n".join(lines) + "\n"
 
 
+def _amount(number: float | None, unit: str) -> str:
+    """A figure with its unit. NaN is none, and null is what the JSON has for it."""
+    return "not measured" if number is None or math.isnan(number) else f"{number:.4g} {unit}"
+
+
 def _show(console: Any, name: str, figures: Sequence[Figure]) -> None:
     for figure in figures:
-        baseline = "" if figure.baseline is None else f"  ({figure.baseline_name}: {figure.baseline:.4g})"
-        mark = {"pass": "✓", "fail": "✗", "reported": " "}[_verdict(figure)]
-        line = f"{mark} {name:4} {figure.what}: {figure.measured:.4g} {figure.unit} {figure.line}{baseline}"
+        baseline = ""
+        if figure.baseline is not None:
+            baseline = f"  ({figure.baseline_name}: {_amount(figure.baseline, '').rstrip()})"
+        mark = {"pass": "✓", "fail": "✗"}.get(_verdict(figure), " ")
+        line = (
+            f"{mark} {name:4} {figure.what}: {_amount(figure.measured, figure.unit)} {figure.line}{baseline}"
+        )
         console.print(line, highlight=False, markup=False)

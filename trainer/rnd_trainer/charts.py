@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,10 +15,19 @@ Row = dict[str, Any]
 
 
 def check_chart(*files: Path) -> None:
-    """Raise :class:`InputError` unless all ``files`` are charts by their suffix."""
+    """Raise :class:`InputError` unless all ``files`` are charts by their suffix, and matplotlib can draw them."""
     for file in files:
         if file.suffix not in (".svg", ".png"):
             raise InputError("--chart", expected=".svg or .png", got=file.name)
+    if files and importlib.util.find_spec("matplotlib") is None:
+        raise _no_matplotlib()
+
+
+def _no_matplotlib() -> InputError:
+    return InputError(
+        "matplotlib is not installed",
+        hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
+    )
 
 
 @contextmanager
@@ -29,10 +39,7 @@ def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
     try:
         import matplotlib
     except ModuleNotFoundError as error:
-        raise InputError(
-            "matplotlib is not installed",
-            hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
-        ) from error
+        raise _no_matplotlib() from error
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -83,7 +84,7 @@ def _train(options: TrainOptions) -> None:
 
     from .config import check_sizes, preset, resized, to_dict
     from .live_view import live_view
-    from .perceptual import load_perceptual
+    from .perceptual import load_lpips
     from .train import Training, run
 
     config = resized(preset(options.preset), options.gaussians, options.steps)
@@ -103,6 +104,7 @@ def _train(options: TrainOptions) -> None:
     check_option(options.seed >= 0, "--seed", "at least 0", options.seed)
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
+    device = _device(options.device)
 
     capture = load_capture(options.capture, motion_file=options.motion)
     folder = output_folder(options.out)
@@ -111,18 +113,13 @@ def _train(options: TrainOptions) -> None:
         raise InputError(
             "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
         )
-    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    perceptual = load_lpips(options.perceptual_weights)
     if perceptual is None:
         print(  # noqa: T201
             "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
             file=sys.stderr,
         )
-    elif not perceptual.heads:
-        raise InputError(
-            "--perceptual-weights", expected="a network with LPIPS heads", got=perceptual.backbone,
-            file=options.perceptual_weights,
-        )  # fmt: skip
-    training = Training(capture, config, perceptual, _device(options.device))
+    training = Training(capture, config, perceptual, device)
     if options.resume:
         training.resume(state)
     write_json(folder / "config.json", to_dict(config))
@@ -143,14 +140,17 @@ def _device(name: str) -> str:
     """``name`` if torch can compute there; the CUDA path is refused where its parts are missing."""
     import torch
 
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError(
-            "--device", expected="a GPU that this torch can use", got="none", hint="--device cpu"
-        )
-    try:
-        return str(torch.device(name))
-    except RuntimeError as error:
-        raise InputError("--device", expected="cpu or cuda", got=name) from error
+    if name == "cpu":
+        return name
+    number = name.removeprefix("cuda").removeprefix(":") or "0"
+    if not (name.startswith("cuda") and number.isdecimal()):
+        raise InputError("--device", expected="cpu, cuda or cuda:NUMBER", got=name)
+    if int(number) >= (count := torch.cuda.device_count()):
+        got = f"{count} of them" if count else "none"
+        raise InputError("--device", expected="a GPU that this torch can use", got=got, hint="--device cpu")
+    if importlib.util.find_spec("gsplat") is None:
+        raise InputError("gsplat is not installed", hint='needs the extra: pip install "rnd-avatar[cuda]"')
+    return name
 
 
 def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
@@ -197,8 +197,17 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
+    """In the poses that it was trained with, corrected ones where they were."""
     from .evaluate import HELD_OUT
+    from .train import REFINED_MOTION
 
     if any(training.capture.split(split) for split in HELD_OUT):
-        scoring = EvalOptions(folder, options.capture, json=folder / "eval.json", pictures=folder / "eval")
-        evaluate_run(dataclasses.replace(scoring, perceptual_weights=options.perceptual_weights))
+        scoring = EvalOptions(
+            folder,
+            options.capture,
+            json=folder / "eval.json",
+            pictures=folder / "eval",
+            perceptual_weights=options.perceptual_weights,
+            motion=str((folder / REFINED_MOTION).resolve()) if options.refine_poses else options.motion,
+        )
+        evaluate_run(scoring)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from rnd_runtime.skeleton import Skeleton, bone_transforms
 from rnd_runtime.window import motion_window
 
 from .config import ModelConfig
-from .metrics import SSIM_WINDOW, mask_box
+from .metrics import SSIM_WINDOW, mask_box, widened
 from .model import PoseInput
 
 CROP_MARGIN = 16
@@ -72,11 +73,13 @@ def load_views(
     views, bad = [], []
     for frame in frames:
         data = capture.load_frame(frame)
-        low, high = MASK_COVERAGE
-        if not low < float(data.mask.mean()) < high:
+        if not usable(data.mask):
             bad.append(frame.frame)
             continue
         normal = data.normal_gt if true_normals else data.normal
+        if true_normals and normal is None:
+            raise InputError("--normals true", expected="normal_gt of every training picture", got="none",
+                             file=capture.folder, frame=frame.frame)  # fmt: skip
         camera = capture.cameras[frame.camera]
         if min(camera.width, camera.height) * scale < SSIM_WINDOW:
             raise InputError(
@@ -92,11 +95,17 @@ def load_views(
     return views, bad
 
 
+def usable(mask: NDArray[np.floating[Any]]) -> bool:
+    """Whether a picture with ``mask`` [H, W] shows a person, whole or in part."""
+    low, high = MASK_COVERAGE
+    return low < float(mask.mean()) < high
+
+
 def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> View:
     if scale != 1.0:
         image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
     rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
-    rows, columns = _widened(rows, camera.height), _widened(columns, camera.width)
+    rows, columns = widened(rows, camera.height), widened(columns, camera.width)
     K = camera.K.copy()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
@@ -108,12 +117,6 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
         np.round(mask[rows, columns] * 255).astype(np.uint8),
         None if normal is None else np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8),
     )
-
-
-def _widened(span: slice, size: int) -> slice:
-    """``span`` within 0 … ``size``, and as wide as the structural term's window: of a person there may be a sliver."""
-    start = max(min(span.start, size - SSIM_WINDOW), 0)
-    return slice(start, min(max(span.stop, start + SSIM_WINDOW), size))
 
 
 def _shrink(image, mask, normal, camera: Camera, scale: float):

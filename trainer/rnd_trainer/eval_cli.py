@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib.util
 import sys
 from dataclasses import dataclass
@@ -11,13 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
 from rnd_runtime.files import is_folder, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from .perceptual import Perceptual
 
 COLUMNS = {
     "psnr": ("PSNR", "{:.2f}"),
@@ -32,6 +31,8 @@ COLUMNS = {
     "psnr_albedo": ("albedo", "{:.2f}"),
 }
 """what the terminal's table shows of a row: heading and format"""
+OF_ONE_RUN = ("pictures", "method")
+OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds")
 WIDTH = 140
 """characters of the widest table"""
 
@@ -82,6 +83,10 @@ def main() -> None:
 
     def command() -> None:
         options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
+        if options.ablate:
+            refuse_changed(options, OF_ONE_RUN, EvalOptions, "a study scores and names its rows itself")
+        else:
+            refuse_changed(options, OF_STUDIES, EvalOptions, "needs --ablate")
         (ablate_run if options.ablate else evaluate_run)(options)
 
     sys.exit(run_command("rnd-eval", command))
@@ -106,6 +111,7 @@ def evaluate_run(options: EvalOptions) -> None:
 
     from .checkpoint import load_checkpoint
     from .held_out import score
+    from .perceptual import load_lpips
 
     path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
@@ -117,8 +123,8 @@ def evaluate_run(options: EvalOptions) -> None:
         method=options.method or path.resolve().parent.name,
         mode=options.shade,
         pictures=options.pictures,
-        perceptual=_perceptual(options.perceptual_weights),
-        avatar=exported if exported.is_file() else None,
+        perceptual=load_lpips(options.perceptual_weights),
+        avatar=exported if _is_of(exported, path) else None,
     )
     names = [name for name in COLUMNS if any(name in row for row in rows)]
     table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=str(path))
@@ -135,20 +141,16 @@ def evaluate_run(options: EvalOptions) -> None:
         write_json(options.json, rows)
 
 
-def _perceptual(path: Path | None) -> Perceptual | None:
-    from .perceptual import load_perceptual
+def _is_of(exported: Path, checkpoint: Path) -> bool:
+    """Whether ``exported`` is there and was made from ``checkpoint`` as it is now."""
+    from rnd_runtime.avatar import Avatar
 
-    if path is None:
-        return None
-    perceptual = load_perceptual(path)
-    if not perceptual.is_lpips:
-        raise InputError(
-            "--perceptual-weights",
-            expected="a whole network with LPIPS heads",
-            got=perceptual.backbone,
-            file=path,
-        )
-    return perceptual
+    if not exported.is_file():
+        return False
+    return (
+        Avatar.load(exported).metadata.checkpoint_sha256
+        == hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    )
 
 
 def ablate_run(options: EvalOptions) -> None:
@@ -160,19 +162,22 @@ def ablate_run(options: EvalOptions) -> None:
 
     from rnd_runtime.capture import load_capture
 
-    from .ablate import STUDIES, ablate, chosen, summarise, time_encoders
+    from .ablate import STUDIES, ablate, check_needs, chosen, summarise, time_encoders
     from .charts import check_chart, draw_lengths
     from .config import check_sizes, preset, resized
+    from .perceptual import load_lpips
 
     variants = chosen(STUDIES[options.study], options.variants)
     config = resized(preset(options.preset), options.gaussians, options.steps)
     config = dataclasses.replace(config, image_scale=options.image_scale)
     if options.chart is not None:
         check_chart(options.chart)
+        check_option(options.study == "lengths", "--chart", "--study lengths beside it", options.study)
     check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
     check_sizes(config)
     capture = load_capture(options.capture, motion_file=options.motion)
-    perceptual = _perceptual(options.perceptual_weights)
+    check_needs(variants, capture)
+    perceptual = load_lpips(options.perceptual_weights)
     console = Console(stderr=True)
     if perceptual is None:
         console.print("rnd-eval: no --perceptual-weights: no LPIPS, and L_gc is off in every row")
@@ -195,8 +200,6 @@ def ablate_run(options: EvalOptions) -> None:
         )
     rows = time_encoders(rows, options.run, variants, seeds[0])
     summary = summarise(rows, variants)
-    if options.chart is not None:
-        draw_lengths(rows, [options.chart])
     splits = [key for key, cell in summary[0].items() if isinstance(cell, dict)]
     table = Table("method", *splits, "read beside", "GFLOP", "ms", title=f"{options.study}, PSNR")
     for line in summary:
@@ -206,6 +209,8 @@ def ablate_run(options: EvalOptions) -> None:
     wide_console().print(table)
     if options.json is not None:
         write_json(options.json, {"summary": summary, "rows": rows})
+    if options.chart is not None:
+        draw_lengths(rows, [options.chart])
 
 
 def wide_console() -> Console:

@@ -11,13 +11,14 @@ from torch import Tensor
 
 from rnd_runtime.capture import Capture, Frame
 from rnd_runtime.capture_format import Split
+from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 
 from .checkpoint import Checkpoint
-from .data import pose_input
+from .data import pose_input, usable
 from .judge import Rendered, render_runtime
 from .perceptual import Perceptual
 from .scores import frame_scores, to_srgb8
@@ -80,7 +81,7 @@ def evaluate(
     perceptual: Perceptual | None = None,
     on_frame: Callable[[Frame, Rendered, Tensor], None] | None = None,
 ) -> SplitScore:
-    """Score one split.
+    """Score one split; pictures that show nobody are left out, as in training.
 
     Args:
         albedo_scale: [3] factor on the albedo, for relighting with the albedo–light ambiguity taken out.
@@ -91,13 +92,18 @@ def evaluate(
     rows: list[dict[str, float]] = []
     frames = judge.capture.split(split)
     for frame in frames:
-        rendered = judge.render(frame, albedo_scale)
         truth = judge.capture.load_frame(frame)
+        if not usable(truth.mask):
+            continue
+        rendered = judge.render(frame, albedo_scale)
         rows.append(
             frame_scores(rendered, truth, perceptual, None if albedo_scale is not None else shown_scale)
         )
         if on_frame is not None:
             on_frame(frame, rendered, torch.from_numpy(truth.image_srgb))
+    if not rows:
+        expected = "a person in one picture at least"
+        raise InputError(f"split {split!r}", expected=expected, got="none", file=judge.capture.folder)
     names = [name for name in rows[0] if all(name in row for row in rows)]
     return SplitScore(split, len(rows), {name: float(np.mean([row[name] for row in rows])) for name in names})
 

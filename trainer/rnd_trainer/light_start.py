@@ -55,6 +55,8 @@ NOISE_FLOOR = 2e-3
 """of the energy: an error below it needs no sun (that of real captures is ten times as large)"""
 CANDIDATES = 24
 """directions that are tried in earnest before one is chosen: both ends of an axis, and their neighbours"""
+ROUND_OFF = 1e-5
+"""share of all irradiance below which what no light explains is float32's rounding"""
 RIDGE = 1e-4
 """relative, on the normal equations: neighbouring lobes are nearly the same column"""
 REWEIGHTINGS = 10
@@ -101,7 +103,7 @@ class Sightings:
 
 
 def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> FirstLight | None:
-    """The light that best explains the pictures; None where too little is seen.
+    """The light that best explains the pictures; None where too little is seen, or always the same.
 
     Its scale is such that what is seen gives back :data:`REFLECTANCE` of what arrives.
 
@@ -116,7 +118,10 @@ def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseI
     wide, wide_angles = _grid(SEARCH_SHAPE)
     coarse = _transport(seen, wide, wide_angles)
     sky = coarse @ _lobes(wide).astype(np.float32)
-    found = _search(_quadratic(seen, np.concatenate([sky, coarse], axis=1), _by_brightness(seen)))
+    everything = _quadratic(seen, np.concatenate([sky, coarse], axis=1), _by_brightness(seen))
+    if everything.says_nothing():
+        return None
+    found = _search(everything)
     near = _texels_near(directions, wide[np.array(found, int) - SKY_LOBES])
     fine = _transport(seen, directions[near], solid_angles[near])
     columns = np.concatenate([sky, fine], axis=1)
@@ -188,6 +193,11 @@ class Quadratic:
     disagreement: Floats
     power: Floats
     seen: Floats
+
+    def says_nothing(self) -> bool:
+        """Whether any light would do: no point is seen twice, or always alike."""
+        unexplained = float(np.trace(self.disagreement.mean(0)))
+        return unexplained < ROUND_OFF * float(np.trace(self.power))
 
     def fit(self, columns: Sequence[int]) -> tuple[float, Floats]:
         """Least error over non-negative strengths [len(columns), 3] whose light is seen as 1, and the strengths."""

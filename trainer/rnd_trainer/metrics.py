@@ -65,3 +65,9 @@ def mask_box(mask: Tensor, margin: int = 0) -> tuple[slice, slice]:
         return slice(0, mask.shape[0]), slice(0, mask.shape[1])
     top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
     return slice(top, int(rows[-1]) + 1 + margin), slice(left, int(columns[-1]) + 1 + margin)
+
+
+def widened(span: slice, size: int) -> slice:
+    """``span`` within 0 … ``size``, and as wide as SSIM's window: of a person there may be a sliver."""
+    start = max(min(span.start, size - SSIM_WINDOW), 0)
+    return slice(start, min(max(span.stop, start + SSIM_WINDOW), size))

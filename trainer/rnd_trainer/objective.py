@@ -94,7 +94,7 @@ class Objective:
         if normals is not None:
             terms["normal"] = config.weight_normal * (picture.normals - normals.to(device)).abs().mean()
         due = _due(step, config.weight_consistency, config.consistency_every)
-        if due and texels is not None and self.perceptual is not None:
+        if due and texels is not None and self._network_for(target) is not None:
             agreement = self._consistency(model, posed, pose, texels, view.camera, image_srgb, background)
             if agreement is not None:
                 terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
@@ -121,10 +121,16 @@ class Objective:
         config = self.config
         scales = 1 if self.perceptual is not None else config.dssim_scales
         terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
-        if self.perceptual is not None and _due(step, config.weight_lpips, config.lpips_every):
-            distance = self.perceptual(image_srgb.clamp(max=1), target_srgb)
+        seen = self._network_for(target_srgb)
+        if seen is not None and _due(step, config.weight_lpips, config.lpips_every):
+            distance = seen(image_srgb.clamp(max=1), target_srgb)
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance
         return terms
+
+    def _network_for(self, image: Tensor) -> Perceptual | None:
+        """The feature network, where there is one and ``image`` [h, w, 3] is large enough for it."""
+        large = self.perceptual is not None and min(image.shape[:2]) >= self.perceptual.smallest
+        return self.perceptual if large else None
 
     def _texels(self, step: int) -> Texels:
         config = self.config

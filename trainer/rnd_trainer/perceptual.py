@@ -115,6 +115,21 @@ class Perceptual:
         return dataclasses.replace(self, weights=weights, heads=heads)
 
 
+def load_lpips(path: Path | None) -> Perceptual | None:
+    """The network of ``--perceptual-weights``, which must be whole and have its heads; None where none is named."""
+    if path is None:
+        return None
+    perceptual = load_perceptual(path)
+    if not perceptual.is_lpips:
+        raise InputError(
+            "--perceptual-weights",
+            expected="a whole network with LPIPS heads",
+            got=perceptual.backbone,
+            file=path,
+        )
+    return perceptual
+
+
 def load_perceptual(path: str | Path) -> Perceptual:
     """Read a network, and LPIPS heads if there are any, from ``.safetensors`` or torchvision's ``.pth``.
 

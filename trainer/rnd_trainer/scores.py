@@ -10,7 +10,7 @@ from rnd_runtime.capture import FrameImages
 from rnd_runtime.images import linear_to_srgb
 
 from .judge import Rendered
-from .metrics import mask_box, normal_degrees, psnr, ssim
+from .metrics import mask_box, normal_degrees, psnr, ssim, widened
 from .perceptual import Perceptual
 
 BOX_MARGIN = 8
@@ -32,7 +32,8 @@ def frame_scores(
     """
     target, mask = torch.from_numpy(truth.image_srgb).float(), torch.from_numpy(truth.mask)
     image = to_srgb8(rendered.image)
-    box = mask_box(mask > 0, BOX_MARGIN)
+    rows, columns = mask_box(mask > 0, BOX_MARGIN)
+    box = widened(rows, mask.shape[0]), widened(columns, mask.shape[1])
     scores = {
         "psnr": psnr(image, target),
         "ssim": ssim(image, target),
@@ -48,7 +49,8 @@ def frame_scores(
     normal = truth.normal_gt if truth.normal_gt is not None else truth.normal
     if normal is not None:
         expected = torch.from_numpy(normal).float()
-        scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside)
+        if inside.any():
+            scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside)
         ours = normal_picture(rendered.normals, rendered.alpha)
         theirs = normal_picture(expected, mask)
         scores |= {
@@ -56,7 +58,7 @@ def frame_scores(
             "ssim_n": ssim(ours, theirs),
             "psnr_n_box": psnr(ours[box], theirs[box]),
         }
-    if truth.albedo_srgb is not None:
+    if truth.albedo_srgb is not None and inside.any():
         albedo = rendered.albedo if scale is None else rendered.albedo * scale
         expected = torch.from_numpy(truth.albedo_srgb).float()
         scores["psnr_albedo"] = psnr(to_srgb8(albedo), expected, inside)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import hashlib
 import json
 import math
 import signal
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -38,6 +40,8 @@ from .template import sample_template
 from .unseen import UnseenPoses
 
 STATE_SCHEMA = "rnd-training/1"
+REFINED_MOTION = "refined_motion.npz"
+"""beside the checkpoint: the capture's motion, its training frames corrected"""
 MAX_BAD_STEPS = 10
 """non-finite steps in a row after which training stops: it will not recover"""
 
@@ -284,7 +288,7 @@ class Training:
         tensors |= {f"probe.{k}": v.cpu().contiguous() for k, v in self.probe.state_dict().items()}
         if self.refinement is not None:
             tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
-            save_motion(folder / "refined_motion.npz", self.motion())
+            save_motion(folder / REFINED_MOTION, self.motion())
         if self.unseen is not None:
             taught = self.unseen.taught.state_dict()
             tensors |= {f"taught.{k}": v.cpu().contiguous() for k, v in taught.items()}
@@ -298,6 +302,7 @@ class Training:
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
             "perceptual_sha256": self._perceptual_sha256(),
+            "seen_sha256": self._seen_sha256,
         }
         write_tensors(folder / "training.state", tensors, header)
         save_checkpoint(
@@ -317,7 +322,7 @@ class Training:
         tensors, header = read_tensors(path, STATE_SCHEMA)
         taught = _strip(tensors, "taught.")
         before, now = to_dict(_trained_with(header, path)), to_dict(self.config)
-        free = set() if taught else {"unseen_fraction", "weight_edges"}
+        free = {"save_every", "preview_every"} | (set() if taught else {"unseen_fraction", "weight_edges"})
         wrong = sorted(name for name, value in now.items() if before[name] != value and name not in free)
         if wrong:
             raise InputError(
@@ -328,6 +333,10 @@ class Training:
                 "--resume", expected=f"the perceptual weights {header.get('perceptual_sha256')}",
                 got=self._perceptual_sha256(), file=path,
             )  # fmt: skip
+        if header.get("seen_sha256", self._seen_sha256) != self._seen_sha256:
+            raise InputError(
+                "--resume", expected="the pictures and poses it was started with", got="others", file=path
+            )
         try:
             self.model.load_state_dict(_strip(tensors, "model."))
             self.probe.load_state_dict(_strip(tensors, "probe."))
@@ -346,6 +355,18 @@ class Training:
             self.bad_steps = int(header["bad_steps"])
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
+
+    @cached_property
+    def _seen_sha256(self) -> str:
+        """Of everything that is learned from: pictures, cameras and poses."""
+        digest = hashlib.sha256()
+        for view in self.views:
+            for values in (view.image, view.mask, view.normal, view.camera.K, view.camera.world_to_camera):
+                digest.update(b"" if values is None else values.tobytes())
+        motion = self.capture.motion
+        for values in (motion.rotations, motion.translations, np.array(motion.fps)):
+            digest.update(values.tobytes())
+        return digest.hexdigest()
 
     def _perceptual_sha256(self) -> str | None:
         return None if self.perceptual is None else self.perceptual.sha256

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, flag
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.skeleton import Skeleton
@@ -66,15 +65,7 @@ def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> N
     for name, (low, high) in limits.items():
         value = getattr(options, name)
         if value is not None and not low <= value <= high:  # false for NaN
-            raise InputError(f"--{name.replace('_', '-')}", expected=f"{low:g} to {high:g}", got=value)
-
-
-def refuse_changed(options: object, names: Sequence[str], declared_in: type[Any], hint: str) -> None:
-    """Refuse options that would do nothing where they have another value than ``declared_in`` gives them."""
-    for name in names:
-        value, default = getattr(options, name), getattr(declared_in, name)
-        if value != default:
-            raise InputError(f"--{name.replace('_', '-')}", expected="the default", got=value, hint=hint)
+            raise InputError(flag(name), expected=f"{low:g} to {high:g}", got=value)
 
 
 @dataclass(frozen=True)

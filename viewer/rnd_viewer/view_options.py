@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, refuse_changed
 
-from .options import MotionOptions, option, refuse_changed
+from .options import MotionOptions, option
 
 
 @dataclass(frozen=True)

@@ -275,7 +275,7 @@ def _bend(few: list[Sight], k1: float) -> float:
 
 def _imported(capture: Capture) -> dict[str, Any]:
     """What ``rnd-data import`` noted in capture.json; nothing where it was not at work."""
-    content = msgspec.json.decode((capture.folder / "capture.json").read_bytes())
+    content = msgspec.json.decode((capture.file or capture.folder / "capture.json").read_bytes())
     imported = content.get("import")
     return imported if isinstance(imported, dict) else {}
 

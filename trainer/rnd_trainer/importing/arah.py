@@ -27,7 +27,8 @@ def detect(source: Path) -> str | None:
 def read(source: Path) -> Recording:
     """Read poses in SMPL's convention (root_orient, trans) and K, D, R, T (metres) of each camera.
 
-    ``opt_models`` before ``models``. Masks lie beside the pictures, as PNG beside JPEG.
+    ``opt_models`` before ``models``. Masks lie beside the pictures, as PNG beside JPEG. Frame numbers name
+    the files.
     """
     models = next(source / name for name in _MODELS if (source / name).is_dir())
     files = listed(models, (".npz",))
@@ -41,14 +42,14 @@ def read(source: Path) -> Recording:
             angles.append(np.concatenate(parts))
             trans.append(archive.numbers("trans").reshape(3))
             betas = archive.numbers("betas") if "betas" in archive.names else betas
-        frames.append(int(file.stem))
+        frames.append(_number(file))
     record = read_json(source / "cam_params.json")
     lenses, shots = {}, []
     for name in record.get("all_cam_names", []):
         folder = source / str(name)
         if not folder.is_dir() or str(name) not in record:
             continue
-        pictures = [p for p in listed(folder) if p.suffix.lower() in (".jpg", ".jpeg")]
+        pictures = listed(folder, (".jpg", ".jpeg"))
         entry = record[str(name)]
         lenses[str(name)] = Lens(
             camera_of(entry["K"], entry["R"], entry["T"], sized(pictures[0])),
@@ -56,10 +57,10 @@ def read(source: Path) -> Recording:
         )
         known = set(frames)
         for picture in pictures:
-            mask = picture.with_suffix(".png")
-            if int(picture.stem) in known:
+            mask, number = picture.with_suffix(".png"), _number(picture)
+            if number in known:
                 read_it = partial(read_mask, mask) if mask.is_file() else None
-                shots.append(Shot(str(name), int(picture.stem), partial(read_rgb, picture), read_it))
+                shots.append(Shot(str(name), number, partial(read_rgb, picture), read_it))
     if not lenses:
         raise InputError(
             "cameras",
@@ -68,3 +69,9 @@ def read(source: Path) -> Recording:
             file=source / "cam_params.json",
         )
     return Recording("ARAH / 3DGS-Avatar", lenses, shots, smpl_poses(frames, angles, trans, betas), FPS)
+
+
+def _number(file: Path) -> int:
+    if not file.stem.isdecimal():
+        raise InputError("file name", expected="a frame number", got=file.name, file=file)
+    return int(file.stem)

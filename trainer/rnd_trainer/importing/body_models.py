@@ -116,6 +116,9 @@ def convert_body_model(
 ) -> str:
     """Write the body of ``model`` for ``betas`` to ``out`` as ``body.npz``; say in a line what it is."""
     loaded = load_body_model(model)
+    if betas and loaded.joint_regressor is None:
+        given = " ".join(f"{beta:g}" for beta in betas)
+        raise InputError("--betas", expected=f"none, as {model} has one shape", got=given)
     body = loaded.shaped(np.array(betas) if betas else None)
     if license is not None:
         body = replace(body, license=license)

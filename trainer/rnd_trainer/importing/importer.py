@@ -28,7 +28,7 @@ from .options import ImportOptions
 from .pose_files import read_poses
 from .recording import Recording, RootConvention, read_as, straightened
 from .surfaces import attached, with_masks, with_normals
-from .write import Scene, chosen_shots, placed, write_capture
+from .write import Scene, chosen_shots, placed, refuse_cameras, write_capture
 
 LAYOUTS: dict[str, Any] = {
     "zju": zju,
@@ -156,6 +156,11 @@ def _refuse_unused(layout: str, options: ImportOptions) -> None:
         given = getattr(options, name)
         if not used and given is not None and given != ():
             raise InputError(f"--{name}", expected=f"none, as {layout} has its own", got=given)
+    if layout == "video":
+        refuse_cameras(options.choice, "a video has one camera, and its last 1/5 are novel poses")
+    elif options.count != ImportOptions.count:
+        hint = f"of a video the sharpest pictures are chosen; of {layout}, --every keeps fewer"
+        raise InputError("--count", expected="the default", got=options.count, hint=hint)
 
 
 def _contents(recording: Recording) -> str:

@@ -26,7 +26,7 @@ from rnd_runtime.video_fits import (
 )
 
 from .pictures import listed
-from .recording import Floats, Poses, easymocap_poses, smpl_poses
+from .recording import Floats, Poses, easymocap_poses, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
 
@@ -82,7 +82,10 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     if path.suffix.lower() == ".npz":
         with Npz(path, what="body poses") as archive:
             names = archive.names
-        return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
+        try:
+            return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
+        except InputError as error:
+            raise error.at(file=path) from error
     content = read_pickle(path, what="body poses")
     if isinstance(content, dict):
         try:
@@ -185,18 +188,22 @@ def _npz(path: Path) -> FoundPoses:
                 "body poses", expected="poses, thetas or body_pose", got=", ".join(archive.names), file=path
             )
         poses = archive.numbers(member)
+        if poses.ndim < 2 or not poses.size:
+            raise InputError(member, expected="a row of numbers a frame", got=list(poses.shape), file=path)
         poses = poses.reshape(len(poses), -1)
         root = archive.first_of("global_orient", "root_orient")
         if member in ("body_pose", "pose_body") and root is not None:
-            poses = np.concatenate([archive.numbers(root).reshape(-1, 3), poses], 1)
+            poses = np.concatenate([threes(root, archive.numbers(root), len(poses)), poses], 1)
         poses = with_root(poses)
         betas_name = archive.first_of("shapes", "betas")
         betas = None if betas_name is None else archive.numbers(betas_name)
         rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
         fps = None if rate is None else float(archive.numbers(rate).reshape(-1)[0])
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
-        trans = np.zeros((len(poses), 3)) if shift is None else archive.numbers(shift).reshape(-1, 3)
-        Rh = None if turn is None else archive.numbers(turn).reshape(-1, 3)
+        trans = (
+            np.zeros((len(poses), 3)) if shift is None else threes(shift, archive.numbers(shift), len(poses))
+        )
+        Rh = None if turn is None else threes(turn, archive.numbers(turn), len(poses))
     notes = () if shift is not None else ("no trans in the file: the root stays at its rest place",)
     frames = range(len(poses))
     family = "SMPL-X" if poses.shape[1] == 165 else "SMPL"

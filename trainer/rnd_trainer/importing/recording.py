@@ -68,7 +68,8 @@ class Poses:
     Attributes:
         frames: [F] ascending, the moments they belong to.
         rotations: [F, J, 3, 3] local, the root first.
-        root: gives the root's places [F, 3] m for a rest place [3] m: where conventions differ.
+        root: gives the root's places [F, 3] m for a rest place [3] m: where conventions differ. Called once to
+            check them.
         joint_names: J.
         family: "SMPL" or "SMPL-X": whose rest pelvis ``root`` wants.
         betas: shape, or None.
@@ -92,7 +93,10 @@ class Poses:
             raise InputError(
                 "body poses", expected=f"{count} × {len(self.joint_names)} rotations", got=list(self.rotations.shape)
             )  # fmt: skip
-        finite = np.isfinite(self.rotations).all((1, 2, 3))
+        places = self.root(np.zeros(3))
+        if places.shape != (count, 3):
+            raise InputError("places of the root", expected=f"{count} × 3", got=_shape(places))
+        finite = np.isfinite(self.rotations).all((1, 2, 3)) & np.isfinite(places).all(1)
         if not finite.all():
             raise InputError("body poses", expected="finite numbers", frame=int(self.frames[~finite][0]))
 
@@ -154,7 +158,7 @@ def smpl_poses(
         trans: [F, 3] m.
     """
     rotations, names = _rotations(axis_angles)
-    offsets = np.asarray(trans, np.float64).reshape(-1, 3)
+    offsets = threes("trans", trans, len(rotations))
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
     )  # fmt: skip
@@ -174,8 +178,8 @@ def easymocap_poses(
     A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first.
     """
     rotations, names = _rotations(axis_angles)
-    turn = axis_angle_to_matrix(np.asarray(Rh, np.float64).reshape(-1, 3))
-    offsets = np.asarray(Th, np.float64).reshape(-1, 3)
+    turn = axis_angle_to_matrix(threes("Rh", Rh, len(rotations)))
+    offsets = threes("Th", Th, len(rotations))
     rotations[:, 0] = turn @ rotations[:, 0]
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas),
@@ -203,6 +207,18 @@ def read_as(poses: Poses, convention: RootConvention) -> Poses:
     return replace(poses, root=root, convention=convention)
 
 
+def threes(name: str, values: ArrayLike, count: int) -> Floats:
+    """``values`` as [count, 3]: three numbers for each of ``count`` poses.
+
+    Raises:
+        InputError: there are more, or fewer; it says ``name``.
+    """
+    array = np.asarray(values, np.float64)
+    if array.size != 3 * count:
+        raise InputError(name, expected=f"{count} × 3, as there are {count} poses", got=_shape(array))
+    return array.reshape(count, 3)
+
+
 def mean_betas(betas: ArrayLike | None) -> Floats | None:
     """One shape [B] of one or many ([F, B] → their mean)."""
     if betas is None:
@@ -213,9 +229,15 @@ def mean_betas(betas: ArrayLike | None) -> Floats | None:
 
 def _rotations(axis_angles: ArrayLike) -> tuple[Floats, tuple[str, ...]]:
     angles = np.asarray(axis_angles, np.float64)
-    angles = angles.reshape(len(angles), -1, 3)
-    names = _NAMES.get(angles.shape[1])
+    if not angles.size:
+        raise InputError("body poses", expected="at least one frame", got="none")
+    joints, over = divmod(angles.size, 3 * len(angles))
+    names = None if over else _NAMES.get(joints)
     if names is None:
         known = ", ".join(map(str, _NAMES))
-        raise InputError("joints of the body poses", expected=known, got=angles.shape[1])
-    return axis_angle_to_matrix(angles), names
+        raise InputError("joints of the body poses", expected=known, got=_shape(angles) if over else joints)
+    return axis_angle_to_matrix(angles.reshape(-1, joints, 3)), names
+
+
+def _shape(array: Floats) -> str:
+    return " × ".join(map(str, array.shape)) or "a single number"

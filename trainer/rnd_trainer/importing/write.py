@@ -87,6 +87,10 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
 
     Shots that have one keep it. Else: the first 4/5 of the training camera's frames train, its last 1/5 are novel
     poses; of the other cameras every so many frames are novel views, or novel poses from there on.
+
+    Raises:
+        InputError: nothing is kept, the training camera has no picture among what is, or ``choice`` speaks of several
+            cameras where there is no choice between them.
     """
     first, last = int(recording.poses.frames[0]), int(recording.poses.frames[-1])
     stop = last + 1 if choice.stop is None else choice.stop
@@ -102,13 +106,18 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
             "pictures", expected=f"some in the {last - first + 1} frames that have poses", got="none"
         )
     if all(shot.split is not None for shot in kept):
+        refuse_cameras(choice, "the pictures' splits are given")
         return kept
     moving = len({shot.frame for shot in kept}) == len(
         kept
     )  # one picture a moment: a single, maybe moving camera
     camera = choice.camera or kept[0].camera
-    if camera not in recording.lenses:
-        raise InputError("--train-camera", expected=" or ".join(list(recording.lenses)[:8]), got=camera)
+    seen = list(dict.fromkeys(shot.camera for shot in kept))
+    if camera not in seen:
+        known = " or ".join(seen[:8])
+        raise InputError("--train-camera", expected=f"one with pictures in range: {known}", got=camera)
+    if moving:
+        refuse_cameras(choice, "there is one picture a moment: the first 4/5 train, the rest are novel poses")
     train = [shot.frame for shot in kept if moving or shot.camera == camera]
     border = sorted(train)[max(0, round(TRAIN_SHARE * len(train)) - 1)] if len(train) > 1 else train[0]
     frames = {frame: k for k, frame in enumerate(sorted({shot.frame for shot in kept}))}
@@ -120,6 +129,16 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
         elif frames[shot.frame] % choice.held_out_every == 0:
             result.append(replace(shot, split="novel_view" if early else "novel_pose"))
     return result
+
+
+def refuse_cameras(choice: Choice, why: str) -> None:
+    """Refuse what ``choice`` says of several cameras where it would change nothing, and say ``why``."""
+    for name, given, usual in (
+        ("--train-camera", choice.camera, Choice.camera),
+        ("--held-out-every", choice.held_out_every, Choice.held_out_every),
+    ):
+        if given != usual:
+            raise InputError(name, expected="the default", got=given, hint=why)
 
 
 def write_capture(

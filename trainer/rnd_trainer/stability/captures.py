@@ -15,21 +15,24 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.images import read_image, write_image
 from rnd_trainer.data import load_views
 
-from .figures import Result, at_most, holds, refusal
+from .figures import Result, at_most, holds, not_measured, refusal
 from .subject import Subject
 
 Breaker = Callable[[Path, dict[str, Any]], None]
 FRAME = 2
 """position in capture.json of the picture that is broken"""
+COPIED = 6
+"""training pictures of a copy"""
+_FEW = f"fewer than {COPIED} training pictures in this capture"
 
 
-def _copy(subject: Subject, name: str, frames: int | None = None) -> Path:
+def _copy(subject: Subject, name: str) -> Path:
     """A capture of its own to break: the first training frames of the subject's."""
     source, folder = subject.capture.folder, subject.work / f"capture_{name}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     record = json.loads((source / "capture.json").read_text(encoding="utf-8"))
-    chosen = [frame for frame in record["frames"] if frame["split"] == "train"][: frames or 6]
+    chosen = [frame for frame in record["frames"] if frame["split"] == "train"][:COPIED]
     record["frames"] = chosen
     used = {frame.get("light") for frame in chosen}
     record["lights"] = {name: light for name, light in record.get("lights", {}).items() if name in used}
@@ -47,6 +50,10 @@ def _copy(subject: Subject, name: str, frames: int | None = None) -> Path:
     return folder
 
 
+def _too_small(subject: Subject) -> bool:
+    return len(subject.capture.split("train")) < COPIED
+
+
 def _save(folder: Path, record: dict[str, Any]) -> None:
     (folder / "capture.json").write_text(json.dumps(record), encoding="utf-8")
 
@@ -57,6 +64,9 @@ def _record(folder: Path) -> dict[str, Any]:
 
 def broken_captures(subject: Subject) -> Result:
     """R5: sizes that differ, a missing mask, 16 bits, alpha, EXIF turn, a frame that does not exist."""
+    what = "broken captures not refused with frame and values"
+    if _too_small(subject):
+        return Result((not_measured(what, _FEW),))
     wrong: list[str] = []
 
     def case(name: str, breaker: Breaker, *said: str) -> None:
@@ -106,11 +116,14 @@ def broken_captures(subject: Subject) -> Result:
     after = load_capture(folder)
     if np.abs(after.load_frame(after.frames[FRAME]).image_srgb - eight).max() > 1e-6:
         wrong.append("16 bits: not the same picture")
-    return Result((holds("broken captures not refused with frame and values", wrong),))
+    return Result((holds(what, wrong),))
 
 
 def bad_masks(subject: Subject) -> Result:
     """R6: one empty mask of six is skipped and counted; two, above a fifth, stop."""
+    whats = "masks not skipped, counted or stopped at", "empty masks kept"
+    if _too_small(subject):
+        return Result(tuple(not_measured(what, _FEW) for what in whats))
     folder, wrong = _copy(subject, "masks"), []
     record = _record(folder)
     camera = subject.capture.cameras[record["frames"][0]["camera"]]
@@ -123,21 +136,16 @@ def bad_masks(subject: Subject) -> Result:
     fault = refusal(lambda: load_views(load_capture(folder), "train"), "20%", "2 of 6")
     if fault is not None:
         wrong.append(f"two of six: {fault}")
-    return Result(
-        (
-            holds("masks not skipped, counted or stopped at", wrong),
-            at_most("empty masks kept", len(views) - 5, 0),
-        )
-    )
+    return Result((holds(whats[0], wrong), at_most(whats[1], len(views) - 5, 0)))
 
 
-def flipped_normals(subject: Subject) -> list[str]:
-    """What is wrong with how a capture is met whose normals all point away from the camera."""
+def flipped_normals(subject: Subject) -> list[str] | None:
+    """What is wrong with how a capture is met whose normals all point away from the camera; None where it has none."""
     folder = _copy(subject, "flipped")
-    for frame in _record(folder)["frames"]:
-        if frame.get("normal"):
-            write_image(
-                folder / frame["normal"], np.asarray(255 - read_image(folder / frame["normal"]), np.uint8)
-            )
+    normals = [folder / frame["normal"] for frame in _record(folder)["frames"] if frame.get("normal")]
+    if not normals:
+        return None
+    for file in normals:
+        write_image(file, np.asarray(255 - read_image(file), np.uint8))
     fault = refusal(lambda: load_views(load_capture(folder), "train"), "normal")
     return [] if fault is None else [fault]

@@ -94,6 +94,11 @@ def stated(
     return _figure(what, measured, unit, "", math.isfinite(measured), baseline)
 
 
+def not_measured(what: str, why: str = "not in this capture") -> Figure:
+    """A figure that there is nothing to measure by, and ``why``. It is judged by no line, and does not pass."""
+    return Figure(f"{what} ({why})", math.nan, "", "", False)
+
+
 def holds(what: str, wrong: list[str]) -> Figure:
     """How many cases went wrong; their names stand in ``what``."""
     said = f"{what}: {'; '.join(wrong)}" if wrong else what

@@ -15,7 +15,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from rnd_runtime import gl_context
-from rnd_runtime.avatar import METADATA_KEY, Avatar
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import METADATA_KEY
 from rnd_runtime.raster import make_rasterizer
 from rnd_trainer.checkpoint import load_checkpoint
 

@@ -18,8 +18,8 @@ from rnd_runtime.sun import Sun, extract_suns
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.evaluate import Judge, albedo_scale, evaluate
 
-from .figures import Floats, Result, at_most, below, coded, decibels, stated
-from .subject import CROSSED, Subject, bytes_of
+from .figures import Figure, Floats, Result, at_most, below, coded, decibels, not_measured, stated
+from .subject import CROSSED, Subject, box_of, bytes_of
 
 TEXELS = (16, 32)
 """of the sky under which visibility is judged: every texel's shadow is traced"""
@@ -28,22 +28,30 @@ TEXELS = (16, 32)
 def relit_scale(subject: Subject) -> Result:
     """L11: relit pictures as they are, and with the albedo scaled per channel."""
     judge = Judge(load_checkpoint(subject.checkpoint), subject.capture)
-    raw = evaluate(judge, "relight").scores
-    scaled = evaluate(judge, "relight", albedo_scale=albedo_scale(judge)).scores
-    return Result((
-        stated("PSNR under other lights, raw", raw["psnr"], "dB"),
-        stated("PSNR under other lights, one albedo scale per channel", scaled["psnr"], "dB"),
-        stated("the same inside the mask's box, raw", raw["psnr_box"], "dB"),
-        stated("the same inside the mask's box, scaled", scaled["psnr_box"], "dB"),
+    relit = bool(subject.capture.split("relight"))
+    scale = albedo_scale(judge) if relit else None
+    raw = evaluate(judge, "relight").scores if relit else None
+    scaled = evaluate(judge, "relight", albedo_scale=scale).scores if scale is not None else None
+    figures = (
+        ("PSNR under other lights, raw", raw, "psnr"),
+        ("PSNR under other lights, one albedo scale per channel", scaled, "psnr"),
+        ("the same inside the mask's box, raw", raw, "psnr_box"),
+        ("the same inside the mask's box, scaled", scaled, "psnr_box"),
+    )
+    return Result(tuple(
+        not_measured(what) if scores is None else stated(what, scores[name], "dB") for what, scores, name in figures
     ))  # fmt: skip
 
 
 def baked_light(subject: Subject) -> Result:
     """L12: correlation of the albedo's error with the light that fell on it, over training pictures."""
+    what = "|correlation| of albedo error and irradiance"
     capture, errors, lights, colours = subject.capture, [], [], []
-    frames = [frame for frame in capture.split("train") if frame.albedo is not None]
+    frames = [frame for frame in capture.split("train") if frame.albedo and frame.light]
+    if not frames:
+        return Result((not_measured(what),))
     frames = frames[:: max(1, len(frames) // subject.few(6, 25))]
-    shader = Shader(capture.load_light(frames[0].light or "unknown"), "table+sun")
+    shader = Shader(capture.load_light(frames[0].light or ""), "table+sun")
     for frame in frames:
         truth = capture.load_frame(frame)
         assert truth.albedo_srgb is not None
@@ -65,7 +73,7 @@ def baked_light(subject: Subject) -> Result:
         scale = (estimate * true).sum(0) / np.maximum((estimate**2).sum(0), 1e-12)
         return abs(float(np.corrcoef((scale * estimate - true).mean(1), light)[0, 1]))
 
-    figure = below("|correlation| of albedo error and irradiance", correlation(ours), 0.2,
+    figure = below(what, correlation(ours), 0.2,
                    baseline=("the picture's colour as albedo", correlation(colour)))  # fmt: skip
     return Result((figure,))
 
@@ -76,25 +84,6 @@ def crossed_arms(subject: Subject) -> Result:
     On the capture's held-out poses, both under its own light and compared with its pictures; and with the arms
     crossed under an overcast sky, compared with each other.
     """
-    capture = subject.capture
-    ours: list[float] = []
-    exact: list[float] = []
-    frames = [frame for frame in capture.split("novel_pose") if frame.light is not None]
-    frames = frames[:: max(1, len(frames) // subject.few(4, 8))]
-    sky, suns = extract_suns(capture.load_light(frames[0].light or ""))
-    for frame in frames:
-        truth = capture.load_frame(frame)
-        rows, columns = (np.flatnonzero(truth.mask.any(axis)) for axis in (1, 0))
-        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        camera = capture.cameras[frame.camera]
-        posed = subject.avatar.pose(capture.motion, frame.frame / capture.motion.fps)
-        lit = _Overcast(subject, posed, sky, suns)
-        for found, visibility in ((ours, lit.ours), (exact, lit.traced)):
-            found.append(
-                decibels(coded(_splat(posed, lit.radiance(visibility), camera))[box], truth.image_srgb[box])
-            )
-    loss = float(np.mean(exact) - np.mean(ours))
-
     posed = subject.avatar.pose(subject.motion(CROSSED), 0.0)
     lit = _Overcast(subject, posed, Light(np.minimum(subject.light.radiance, 1.0)), ())
     camera = subject.camera(0.2)
@@ -106,13 +95,36 @@ def crossed_arms(subject: Subject) -> Result:
     blind = decibels(picture(subject.rest.visibility @ lit.basis.T), truth_picture)
     clamped = decibels(picture(np.clip(lit.ours, 0, 1)), truth_picture)
     figures = (
-        at_most("PSNR lost to exact visibility on held-out poses", loss, 3, "dB"),
+        _lost_to_exact(subject),
         stated("arms crossed, overcast: PSNR to exact visibility", decibels(drawn, truth_picture), "dB",
                baseline=("visibility of the rest pose", blind)),
         stated("the same, and with v clamped to 0…1", decibels(drawn, truth_picture), "dB",
                baseline=("clamped", clamped)),
     )  # fmt: skip
     return Result(figures, (bytes_of(drawn), bytes_of(truth_picture)))
+
+
+def _lost_to_exact(subject: Subject) -> Figure:
+    what, capture = "PSNR lost to exact visibility on held-out poses", subject.capture
+    ours: list[float] = []
+    exact: list[float] = []
+    frames = [frame for frame in capture.split("novel_pose") if frame.light is not None]
+    frames = frames[:: max(1, len(frames) // subject.few(4, 8))]
+    if not frames:
+        return not_measured(what)
+    sky, suns = extract_suns(capture.load_light(frames[0].light or ""))
+    for frame in frames:
+        truth = capture.load_frame(frame)
+        if (box := box_of(truth.mask)) is None:
+            continue
+        camera = capture.cameras[frame.camera]
+        posed = subject.avatar.pose(capture.motion, frame.frame / capture.motion.fps)
+        lit = _Overcast(subject, posed, sky, suns)
+        for found, visibility in ((ours, lit.ours), (exact, lit.traced)):
+            found.append(
+                decibels(coded(_splat(posed, lit.radiance(visibility), camera))[box], truth.image_srgb[box])
+            )
+    return at_most(what, float(np.mean(exact) - np.mean(ours)), 3, "dB") if ours else not_measured(what)
 
 
 class _Overcast:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from rnd_runtime.avatar import POSED_OUTPUTS
+from rnd_runtime.avatar_file import POSED_OUTPUTS
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, texel_directions
@@ -18,8 +18,8 @@ from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import bone_transforms
 
-from .figures import Floats, Result, above, at_most, below, coded, decibels, stated
-from .subject import APART, ARMS_DOWN, EXTREMES, Angles, Subject, bytes_of
+from .figures import Figure, Floats, Result, above, at_most, below, coded, decibels, not_measured, stated
+from .subject import APART, ARMS_DOWN, EXTREMES, Angles, Subject, box_of, bytes_of
 
 BYTE = 1 / 255
 RING_M = 0.02
@@ -35,7 +35,7 @@ def out_of_distribution(subject: Subject) -> Result:
     extremes = [subject.motion(pose) for pose in EXTREMES.values()]
     posed = [subject.avatar.pose(motion, 0.0) for motion in extremes]
     holes = [_holes(subject, gaussians, motion) for gaussians, motion in zip(posed, extremes)]
-    ours, plain, worst = _held_out(subject)
+    held_out, worst = _held_out(subject)
     (stretch, longest), (plain_stretch, plain_longest) = (
         _stretch(subject, pose) for pose in (subject.avatar.pose, subject.by_template)
     )
@@ -44,8 +44,7 @@ def out_of_distribution(subject: Subject) -> Result:
               baseline=("template LBS", plain_stretch)),
         stated("the same, the edge that is stretched most", longest, "×", baseline=("template LBS", plain_longest)),
         below("alpha holes inside the template's silhouette", 100 * max(holes), 1, "%"),
-        above("PSNR over template LBS on held-out poses, mean", float(np.mean(np.array(ours) - plain)), -0.5, "dB",
-              baseline=("template LBS, its PSNR", float(np.mean(plain)))),
+        held_out,
     )  # fmt: skip
     return Result(figures, worst)
 
@@ -81,19 +80,19 @@ def _holes(subject: Subject, posed: Gaussians, motion: Motion) -> float:
     return float((alpha[inside > 0] < 0.5).mean())
 
 
-def _held_out(
-    subject: Subject,
-) -> tuple[list[float], Floats, tuple[NDArray[np.uint8], NDArray[np.uint8]] | None]:
-    """PSNR of ours and of template LBS on held-out poses, inside the mask's box; the worst frame of ours."""
-    capture = subject.capture
+def _held_out(subject: Subject) -> tuple[Figure, tuple[NDArray[np.uint8], NDArray[np.uint8]] | None]:
+    """PSNR of ours over that of template LBS on held-out poses, inside the mask's box; the worst frame of ours."""
+    what, capture = "PSNR over template LBS on held-out poses, mean", subject.capture
     frames = capture.split("novel_pose")
     frames = frames[:: max(1, len(frames) // subject.few(4, 12))]
     shader = Shader(Light(subject.avatar.trained_light), "table+sun")
-    ours, plain, worst = [], [], None
+    ours: list[float] = []
+    plain: list[float] = []
+    worst = None
     for frame in frames:
         truth = capture.load_frame(frame)
-        rows, columns = (np.flatnonzero(truth.mask.any(axis)) for axis in (1, 0))
-        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        if (box := box_of(truth.mask)) is None:
+            continue
         camera, time = capture.cameras[frame.camera], frame.frame / capture.motion.fps
         picture = subject.picture(subject.avatar.pose(capture.motion, time), camera, shader)
         template = subject.picture(subject.by_template(capture.motion, time), camera, shader)
@@ -101,7 +100,10 @@ def _held_out(
         plain.append(decibels(template[box], truth.image_srgb[box]))
         if ours[-1] == min(ours):
             worst = bytes_of(picture), bytes_of(truth.image_srgb)
-    return ours, np.array(plain), worst
+    if not ours:
+        return not_measured(what), None
+    baseline = "template LBS, its PSNR", float(np.mean(plain))
+    return above(what, float(np.mean(np.subtract(ours, plain))), -0.5, "dB", baseline=baseline), worst
 
 
 def candy_wrapper(subject: Subject) -> Result:

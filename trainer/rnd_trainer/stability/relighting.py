@@ -17,7 +17,19 @@ from rnd_runtime.shading import Shader
 from rnd_runtime.shading_reference import shade_reference
 
 from .commands import PLAY, run_commands
-from .figures import Floats, Result, above, at_least, at_most, below, decibels, holds, stated
+from .figures import (
+    Figure,
+    Floats,
+    Result,
+    above,
+    at_least,
+    at_most,
+    below,
+    decibels,
+    holds,
+    not_measured,
+    stated,
+)
 from .lights import SUN_RADIUS, sun_and_sky, sun_disc
 from .subject import Subject, bytes_of
 
@@ -249,10 +261,11 @@ def broken_normals(subject: Subject) -> Result:
     return Result((holds("broken normals that make a picture not finite", wrong), _flipped_capture(subject)))
 
 
-def _flipped_capture(subject: Subject):
+def _flipped_capture(subject: Subject) -> Figure:
     from .captures import flipped_normals
 
-    return holds("a capture whose normals are all flipped is not found at load", flipped_normals(subject))
+    what, wrong = "a capture whose normals are all flipped is not found at load", flipped_normals(subject)
+    return not_measured(what) if wrong is None else holds(what, wrong)
 
 
 def grazing(subject: Subject) -> Result:

@@ -25,7 +25,7 @@ import numpy as np
 from rnd_runtime.files import atomic_path
 from rnd_runtime.raster_cpu import rasterize
 
-from .figures import Figure, at_most, below
+from .figures import Figure, at_most, below, not_measured
 from .subject import Subject
 from .trainings import studio, tiny_config
 
@@ -34,6 +34,7 @@ WARM = 200
 """frames or steps before memory is watched: caches fill"""
 EVERY = 20
 """frames or steps between two readings"""
+TOO_SHORT = "too few in one go"
 PACE = 1.2
 """median of the last tenth over that of the first, of all and among steps of one kind"""
 
@@ -131,9 +132,8 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
     slopes = [_slope(s["memory"]) for s in segments if len(s["memory"]) > 10]
     long = [(s["seconds"], s["loads"]) for s in segments if len(s["seconds"]) > 10 * WARM // 2]
     frames = sum(segment["frames"] for segment in segments)
-    figures = [
-        below(f"{name}, {frames}: memory a frame", max(slopes, default=float("nan")), SLOPE_BYTES, "bytes")
-    ]
+    what = f"{name}, {frames}: memory a frame"
+    figures = [below(what, max(slopes), SLOPE_BYTES, "bytes") if slopes else not_measured(what, TOO_SHORT)]
     paces: list[tuple[str, list[tuple[int, int | None]]]] = [("end over start", [(0, None)])]
     if borders:
         paces.append(("of each kind of step, end over start", list(pairwise((0, *borders)))))

@@ -222,11 +222,11 @@ def _benchmark(options: Benchmark) -> None:
     from rich.table import Table
 
     from rnd_trainer.eval_cli import wide_console
-    from rnd_trainer.perceptual import load_perceptual
+    from rnd_trainer.perceptual import load_lpips
 
     from .benchmark import FIGURES, film_subjects, run_benchmark
 
-    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    perceptual = load_lpips(options.perceptual_weights)
     output_folder(options.out)
     with Progress(console=Console(stderr=True)) as progress:
         filming = progress.add_task("filming", total=None)

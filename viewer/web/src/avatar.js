@@ -20,7 +20,6 @@ export class Avatar {
     // Threads need the headers COOP and COEP, which a static host may not send.
     ort.env.wasm.numThreads = globalThis.crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, 4) : 1;
     const avatar = new Avatar();
-    avatar.session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], graphOptimizationLevel: "all" });
     avatar.name = name;
     avatar.gaussians = about.gaussians;
     avatar.windowPoses = about.window_poses;
@@ -28,9 +27,16 @@ export class Avatar {
     const { names, parents, rest_joints: rest } = about.skeleton;
     avatar.skeleton = { names, parents, rest: Float64Array.from(rest.flat()) };
     avatar.trainedLight = new Float32Array(Uint8Array.from(atob(about.trained_light), (c) => c.charCodeAt(0)).buffer);
-    await avatar.readConstants();
+    avatar.session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], graphOptimizationLevel: "all" });
+    await avatar.readConstants().catch(async (error) => {
+      await avatar.release();
+      throw error;
+    });
     return avatar;
   }
+
+  /** Give onnxruntime's memory back; the avatar cannot pose any more. */
+  release() { return this.session.release(); }
 
   async readConstants() {
     const joints = this.skeleton.names.length, others = joints - 1;

@@ -3,7 +3,8 @@
 import { Avatar } from "./avatar.js";
 import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
 import { downsize, readLight } from "./light.js";
-import { readMotion, restMotion } from "./motion.js";
+import { fitMotion, restMotion } from "./motion.js";
+import { readMotionFile } from "./motion_files.js";
 import { project } from "./project.js";
 import { multiply, transposed } from "./rotations.js";
 import { shBasis } from "./sh.js";
@@ -16,30 +17,45 @@ const SIZE = 512;
 const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
 
 const splatter = new Splatter();
-const lights = [];  // {name, light, shaders: Map of shade → function}
-let avatar = null, motion = null, motionFile = null, posed = null, shownSky = null;
+// What is shown: the motion as its file has it (null: at rest) and for the avatar, and
+// lights {name, light, shaders: Map of shade → function}
+let scene = { avatar: null, record: null, motion: null, lights: [] };
+let posed = null, shownSky = null;
 
-/** Take in files [{name, bytes}]; the page learns of the new scene. */
+/** Take in files [{name, bytes}], all of them or none; the page learns of the new scene. */
 async function load(files) {
-  for (const { name, bytes } of files) {
-    const kind = name.toLowerCase().split(".").pop();
-    if (kind === "onnx") {
-      avatar = await Avatar.load(bytes, name);
-      const own = { height: 32, width: 64, radiance: avatar.trainedLight };
-      lights.splice(0, lights.length && lights[0].own ? 1 : 0, { name: "the avatar's own", own: true, light: own, shaders: new Map() });
-      motion = motionFile ? readMotion(motionFile.bytes, motionFile.name, avatar.skeleton) : restMotion(avatar.skeleton);
-    } else if (kind === "npz") {
-      if (avatar) motion = readMotion(bytes, name, avatar.skeleton);
-      motionFile = { name, bytes };
-    } else if (kind === "hdr" || kind === "exr") lights.push({ name, light: readLight(bytes, name), shaders: new Map() });
-    else throw new Error(`${name}: expected .onnx, .npz, .hdr or .exr`);
+  const before = scene, next = { ...scene }, opened = [];
+  let answer = { kind: "message", text: "drop an avatar (.onnx) too" };
+  try {
+    for (const file of files) await take(file, next, opened);
+    if (next.avatar) {
+      const { skeleton } = next.avatar;
+      next.motion = next.record ? fitMotion(next.record, skeleton) : restMotion(skeleton);
+      answer = { kind: "scene", scene: description(next, files) };
+    }
+    scene = next;
+    posed = null;
+  } finally {
+    for (const avatar of [before.avatar, ...opened]) if (avatar && avatar !== scene.avatar) await avatar.release();
   }
-  posed = null;
-  if (avatar) postMessage({ kind: "scene", scene: description(files) });
-  else postMessage({ kind: "message", text: "drop an avatar (.onnx) too" });
+  postMessage(answer);
 }
 
-function description(files) {
+/** Read one file into the scene `next`; avatars go to `opened` too. */
+async function take({ name, bytes }, next, opened) {
+  const kind = name.toLowerCase().split(".").pop();
+  if (kind === "onnx") {
+    next.avatar = await Avatar.load(bytes, name);
+    opened.push(next.avatar);
+    const own = { height: 32, width: 64, radiance: next.avatar.trainedLight }, others = next.lights.filter((light) => !light.own);
+    next.lights = [{ name: "the avatar's own", own: true, light: own, shaders: new Map() }, ...others];
+  } else if (kind === "npz") next.record = readMotionFile(bytes, name);
+  else if (kind === "hdr" || kind === "exr") {
+    next.lights = [...next.lights, { name, light: readLight(bytes, name), shaders: new Map() }];
+  } else throw new Error(`${name}: expected .onnx, .npz, .hdr or .exr`);
+}
+
+function description({ avatar, motion, lights }, files) {
   const lit = files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
   const repaired = lights.filter(({ light }) => light.repaired).map(({ name, light }) => `${name}: ${light.repaired} broken texels filled in`);
   return {
@@ -52,7 +68,7 @@ function description(files) {
 }
 
 async function render({ number, state }) {
-  const clock = lap();
+  const clock = lap(), { avatar, motion } = scene;
   if (!posed || posed.time !== state.time) posed = { time: state.time, gaussians: await avatar.pose(motion, state.time) };
   clock("encoders");
   const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
@@ -85,7 +101,7 @@ function fewer(gaussians, count) {
 }
 
 function radianceOf(state, gaussians, count, eye, grown) {
-  const entry = lights[state.light];
+  const entry = scene.lights[state.light];
   if (!entry.shaders.has(state.shade)) entry.shaders.set(state.shade, makeShader(entry.light, state.shade));
   const shown = state.output === "light" ? { ...gaussians, albedo: new Float32Array(3 * count).fill(CLAY) } : gaussians;
   const lightToRoot = new Float64Array(9);
@@ -121,8 +137,8 @@ function look(state, { rotation: r, focal, width, height }) {
     const hex = /^#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})$/i.exec(state.background);
     return { show, behind: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
   }
-  if (shownSky !== lights[state.light]) {
-    shownSky = lights[state.light];
+  if (shownSky !== scene.lights[state.light]) {
+    shownSky = scene.lights[state.light];
     const { light } = shownSky;
     splatter.setSky(light.height > LARGEST_SKY ? downsize(light, LARGEST_SKY, 2 * LARGEST_SKY) : light);
   }

@@ -1,0 +1,163 @@
+// The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion_files.py).
+
+import { refusal, short, sizes } from "./errors.js";
+import { NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT } from "./motion_names.js";
+import { Npz } from "./npz.js";
+import { axisAngleToMatrix, multiply, rotate } from "./rotations.js";
+
+// What AMASS' SMPL-X files hold beside the split poses, and nobody else's
+const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length"];
+const MAX_ANGLE = 100, MANY_BEYOND_A_TURN = 0.2;  // rad; share of the rotations
+const MAX_DISTANCE = 1000;  // m
+const DEFAULT_FPS = 60, MAX_FPS = 10_000;
+const FINGERS = 30;
+
+/** {name, rotations [F·J·9] local, translations [F·3] m, added to the root's rest position, restRoot [3] m that they were made
+ *  for or null for the avatar's own, frames, joints, jointNames, fps, zUp, notes}; throws where it cannot be a person's motion. */
+export function readMotionFile(bytes, name) {
+  const members = new Npz(bytes, name, "motion"), notes = [];
+  const easymocap = members.firstOf("Rh", "Rh_all") !== undefined;
+  const { frames, joints, angles } = readAngles(members, notes);
+  const jointNames = readNames(members, joints);
+  checkAngles(angles, jointNames, name, notes);
+  const rotations = new Float64Array(frames * joints * 9);
+  for (let k = 0; k < frames * joints; k++)
+    axisAngleToMatrix(angles[3 * k], angles[3 * k + 1], angles[3 * k + 2], rotations, 9 * k);
+  const named = members.has("joint_names"), split = members.has("pose_body") && !members.has("poses");
+  const whole = (joints === 52 || joints === 55) && members.has("poses") && !named;
+  const amass = whole || (split && !named && members.firstOf(...AMASS_MEMBERS) !== undefined);
+  const smplRoot = joints === 55 || (split && amass) ? SMPLX_REST_ROOT : SMPL_REST_ROOT;
+  let translations = new Float64Array(3 * frames);
+  if (easymocap) translations = turnAboutOrigin(members, rotations, frames, joints, smplRoot);
+  else if (members.firstOf("trans", "transl")) translations = perFrame(members, frames, "trans", "transl");
+  else notes.push("no trans in the file: the root stays in place");
+  checkTranslations(translations, name);
+  if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
+  const fps = readFrameRate(members, notes), zUp = readUpAxis(members, amass || easymocap ? "z" : "y") === "z";
+  const restRoot = amass || easymocap ? smplRoot : null;
+  return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, zUp, notes };
+}
+
+/** Axis-angles [F·J·3] rad with the root first, from whichever member holds the poses: {frames, joints, angles}. */
+function readAngles(members, notes) {
+  const { file } = members, key = members.firstOf("poses", "poses_all", "pose_body", "body_pose");
+  if (!key) {
+    const expected = "a member called poses, poses_all, pose_body or body_pose";
+    throw refusal("motion", { expected, got: members.names.join(", ") || "an empty archive", file });
+  }
+  const { shape, numbers } = members.numbers(key), [frames, width] = shape;
+  const flat = shape.length === 2 && width % 3 === 0, byJoint = shape.length === 3 && shape[2] === 3;
+  if (!flat && !byJoint) throw refusal(`shape of ${key}`, { expected: "F×3J or F×J×3", got: sizes(shape), file });
+  if (frames === 0) throw refusal(key, { expected: "at least one frame", got: "none", file });
+  const joints = flat ? width / 3 : width;
+  if ((joints !== 21 && joints !== 23) || members.has("joint_names")) return { frames, joints, angles: numbers };
+  return joined(frames, [readRoot(members, frames, notes), numbers, ...readFingers(members, frames, joints, notes)]);
+}
+
+/** The root's axis-angles [F·3] beside a body without it. */
+function readRoot(members, frames, notes) {
+  if (members.firstOf("root_orient", "global_orient")) return perFrame(members, frames, "root_orient", "global_orient");
+  if (!members.firstOf("Rh", "Rh_all")) notes.push("no root orientation in the file: the root stays upright");
+  return new Float64Array(3 * frames);
+}
+
+/** Thirty finger joints beside a split body of 21, where the file has them: the parts of [F·90], side by side. */
+function readFingers(members, frames, bodyJoints, notes) {
+  if (bodyJoints !== 21 || !members.firstOf("pose_hand", "left_hand_pose")) return [];
+  const sides = members.has("pose_hand") ? ["pose_hand"] : ["left_hand_pose", "right_hand_pose"];
+  const poses = sides.map((side) => members.numbers(side));
+  const widths = poses.map(({ shape, numbers }) => (shape[0] === frames ? numbers.length / frames : NaN));
+  if (widths.every((width) => width % 3 === 0) && widths.reduce((a, b) => a + b) === 3 * FINGERS)
+    return poses.map(({ numbers }) => numbers);
+  notes.push("hands stay at rest: they are not given as 15 joints each");
+  return [];
+}
+
+/** Parts [F·3J] of F poses side by side. */
+function joined(frames, parts) {
+  const widths = parts.map((part) => part.length / frames), width = widths.reduce((a, b) => a + b);
+  const angles = new Float64Array(frames * width);
+  for (let f = 0; f < frames; f++) {
+    let at = f * width;
+    parts.forEach((part, k) => {
+      angles.set(part.subarray(f * widths[k], (f + 1) * widths[k]), at);
+      at += widths[k];
+    });
+  }
+  return { frames, joints: width / 3, angles };
+}
+
+function readNames(members, joints) {
+  const given = members.has("joint_names"), { file } = members;
+  const names = given ? members.strings("joint_names") : NAMES_BY_COUNT[joints];
+  if (names?.length !== joints) {
+    const expected = given ? `${names.length} joints (${3 * names.length} columns)`
+      : "22, 24, 52 or 55 joints (66, 72, 156 or 165 columns), or joint_names beside them";
+    throw refusal("joints of the motion", { expected, got: `${joints} joints (${3 * joints} columns)`, file });
+  }
+  if (new Set(names).size !== joints) throw refusal("joint_names", { expected: "each name once", got: names.join(", "), file });
+  return names;
+}
+
+/** [F·3] of the first member present; F×1×3 is how EasyMocap's users store it. */
+function perFrame(members, frames, ...names) {
+  const { file } = members, key = members.firstOf(...names);
+  if (!key) throw refusal(`${names[0]} is missing`, { got: members.names.join(", "), file });
+  const { shape, numbers } = members.numbers(key);
+  const kept = shape.length === 3 && shape[1] === 1 ? [shape[0], shape[2]] : shape;
+  if (kept.length !== 2 || kept[0] !== frames || kept[1] !== 3)
+    throw refusal(`shape of ${key}`, { expected: `${frames}×3, as many frames as poses`, got: sizes(kept), file });
+  return numbers;
+}
+
+/** EasyMocap's Rh turns about the origin: the roots of `rotations` [F·J·9] are turned, and transl = Th + Rh·J0 − J0 returned. */
+function turnAboutOrigin(members, rotations, frames, joints, restRoot) {
+  const angles = perFrame(members, frames, "Rh", "Rh_all"), turn = new Float64Array(9), turned = new Float64Array(9);
+  const translations = perFrame(members, frames, "Th", "Th_all");
+  for (let f = 0; f < frames; f++) {
+    axisAngleToMatrix(angles[3 * f], angles[3 * f + 1], angles[3 * f + 2], turn, 0);
+    multiply(turn, 0, rotations, 9 * f * joints, turned, 0);
+    rotations.set(turned, 9 * f * joints);
+    rotate(turn, restRoot).forEach((value, k) => { translations[3 * f + k] += value - restRoot[k]; });
+  }
+  return translations;
+}
+
+function checkAngles(axisAngles, names, file, notes) {
+  const angles = Float64Array.from({ length: axisAngles.length / 3 }, (_, k) => Math.hypot(...axisAngles.subarray(3 * k, 3 * k + 3)));
+  const wild = angles.findIndex((angle) => angle > MAX_ANGLE);
+  if (wild >= 0) {
+    const expected = `an axis-angle of at most ${MAX_ANGLE} rad`, frame = Math.floor(wild / names.length);
+    throw refusal(`poses: ${names[wild % names.length]}`, { expected, got: short(angles[wild]), file, frame, hint: "are these degrees?" });
+  }
+  const beyond = angles.filter((angle) => angle > 2 * Math.PI).length / angles.length;
+  if (beyond > MANY_BEYOND_A_TURN)
+    notes.push(`${(100 * beyond).toFixed()}% of the rotations are beyond a whole turn: are these degrees instead of radians?`);
+}
+
+function checkTranslations(translations, file) {
+  const far = translations.findIndex((value) => Math.abs(value) > MAX_DISTANCE);
+  if (far < 0) return;
+  const frame = Math.floor(far / 3), distance = Math.max(...translations.subarray(3 * frame, 3 * frame + 3).map(Math.abs));
+  const expected = `metres, at most ${MAX_DISTANCE} from the origin`;
+  throw refusal("trans", { expected, got: short(distance), file, frame, hint: "are these millimetres?" });
+}
+
+function readFrameRate(members, notes) {
+  const key = members.firstOf("mocap_framerate", "mocap_frame_rate", "fps");
+  if (!key) {
+    notes.push(`no frame rate in the file: ${DEFAULT_FPS} frames per second assumed`);
+    return DEFAULT_FPS;
+  }
+  const { numbers } = members.numbers(key);
+  if (numbers.length === 1 && numbers[0] > 0 && numbers[0] <= MAX_FPS) return numbers[0];
+  const few = Array.from(numbers.subarray(0, 4), (value) => (Number.isInteger(value) ? value.toFixed(1) : String(value)));
+  throw refusal(key, { expected: "frames per second, above 0", got: `[${few.join(", ")}]`, file: members.file });
+}
+
+function readUpAxis(members, otherwise) {
+  if (!members.has("up_axis")) return otherwise;
+  const up = members.strings("up_axis").join("").toLowerCase();
+  if (up !== "y" && up !== "z") throw refusal("up_axis", { expected: "y or z", got: up, file: members.file });
+  return up;
+}
