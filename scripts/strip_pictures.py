@@ -44,4 +44,6 @@ def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit("usage: strip_pictures.py FOLDER OUT NAME ...")
     main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])

@@ -15,7 +15,17 @@ from rnd_runtime.capture import Capture
 from rnd_runtime.images import write_image
 from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, stability_main
 from rnd_trainer.stability import captures, materials, poses, relighting, soak
-from rnd_trainer.stability.figures import Figure, Result, above, below, holds, not_measured, stated
+from rnd_trainer.stability.figures import (
+    IDENTICAL_DB,
+    Figure,
+    Result,
+    above,
+    below,
+    decibels,
+    holds,
+    not_measured,
+    stated,
+)
 from rnd_trainer.stability.rows import ROWS
 from rnd_trainer.stability.subject import Subject
 
@@ -158,3 +168,9 @@ def test_frames_without_light_or_person_are_passed_over(bare, tiny_capture, tmp_
     assert len(_missing(materials.baked_light(subject).figures)) == 1
     assert len(_missing((materials._lost_to_exact(subject),))) == 1
     assert len(_missing((poses._held_out(subject)[0],))) == 1
+
+
+def test_a_picture_that_is_not_finite_is_not_identical():
+    spoilt = np.full((2, 2), np.nan)
+    assert np.isnan(decibels(spoilt, np.ones((2, 2)))) and decibels(np.ones(3), np.ones(3)) == IDENTICAL_DB
+    assert not above("PSNR", decibels(spoilt, spoilt), 45, "dB").passes

@@ -31,7 +31,7 @@ def read(source: Path) -> Recording:
     the files.
     """
     models = next(source / name for name in _MODELS if (source / name).is_dir())
-    files = listed(models, (".npz",))
+    files = sorted(listed(models, (".npz",)), key=_number)
     frames, angles, trans, betas = [], [], [], None
     for file in files:
         with Npz(file, what="model") as archive:

@@ -223,7 +223,7 @@ def mean_betas(betas: ArrayLike | None) -> Floats | None:
     """One shape [B] of one or many ([F, B] → their mean)."""
     if betas is None:
         return None
-    array = np.asarray(betas, np.float64)
+    array = np.atleast_1d(np.asarray(betas, np.float64))
     return array.reshape(-1, array.shape[-1]).mean(0)
 
 

@@ -53,8 +53,9 @@ def torch_against_onnx(subject: Subject) -> Result:
         places = max(places, float(np.abs(played.means - posed.means.numpy()[rows]).max()))
         if frame % (count // subject.few(6, 20)) == 0:
             ours, theirs = subject.picture(played), subject.picture(to_gaussians(posed, pose))
-            if decibels(ours, theirs) < worst:
-                worst, pair = decibels(ours, theirs), (bytes_of(ours), bytes_of(theirs))
+            agreement = float(np.nan_to_num(decibels(ours, theirs), nan=-np.inf))
+            if agreement < worst:
+                worst, pair = agreement, (bytes_of(ours), bytes_of(theirs))
     figures = (
         below("skinning weights, largest difference", weights, 1e-4),
         below("places, largest difference", 1e3 * places, 0.1, "mm"),

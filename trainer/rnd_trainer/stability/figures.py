@@ -129,8 +129,10 @@ def refusal(call: Callable[[], object], *said: str) -> str | None:
 
 
 def decibels(ours: ArrayLike, theirs: ArrayLike) -> float:
-    """PSNR of values in 0…1."""
+    """PSNR of values in 0…1; NaN where any of them is, which no line lets pass."""
     error = float(np.mean((np.asarray(ours, np.float64) - np.asarray(theirs, np.float64)) ** 2))
+    if math.isnan(error):
+        return math.nan
     return min(IDENTICAL_DB, -10 * math.log10(error)) if error > 0 else IDENTICAL_DB
 
 

@@ -31,7 +31,7 @@ def self_contact(subject: Subject) -> Result:
     ):  # fmt: skip
         motion = subject.motion(*sweep)
         frames = [subject.shown(motion, k / motion.fps) for k in range(motion.frame_count)]
-        worst = min(worst, *(decibels(a, b) for a, b in pairwise(frames)))
+        worst = float(np.min([worst, *(decibels(a, b) for a, b in pairwise(frames))]))  # NaN goes through
     return Result((above("consecutive frames, least PSNR", worst, 40, "dB"),))
 
 
@@ -102,7 +102,9 @@ def frame_rates(subject: Subject) -> Result:
     worst, by_frames = np.inf, np.inf
     for fps in (24.0, 25.0, 29.97, 50.0, 60.0, 120.0):
         motion = subject.walk(2.0 + 1 / fps, fps)
-        worst = min(worst, *(decibels(subject.shown(motion, t), r) for t, r in zip(times, references)))
+        worst = float(
+            np.min([worst, *(decibels(subject.shown(motion, t), r) for t, r in zip(times, references))])
+        )
         by_frames = min(
             by_frames, *(decibels(_in_frames(subject, motion, t), r) for t, r in zip(times, references))
         )

@@ -76,7 +76,7 @@ def bright_suns(subject: Subject) -> Result:
             lit = Shader(light, "table+sun").shade(subjects, eye) - Shader(light, "table+sun").shade(
                 dark, eye
             )
-            worst = max(worst, abs(float(lit[facing, 1]) / expected - 1))
+            worst = float(np.maximum(worst, abs(float(lit[facing, 1]) / expected - 1)))  # NaN goes through
             small = cv2.resize(disc[..., 1].astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
             energy = float((small * texel_solid_angles(32, 64)).sum())
             plain = max(plain, abs(energy / (2 * np.pi * (1 - np.cos(SUN_RADIUS)) * radiance) - 1))
@@ -136,7 +136,7 @@ def broken_texels(subject: Subject) -> Result:
         picture = subject.picture(subject.rest, shader=Shader(light, "table+sun"))
         if not np.isfinite(picture).all():
             wrong.append(f"{name}: not finite")
-        worst = min(worst, decibels(picture, truth))
+        worst = float(np.minimum(worst, decibels(picture, truth)))  # NaN goes through
     figures = (
         holds("texels not repaired or not counted", wrong),
         above("PSNR to the clean map", worst, 45, "dB"),
@@ -161,7 +161,7 @@ def orientation(subject: Subject) -> Result:
                 lit = Shader(Light(radiance, up=up), mode).shade(white, [0, 0, 0])[:, 1]
                 brightest = (lit[:, None] * white.normals).sum(0)
                 brightest = brightest / np.linalg.norm(brightest)
-                worst = min(worst, float(brightest @ (to_world @ axis)))
+                worst = float(np.minimum(worst, brightest @ (to_world @ axis)))
     return Result((above("cosine between the lit side and the axis, worst of 54", worst, 0.99),))
 
 
@@ -174,7 +174,9 @@ def resizing(subject: Subject) -> Result:
         energy = float((source[..., 0] * texel_solid_angles(256, 512)).sum())
         for height, width in ((32, 64), (17, 34), (100, 200)):
             small = downsize(source, height, width)[..., 0]
-            worst = max(worst, abs(float((small * texel_solid_angles(height, width)).sum()) / energy - 1))
+            worst = float(
+                np.maximum(worst, abs((small * texel_solid_angles(height, width)).sum() / energy - 1))
+            )
         linear = cv2.resize(source[..., 0].astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
         plain = max(plain, abs(float((linear * texel_solid_angles(32, 64)).sum()) / energy - 1))
     return Result(
@@ -289,7 +291,7 @@ def grazing(subject: Subject) -> Result:
             ours = Shader(subject.light, "table+sun").shade(part, eye)
             exact = shade_reference(part, subject.light, eye, texels=(256, 512))
             finite &= bool(np.isfinite(ours).all())
-            worst[roughness] = max(worst.get(roughness, 0.0), float(ours.mean() / exact.mean() - 1))
+            worst[roughness] = float(np.maximum(worst.get(roughness, 0.0), ours.mean() / exact.mean() - 1))
     rough = max(excess for roughness, excess in worst.items() if roughness > 0.1)
     figures = (
         at_most(

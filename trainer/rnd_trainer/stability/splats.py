@@ -284,7 +284,7 @@ def rasters_agree(subject: Subject) -> Result:
         by_torch = rasterize_by_torch(means, covariances, opacities, features, camera)[0]
         images["torch"] = coded(by_torch.numpy())
         missing = rasters.missing
-    worst = min(images, key=lambda name: decibels(images[name], truth))
+    worst = min(images, key=lambda name: np.nan_to_num(decibels(images[name], truth), nan=-np.inf))
     largest = max(float(np.abs(image - truth).max()) for image in images.values())
     figures = (
         holds("backends missing", missing),
