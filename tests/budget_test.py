@@ -280,3 +280,18 @@ def test_every_rung_is_a_file(bench) -> None:
     what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
     assert 5 < what.psnr < 60
     assert len(given_up(bench, deepest)) == len(LADDERS) - 1  # no window where nothing is dynamic
+
+
+def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
+    plan = Plan(gaussians=len(LADDERS["gaussians"]))
+    model = bench.model(plan.recipe(bench.config))
+    opacities = next(output for output in model.graph.output if output.name == "opacities")
+    left = opacities.type.tensor_type.shape.dim[0].dim_value
+    assert given_up(bench, plan)[0].startswith(f"{left} of {bench.config.gaussians} Gaussians")
+
+
+def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint) -> None:
+    still = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=2, seed=5).at(0.0)
+    light = Light(np.ones((32, 64, 3), np.float32))
+    bench = Workbench(tiny_checkpoint, Scene(still, light, size=48, shade="table"), _clock)
+    assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100

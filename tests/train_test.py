@@ -6,16 +6,20 @@ import dataclasses
 import json
 import os
 import signal
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+import rnd_trainer.cli
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
 from rnd_trainer.config import from_dict
+from rnd_trainer.eval_cli import EvalOptions
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
@@ -169,6 +173,18 @@ def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config
     training = Training(tiny_capture, tiny_config, Demanding())
     terms = training.objective(training.model, training.views[0], training.poses[0], 0, 1)
     assert "image" in terms and "lpips" not in terms and "consistency" not in terms
+
+
+@pytest.mark.parametrize(
+    ("changes", "motion"),
+    [({}, None), ({"motion": "b.npz"}, "b.npz"), ({"refine_poses": True}, "OUT/refined_motion.npz")],
+)
+def test_a_training_is_scored_in_its_own_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
+    scored: list[EvalOptions] = []
+    monkeypatch.setattr(rnd_trainer.cli, "evaluate_run", scored.append)
+    options = rnd_trainer.cli.TrainOptions(Path("capture"), **changes)
+    rnd_trainer.cli._score_after_training(SimpleNamespace(capture=tiny_capture), tmp_path, options)
+    assert scored[0].motion == (motion and motion.replace("OUT", str(tmp_path)))
 
 
 def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refused(
