@@ -235,6 +235,8 @@ LAYOUTS: dict[str, dict[str, object]] = {
     "AMASS, split": AMASS_X | HANDS,
     "AMASS, split, body only": AMASS_X,
     "AMASS, split, few fingers": AMASS_X | {"pose_hand": _poses(12)},
+    "AMASS, split, uneven sides": AMASS_X | {"left_hand_pose": _poses(42), "right_hand_pose": _poses(48)},
+    "AMASS, split, a number for a hand": AMASS_X | {"pose_hand": np.array(1.0)},
     "AMASS, split, other fingers": AMASS_X | {"pose_hand": _poses(90, FRAMES + 1)},
     "AMASS, split, sides": AMASS_X | {"left_hand_pose": _poses(45), "right_hand_pose": _poses(45)},
     "AMASS, split, by its rate": SPLIT | {"mocap_frame_rate": 120.0},

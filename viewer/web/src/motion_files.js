@@ -66,9 +66,8 @@ function readFingers(members, frames, bodyJoints, notes) {
   if (bodyJoints !== 21 || !members.firstOf("pose_hand", "left_hand_pose")) return [];
   const sides = members.has("pose_hand") ? ["pose_hand"] : ["left_hand_pose", "right_hand_pose"];
   const poses = sides.map((side) => members.numbers(side));
-  const widths = poses.map(({ shape, numbers }) => (shape[0] === frames ? numbers.length / frames : NaN));
-  if (widths.every((width) => width % 3 === 0) && widths.reduce((a, b) => a + b) === 3 * FINGERS)
-    return poses.map(({ numbers }) => numbers);
+  const widths = poses.map(({ shape, numbers }) => (shape.length > 1 && shape[0] === frames ? numbers.length / frames : NaN));
+  if (widths.every((width) => width === 3 * FINGERS / sides.length)) return poses.map(({ numbers }) => numbers);
   notes.push("hands stay at rest: they are not given as 15 joints each");
   return [];
 }
