@@ -117,7 +117,8 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
         known = " or ".join(seen[:8])
         raise InputError("--train-camera", expected=f"one with pictures in range: {known}", got=camera)
     if moving:
-        refuse_cameras(choice, "there is one picture a moment: the first 4/5 train, the rest are novel poses")
+        said = replace(choice, camera=None) if seen == [camera] else choice
+        refuse_cameras(said, "there is one picture a moment: the first 4/5 train, the rest are novel poses")
     train = [shot.frame for shot in kept if moving or shot.camera == camera]
     border = sorted(train)[max(0, round(TRAIN_SHARE * len(train)) - 1)] if len(train) > 1 else train[0]
     frames = {frame: k for k, frame in enumerate(sorted({shot.frame for shot in kept}))}
