@@ -179,7 +179,9 @@ def split_camera(text: str) -> tuple[Path, str]:
     """``FILE.json:NAME`` as file and name, which may be missing. Raises :class:`InputError` for anything else."""
     match = re.fullmatch(r"(.+?\.json)(?::(.*))?", text)
     if match is None:
-        raise InputError("--camera", expected="front, orbit (rnd-play), FILE.json or FILE.json:NAME", got=text)
+        raise InputError(
+            "--camera", expected="front, orbit (rnd-play), FILE.json or FILE.json:NAME", got=text
+        )
     return Path(match[1]), match[2] or ""
 
 
