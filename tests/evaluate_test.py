@@ -158,7 +158,7 @@ def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_
 def test_ablations_are_trained_once_and_compared_seed_by_seed(
     tiny_capture, tiny_config, tmp_path, monkeypatch
 ) -> None:
-    calls: list[tuple[str, int, int, int]] = []
+    calls: list[tuple[str, int, float, int]] = []
     config = dataclasses.replace(tiny_config, steps=4)
 
     def go():
@@ -173,7 +173,9 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
         )
 
     rows = go()
-    assert len(calls) == 6 and {row["seed"] for row in rows} == {0, 1}
+    told = [done for _, _, done, _ in calls]
+    assert len({call[:2] for call in calls}) == 6 and {row["seed"] for row in rows} == {0, 1}
+    assert told == sorted(told) and {0, 0.25, 0.5, 0.75, 1, 5.5, 6} <= set(told)  # four steps each
     written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
     assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
     config = dataclasses.replace(config, steps=5)

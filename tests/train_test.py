@@ -6,8 +6,10 @@ import dataclasses
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -276,3 +278,24 @@ def test_a_device_that_is_not_there_is_refused() -> None:
     assert _device("cpu") == "cpu"
     with pytest.raises(InputError, match="--device: expected cpu, cuda or cuda:NUMBER, got teapot"):
         _device("teapot")
+
+
+def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(
+    tiny_capture, tmp_path, monkeypatch, capsys
+) -> None:
+    def step(self: Training) -> Any:
+        if self.step_index == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return one_step(self)
+
+    one_step = Training.step
+    monkeypatch.setattr(Training, "step", step)
+    sizes = ["--preset", "quick", "--gaussians", "200", "--steps", "5", "--save-every", "2"]
+    out = tmp_path / "run"
+    monkeypatch.setattr(sys, "argv", ["rnd-train", str(tiny_capture.folder), "--out", str(out), *sizes])
+    with pytest.raises(SystemExit) as leaving:
+        rnd_trainer.cli.main()
+    said = capsys.readouterr().err.splitlines()
+    assert leaving.value.code == 2
+    assert said[-1].startswith("rnd-train: --device: expected enough memory, got a GPU that is full (fewer")
+    assert load_checkpoint(out / "avatar.ckpt").info["step"] == 2

@@ -28,7 +28,7 @@ from .held_out import score
 from .model import AvatarModel
 from .perceptual import Perceptual
 from .pose_refinement import joint_error_degrees
-from .train import Training, run
+from .train import Step, Training, run
 
 POSE_SECONDS = 0.3 / 9
 """between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
@@ -128,18 +128,22 @@ def ablate(
     seeds: Sequence[int],
     perceptual: Perceptual | None,
     mode: str = "table+sun",
-    on_run: Callable[[str, int, int, int], None],
+    on_run: Callable[[str, int, float, int], None],
 ) -> list[dict[str, Any]]:
     """Train and score every variant with every seed; rows as of rnd-eval with the encoder's cost added.
 
     They compare what pictures teach: the third stage is off but in the row that asks for it. Each run leaves
     ``rows.json`` in ``folder/NAME-SEED``, and is not done again where that exists. ``on_run`` is called with the
-    variant's name, the seed, how many runs are done and how many there are.
+    variant's name, the seed, how many runs are done (that in hand by its share of steps) and how many there are.
     """
     rows: list[dict[str, Any]] = []
     jobs = [(variant, seed) for seed in seeds for variant in variants]
     for done, (variant, seed) in enumerate(jobs):
-        on_run(variant.name, seed, done, len(jobs))
+
+        def tell(share: float, name: str = variant.name, seed: int = seed, before: int = done) -> None:
+            on_run(name, seed, before + share, len(jobs))
+
+        tell(0.0)
         place = _place(folder, variant, seed)
         model = dataclasses.replace(base.model, **variant.model)
         steps = round(base.steps * variant.length)
@@ -147,7 +151,7 @@ def ablate(
         config = dataclasses.replace(base, model=model, seed=seed, **changed)
         if not (place / "rows.json").exists():
             seen = _noisy(capture) if variant.noisy else capture
-            extra = _train(seen, config, place, perceptual, capture)
+            extra = _train(seen, config, place, perceptual, capture, tell)
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
@@ -270,14 +274,23 @@ def encoder_cost(model: AvatarModel) -> dict[str, float]:
 
 
 def _train(
-    seen: Capture, config: TrainConfig, place: Path, perceptual: Perceptual | None, truth: Capture
+    seen: Capture,
+    config: TrainConfig,
+    place: Path,
+    perceptual: Perceptual | None,
+    truth: Capture,
+    on_share: Callable[[float], None],
 ) -> dict[str, float]:
     """Train on ``seen``; what the poses were off by before and after, in degrees, where they were not exact."""
     place.mkdir(parents=True, exist_ok=True)
     training = Training(seen, config, perceptual)
     if (place / "training.state").exists():
         training.resume(place / "training.state")
-    if run(training, place, on_step=lambda step: None, on_preview=lambda: None):
+
+    def on_step(step: Step) -> None:
+        on_share((step.index + 1) / training.total_steps)
+
+    if run(training, place, on_step=on_step, on_preview=lambda: None):
         raise KeyboardInterrupt
     if seen is truth:
         return {}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import sys
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -119,7 +120,8 @@ def _train(options: TrainOptions) -> None:
             "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
             file=sys.stderr,
         )
-    training = Training(capture, config, perceptual, device)
+    with _memory_runs_out():
+        training = Training(capture, config, perceptual, device)
     if options.resume:
         training.resume(state)
     write_json(folder / "config.json", to_dict(config))
@@ -128,12 +130,25 @@ def _train(options: TrainOptions) -> None:
     with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
         if page:
             print(f"rnd-train: {page}", file=sys.stderr)  # noqa: T201
-        interrupted = _run_with_progress(training, folder, run)
+        with _memory_runs_out():
+            interrupted = _run_with_progress(training, folder, run)
     print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
     if interrupted:
         print(f"rnd-train: stopped; continue with --resume --out {folder}", file=sys.stderr)  # noqa: T201
         raise KeyboardInterrupt
     _score_after_training(training, folder, options)
+
+
+@contextmanager
+def _memory_runs_out() -> Iterator[None]:
+    """Say in one line that the GPU has too little memory; the last saved state stands."""
+    import torch
+
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        hint = "fewer --gaussians, a smaller --image-scale, or --device cpu"
+        raise InputError("--device", expected="enough memory", got="a GPU that is full", hint=hint) from error
 
 
 def _device(name: str) -> str:

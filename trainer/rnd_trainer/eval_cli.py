@@ -181,10 +181,10 @@ def ablate_run(options: EvalOptions) -> None:
     console = Console(stderr=True)
     if perceptual is None:
         console.print("rnd-eval: no --perceptual-weights: no LPIPS, and L_gc is off in every row")
-    with Progress(console=console) as progress:
+    with Progress(console=console, speed_estimate_period=600) as progress:
         task = progress.add_task("", total=None)
 
-        def on_run(name: str, seed: int, done: int, total: int) -> None:
+        def on_run(name: str, seed: int, done: float, total: int) -> None:
             progress.update(task, description=f"{name}, seed {seed}", completed=done, total=total)
 
         seeds = range(options.seeds)

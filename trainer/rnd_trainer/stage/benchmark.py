@@ -63,11 +63,12 @@ def run_benchmark(
     folder: Path,
     *,
     perceptual: Perceptual | None,
-    on_run: Callable[[str, int, int], None],
+    on_run: Callable[[str, float, int], None],
 ) -> dict[str, Any]:
     """Train and score every method on every filmed subject: rows, their summary, and what it all cost.
 
-    ``on_run`` is called with a line on what is being trained, how many trainings are done and how many there are.
+    ``on_run`` is called with a line on what is being trained, how many trainings are done (that in hand by its share of
+    steps) and how many there are.
     """
     started = time.perf_counter()
     base = resized(preset("quick"), options.gaussians, options.steps)
@@ -81,7 +82,7 @@ def run_benchmark(
         seeds = tuple(range(options.seeds if subject == 0 else 1))
 
         def tell(
-            name: str, seed: int, of_subject: int, _: int, subject: int = subject, before: int = done
+            name: str, seed: int, of_subject: float, _: int, subject: int = subject, before: int = done
         ) -> None:
             on_run(f"subject {subject}, {name}, seed {seed}", before + of_subject, total)
 

@@ -228,7 +228,7 @@ def _benchmark(options: Benchmark) -> None:
 
     perceptual = load_lpips(options.perceptual_weights)
     output_folder(options.out)
-    with Progress(console=Console(stderr=True)) as progress:
+    with Progress(console=Console(stderr=True), speed_estimate_period=600) as progress:
         filming = progress.add_task("filming", total=None)
         film_subjects(
             settings,
