@@ -44,6 +44,16 @@ def test_edits_and_rates(tmp_path, monkeypatch, capsys):
         assert 60 < len(archive["poses"]) < 120  # half of 4.4 s, less the seam, at 60
 
 
+def test_a_loop_at_another_rate_repeats_no_frame(tmp_path, monkeypatch, capsys):
+    """132 frames less a seam of 15 go round in 3.9 s, at 60 per second in 234 frames."""
+    arguments = ("--loop", "--in-place", "--fps", 60)
+    assert _run(monkeypatch, ASSETS / "walk.npz", tmp_path / "w.npz", *arguments) == 0
+    assert "234 frames, 60 per second, 3.9 s" in capsys.readouterr().out
+    with np.load(tmp_path / "w.npz") as archive:
+        assert len(archive["poses"]) == 234
+        assert np.abs(archive["poses"][0] - archive["poses"][-1]).max() > 1e-3  # rad
+
+
 @pytest.mark.parametrize("write", [_easymocap_json, _phalp])
 def test_fits_of_a_video_go_out_as_amass(tmp_path, monkeypatch, capsys, write):
     """EasyMocap's folder and PHALP's pickle: the command says whom it took and what it assumed."""

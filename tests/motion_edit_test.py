@@ -87,6 +87,27 @@ def test_resampling_keeps_the_time():
     assert_allclose(_angles(after), np.linspace(0, 1.2, 51), atol=ROUND_OFF)
 
 
+def test_a_loop_stays_one_at_another_rate_and_speed():
+    """Half or twice its frames go round, and none of them twice."""
+    once = looped(_motion(0.8 * np.sin(np.arange(72) / 7)))
+    assert once.frame_count == 48
+    for after, frames in (
+        (resampled(once, 30.0), 24),
+        (resampled(once, 120.0), 96),
+        (sped_up(once, 2.0), 24),
+    ):
+        assert after.closed and after.frame_count == frames
+        assert after.duration == pytest.approx(frames / after.fps)
+        expected = once.at(np.arange(frames) * 48 / frames / FPS)
+        assert_allclose(after.rotations, expected.rotations, atol=ROUND_OFF)
+
+
+def test_a_loop_that_no_whole_number_of_frames_goes_round_is_open():
+    """48 frames at 60 per second are 20.8 at 26: the one after the 21st would come too late."""
+    after = resampled(looped(_motion(0.8 * np.sin(np.arange(72) / 7))), 26.0)
+    assert after.frame_count == 21 and not after.closed
+
+
 def test_in_place_keeps_heights_and_turns():
     path = np.cumsum(np.random.default_rng(0).normal(size=(30, 3)), 0)
     motion = _motion(np.linspace(0, 1, 30), path)

@@ -19,7 +19,7 @@ from rnd_runtime.sh import sh_basis, sphere_quadrature
 from rnd_viewer.aov import CHANNELS, ambient_visibility, parse_aovs
 from rnd_viewer.background import Background
 from rnd_viewer.cameras import View, frame_motion, front_path
-from rnd_viewer.options import frame_count, parse_frames, parse_size
+from rnd_viewer.options import parse_frames, parse_size
 from rnd_viewer.player import Frame, Player
 from rnd_viewer.timing import StageTimes
 
@@ -187,8 +187,8 @@ def test_options_parse():
 def test_frames_of_a_motion():
     for frames, fps in ((31, 30), (1, 30), (12, 30), (11, 60)):
         motion = fake_motion(frames, fps)
-        assert frame_count(motion, fps) == frames and frame_count(motion, 2 * fps) == 2 * frames - 1
-        assert frame_count(replace(motion, closed=True), 2 * fps) == 2 * frames
+        assert motion.frames_at(fps) == frames and motion.frames_at(2 * fps) == 2 * frames - 1
+        assert replace(motion, closed=True).frames_at(2 * fps) == 2 * frames
 
 
 @pytest.mark.parametrize("text", ["5:5", "6:5", "0:10", "9:", "a:b", "3", "-1:4", ""])

@@ -36,7 +36,6 @@ from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_viewer.background import Background
 from rnd_viewer.cameras import View, frame_motion, front_path
-from rnd_viewer.options import frame_count
 from rnd_viewer.player import Player
 from rnd_viewer.view_cli import main
 from rnd_viewer.view_options import ViewOptions
@@ -193,7 +192,7 @@ def test_the_clip_has_every_frame(options):
         seen = 0
         while header["kind"] == "progress":
             seen, header = header["done"], json.loads(visitor.socket.recv())
-        assert header["kind"] == "clip" and seen == frame_count(scene.motion, 30) == FRAMES
+        assert header["kind"] == "clip" and seen == scene.motion.frames_at(30) == FRAMES
         with av.open(BytesIO(visitor.socket.recv())) as container:
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert len(frames) == FRAMES and frames[0].shape == (SIZE, SIZE, 3)

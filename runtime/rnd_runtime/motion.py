@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +28,8 @@ Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 
 # SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
 _STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
+
+_PART_OF_A_FRAME = 1e-6  # less than which a duration's rounding may add or take
 
 _MOCAP_READERS = {".bvh": read_bvh, ".amc": read_acclaim}
 
@@ -69,6 +72,17 @@ class Motion:
     def duration(self) -> float:
         """Seconds from the first frame to the last; of a closed motion to its first frame's return."""
         return (self.frame_count - (not self.closed)) / self.fps
+
+    def frames_at(self, fps: float) -> int:
+        """How many frames at ``fps`` show it: its first and last pose included, of a closed motion no pose twice."""
+        if self.closed:
+            return max(1, math.ceil(self.duration * fps - _PART_OF_A_FRAME))
+        return math.floor(self.duration * fps + _PART_OF_A_FRAME) + 1
+
+    def goes_round_at(self, fps: float) -> bool:
+        """Whether it is closed, and a whole number of frames at ``fps`` long."""
+        frames = self.duration * fps
+        return self.closed and abs(frames - round(frames)) < _PART_OF_A_FRAME
 
     def at(self, times_s: ArrayLike) -> Motion:
         """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames.

@@ -71,15 +71,14 @@ def smoothed(motion: Motion, cutoff_hz: float) -> Motion:
 def sped_up(motion: Motion, speed: float) -> Motion:
     """``motion`` in 1/``speed`` of its time at the same frame rate: what depends on how fast it moves, sees it."""
     _check("speed", speed, "a factor")
-    frames = int(motion.duration / speed * motion.fps + 1e-6) + 1
-    return motion.at(np.arange(frames) / motion.fps * speed)
+    return replace(resampled(motion, motion.fps / speed), fps=motion.fps)
 
 
 def resampled(motion: Motion, fps: float) -> Motion:
-    """``motion`` at ``fps`` frames per second."""
+    """``motion`` at ``fps`` frames per second; a closed one stays so where a whole number of frames goes round."""
     _check("fps", fps, "frames per second")
-    frames = int(motion.duration * fps + 1e-6) + 1
-    return replace(motion.at(np.arange(frames) / fps), fps=fps)
+    frames = motion.at(np.arange(motion.frames_at(fps)) / fps)
+    return replace(frames, fps=fps, closed=motion.goes_round_at(fps))
 
 
 def kept_in_place(motion: Motion) -> Motion:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -171,10 +170,3 @@ def parse_frames(text: str | None, count: int) -> range:
     if not 0 <= start < end <= count:
         raise InputError("--frames", expected=f"START:END within 0:{count}, START before END", got=text)
     return range(start, end)
-
-
-def frame_count(motion: Motion, fps: float) -> int:
-    """How many frames at ``fps`` a motion has: its first and last pose included, of a closed one no pose twice."""
-    if motion.closed:
-        return max(1, math.ceil(motion.duration * fps - 1e-6))
-    return math.floor(motion.duration * fps + 1e-6) + 1

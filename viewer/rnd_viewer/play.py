@@ -32,7 +32,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
-from .options import PlayOptions, frame_count, parse_frames, parse_size
+from .options import PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
 from .report import FRAME, LATENCY, print_summary, warn, with_progress
@@ -72,7 +72,8 @@ def play(options: PlayOptions) -> int:
     player = Player(avatar, light, shader, rasterizer, background, aovs, times)
 
     fps = options.fps or motion.fps
-    frames = parse_frames(options.frames, frame_count(motion, fps))
+    count = motion.frames_at(fps)
+    frames = parse_frames(options.frames, count)
     framing = frame_motion(avatar.skeleton, motion)
     camera_at = _camera_path(options, size, framing)
     notes = [*motion.notes, *_light_notes(light)]
@@ -106,7 +107,6 @@ def play(options: PlayOptions) -> int:
             governor.observe(encoding + now - started)
         return frame, camera
 
-    count = frame_count(motion, fps)
     name = part_name("play", frames, count)
     common = {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
     inputs = _inputs(options)

@@ -33,7 +33,6 @@ from msgspec.structs import replace
 from rnd_runtime.errors import InputError
 from rnd_runtime.threads import set_threads
 
-from .options import frame_count
 from .video import mp4_writer
 from .view_scene import Bytes, Picture, Scene
 from .view_state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, TruthRequest, parse_request
@@ -222,7 +221,7 @@ class _Visitor:
 
     def _clip(self, socket: Any, request: ClipRequest) -> None:
         motion, state = self._scene.motion, replace(request.state, truth=None)
-        frames = frame_count(motion, request.fps)
+        frames = motion.frames_at(request.fps)
         if frames > MOST_CLIP_FRAMES:
             raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
         with TemporaryDirectory() as folder:
