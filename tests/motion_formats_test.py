@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 from rnd_runtime.joint_names import load_joint_map, match_joints
-from rnd_runtime.motion import load_motion
+from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS
 
@@ -664,6 +664,18 @@ def test_acclaim_is_the_same_motion(tmp_path):
     assert_allclose(motion.rotations, MATRICES, atol=TEXT)
     assert_allclose(np.diff(motion.translations, axis=0), np.diff(PELVIS, axis=0), atol=METRES)
     assert load_motion(tmp_path / "02_01.amc", SKELETON, fps=60).notes == ()
+
+
+def test_the_inputs_of_a_motion_are_the_files_that_it_is_read_from(tmp_path):
+    file = _acclaim(tmp_path)
+    (tmp_path / "03.asf").write_text(":root\n")
+    assert motion_inputs(file) == [file, tmp_path / "02.asf"]
+    folder = _easymocap_json(tmp_path, frames=range(FRAMES))
+    (folder / "out").mkdir()
+    for name in ("picture.png", "out/000001.json"):
+        (folder / name).write_text("{}")
+    assert motion_inputs(folder) == [folder / f"{frame:06d}.json" for frame in range(FRAMES)]
+    assert motion_inputs(tmp_path / "walk.npz") == [tmp_path / "walk.npz"]
 
 
 def test_acclaim_bones_keep_their_lengths(tmp_path):

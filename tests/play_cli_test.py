@@ -144,6 +144,20 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     assert {"play_000000-000002.json", "play_000002-000006.json"} <= parts.keys()
 
 
+def test_parts_share_a_folder_inside_the_motions(files, tmp_path, capsys):
+    motion, out = tmp_path / "smpl", tmp_path / "smpl/out"
+    motion.mkdir()
+    person = {"id": 0, "Rh": [[1.57, 0, 0]], "Th": [[0, 0, 1]], "poses": [[0] * 72], "shapes": [[0] * 10]}
+    for frame in range(4):
+        (motion / f"{frame:06d}.json").write_text(json.dumps([person]))
+    for part in ("0:2", "2:4"):
+        assert main(_arguments(files, out, motion=motion, frames=part)) == 0
+    pictures = {name for name in _tree(out) if name.startswith("frames/")}
+    assert pictures == {f"frames/{k:06d}.png" for k in range(4)}
+    assert main(_arguments(files, motion, motion=motion)) == 2  # whose play.json would be one of its files
+    assert "--out: expected another folder than the motion's" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(shutil.which("parallel") is None, reason="needs GNU parallel")
 def test_the_readmes_line_for_a_queue_makes_the_whole(tmp_path):
     readme = (ASSETS.parent / "README.md").read_text(encoding="utf-8")

@@ -198,14 +198,13 @@ def _bvh_motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats
 def read_acclaim(path: str | Path) -> MocapTree:
     """Read an AMC motion with the ASF skeleton beside it.
 
-    The skeleton is ``NAME.asf``, else ``SUBJECT.asf`` of a CMU name ``SUBJECT_TRIAL.amc``, else the folder's only
-    one. A bone here is a joint at the bone's start.
+    A bone here is a joint at the bone's start.
 
     Raises:
-        InputError: when there is no such skeleton, or the files do not fit together.
+        InputError: when there is no such skeleton (:func:`asf_beside`), or the files do not fit together.
     """
     path = existing_file(path, what="motion")
-    skeleton = _asf_beside(path)
+    skeleton = asf_beside(path)
     try:
         bones, degrees = _read_asf(skeleton)
     except (ValueError, IndexError, KeyError, StopIteration) as error:
@@ -248,7 +247,10 @@ class _Bone:
     parent: str | None = None
 
 
-def _asf_beside(path: Path) -> Path:
+def asf_beside(path: Path) -> Path:
+    """The skeleton of the AMC ``path``: ``NAME.asf``, else ``SUBJECT.asf`` of a CMU name ``SUBJECT_TRIAL.amc``, else
+    the folder's only one.
+    """
     for stem in (path.stem, path.stem.rsplit("_", 1)[0]):
         if (candidate := path.with_name(f"{stem}.asf")).is_file():
             return candidate

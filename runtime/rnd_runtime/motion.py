@@ -12,14 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .files import is_folder
 from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import JointTable, load_joint_map, match_joints
-from .mocap import read_acclaim, read_bvh
+from .mocap import asf_beside, read_acclaim, read_bvh
 from .motion_files import SMPL_REST_ROOT, read_motion_file
 from .npz import save_npz
 from .retarget import retarget
 from .rotations import matrix_to_axis_angle
 from .skeleton import Skeleton
+from .video_fits import easymocap_files
 
 Floats = NDArray[np.float64]
 
@@ -148,6 +150,18 @@ def load_motion(
         return motion
     notes = tuple(note for note in motion.notes if "frame rate" not in note)
     return replace(motion, fps=float(fps), notes=notes)
+
+
+def motion_inputs(path: str | Path) -> list[Path]:
+    """The files that :func:`load_motion` reads of ``path``: itself, an .amc with its .asf, a folder's .json files.
+
+    Raises:
+        InputError: for an .amc without a skeleton.
+    """
+    path = Path(path)
+    if is_folder(path):
+        return easymocap_files(path)
+    return [path, asf_beside(path)] if path.suffix.lower() == ".amc" else [path]
 
 
 def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, table: JointTable | None) -> Motion:

@@ -53,7 +53,7 @@ def read_easymocap_folder(folder: Path, person: int | None = None) -> VideoFits:
 
     ``person`` is an id; the one with most frames when None.
     """
-    files = sorted(folder.glob("*.json"))
+    files = easymocap_files(folder)
     if not files:
         raise InputError("EasyMocap fits", expected=".json files", got="none", file=folder)
     moments: dict[int, dict[int, Any]] = {}
@@ -78,6 +78,11 @@ def read_easymocap_folder(folder: Path, person: int | None = None) -> VideoFits:
     poses = with_root(poses[:, :66] if poses.shape[1] in _HAND_COEFFICIENTS else poses)
     frames = np.array(list(kept), np.int64)
     return VideoFits(chosen, others, frames, poses, translations, betas, turns, family)
+
+
+def easymocap_files(folder: Path) -> list[Path]:
+    """The files of ``folder`` that :func:`read_easymocap_folder` reads."""
+    return sorted(folder.glob("*.json"))
 
 
 def is_phalp(content: Mapping[Any, Any]) -> bool:

@@ -13,8 +13,9 @@ from rnd_runtime import __version__
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import output_folder
+from rnd_runtime.files import is_folder, output_folder
 from rnd_runtime.light import Light, load_light
+from rnd_runtime.motion import motion_inputs
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.threads import set_threads
@@ -168,14 +169,16 @@ def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
             f"missing {', '.join(missing)}", hint="rnd-play AVATAR.onnx --motion FILE --out FOLDER"
         )
     assert options.avatar and options.motion and options.out
+    if is_folder(options.motion) and options.out.resolve() == options.motion.resolve():
+        raise InputError("--out", expected="another folder than the motion's", got=options.out)
     return options.avatar, options.motion, output_folder(options.out)
 
 
 def _inputs(options: PlayOptions) -> list[Path]:
-    """Every file and folder that the pictures are made from."""
-    given = [options.avatar, options.motion, options.hdr, options.joint_map]
-    if options.motion and options.motion.suffix.lower() == ".amc":
-        given += options.motion.parent.glob("*.asf")
+    """Every file that the pictures are made from."""
+    given = [options.avatar, options.hdr, options.joint_map]
+    if options.motion:
+        given += motion_inputs(options.motion)
     if options.camera not in OWN_CAMERAS:
         given.append(split_camera(options.camera)[0])
     return [path for path in given if path is not None]

@@ -13,8 +13,6 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from rnd_runtime.files import is_folder
-
 _MARK = ".run-"
 _FRAME = re.compile(
     r"\d{6,}\.(png|exr)"
@@ -24,7 +22,7 @@ _WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4)")  # beside them, see pa
 
 
 def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> None:
-    """Make ``folder`` the folder of the run with ``settings`` on ``inputs``, files and folders, and free of others'."""
+    """Make ``folder`` the folder of the run with ``settings`` on the files ``inputs``, and free of others'."""
     mark = folder / f"{_MARK}{_identity(settings, inputs)}"
     try:
         mark.touch(exist_ok=False)
@@ -51,9 +49,8 @@ def _identity(settings: Mapping[str, object], inputs: Iterable[Path]) -> str:
     """What two processes of one run agree on: settings, and name, size and time of every input."""
     files = []
     for path in inputs:
-        for file in sorted(path.rglob("*")) if is_folder(path) else [path]:
-            if file.is_file():
-                status = file.stat()
-                files.append((str(file.resolve()), status.st_size, status.st_mtime_ns))
+        if path.is_file():
+            status = path.stat()
+            files.append((str(path.resolve()), status.st_size, status.st_mtime_ns))
     text = json.dumps([settings, files], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
