@@ -370,6 +370,18 @@ def test_rigged_glb_moves_like_the_template(tmp_path):
     assert 0.03 < posed.volume < 0.15  # m³: a person, and not inside out
 
 
+def test_a_loops_animation_ends_where_it_begins(tmp_path, capsys):
+    """glTF's ends at its last key: without the first frame as that, the last interval would be left out."""
+    line = ["mesh", str(ASSETS / "body.npz"), "--motion", str(WALK), "--out", str(tmp_path), "--loop"]
+    assert main([*line, "--format", "glb"]) == 0
+    assert "3.9 s of motion" in capsys.readouterr().out  # 132 frames at 30 per second, less a seam of 15
+    document, arrays = _glb(tmp_path / "body.glb")
+    for sampler in document["animations"][0]["samplers"]:
+        times, values = arrays[sampler["input"]], arrays[sampler["output"]]
+        assert len(times) == len(values) == 118 and times[-1] == pytest.approx(3.9)
+        np.testing.assert_allclose(np.abs(values[-1]), np.abs(values[0]), atol=1e-6)  # q and −q turn alike
+
+
 def test_amass_brings_the_motion_back(tmp_path):
     skeleton = Body.load(ASSETS / "body.npz").skeleton
     walk = load_motion(WALK, skeleton)

@@ -112,15 +112,17 @@ def _weight_sets(glb: GlbBuilder, weights: NDArray[np.float32]) -> dict[str, int
 
 
 def _animation(glb: GlbBuilder, rest_root: Floats, motion: Motion) -> dict[str, Any]:
-    """Rotations of all joints and the root's place at every frame of ``motion``."""
-    times = glb.accessor(
-        np.arange(motion.frame_count) / motion.fps, "SCALAR", FLOAT, target=None, bounds=True
-    )
-    quaternions = matrix_to_quaternion(motion.rotations)  # [F, J, 4]
+    """Rotations of all joints and the root's place at every frame of ``motion``, and of a closed one at its first
+    frame's return: an animation ends at its last key, and players that repeat it begin again there.
+    """
+    keys = np.arange(motion.frame_count + motion.closed)
+    times = glb.accessor(keys / motion.fps, "SCALAR", FLOAT, target=None, bounds=True)
+    frames = keys % motion.frame_count
+    quaternions = matrix_to_quaternion(motion.rotations[frames])  # [K, J, 4]
     dots = (quaternions[1:] * quaternions[:-1]).sum(axis=-1)
     signs = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
     quaternions[1:] *= signs[..., None]  # neighbours on one half of the sphere: players may not look
-    places = glb.accessor(rest_root + motion.translations, "VEC3", FLOAT, target=None)
+    places = glb.accessor(rest_root + motion.translations[frames], "VEC3", FLOAT, target=None)
     samplers = [{"input": times, "output": places, "interpolation": "LINEAR"}]
     channels: list[dict[str, Any]] = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
     for joint in range(motion.rotations.shape[1]):
