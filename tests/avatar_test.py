@@ -119,6 +119,28 @@ def test_posing_arrays_of_another_shape_are_refused(tiny_avatar, tmp_path, name)
         Avatar.load(_changed(tiny_avatar, tmp_path / "wide.onnx", widen))
 
 
+@pytest.mark.parametrize(
+    ("name", "shape", "said"),
+    [
+        ("node_offsets", [], r"expected \[M, 6\], got \[\]"),
+        ("node_offsets", [0, 6], r"expected \[M, 6\], got \[0, 6\]"),
+        ("node_visibility", [200, 20], r"expected \[200, 1 to 16\], got \[200, 20\]"),
+        ("node_visibility", [200], r"expected \[200, 1 to 16\], got \[200\]"),
+        ("neighbour_weights", [800], r"expected \[800, K\], got \[800\]"),
+        ("posing_limits", [2], r"expected \[3\], got \[2\]"),
+    ],
+)
+def test_a_posing_array_of_another_shape_is_named_alone(tiny_avatar, tmp_path, name, shape, said) -> None:
+    def reshape(model) -> None:
+        output = next(value for value in model.graph.output if value.name == name)
+        del output.type.tensor_type.shape.dim[:]
+        for size in shape:
+            output.type.tensor_type.shape.dim.add().dim_value = size
+
+    with pytest.raises(InputError, match=rf"other\.onnx: {name}: {said}$"):
+        Avatar.load(_changed(tiny_avatar, tmp_path / "other.onnx", reshape))
+
+
 def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:
     secret = tmp_path / "secret.bin"
     secret.write_bytes(b"\0" * 4 * 800)
