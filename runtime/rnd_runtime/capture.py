@@ -53,7 +53,7 @@ class Capture:
         body: the template.
         motion: poses of ``body.skeleton``; ``Frame.frame`` indexes it.
         frames: every picture, in file order.
-        file: what it was read from; None where it was made.
+        name: of the file in ``folder`` that it was read from.
     """
 
     folder: Path
@@ -62,7 +62,12 @@ class Capture:
     body: Body
     motion: Motion
     frames: tuple[Frame, ...]
-    file: Path | None = None
+    name: str = "capture.json"
+
+    @property
+    def file(self) -> Path:
+        """What it was read from; of a capture that was made, what :func:`save_capture` writes."""
+        return self.folder / self.name
 
     @property
     def fps(self) -> float:
@@ -151,7 +156,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
             expected = f"an index below the {motion.frame_count} frames of {motion.source}"
             raise InputError("frame", expected=expected, got=frame.frame, file=file, frame=frame.frame)
         check_pictures(frame, cameras[frame.camera], file)
-    return Capture(folder, cameras, record.lights, body, motion, tuple(record.frames), file)
+    return Capture(folder, cameras, record.lights, body, motion, tuple(record.frames), file.name)
 
 
 def save_capture(capture: Capture, **information: object) -> None:

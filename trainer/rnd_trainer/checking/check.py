@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.capture import Capture, Frame, FrameImages, load_capture
 from rnd_runtime.capture_format import decode_normals, read_unit_range
+from rnd_trainer.data import usable
 from rnd_trainer.silhouette import overlap
 
 from .hypotheses import explain, explain_timing
@@ -30,7 +31,6 @@ BODY_SIZE = (0.4, 2.6)
 DISTANCE = (0.3, 300.0)
 """metres: PHALP's lens puts a person of a third of the picture's height a hundred metres away"""
 FIELD_OF_VIEW = (2.0, 150.0)  # degrees; PHALP's is 2.9
-MASK_COVERAGE = (0.001, 0.95)
 BACKGROUND = 0.02
 """mean sRGB value outside the mask from which on a picture is not on black"""
 FASTEST_JOINT = 20.0
@@ -110,8 +110,7 @@ def check_capture(
             frame, normal=None, normal_gt=None
         )  # flipped normals are judged, not refused
         images = capture.load_frame(bare)
-        low, high = MASK_COVERAGE
-        if low < float(images.mask.mean()) < high:
+        if usable(images.mask):
             seen = sight(capture, bare, images.mask)
             view = seen.view()
             sights.append(seen)
@@ -275,7 +274,7 @@ def _bend(few: list[Sight], k1: float) -> float:
 
 def _imported(capture: Capture) -> dict[str, Any]:
     """What ``rnd-data import`` noted in capture.json; nothing where it was not at work."""
-    content = msgspec.json.decode((capture.file or capture.folder / "capture.json").read_bytes())
+    content = msgspec.json.decode(capture.file.read_bytes())
     imported = content.get("import")
     return imported if isinstance(imported, dict) else {}
 

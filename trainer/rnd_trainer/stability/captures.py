@@ -31,7 +31,7 @@ def _copy(subject: Subject, name: str) -> Path:
     source, folder = subject.capture.folder, subject.work / f"capture_{name}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    record = json.loads((source / "capture.json").read_text(encoding="utf-8"))
+    record = json.loads(subject.capture.file.read_text(encoding="utf-8"))
     chosen = [frame for frame in record["frames"] if frame["split"] == "train"][:COPIED]
     record["frames"] = chosen
     used = {frame.get("light") for frame in chosen}
