@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from rich.console import Console
 
-from rnd_runtime.capture import Capture
+from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.images import write_image
 from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, stability_main
 from rnd_trainer.stability import captures, materials, poses, relighting, soak
@@ -81,21 +82,23 @@ def test_a_figure_that_is_missing_is_said_so_and_stops_no_later_row(tmp_path):
     figures = (
         not_measured("scale"),
         below("pace", nan, 1, "×", baseline=("plain", nan)),
+        stated("lost", nan, "dB"),
         stated("length", 2.0, "m"),
     )
     _keep(options, "L11", "scale", figures, None)
     _keep(options, "P1", "poses", (stated("length", 2.0, "m"),), None)
     rows = json.loads(options.json.read_text())
     assert [(row["measured"], row["verdict"]) for row in rows] == [
-        (2.0, "reported"), (None, "not measured"), (None, "fail"), (2.0, "reported"),
+        (2.0, "reported"), (None, "not measured"), (None, "fail"), (None, "fail"), (2.0, "reported"),
     ]  # fmt: skip
     table = (tmp_path / "table.md").read_text()
     assert "| L11 | scale | scale (not in this capture) | not measured |  |  |  |" in table
-    assert "| L11 | scale | pace | not measured | < 1 | **✗** | plain: not measured |" in table
+    assert "| L11 | scale | pace | nan × | < 1 | **✗** | plain: nan × |" in table
+    assert "| L11 | scale | lost | nan dB |  | **✗** |  |" in table
     shown = io.StringIO()
     _show(Console(file=shown, width=120), "L11", figures)
-    assert [line.split(":", 1)[1].strip() for line in shown.getvalue().splitlines()] == [
-        "not measured", "not measured < 1  (plain: not measured)", "2 m",
+    assert [(line[0], line.split(":", 1)[1].strip()) for line in shown.getvalue().splitlines()] == [
+        (" ", "not measured"), ("✗", "nan × < 1  (plain: nan)"), ("✗", "nan dB"), (" ", "2 m"),
     ]  # fmt: skip
 
 
@@ -103,7 +106,7 @@ def test_a_short_soak_has_no_slope_of_memory():
     segment = {"frames": 300, "memory": [1, 2], "seconds": [1.0] * 300, "loads": [], "wrong": 0}
     figures = soak._figures("playback", [segment], True, ())
     assert figures[0].what == "playback, 300: memory a frame (too few in one go)" and not figures[0].line
-    assert np.isnan(figures[0].measured) and len(figures) == 2 and figures[1].passes
+    assert figures[0].measured is None and len(figures) == 2 and figures[1].passes
 
 
 @pytest.fixture(scope="module")
@@ -119,9 +122,18 @@ def _with(avatar, checkpoint, capture: Capture, work, frames) -> Subject:
     return Subject(avatar, checkpoint, dataclasses.replace(capture, frames=frames), work, small=True, size=24)
 
 
+def _linked(capture: Capture, folder: Path) -> Path:
+    """All of ``capture`` but its normals and capture.json."""
+    folder.mkdir()
+    for part in ("images", "masks", "lights", "body.npz", "motion.npz"):
+        (folder / part).symlink_to(capture.folder / part)
+    return folder
+
+
 def _missing(figures: tuple[Figure, ...]) -> list[str]:
     """What was not measured; the others are numbers."""
-    missing = [figure for figure in figures if np.isnan(figure.measured)]
+    missing = [figure for figure in figures if figure.measured is None]
+    assert not any(np.isnan(figure.measured) for figure in figures if figure not in missing)
     assert all(not figure.line and not figure.passes and "this capture)" in figure.what for figure in missing)
     return [figure.what.split(" (")[0] for figure in missing]
 
@@ -140,13 +152,22 @@ def test_flipped_normals_are_of_captures_that_have_normals(bare, tiny_capture, t
     assert relighting._flipped_capture(subject).passes
     record = captures._record(tiny_capture.folder)
     record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"]]
-    (tmp_path / "plain").mkdir()
-    for part in ("images", "masks", "lights", "body.npz", "motion.npz"):
-        (tmp_path / "plain" / part).symlink_to(tiny_capture.folder / part)
-    captures._save(tmp_path / "plain", record)
-    plain = dataclasses.replace(tiny_capture, folder=tmp_path / "plain")
+    folder = _linked(tiny_capture, tmp_path / "plain")
+    captures._save(folder, record)
+    plain = dataclasses.replace(tiny_capture, folder=folder)
     subject = _with(bare.avatar_file, bare.checkpoint, plain, tmp_path, plain.frames)
     assert len(_missing((relighting._flipped_capture(subject),))) == 1
+
+
+def test_a_copy_is_of_the_file_that_was_read(bare, tiny_capture, tmp_path):
+    record = captures._record(tiny_capture.folder)
+    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"][1:4]]
+    night = _linked(tiny_capture, tmp_path / "plain") / "night.json"
+    night.write_text(json.dumps(record))
+    capture = load_capture(night)
+    assert capture.file == night
+    subject = _with(bare.avatar_file, bare.checkpoint, capture, tmp_path, capture.frames)
+    assert captures._record(captures._copy(subject, "night"))["frames"] == record["frames"]
 
 
 def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture, tmp_path):
@@ -154,7 +175,7 @@ def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture
     frames = (*tiny_capture.frames[1:3], other)
     subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, frames)
     figures = materials.relit_scale(subject).figures
-    assert [np.isnan(figure.measured) for figure in figures] == [False, True, False, True]
+    assert [figure.measured is None for figure in figures] == [False, True, False, True]
 
 
 def test_frames_without_light_or_person_are_passed_over(bare, tiny_capture, tmp_path):

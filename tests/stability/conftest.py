@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from rnd_trainer.stability.figures import amount
+
 MEASURED = pytest.StashKey[list]()
 STEPS, GAUSSIANS, SIZE, FRAMES = 160, 1500, 64, 8
 
@@ -36,6 +38,7 @@ def pytest_terminal_summary(terminalreporter, config):
     if rows:
         terminalreporter.section("stability: what was measured")
     for row, figure in rows:
+        measured = amount(figure.measured, figure.unit)
         baseline = "" if figure.baseline is None else f"   ({figure.baseline_name}: {figure.baseline:.4g})"
         judged = "" if not figure.line else f" {figure.line} {'✓' if figure.passes else '✗'}"
-        terminalreporter.line(f"{row:4} {figure.what}: {figure.measured:.4g} {figure.unit}{judged}{baseline}")
+        terminalreporter.line(f"{row:4} {figure.what}: {measured}{judged}{baseline}")

@@ -35,7 +35,8 @@ def _parameter(row):
 def test_row(row, subject, record_property, request):
     result = row.measure(subject)
     for figure in result.figures:
-        record_property(figure.what, f"{figure.measured:.6g} {figure.unit} ({figure.line or 'reported'})")
+        measured = "not measured" if figure.measured is None else f"{figure.measured:.6g} {figure.unit}"
+        record_property(figure.what, f"{measured} ({figure.line or 'reported'})")
         request.config.stash.setdefault(MEASURED, []).append((row.id, figure))
     failing = [figure.what for figure in result.figures if not (figure.passes or figure.timing)]
     expected, why = KNOWN.get(row.id, ((), ""))

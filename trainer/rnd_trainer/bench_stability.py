@@ -198,42 +198,46 @@ def _place(name: str) -> tuple[int, int]:
 
 
 def _verdict(figure: Figure) -> str:
-    if not figure.line:
-        return "reported" if math.isfinite(figure.measured) else "not measured"
-    return "pass" if figure.passes else "fail"
+    if figure.measured is None:
+        return "not measured"
+    if not figure.passes:
+        return "fail"
+    return "pass" if figure.line else "reported"
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a table."""
+    """The rows as a table. JSON has null for NaN: what was measured and is no number is told by its verdict."""
+    from .stability.figures import amount
+
     lines = [
         "| id | failure | measured | | line | | the plain method |",
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        baseline, unit = "", row["unit"]
+        baseline, unit, measured = "", row["unit"], row["measured"]
+        if measured is None and row["verdict"] != "not measured":
+            measured = math.nan
         if row["baseline_name"]:
-            baseline = f"{row['baseline_name']}: {_amount(row['baseline'], unit)}"
+            plain = math.nan if row["baseline"] is None else row["baseline"]
+            baseline = f"{row['baseline_name']}: {amount(plain, unit)}"
         mark = {"pass": "✓", "fail": "**✗**"}.get(row["verdict"], "")
         what = row["what"].replace("|", "\\|").replace("\n", " ")
         lines.append(
-            f"| {row['id']} | {row['failure']} | {what} | {_amount(row['measured'], unit)} | {row['line']} | {mark} "
+            f"| {row['id']} | {row['failure']} | {what} | {amount(measured, unit)} | {row['line']} | {mark} "
             f"| {baseline} |"
         )
     return "\n".join(lines) + "\n"
 
 
-def _amount(number: float | None, unit: str) -> str:
-    """A figure with its unit. NaN is none, and null is what the JSON has for it."""
-    return "not measured" if number is None or math.isnan(number) else f"{number:.4g} {unit}"
-
-
 def _show(console: Any, name: str, figures: Sequence[Figure]) -> None:
+    from .stability.figures import amount
+
     for figure in figures:
         baseline = ""
         if figure.baseline is not None:
-            baseline = f"  ({figure.baseline_name}: {_amount(figure.baseline, '').rstrip()})"
+            baseline = f"  ({figure.baseline_name}: {amount(figure.baseline, '')})"
         mark = {"pass": "✓", "fail": "✗"}.get(_verdict(figure), " ")
         line = (
-            f"{mark} {name:4} {figure.what}: {_amount(figure.measured, figure.unit)} {figure.line}{baseline}"
+            f"{mark} {name:4} {figure.what}: {amount(figure.measured, figure.unit)} {figure.line}{baseline}"
         )
         console.print(line, highlight=False, markup=False)

@@ -29,7 +29,7 @@ class Figure:
 
     Attributes:
         what: what was measured, in words.
-        measured: the number. NaN never passes.
+        measured: the number, None where there was nothing to measure by. NaN never passes.
         line: such as "< 3"; empty where the number is only reported.
         passes: whether it does.
         baseline, baseline_name: the same number of the plain method, where there is one.
@@ -37,7 +37,7 @@ class Figure:
     """
 
     what: str
-    measured: float
+    measured: float | None
     unit: str
     line: str
     passes: bool
@@ -96,7 +96,12 @@ def stated(
 
 def not_measured(what: str, why: str = "not in this capture") -> Figure:
     """A figure that there is nothing to measure by, and ``why``. It is judged by no line, and does not pass."""
-    return Figure(f"{what} ({why})", math.nan, "", "", False)
+    return Figure(f"{what} ({why})", None, "", "", False)
+
+
+def amount(number: float | None, unit: str) -> str:
+    """A figure with its unit, in words where nothing was measured."""
+    return "not measured" if number is None else f"{number:.4g} {unit}".rstrip()
 
 
 def holds(what: str, wrong: list[str]) -> Figure:
