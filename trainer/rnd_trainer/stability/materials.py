@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from rnd_runtime.camera import Camera
 from rnd_runtime.gaussians import Gaussians
@@ -16,10 +17,12 @@ from rnd_runtime.shading import Shader
 from rnd_runtime.shadow import directional_visibility
 from rnd_runtime.sun import Sun, extract_suns
 from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.data import usable
 from rnd_trainer.evaluate import Judge, albedo_scale, evaluate
+from rnd_trainer.metrics import mask_box
 
 from .figures import Figure, Floats, Result, at_most, below, coded, decibels, not_measured, stated
-from .subject import CROSSED, Subject, box_of, bytes_of
+from .subject import CROSSED, Subject, bytes_of
 
 TEXELS = (16, 32)
 """of the sky under which visibility is judged: every texel's shadow is traced"""
@@ -115,8 +118,9 @@ def _lost_to_exact(subject: Subject) -> Figure:
     sky, suns = extract_suns(capture.load_light(frames[0].light or ""))
     for frame in frames:
         truth = capture.load_frame(frame)
-        if (box := box_of(truth.mask)) is None:
+        if not usable(truth.mask):
             continue
+        box = mask_box(torch.from_numpy(truth.mask))
         camera = capture.cameras[frame.camera]
         posed = subject.avatar.pose(capture.motion, frame.frame / capture.motion.fps)
         lit = _Overcast(subject, posed, sky, suns)

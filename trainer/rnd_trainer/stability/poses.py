@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
@@ -17,9 +18,11 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import bone_transforms
+from rnd_trainer.data import usable
+from rnd_trainer.metrics import mask_box
 
 from .figures import Figure, Floats, Result, above, at_most, below, coded, decibels, not_measured, stated
-from .subject import APART, ARMS_DOWN, EXTREMES, Angles, Subject, box_of, bytes_of
+from .subject import APART, ARMS_DOWN, EXTREMES, Angles, Subject, bytes_of
 
 BYTE = 1 / 255
 RING_M = 0.02
@@ -91,8 +94,9 @@ def _held_out(subject: Subject) -> tuple[Figure, tuple[NDArray[np.uint8], NDArra
     worst = None
     for frame in frames:
         truth = capture.load_frame(frame)
-        if (box := box_of(truth.mask)) is None:
+        if not usable(truth.mask):
             continue
+        box = mask_box(torch.from_numpy(truth.mask))
         camera, time = capture.cameras[frame.camera], frame.frame / capture.motion.fps
         picture = subject.picture(subject.avatar.pose(capture.motion, time), camera, shader)
         template = subject.picture(subject.by_template(capture.motion, time), camera, shader)

@@ -214,14 +214,6 @@ class Subject:
         return self.picture(self.avatar.pose(motion, time), camera)
 
 
-def box_of(mask: Floats32) -> tuple[slice, slice] | None:
-    """Rows and columns of what ``mask`` [H, W] covers; None where it covers nothing."""
-    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    return np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-
-
 def bytes_of(picture: ArrayLike) -> Bytes:
     """An sRGB picture in 0…1 as 8 bits."""
     return to_bytes(picture)
