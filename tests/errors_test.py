@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
 
 
 @pytest.mark.parametrize(
@@ -75,6 +75,18 @@ def test_what_tyro_has_against_a_command_line_is_one_line(words, line, capsys):
 
     assert run_command("rnd-x", command) == 2
     assert capsys.readouterr() == ("", f"rnd-x: {line}\n")
+
+
+@dataclass
+class Named(Options):
+    name: str = "a"
+
+
+def test_what_is_not_as_its_class_has_it_is_refused():
+    refuse_changed(Named(size=4), ("name",), "no use")
+    refuse_changed(Named(), ("name", "size"), "no use")
+    with pytest.raises(InputError, match=r"^--size: expected the default, got 4 \(no use\)$"):
+        refuse_changed(Named(size=4), ("name", "size"), "no use")
 
 
 def test_options_that_are_right_and_help_pass(capsys):

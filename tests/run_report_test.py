@@ -187,6 +187,21 @@ def test_a_damaged_run_is_one_line_and_exit_2(run, name, content, message, capsy
     assert not (run / "report.html").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--loop", "--smooth", "2"), "--smooth: expected the default, got 2.0"),
+        (("--loop",), "--loop: expected the default, got True"),
+        (("--motion-up", "z"), "--motion-up: expected the default, got z"),
+    ],
+)
+def test_options_of_a_motion_that_is_not_there_are_refused(run, words, message, capsys):
+    assert main([str(run), *words]) == 2
+    error = capsys.readouterr().err
+    assert f"{message} (needs --motion" in error and error.count("\n") == 1
+    assert not (run / "report.html").exists()
+
+
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_the_slider_moves_in_a_browser(run, tmp_path):
     text, _ = _write(run)

@@ -303,6 +303,13 @@ def test_options_of_a_motion_that_is_not_there_are_refused(changes, line):
         ViewOptions(Path("avatar.onnx"), **changes)
 
 
+def test_a_captures_motion_is_edited_and_read_by_its_own_rules():
+    edited = ViewOptions(Path("a"), capture=Path("b"), loop=True, smooth=2.0, speed=2.0, in_place=True)
+    assert edited.edits == MotionEdits(2.0, 2.0, True, True)
+    with pytest.raises(InputError, match=r"--motion-up: .* \(needs --motion: the capture's own"):
+        replace(edited, motion_up="z")
+
+
 def test_a_token_is_asked_for_everywhere(options):
     with _serving(options, token="s3cret") as (port, _):
         for path in ("/", "/app.js", "/?token=wrong", "/?token=", "/socket"):

@@ -107,8 +107,8 @@ def _export(options: Options) -> None:
 def _refuse_idle(options: Options, *, bounded: bool) -> None:
     """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
     if bounded:
-        refuse_changed(options, CHOICES, Options, "a bound finds this by itself")
+        refuse_changed(options, CHOICES, "a bound finds this by itself")
     else:
-        refuse_changed(options, SEARCHES, Options, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
+        refuse_changed(options, SEARCHES, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
     if options.motion is not None:
-        refuse_changed(options, ("frames",), Options, "of random motion: --motion has frames of its own")
+        refuse_changed(options, ("frames",), "of random motion: --motion has frames of its own")

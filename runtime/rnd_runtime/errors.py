@@ -10,7 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 Parsed = TypeVar("Parsed")
 # No permission, a file system that is read-only, full, or full for this user: nobody's mistake in the program.
@@ -64,11 +64,11 @@ class InputError(Exception):
         )
 
 
-def refuse_changed(options: object, names: Iterable[str], declared_in: type[Any], hint: str) -> None:
-    """Raise :class:`InputError` for one of ``names`` that is not as ``declared_in`` has it: it would do nothing."""
+def refuse_changed(options: object, names: Iterable[str], hint: str) -> None:
+    """Raise :class:`InputError` for one of ``names`` that is not as its class has it: it would do nothing."""
     for name in names:
         value = getattr(options, name)
-        if value != getattr(declared_in, name):
+        if value != getattr(type(options), name):
             raise InputError(flag(name), expected="the default", got=value, hint=hint)
 
 

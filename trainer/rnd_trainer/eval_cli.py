@@ -84,9 +84,9 @@ def main() -> None:
     def command() -> None:
         options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
         if options.ablate:
-            refuse_changed(options, OF_ONE_RUN, EvalOptions, "a study scores and names its rows itself")
+            refuse_changed(options, OF_ONE_RUN, "a study scores and names its rows itself")
         else:
-            refuse_changed(options, OF_STUDIES, EvalOptions, "needs --ablate")
+            refuse_changed(options, OF_STUDIES, "needs --ablate")
         (ablate_run if options.ablate else evaluate_run)(options)
 
     sys.exit(run_command("rnd-eval", command))

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, flag
+from rnd_runtime.errors import InputError, flag, refuse_changed
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.skeleton import Skeleton
 
+_EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
 
@@ -44,7 +45,7 @@ class MotionOptions:
     @property
     def edits(self) -> MotionEdits:
         """What is done to the motion once it is read."""
-        return MotionEdits(self.smooth, self.speed, self.in_place, self.loop)
+        return MotionEdits(**{name: getattr(self, name) for name in _EDITS})
 
     def read_motion(self, path: Path, skeleton: Skeleton) -> Motion:
         """The motion in ``path`` for ``skeleton``, edited.
@@ -54,6 +55,15 @@ class MotionOptions:
         """
         motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
         return edit_motion(motion, self.edits)
+
+    def refuse_unread(self, why: str, *, edited: bool = False) -> None:
+        """Refuse what is said of a motion's file where none is given, and ``why``; edits too unless one is ``edited``.
+
+        Raises:
+            InputError: for an option that would do nothing.
+        """
+        names = (field.name for field in fields(MotionOptions))
+        refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 
     def __post_init__(self) -> None:
         refuse_outside(self, {"smooth": (1e-2, 1e3), "speed": (1e-2, 100)})

@@ -42,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(lambda: tyro.cli(ReportOptions, prog="rnd-report", args=arguments))
         if options.pictures < 0:
             raise InputError("--pictures", expected="0 or more", got=options.pictures)
+        if options.motion is None:
+            options.refuse_unread("needs --motion: the rest pose does not move")
         from .report import say
         from .run_report import write_run_report
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, refuse_changed
+from rnd_runtime.errors import InputError
 
 from .options import MotionOptions, option
 
@@ -46,15 +46,9 @@ class ViewOptions(MotionOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.motion is None:
-            reading = ("motion_up", "motion_fps", "joint_map")
-            refuse_changed(
-                self, reading, MotionOptions, "needs --motion: the capture's own is read by its rules"
-            )
-        if self.motion is None and self.capture is None:
-            edits = ("smooth", "speed", "in_place", "loop")
-            refuse_changed(
-                self, edits, MotionOptions, "needs --motion or --capture: the pose at rest does not move"
-            )
+            captured = self.capture is not None
+            ours = "the capture's own is read by its rules" if captured else "the pose at rest does not move"
+            self.refuse_unread(f"needs --motion: {ours}", edited=captured)
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         if not 64 <= self.size <= 2048:
