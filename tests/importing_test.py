@@ -241,7 +241,7 @@ def test_an_arah_file_without_a_number_is_named(tmp_path, inner) -> None:
 def test_a_training_camera_without_pictures_in_range_is_refused(tmp_path) -> None:
     source, refusal = _arah(tmp_path)
     expected = "--train-camera: expected one with pictures in range: 1 or 2, got 3"
-    assert refusal(choice=Choice(camera="3")) == expected
+    assert refusal(choice=Choice(train_camera="3")) == expected
     for name, theirs in (("3", "1"), ("2", "2")):  # a third camera; the second missed the first frames
         for picture in (source / theirs).glob("*"):
             if name == "3":
@@ -252,13 +252,13 @@ def test_a_training_camera_without_pictures_in_range_is_refused(tmp_path) -> Non
     record = json.loads((source / "cam_params.json").read_text())
     record["all_cam_names"].append("3")
     (source / "cam_params.json").write_text(json.dumps(record | {"3": record["1"]}))
-    assert refusal(choice=Choice(camera="2", stop=2)) == (
+    assert refusal(choice=Choice(train_camera="2", stop=2)) == (
         "--train-camera: expected one with pictures in range: 1 or 3, got 2"
     )
 
 
-@pytest.mark.parametrize("name", ["RANA", "NeuMan", "a split of its own"])
-def test_a_choice_between_cameras_where_there_is_none_is_refused(tmp_path, name) -> None:
+def _one_camera(tmp_path: Path, name: str) -> tuple[Path, str]:
+    """A layout without a choice between cameras, and why a choice would change nothing."""
     source, why = tmp_path / "female-3-casual", "the pictures' splits are given"
     source.mkdir()
     if name == "a split of its own":
@@ -269,13 +269,33 @@ def test_a_choice_between_cameras_where_there_is_none_is_refused(tmp_path, name)
     else:
         layouts.write_rana(source)
         why = "there is one picture a moment: the first 4/5 train, the rest are novel poses"
+    return source, why
+
+
+@pytest.mark.parametrize(
+    ("name", "choice", "said"),
+    [
+        *(
+            (name, Choice(held_out_every=2), "--held-out-every: expected the default, got 2")
+            for name in ("RANA", "NeuMan", "a split of its own")
+        ),
+        ("NeuMan", Choice(train_camera="00001"), "--train-camera: expected the default, got 00001"),
+        ("a split of its own", Choice(train_camera="1"), "--train-camera: expected the default, got 1"),
+    ],
+)
+def test_a_choice_between_cameras_where_there_is_none_is_refused(tmp_path, name, choice, said) -> None:
+    source, why = _one_camera(tmp_path, name)
     body = str(layouts.body_file(tmp_path))
-    camera = "00001" if name == "NeuMan" else "0"
-    refused = [(Choice(held_out_every=2), "--held-out-every: expected the default, got 2")]
-    if name != "RANA":  # whose one camera may be named
-        refused.append((Choice(camera=camera), f"--train-camera: expected the default, got {camera}"))
-    for choice, said in refused:
-        with pytest.raises(InputError) as caught:
-            import_source(source, tmp_path / "out", ImportOptions(body=body, choice=choice))
-        assert str(caught.value) == f"{said} ({why})"
+    with pytest.raises(InputError) as caught:
+        import_source(source, tmp_path / "out", ImportOptions(body=body, choice=choice))
+    assert str(caught.value) == f"{said} ({why})"
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["RANA", "a split of its own"])
+def test_the_only_camera_may_be_named(tmp_path, name) -> None:
+    """Whether splits are chosen or given."""
+    source, _ = _one_camera(tmp_path, name)
+    options = ImportOptions(body=str(layouts.body_file(tmp_path)), choice=Choice(train_camera="0"))
+    import_source(source, tmp_path / "out", options)
+    assert set(load_capture(tmp_path / "out").cameras) == {"0"}

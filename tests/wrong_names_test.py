@@ -153,9 +153,10 @@ def test_options_that_would_change_nothing_are_refused(frames, import_it) -> Non
     assert "such as x,-y,-z" in refusal(frames / "rana", "--normal-axes=x,y")
     both = ("--mask-net", frames / "net.onnx")
     assert "--masks and --mask-net: expected one of them" in refusal(folder, *_of_frames(frames), *both)
-    for option in ("--held-out-every", 2), ("--train-camera", 0):
+    for option in ("--held-out-every", 2), ("--train-camera", 1):
         said = f"{option[0]}: expected the default, got {option[1]} (a video has one camera, and its last 1/5 are"
         assert said in refusal(folder, *_of_frames(frames), *option)
+    assert import_it(folder, *_of_frames(frames), "--train-camera", 0)[0] == 0  # the only one there is
     assert "--count: expected the default, got 5 (of a video the sharpest pictures" in refusal(
         frames / "rana", "--count", 5
     )

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.errors import InputError, check_option
+from rnd_runtime.errors import InputError, check_option, flag, refuse_changed
 
 from . import (
     arah,
@@ -155,12 +155,13 @@ def _refuse_unused(layout: str, options: ImportOptions) -> None:
     ):
         given = getattr(options, name)
         if not used and given is not None and given != ():
-            raise InputError(f"--{name}", expected=f"none, as {layout} has its own", got=given)
+            raise InputError(flag(name), expected=f"none, as {layout} has its own", got=given)
     if layout == "video":
-        refuse_cameras(options.choice, "a video has one camera, and its last 1/5 are novel poses")
-    elif options.count != ImportOptions.count:
-        hint = f"of a video the sharpest pictures are chosen; of {layout}, --every keeps fewer"
-        raise InputError("--count", expected="the default", got=options.count, hint=hint)
+        why = "a video has one camera, and its last 1/5 are novel poses"
+        refuse_cameras(options.choice, [video.CAMERA], why)
+    else:
+        why = f"of a video the sharpest pictures are chosen; of {layout}, --every keeps fewer"
+        refuse_changed(options, ["count"], why)
 
 
 def _contents(recording: Recording) -> str:

@@ -15,7 +15,7 @@ Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 class Choice:
     """Which pictures become part of the capture."""
 
-    camera: Annotated[str | None, tyro.conf.arg(name="train-camera")] = None
+    train_camera: str | None = None
     """whose first 4/5 are trained on; the first"""
     held_out_every: int = 30
     """of the other cameras, one frame in so many is a novel view"""

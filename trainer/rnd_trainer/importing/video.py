@@ -24,6 +24,7 @@ from .write import TRAIN_SHARE, Scene, placed
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 FPS = 30.0
+CAMERA = "0"
 _SMALL = (
     320  # pixels, the side at which sharpness is measured: motion blur shows there, sensor noise does not
 )
@@ -76,12 +77,12 @@ def read(
             "body poses", expected=f"frames below {film.count}", got=int(poses.frames[0]), file=source
         )
     recording = Recording(
-        f"a video with {found.kind}'s poses", {"0": lens}, [], poses, rate, (*found.notes, *notes)
+        f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes)
     )
     chosen = _choose(film, placed(recording, model), recording, count)
     stills = _stills(film, [frame for frame, _ in chosen])
     shots = [
-        Shot("0", frame, partial(stills.__getitem__, k), split=split)
+        Shot(CAMERA, frame, partial(stills.__getitem__, k), split=split)
         for k, (frame, split) in enumerate(chosen)
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
@@ -116,7 +117,7 @@ def _choose(film: Film | _Folder, scene: Scene, recording: Recording, count: int
     first = int(recording.poses.frames[0])
     frames = min(scene.motion.frame_count, film.count - first)
     given = {int(frame) - first for frame in recording.poses.frames}
-    camera = scene.cameras["0"]
+    camera = scene.cameras[CAMERA]
     factor = min(1.0, _SMALL / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     sharp = np.full(scene.motion.frame_count, -np.inf)

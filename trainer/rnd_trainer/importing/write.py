@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame, save_capture
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, refuse_changed
 from rnd_runtime.files import output_folder
 from rnd_runtime.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 from rnd_runtime.motion import Motion
@@ -105,20 +105,20 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
         raise InputError(
             "pictures", expected=f"some in the {last - first + 1} frames that have poses", got="none"
         )
+    seen = list(dict.fromkeys(shot.camera for shot in kept))
     if all(shot.split is not None for shot in kept):
-        refuse_cameras(choice, "the pictures' splits are given")
+        refuse_cameras(choice, seen, "the pictures' splits are given")
         return kept
     moving = len({shot.frame for shot in kept}) == len(
         kept
     )  # one picture a moment: a single, maybe moving camera
-    camera = choice.camera or kept[0].camera
-    seen = list(dict.fromkeys(shot.camera for shot in kept))
+    camera = choice.train_camera or kept[0].camera
     if camera not in seen:
         known = " or ".join(seen[:8])
         raise InputError("--train-camera", expected=f"one with pictures in range: {known}", got=camera)
     if moving:
-        said = replace(choice, camera=None) if seen == [camera] else choice
-        refuse_cameras(said, "there is one picture a moment: the first 4/5 train, the rest are novel poses")
+        why = "there is one picture a moment: the first 4/5 train, the rest are novel poses"
+        refuse_cameras(choice, seen, why)
     train = [shot.frame for shot in kept if moving or shot.camera == camera]
     border = sorted(train)[max(0, round(TRAIN_SHARE * len(train)) - 1)] if len(train) > 1 else train[0]
     frames = {frame: k for k, frame in enumerate(sorted({shot.frame for shot in kept}))}
@@ -132,14 +132,13 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
     return result
 
 
-def refuse_cameras(choice: Choice, why: str) -> None:
-    """Refuse what ``choice`` says of several cameras where it would change nothing, and say ``why``."""
-    for name, given, usual in (
-        ("--train-camera", choice.camera, Choice.camera),
-        ("--held-out-every", choice.held_out_every, Choice.held_out_every),
-    ):
-        if given != usual:
-            raise InputError(name, expected="the default", got=given, hint=why)
+def refuse_cameras(choice: Choice, seen: Sequence[str], why: str) -> None:
+    """Refuse what ``choice`` says of several cameras where it would change nothing, and say ``why``.
+
+    To name the only one of the cameras ``seen`` is to say nothing.
+    """
+    said = replace(choice, train_camera=None) if [choice.train_camera] == list(seen) else choice
+    refuse_changed(said, ("train_camera", "held_out_every"), why)
 
 
 def write_capture(
