@@ -265,6 +265,14 @@ COUNTS = {
         {"poses": (10, 72), "Rh": (10, 3), "Th": (1, 3)},
         "Th: expected 10 × 3, as there are 10 poses, got 1 × 3",
     ),
+    "all": (
+        {"poses_all": (10, 72), "Rh_all": (10, 3), "Th_all": (9, 3)},
+        "Th_all: expected 10 × 3, as there are 10 poses, got 9 × 3",
+    ),
+    "turn": (
+        {"poses": (10, 72), "Rh_all": (9, 3)},
+        "Rh_all: expected 10 × 3, as there are 10 poses, got 9 × 3",
+    ),
     "root": ({"body_pose": (10, 69), "global_orient": (9, 3)}, "global_orient: expected 10 × 3, as"),
     "columns": ({"poses": (10, 71)}, "joints of the body poses: expected 22, 24, 52, 55, got 10 × 71"),
     "none": ({"poses": (0, 72)}, "poses: expected a row of numbers a frame, got [0, 72]"),

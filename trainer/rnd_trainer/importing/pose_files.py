@@ -200,17 +200,18 @@ def _npz(path: Path) -> FoundPoses:
         rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
         fps = None if rate is None else float(archive.numbers(rate).reshape(-1)[0])
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
-        trans = (
-            np.zeros((len(poses), 3)) if shift is None else threes(shift, archive.numbers(shift), len(poses))
+        Rh, trans = (
+            np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift)
         )
-        Rh = None if turn is None else threes(turn, archive.numbers(turn), len(poses))
     notes = () if shift is not None else ("no trans in the file: the root stays at its rest place",)
     frames = range(len(poses))
     family = "SMPL-X" if poses.shape[1] == 165 else "SMPL"
-    if Rh is not None:
-        found = easymocap_poses(frames, poses, Rh, trans, betas, family=family)
+    place = shift or "trans"
+    if turn is not None:
+        found = easymocap_poses(frames, poses, Rh, trans, betas, family=family, members=(turn, place))
         return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
-    return FoundPoses("SMPL", smpl_poses(frames, poses, trans, betas, family=family), fps=fps, notes=notes)
+    found = smpl_poses(frames, poses, trans, betas, family=family, member=place)
+    return FoundPoses("SMPL", found, fps=fps, notes=notes)
 
 
 def _several(chosen: int, others: tuple[int, ...]) -> tuple[str, ...]:

@@ -150,15 +150,17 @@ def smpl_poses(
     betas: ArrayLike | None = None,
     *,
     family: str = "SMPL",
+    member: str = "trans",
 ) -> Poses:
     """Poses in SMPL's own convention: the root turns about its rest place J0 and lies at J0 + trans.
 
     Args:
         axis_angles: [F, 3J] or [F, J, 3] rad, the root first; J is 22, 24, 52 or 55.
         trans: [F, 3] m.
+        member: what the file calls ``trans``.
     """
     rotations, names = _rotations(axis_angles)
-    offsets = threes("trans", trans, len(rotations))
+    offsets = threes(member, trans, len(rotations))
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
     )  # fmt: skip
@@ -172,14 +174,16 @@ def easymocap_poses(
     betas: ArrayLike | None = None,
     *,
     family: str = "SMPL",
+    members: tuple[str, str] = ("Rh", "Th"),
 ) -> Poses:
     """Poses in EasyMocap's convention: a body with an unturned root, then x = R(Rh) X + Th about the origin.
 
-    A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first.
+    A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first. ``members``: what the
+    file calls ``Rh`` and ``Th``.
     """
     rotations, names = _rotations(axis_angles)
-    turn = axis_angle_to_matrix(threes("Rh", Rh, len(rotations)))
-    offsets = threes("Th", Th, len(rotations))
+    turn = axis_angle_to_matrix(threes(members[0], Rh, len(rotations)))
+    offsets = threes(members[1], Th, len(rotations))
     rotations[:, 0] = turn @ rotations[:, 0]
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas),
