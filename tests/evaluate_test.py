@@ -104,6 +104,7 @@ def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_ca
     scores = evaluate(judge, "novel_view")
     assert scores.frames == len(tiny_capture.split("novel_view")) and "ssim_box" in scores.scores
     assert not np.isnan(list(scores.scores.values())).any()
+    assert scores.scores["normal_deg"] > 0  # of the other frames: nothing of this one's is in the sliver
     monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 0)))
     assert evaluate(judge, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
 

@@ -30,7 +30,10 @@ FLICKER_FRAMES = 24
 
 @dataclass
 class SplitScore:
-    """Means over the frames of one split of what :func:`rnd_trainer.scores.frame_scores` names."""
+    """Means over the frames of one split of what :func:`rnd_trainer.scores.frame_scores` names.
+
+    Each is of the frames that have it: a sliver of a person may have no normals to compare, and none for LPIPS.
+    """
 
     split: str
     frames: int
@@ -104,8 +107,11 @@ def evaluate(
     if not rows:
         expected = "a person in one picture at least"
         raise InputError(f"split {split!r}", expected=expected, got="none", file=judge.capture.folder)
-    names = [name for name in rows[0] if all(name in row for row in rows)]
-    return SplitScore(split, len(rows), {name: float(np.mean([row[name] for row in rows])) for name in names})
+    figures: dict[str, list[float]] = {}
+    for row in rows:
+        for name, value in row.items():
+            figures.setdefault(name, []).append(value)
+    return SplitScore(split, len(rows), {name: float(np.mean(values)) for name, values in figures.items()})
 
 
 def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
