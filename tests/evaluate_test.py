@@ -12,7 +12,9 @@ import pytest
 import torch
 from msgspec import structs
 
+import rnd_trainer.ablate
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import write_json
 from rnd_runtime.images import srgb_to_linear
 from rnd_trainer.ablate import (
     CAUSES,
@@ -182,6 +184,13 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     config = dataclasses.replace(config, steps=5)
     with pytest.raises(InputError, match="steps of a run done before: expected 5, got 4"):
         go()
+    config = dataclasses.replace(config, steps=4)
+    poses = tiny_capture.motion
+    tiny_capture = dataclasses.replace(tiny_capture, motion=dataclasses.replace(poses, source="other.npz"))
+    with pytest.raises(
+        InputError, match=r"motion of a run done before: expected other\.npz, got motion\.npz"
+    ):
+        go()
     timed = time_encoders(rows, tmp_path, VARIANTS[:3], 0)
     assert [row["encoder_gflop"] for row in timed] == [row["encoder_gflop"] for row in rows]
     table = summarise(timed, VARIANTS[:3])
@@ -199,12 +208,49 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
 
 
+def test_runs_done_before_are_looked_at_before_any_is_trained(
+    tiny_capture, tiny_config, tmp_path, monkeypatch
+) -> None:
+    def train(*_: object) -> None:
+        raise AssertionError("trained")
+
+    def go() -> object:
+        return ablate(tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None,
+                      on_run=lambda *call: None)  # fmt: skip
+
+    monkeypatch.setattr(rnd_trainer.ablate, "_train", train)
+    row = {"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": 12}
+    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
+    file = tmp_path / "lbs__plain_colour-0" / "rows.json"
+    with pytest.raises(AssertionError, match="trained"):
+        go()
+    write_json(file, [row | {"steps": 4}])  # the second variant's
+    with pytest.raises(InputError, match=r"rows\.json: steps of a run done before: expected 12, got 4"):
+        go()
+    for broken in ('[{"method": "LBS', "{}", '[{"psnr": 20}]'):
+        file.write_text(broken)
+        with pytest.raises(
+            InputError, match=r"rows\.json: a run done before: expected rows of a study, got an"
+        ):
+            go()
+    for usable in ([row], [row | {"motion": "motion.npz"}], []):  # older rows do not name their motion
+        write_json(file, usable)
+        with pytest.raises(AssertionError, match="trained"):
+            go()
+
+
 def test_what_a_study_needs_is_looked_for_before_it_begins(tiny_capture) -> None:
     noisy, true_light = (next(v for v in CAUSES if v.name == name) for name in ("noisy poses", "true light"))
     with pytest.raises(InputError, match="motion_noisy"):
         check_needs([noisy], tiny_capture)
     with pytest.raises(InputError, match="light: expected"):
         check_needs([true_light], dataclasses.replace(tiny_capture, lights={}))
+    first, *others = tiny_capture.frames
+    two = dataclasses.replace(tiny_capture, frames=(structs.replace(first, light="sky"), *others))
+    with pytest.raises(
+        InputError, match="variant 'true light': expected one light in the train split, got sk"
+    ):
+        check_needs([true_light], two)
 
 
 def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:

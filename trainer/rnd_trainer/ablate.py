@@ -7,7 +7,6 @@ light, true normals) or adds one (noisy poses, fewer Gaussians); ``LENGTHS`` wha
 from __future__ import annotations
 
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -20,16 +19,22 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import write_json
+from rnd_runtime.files import read_rows, write_json
 
 from .checkpoint import load_checkpoint
 from .config import TrainConfig
+from .data import check_true_normals, training_light
 from .held_out import score
 from .model import AvatarModel
 from .perceptual import Perceptual
 from .pose_refinement import joint_error_degrees
 from .train import Step, Training, run
 
+ROWS = "rows.json"
+"""of one run, in its folder"""
+MOTION = "motion"
+"""of a row: the file of the poses that were learned from and scored in; older rows do not say"""
+ELSEWHERE = "another folder for RUN, or delete this one"
 POSE_SECONDS = 0.3 / 9
 """between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
 NOISY_MOTION = "motion_noisy.npz"
@@ -135,67 +140,87 @@ def ablate(
     They compare what pictures teach: the third stage is off but in the row that asks for it. Each run leaves
     ``rows.json`` in ``folder/NAME-SEED``, and is not done again where that exists. ``on_run`` is called with the
     variant's name, the seed, how many runs are done (that in hand by its share of steps) and how many there are.
+
+    Raises :class:`InputError`, before anything is trained, where a run done before is not of this study.
     """
+    motion = Path(capture.motion.source).name
+
+    def same(config: TrainConfig) -> dict[str, Any]:
+        """What rows of a run with ``config`` say of themselves."""
+        return {
+            "capture": capture.folder.name, "steps": config.steps, "gaussians": config.model.gaussians,
+            "image_scale": config.image_scale, "shade": mode,
+            "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+            MOTION: motion,
+        }  # fmt: skip
+
     rows: list[dict[str, Any]] = []
-    jobs = [(variant, seed) for seed in seeds for variant in variants]
-    for done, (variant, seed) in enumerate(jobs):
+    jobs = [(variant, seed, _config(base, variant, seed)) for seed in seeds for variant in variants]
+    for variant, seed, config in jobs:
+        _done_before(_place(folder, variant, seed), same(config))
+    for done, (variant, seed, config) in enumerate(jobs):
 
         def tell(share: float, name: str = variant.name, seed: int = seed, before: int = done) -> None:
             on_run(name, seed, before + share, len(jobs))
 
         tell(0.0)
         place = _place(folder, variant, seed)
-        model = dataclasses.replace(base.model, **variant.model)
-        steps = round(base.steps * variant.length)
-        changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
-        config = dataclasses.replace(base, model=model, seed=seed, **changed)
-        if not (place / "rows.json").exists():
+        found = _done_before(place, same(config))
+        if not found:
             seen = _noisy(capture) if variant.noisy else capture
             extra = _train(seen, config, place, perceptual, capture, tell)
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
-            write_json(place / "rows.json", [row | cost | extra for row in scored])
-        found = json.loads((place / "rows.json").read_text(encoding="utf-8"))
-        _check_same(found, place / "rows.json", config, capture, perceptual, mode)
+            write_json(place / ROWS, [row | cost | extra | {MOTION: motion} for row in scored])
+            found = _rows(place)
         rows += found
     return rows
 
 
 def check_needs(variants: Iterable[Variant], capture: Capture) -> None:
     """Raise :class:`InputError` where ``capture`` lacks what one of ``variants`` learns from."""
-    train = capture.split("train")
     for variant in variants:
         if variant.noisy:
             _noisy(capture)
         if variant.train.get("light") == "capture":
-            for name in {frame.light or "unknown" for frame in train}:
-                capture.load_light(name)
-        if variant.train.get("normals") == "true" and any(frame.normal_gt is None for frame in train):
-            expected = "normal_gt of every training picture"
-            raise InputError(f"variant {variant.name!r}", expected=expected, got="none", file=capture.folder)
+            training_light(capture, f"variant {variant.name!r}")
+        if variant.train.get("normals") == "true":
+            check_true_normals(capture, capture.split("train"), f"variant {variant.name!r}")
+
+
+def _config(base: TrainConfig, variant: Variant, seed: int) -> TrainConfig:
+    model = dataclasses.replace(base.model, **variant.model)
+    steps = round(base.steps * variant.length)
+    changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
+    return dataclasses.replace(base, model=model, seed=seed, **changed)
 
 
 def _noisy(capture: Capture) -> Capture:
-    return load_capture(capture.file or capture.folder, motion_file=NOISY_MOTION)
+    return load_capture(capture.file, motion_file=NOISY_MOTION)
 
 
-def _check_same(
-    rows: list[dict[str, Any]], file: Path, config: TrainConfig, capture: Capture, perceptual: Perceptual | None,
-    mode: str,
-) -> None:  # fmt: skip
-    """Rows of another training in the same folder would be compared as if they were of this."""
-    expected = {
-        "capture": capture.folder.name, "steps": config.steps, "gaussians": config.model.gaussians,
-        "image_scale": config.image_scale, "shade": mode,
-        "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
-    }  # fmt: skip
-    for name, value in expected.items():
-        if rows[0].get(name) != value:
-            hint = "another folder for RUN, or delete this one"
-            raise InputError(
-                f"{name} of a run done before", expected=value, got=rows[0].get(name), file=file, hint=hint
-            )
+def _done_before(place: Path, same: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a run that is done, none of one that is not.
+
+    Raises :class:`InputError` where they do not say ``same``: they would be compared as if they were of this study.
+    """
+    rows = _rows(place)
+    for name, value in same.items() if rows else ():
+        got = rows[0].get(name, value if name == MOTION else None)
+        if got != value:
+            what = f"{name} of a run done before"
+            raise InputError(what, expected=value, got=got, file=place / ROWS, hint=ELSEWHERE)
+    return rows
+
+
+def _rows(place: Path) -> list[dict[str, Any]]:
+    file = place / ROWS
+    try:
+        return read_rows(file, what="rows of a study", names=("method", "split", "seed", "psnr"))
+    except InputError as error:
+        what, expected = "a run done before", error.expected
+        raise InputError(what, expected=expected, got=error.got, file=file, hint=ELSEWHERE) from error
 
 
 def time_encoders(

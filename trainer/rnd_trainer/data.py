@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
+from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton, bone_transforms
 from rnd_runtime.window import motion_window
@@ -70,6 +72,8 @@ def load_views(
     frames = [frame for frame in capture.frames if frame.split == split]
     if not frames:
         raise InputError(f"split {split!r}", expected="at least one frame", got="none", file=capture.folder)
+    if true_normals:
+        check_true_normals(capture, frames)
     views, bad = [], []
     for frame in frames:
         data = capture.load_frame(frame)
@@ -77,9 +81,6 @@ def load_views(
             bad.append(frame.frame)
             continue
         normal = data.normal_gt if true_normals else data.normal
-        if true_normals and normal is None:
-            raise InputError("--normals true", expected="normal_gt of every training picture", got="none",
-                             file=capture.folder, frame=frame.frame)  # fmt: skip
         camera = capture.cameras[frame.camera]
         if min(camera.width, camera.height) * scale < SSIM_WINDOW:
             raise InputError(
@@ -93,6 +94,27 @@ def load_views(
             file=capture.folder, frame=bad[0],
         )  # fmt: skip
     return views, bad
+
+
+def check_true_normals(capture: Capture, frames: Iterable[Frame], what: str = "--normals true") -> None:
+    """Raise :class:`InputError` where one of ``frames`` has no exact normals, which ``what`` asks for."""
+    for frame in frames:
+        if frame.normal_gt is None:
+            expected = "normal_gt of every training picture"
+            raise InputError(what, expected=expected, got="none", file=capture.folder, frame=frame.frame)
+
+
+def training_light(capture: Capture, what: str = "--light capture") -> tuple[str, Light]:
+    """The light that all training pictures were taken under, and its name; ``what`` asks for it.
+
+    Raises :class:`InputError` where there are several, or the capture does not have it.
+    """
+    names = {frame.light or "unknown" for frame in capture.split("train")}
+    if len(names) != 1:
+        got = ", ".join(sorted(names))
+        raise InputError(what, expected="one light in the train split", got=got, file=capture.folder)
+    name = names.pop()
+    return name, capture.load_light(name)
 
 
 def usable(mask: NDArray[np.floating[Any]]) -> bool:

@@ -30,7 +30,7 @@ from rnd_runtime.motion import Motion, save_motion
 from . import light_start
 from .checkpoint import read_tensors, save_checkpoint, write_tensors
 from .config import TrainConfig, from_dict, to_dict
-from .data import View, load_views, pose_input
+from .data import View, load_views, pose_input, training_light
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
@@ -272,12 +272,7 @@ class Training:
         return UnseenPoses(self.model, self.capture.body.skeleton, self.config)
 
     def _capture_light(self) -> Tensor:
-        names = {view.frame.light or "unknown" for view in self.views}
-        if len(names) != 1:
-            raise InputError("training light", expected="one light in the train split", got=sorted(names))
-        light = self.capture.load_light(names.pop()).resized(
-            *PROBE_SHAPE
-        )  # before turning: a sun stays whole
+        light = training_light(self.capture)[1].resized(*PROBE_SHAPE)  # before turning: a sun stays whole
         return as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
 
     # -- saving and resuming -------------------------------------------------------------------------------
