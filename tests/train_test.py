@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 
 import rnd_trainer.cli
 from rnd_runtime.capture import load_capture
@@ -150,12 +151,43 @@ def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, 
 def test_resuming_on_other_pictures_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
     moved = dataclasses.replace(tiny_capture.motion, translations=tiny_capture.motion.translations + 0.01)
     fewer = tuple(frame for frame in tiny_capture.frames if frame.frame != tiny_capture.frames[0].frame)
-    for other in ({"motion": moved}, {"frames": fewer}):
+    first, second, *others = tiny_capture.frames
+    swapped = (replace(first, frame=second.frame), replace(second, frame=first.frame), *others)
+    bodies = tiny_capture.body
+    wider = dataclasses.replace(bodies, vertices=bodies.vertices * [1.01, 1, 1])
+    for other in ({"motion": moved}, {"frames": fewer}, {"frames": swapped}, {"body": wider}):
         training = Training(dataclasses.replace(tiny_capture, **other), tiny_config)
         with pytest.raises(
             InputError, match="expected the pictures and poses it was started with, got others"
         ):
             training.resume(tiny_run / "training.state")
+
+
+def test_resuming_under_another_light_of_the_capture_is_refused(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, light="capture")
+    Training(tiny_capture, config).save(tmp_path)
+    Training(tiny_capture, config).resume(tmp_path / "training.state")
+    white = tiny_capture.lights["white"]
+    brighter = {"white": replace(white, scale=(2.0, 2.0, 2.0))}
+    with pytest.raises(InputError, match="expected the pictures and poses it was started with, got others"):
+        Training(dataclasses.replace(tiny_capture, lights=brighter), config).resume(
+            tmp_path / "training.state"
+        )
+
+
+def test_a_last_bit_of_another_machines_sine_is_no_other_motion(tiny_run, tiny_capture, tiny_config) -> None:
+    moves = tiny_capture.motion
+    near = dataclasses.replace(moves, rotations=np.nextafter(moves.rotations, 2))
+    Training(dataclasses.replace(tiny_capture, motion=near), tiny_config).resume(tiny_run / "training.state")
+
+
+def test_states_from_before_the_digest_are_resumed(tiny_run, tiny_capture, tiny_config, tmp_path) -> None:
+    tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
+    del header["learned_from_sha256"]
+    write_tensors(tmp_path / "older.state", tensors, header | {"seen_sha256": "of float64 bits"})
+    training = Training(tiny_capture, tiny_config)
+    training.resume(tmp_path / "older.state")
+    assert training.step_index == 14
 
 
 def test_how_often_a_state_is_saved_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:

@@ -19,6 +19,7 @@ from typing import Any, TextIO
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from rnd_runtime.capture import Capture
@@ -297,7 +298,7 @@ class Training:
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
             "perceptual_sha256": self._perceptual_sha256(),
-            "seen_sha256": self._seen_sha256,
+            "learned_from_sha256": self._learned_from_sha256,
         }
         write_tensors(folder / "training.state", tensors, header)
         save_checkpoint(
@@ -328,7 +329,7 @@ class Training:
                 "--resume", expected=f"the perceptual weights {header.get('perceptual_sha256')}",
                 got=self._perceptual_sha256(), file=path,
             )  # fmt: skip
-        if header.get("seen_sha256", self._seen_sha256) != self._seen_sha256:
+        if header.get("learned_from_sha256", self._learned_from_sha256) != self._learned_from_sha256:
             raise InputError(
                 "--resume", expected="the pictures and poses it was started with", got="others", file=path
             )
@@ -352,15 +353,29 @@ class Training:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
     @cached_property
-    def _seen_sha256(self) -> str:
-        """Of everything that is learned from: pictures, cameras and poses."""
+    def _learned_from_sha256(self) -> str:
+        """Of all that the capture teaches: pictures, cameras, which pose is whose, poses, body, and light if given.
+
+        The same on every CPU: what was computed is rounded, since a sine may differ in its last bit.
+        """
         digest = hashlib.sha256()
+
+        def add(*arrays: NDArray[Any] | None) -> None:
+            for array in arrays:
+                if array is not None:
+                    digest.update(np.ascontiguousarray(array).data)
+
         for view in self.views:
-            for values in (view.image, view.mask, view.normal, view.camera.K, view.camera.world_to_camera):
-                digest.update(b"" if values is None else values.tobytes())
-        motion = self.capture.motion
-        for values in (motion.rotations, motion.translations, np.array(motion.fps)):
-            digest.update(values.tobytes())
+            add(np.array(view.frame.frame), view.image, view.mask, view.normal)
+            add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
+        motion, body = self.capture.motion, self.capture.body
+        add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))
+        add(_rounded(body.vertices), body.faces, _rounded(body.skinning_weights))
+        add(_rounded(body.skeleton.rest_joints))
+        if self.config.light == "capture":
+            name, light = training_light(self.capture)
+            digest.update(name.encode())
+            add(light.radiance, _rounded(light.rotation))
         return digest.hexdigest()
 
     def _perceptual_sha256(self) -> str | None:
@@ -452,6 +467,11 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
         yield lambda: pressed
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _rounded(values: ArrayLike) -> NDArray[np.float32]:
+    """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
+    return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)
 
 
 def _strip(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
