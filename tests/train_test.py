@@ -312,6 +312,22 @@ def test_a_device_that_is_not_there_is_refused() -> None:
         _device("teapot")
 
 
+def test_a_device_is_named_as_torch_names_it(monkeypatch) -> None:
+    from rnd_trainer.cli import _device
+
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=None))
+    assert [_device(name) for name in ("cuda", "cuda:0", "cuda:1")] == ["cuda", "cuda:0", "cuda:1"]
+    for typo in ("cuda:", "cuda0", "cuda:00", "cuda:01", "cuda:٠", "cuda:0\n"):
+        with pytest.raises(InputError, match="--device: expected cpu, cuda or cuda:NUMBER, got"):
+            _device(typo)
+    with pytest.raises(InputError, match="expected a GPU that this torch can use, got 2 of them"):
+        _device("cuda:2")
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match=r"gsplat cannot be imported: .*rnd-avatar\[cuda\]"):
+        _device("cuda")
+
+
 def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(
     tiny_capture, tmp_path, monkeypatch, capsys
 ) -> None:

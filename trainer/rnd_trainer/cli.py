@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -155,16 +155,17 @@ def _device(name: str) -> str:
     """``name`` if torch can compute there; the CUDA path is refused where its parts are missing."""
     import torch
 
+    from .raster import gsplat_rasterization
+
     if name == "cpu":
         return name
-    number = name.removeprefix("cuda").removeprefix(":") or "0"
-    if not (name.startswith("cuda") and number.isdecimal()):
+    cuda = re.fullmatch("cuda(?::(0|[1-9][0-9]*))?", name)
+    if cuda is None:
         raise InputError("--device", expected="cpu, cuda or cuda:NUMBER", got=name)
-    if int(number) >= (count := torch.cuda.device_count()):
+    if int(cuda[1] or 0) >= (count := torch.cuda.device_count()):
         got = f"{count} of them" if count else "none"
         raise InputError("--device", expected="a GPU that this torch can use", got=got, hint="--device cpu")
-    if importlib.util.find_spec("gsplat") is None:
-        raise InputError("gsplat is not installed", hint='needs the extra: pip install "rnd-avatar[cuda]"')
+    gsplat_rasterization()
     return name
 
 

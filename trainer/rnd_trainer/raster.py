@@ -66,16 +66,20 @@ class _CpuRasterizer(torch.autograd.Function):
         return *(torch.from_numpy(grad).to(dtype) for grad, dtype in zip(grads, ctx.dtypes)), None, None
 
 
-def _rasterize_cuda(
-    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, camera: Camera, depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
+def gsplat_rasterization() -> Any:
+    """gsplat's function of that name. Raises :class:`InputError` where there is none."""
     try:
         from gsplat import rasterization
     except ImportError as error:
-        raise InputError(
-            "the rasteriser for CUDA tensors is missing", hint="pip install 'rnd-avatar[cuda]' brings gsplat"
-        ) from error
-    picture, alpha, _ = rasterization(
+        hint = 'needs the extra: pip install "rnd-avatar[cuda]"'
+        raise InputError("gsplat cannot be imported", got=error, hint=hint) from error
+    return rasterization
+
+
+def _rasterize_cuda(
+    means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, camera: Camera, depth: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    picture, alpha, _ = gsplat_rasterization()(
         means,
         None,
         None,
