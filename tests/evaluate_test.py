@@ -29,6 +29,7 @@ from rnd_trainer.ablate import (
 )
 from rnd_trainer.charts import draw_lengths
 from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.eval_cli import _is_of
 from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
 from rnd_trainer.judge import Rendered
@@ -289,6 +290,23 @@ def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_c
         costs[variant.name] = encoder_cost(training.model)["encoder_gflop"]
     assert costs["d = 2"] < costs["d = 5"] < costs["d = 20"] < costs["d = 30"]
     assert costs["spatial only"] < costs["ours"]
+
+
+def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
+    tiny_checkpoint, tiny_avatar, tmp_path, capsys
+) -> None:
+    checkpoint, exported = tmp_path / "avatar.ckpt", tmp_path / "avatar.onnx"
+    checkpoint.write_bytes(tiny_checkpoint.read_bytes())
+    assert not _is_of(exported, checkpoint)
+    exported.write_bytes(tiny_avatar.read_bytes())
+    assert _is_of(exported, checkpoint) and not capsys.readouterr().err
+    checkpoint.write_bytes(tiny_checkpoint.read_bytes() + b"later")
+    assert not _is_of(exported, checkpoint)
+    said = capsys.readouterr().err
+    assert said == f"{exported}: of another checkpoint: its size and speed are left out\n"
+    exported.write_bytes(b"cut")
+    with pytest.raises(InputError, match=r"avatar\.onnx: not a readable ONNX model"):
+        _is_of(exported, checkpoint)
 
 
 def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar, tiny_capture) -> None:
