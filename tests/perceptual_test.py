@@ -14,6 +14,8 @@ from torch import nn
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_image
+from rnd_trainer import bench_cli
+from rnd_trainer.bench_options import Step
 from rnd_trainer.perceptual import Perceptual, load_perceptual
 
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "perceptual"
@@ -293,6 +295,11 @@ def test_whole_networks_are_lpips_and_parts_are_not(distances, folder, nets, tmp
     assert len(bare.features(_image(31, 31).float())) == 5
     with pytest.raises(InputError, match=r"bare\.safetensors: .*expected LPIPS heads.*alexnet without heads"):
         bare(_image(31, 31).float(), _image(31, 31).float())
+
+
+def test_the_bench_of_a_step_takes_what_training_takes(small) -> None:
+    with pytest.raises(InputError, match="--perceptual-weights: expected a whole network with LPIPS heads"):
+        bench_cli._step(Step(small.parent, perceptual_weights=small))
 
 
 @pytest.mark.parametrize("zipped", [True, False])

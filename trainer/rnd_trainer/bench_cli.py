@@ -163,9 +163,9 @@ def _step(options: Step) -> None:
 
     from .bench_step import bench_step
     from .config import preset
-    from .perceptual import load_perceptual
+    from .perceptual import load_lpips
 
-    perceptual = None if options.perceptual_weights is None else load_perceptual(options.perceptual_weights)
+    perceptual = load_lpips(options.perceptual_weights)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("training")
         rows = bench_step(
