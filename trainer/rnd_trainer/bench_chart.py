@@ -27,7 +27,7 @@ COLUMNS, WIDE = 5, 3
 def draw_chart(rows: list[Row], files: list[Path]) -> None:
     """Write the chart of ``rows`` to every file, SVG or PNG by its suffix.
 
-    Raises :class:`InputError` where matplotlib is missing.
+    Raises :class:`InputError` where nothing was measured.
     """
     rows = [row for row in rows if "psnr_db" in row]
     if not rows:

@@ -20,26 +20,18 @@ def check_chart(*files: Path) -> None:
         if file.suffix not in (".svg", ".png"):
             raise InputError("--chart", expected=".svg or .png", got=file.name)
     if files and importlib.util.find_spec("matplotlib") is None:
-        raise _no_matplotlib()
-
-
-def _no_matplotlib() -> InputError:
-    return InputError(
-        "matplotlib is not installed",
-        hint='needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"',
-    )
+        hint = 'needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"'
+        raise InputError("matplotlib is not installed", hint=hint)
 
 
 @contextmanager
 def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
     """A matplotlib figure of ``size`` inches, written to every file, SVG or PNG by its suffix, when the block ends.
 
-    Raises :class:`InputError` where matplotlib is missing.
+    :func:`check_chart` has found matplotlib, before what is drawn was measured.
     """
-    try:
-        import matplotlib
-    except ModuleNotFoundError as error:
-        raise _no_matplotlib() from error
+    import matplotlib
+
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
