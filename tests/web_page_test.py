@@ -90,6 +90,7 @@ def site(tmp_path_factory) -> Path:
     broken[40, 3:6, 1] = np.nan
     broken[41, 4] = -1
     write_image(folder / "broken.exr", broken)
+    (folder / "torn.hdr").write_bytes((folder / "window.hdr").read_bytes()[:4000])
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
     _write_avatar(folder / "other.onnx", _raise_and_dim)
     _write_avatar(folder / "stranger.onnx", _rename)
@@ -344,14 +345,15 @@ def test_the_clip_is_a_download(loaded, tmp_path):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("torn.onnx", "cut short"),
+        ("torn.onnx", "torn.onnx: the .onnx file is cut short"),
+        ("torn.hdr", "torn.hdr: the .hdr file is cut short"),
         ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),
         ("nobodys.npz", "expected some of the avatar's"),
-        ("index.html", "expected .onnx, .npz, .hdr or .exr"),
+        ("index.html", "index.html: kind of file: expected .onnx, .npz, .hdr or .exr, got .html"),
     ],
 )
 def test_a_file_that_is_none_of_ours_is_refused_in_one_line(loaded, name, reason):
-    message = _drop(loaded, name)
+    message = _drop(loaded, "window.hdr", name)  # of several files it is named
     assert reason in message and "\n" not in message and _is_refusal(loaded)
     assert _picture(loaded).any()  # what was there still plays
 

@@ -10,6 +10,12 @@ export function refusal(what, { expected, got, file, frame, hint } = {}) {
   return new Error(line.trim().replace(/\s+/g, " "));
 }
 
+/** `error`, whatever was thrown over a file, with the file's name where its message lacks it. */
+export function inFile(error, file) {
+  const what = error.message ?? String(error);
+  return what.startsWith(file) ? error : refusal(what, { file });
+}
+
 /** A number in six digits, as Python's `g` has it. */
 export function short(value) {
   if (!Number.isFinite(value)) return String(value).replace("NaN", "nan").replace("Infinity", "inf");

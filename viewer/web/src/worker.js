@@ -2,6 +2,7 @@
 
 import { Avatar } from "./avatar.js";
 import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
+import { inFile, refusal } from "./errors.js";
 import { downsize, readLight } from "./light.js";
 import { fitMotion, restMotion } from "./motion.js";
 import { readMotionFile } from "./motion_files.js";
@@ -27,7 +28,7 @@ async function load(files) {
   const before = scene, next = { ...scene }, opened = [];
   let answer = { kind: "message", text: "drop an avatar (.onnx) too" };
   try {
-    for (const file of files) await take(file, next, opened);
+    for (const file of files) await take(file, next, opened).catch((error) => { throw inFile(error, file.name); });
     if (next.avatar) {
       const { skeleton } = next.avatar;
       next.motion = next.record ? fitMotion(next.record, skeleton) : restMotion(skeleton);
@@ -52,7 +53,7 @@ async function take({ name, bytes }, next, opened) {
   } else if (kind === "npz") next.record = readMotionFile(bytes, name);
   else if (kind === "hdr" || kind === "exr") {
     next.lights = [...next.lights, { name, light: readLight(bytes, name), shaders: new Map() }];
-  } else throw new Error(`${name}: expected .onnx, .npz, .hdr or .exr`);
+  } else throw refusal("kind of file", { expected: ".onnx, .npz, .hdr or .exr", got: `.${kind}`, file: name });
 }
 
 function description({ avatar, motion, lights }, files) {
