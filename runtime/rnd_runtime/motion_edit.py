@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from .errors import InputError, flag
 from .motion import Motion
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 
@@ -148,4 +148,4 @@ def _share(cutoff_hz: Floats | float, fps: float) -> Floats:
 
 def _check(what: str, value: float, expected: str) -> None:
     if not (np.isfinite(value) and value > 0):
-        raise InputError(f"--{what}", expected=f"{expected}, above 0", got=value)
+        raise InputError(flag(what), expected=f"{expected}, above 0", got=value)

@@ -9,7 +9,7 @@ from typing import Any
 
 import tyro
 
-from rnd_runtime.errors import check_option, parse_options, run_command
+from rnd_runtime.errors import check_option, flag, parse_options, run_command
 from rnd_runtime.files import write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
@@ -200,7 +200,7 @@ def _prepare(options: Any, *counts: str) -> None:
 
     need_extra()
     for name in counts:
-        check_option(getattr(options, name) >= 1, f"--{name}", "at least 1", getattr(options, name))
+        check_option(getattr(options, name) >= 1, flag(name), "at least 1", getattr(options, name))
     if getattr(options, "threads", None) is not None:
         from rnd_runtime.threads import check_threads
 

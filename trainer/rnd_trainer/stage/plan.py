@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rnd_runtime.capture_format import Frame, Split
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, flag
 
 from .lights import WHITE
 
@@ -61,8 +61,7 @@ class Recipe:
             ("relight_cameras", 1), ("estimate_seed", 0),
         ):  # fmt: skip
             if getattr(self, name) < least:
-                option = name.replace("_", "-")
-                raise InputError(f"--{option}", expected=f"at least {least}", got=getattr(self, name))
+                raise InputError(flag(name), expected=f"at least {least}", got=getattr(self, name))
         if self.step is not None and not 1e-3 <= self.step <= 0.03:
             raise InputError("--step", expected="0.001 to 0.03 m", got=self.step)
         if not 0 <= self.estimate_strength <= 10:
@@ -98,7 +97,7 @@ class BenchmarkOptions:
         """Refuse what cannot be filmed or trained."""
         for name, least in (("subjects", 1), ("seeds", 1), ("steps", 1), ("gaussians", 64)):
             if getattr(self, name) < least:
-                raise InputError(f"--{name}", expected=f"at least {least}", got=getattr(self, name))
+                raise InputError(flag(name), expected=f"at least {least}", got=getattr(self, name))
         self.recipe(0).check()
 
     def recipe(self, subject: int) -> Recipe:
