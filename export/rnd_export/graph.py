@@ -20,7 +20,7 @@ PRODUCER = "rnd-avatar"
 def build_model(
     baked: BakedAvatar, precision: Precision, poses: int, metadata: dict[str, str]
 ) -> onnx.ModelProto:
-    """The avatar as an ONNX model; see :mod:`rnd_runtime.avatar` for inputs and outputs."""
+    """The avatar as an ONNX model; see :mod:`rnd_runtime.avatar_file` for inputs and outputs."""
     graph = GraphBuilder("rnd_avatar")
     count, joints = baked.weights.shape
     window = graph.input("pose_window", (poses, joints - 1, 6))

@@ -26,7 +26,7 @@ SMALLEST_LOG = 1e-4
 
 class RestConstants:
     """What does not depend on the pose, by name. All of it becomes outputs of the graph, for players that pose by
-    themselves: see :mod:`rnd_runtime.avatar`.
+    themselves: see :mod:`rnd_runtime.avatar_file`.
     """
 
     def __init__(self, graph: GraphBuilder, baked: BakedAvatar, precision: Precision) -> None:
