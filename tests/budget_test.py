@@ -287,6 +287,7 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
     model = bench.model(plan.recipe(bench.config))
     opacities = next(output for output in model.graph.output if output.name == "opacities")
     left = opacities.type.tensor_type.shape.dim[0].dim_value
+    assert plan.recipe(bench.config).gaussians == left
     assert given_up(bench, plan)[0].startswith(f"{left} of {bench.config.gaussians} Gaussians")
 
 

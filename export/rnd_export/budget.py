@@ -79,7 +79,8 @@ class Plan:
             window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
             visibility_degree=3 if degree is None else int(degree),
         )
-        count = int(gaussians * config.gaussians) if gaussians else None
+        least = variant.nodes or config.nodes  # nodes stay
+        count = max(int(gaussians * config.gaussians), least) if gaussians else None
         return Recipe(variant, count, rung("dynamic_mm") or 0.0)
 
 
@@ -172,8 +173,9 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
     recipe, config = plan.recipe(bench.config), bench.config
     lines = []
     if recipe.gaussians is not None:
-        left = max(recipe.gaussians, recipe.variant.nodes or config.nodes)  # nodes stay
-        lines.append(f"{left} of {config.gaussians} Gaussians, the others merged, colours fitted again")
+        lines.append(
+            f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again"
+        )
     if recipe.variant.nodes is not None:
         lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
     if recipe.dynamic_mm == np.inf:

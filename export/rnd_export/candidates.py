@@ -62,8 +62,9 @@ class Recipe:
     dynamic_mm: float = 0.0
 
 
-class Shot(NamedTuple):
-    """A moment of the motion and where it is seen from."""
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A moment of the motion and where it is seen from; equal to itself alone, since those of one pose share a time."""
 
     time: float
     camera: Camera
@@ -90,9 +91,7 @@ class Workbench:
         shots = [Shot(float(t), self._view(float(t), k)) for k, t in enumerate(times)]
         self.seen, self.held_out = shots[::2], shots[1::2]
         renderer = self._renderer(self._whole)
-        self._truth = {
-            id(shot): self._picture(renderer, shot) for shot in shots
-        }  # of one pose they share a time
+        self._truth = {shot: self._picture(renderer, shot) for shot in shots}
         stopwatch = Stopwatch(self._frames(self._whole))
         self._clock = clock or (lambda avatar: stopwatch.ms(self._frames(avatar)))
         self._fit = [Shot(shot.time, shot.camera.resized(FIT_SIDE, FIT_SIDE)) for shot in self.seen]
@@ -115,7 +114,7 @@ class Workbench:
         """``model`` in ``shots``."""
         avatar = _loaded(model)
         renderer = self._renderer(avatar)
-        squares = [np.mean((self._picture(renderer, shot) - self._truth[id(shot)]) ** 2) for shot in shots]
+        squares = [np.mean((self._picture(renderer, shot) - self._truth[shot]) ** 2) for shot in shots]
         psnr = -10 * np.log10(max(float(max(squares)), 1e-12))
         return Measured(float(psnr), self._clock(avatar), model.ByteSize() / 1e6)
 
