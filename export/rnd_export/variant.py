@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar_file import EncoderKind, Precision
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, flag
 from rnd_runtime.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.template import NEIGHBOURS, node_interpolation
@@ -58,7 +58,7 @@ class Variant:
         for name, low in least.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= most[name]:
-                option = f"--{name.replace('_', '-')}"
+                option = flag(name)
                 raise InputError(option, expected=f"{low} to {most[name]}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rnd_runtime.capture import Capture, CaptureLight, load_capture, save_capture
 from rnd_runtime.capture_format import Frame
 from rnd_runtime.doctor import machine
+from rnd_runtime.errors import flag
 from rnd_runtime.files import atomic_path, write_json
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion import save_motion
@@ -106,7 +107,7 @@ def _engine(variant: str) -> dict[str, str]:
 def _readme(production: Production, variant: str, seconds: float | None) -> str:
     recipe = production.recipe
     options = " ".join(
-        f"--{key.replace('_', '-')} {' '.join(map(str, value)) if isinstance(value, (list, tuple)) else value}"
+        f"{flag(key)} {' '.join(map(str, value)) if isinstance(value, (list, tuple)) else value}"
         for key, value in asdict(recipe).items()
         if value not in (None, ()) and not isinstance(value, bool)
     )
