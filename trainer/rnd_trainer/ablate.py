@@ -155,18 +155,19 @@ def ablate(
         }  # fmt: skip
 
     rows: list[dict[str, Any]] = []
-    jobs = [(variant, seed, _config(base, variant, seed)) for seed in seeds for variant in variants]
-    for variant, seed, config in jobs:
-        _done_before(_place(folder, variant, seed), same(config))
-    for done, (variant, seed, config) in enumerate(jobs):
+    jobs: list[tuple[Variant, int, TrainConfig, list[dict[str, Any]]]] = []
+    for seed in seeds:
+        for variant in variants:
+            config = _config(base, variant, seed)
+            jobs.append((variant, seed, config, _done_before(_place(folder, variant, seed), same(config))))
+    for done, (variant, seed, config, found) in enumerate(jobs):
 
         def tell(share: float, name: str = variant.name, seed: int = seed, before: int = done) -> None:
             on_run(name, seed, before + share, len(jobs))
 
         tell(0.0)
-        place = _place(folder, variant, seed)
-        found = _done_before(place, same(config))
         if not found:
+            place = _place(folder, variant, seed)
             seen = _noisy(capture) if variant.noisy else capture
             extra = _train(seen, config, place, perceptual, capture, tell)
             checkpoint = load_checkpoint(place / "avatar.ckpt")
