@@ -101,12 +101,26 @@ def test_a_point_in_gl_has_the_cpus_pictures(tiny_avatar, raster) -> None:
     assert errors(gl, Reference(cpu.radiance, cpu.means))["psnr_db"] > 50
 
 
+def test_a_point_may_leave_the_back_out(tiny_avatar) -> None:
+    """Measured as the renderer draws it; a cosine as high as this one leaves front out too."""
+    point = Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table", threads=1, frames=1)
+    whole, culled = (
+        bench_frame.measure(dataclasses.replace(point, cull=cull)).radiance for cull in (None, 0.5)
+    )
+    avatar = Avatar.load(tiny_avatar, threads=1)
+    renderer = FrameRenderer(avatar, load_light(SKY), bench_camera(48), shade="table", cull=0.5)
+    renderer.turn(TURN * COMPARED[0])
+    drawn = renderer.render(load_motion(WALK, avatar.skeleton), STEP_S * COMPARED[0]).radiance
+    assert np.array_equal(culled[0], drawn) and np.abs(culled - whole).max() > 0.01
+
+
 def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
     points = settings()
     assert len(points) == len(set(points)) and points[0] == Setting()
     values = {name: {getattr(p, name) for p in points} for name in dataclasses.asdict(Setting())}
     assert values["n"] == {4_000, 8_000, 15_000, 30_000, 60_000} and values["size"] == {256, 512, 1024}
     assert values["raster"] == {"cpu", "gl-egl", "gl-osmesa"} and values["threads"] == {1, 2}
+    assert values["cull"] == {None, *bench_grid.CULLS}
     assert values["encoder"] == {"full", "coarse", "static"} and values["precision"] == {"f32", "f16", "int8"}
     assert {"ao", "table", "table+sun", "brute"} < values["shade"] and len(values["window"]) == 3
     assert len(settings(quick=True)) < len(points) / 2

@@ -34,8 +34,9 @@ from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
 from rnd_trainer.judge import Rendered
 from rnd_trainer.metrics import psnr, ssim_map
-from rnd_trainer.scores import EDGE, frame_scores, normal_picture, silhouette, to_srgb8
+from rnd_trainer.scores import EDGE, frame_scores, normal_picture, outline_length, silhouette, to_srgb8
 
+OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
 CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
 
 
@@ -56,7 +57,7 @@ def test_a_perfect_rendering_is_perfect_in_every_figure(tiny_capture) -> None:
     assert scores["psnr"] == scores["psnr_box"] == math.inf
     assert scores["psnr_n"] > 120  # normals are scaled to unit length once more
     assert scores["ssim"] == pytest.approx(1) and scores["ssim_n"] == pytest.approx(1)
-    assert scores["normal_deg"] == pytest.approx(0, abs=0.1)
+    assert scores["normal_deg"] == pytest.approx(0, abs=0.1) and scores["outline_px"] == 0
 
 
 def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
@@ -72,6 +73,26 @@ def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
     target = torch.from_numpy(truth.image_srgb)
     assert scores["psnr_box"] == pytest.approx(psnr(to_srgb8(spoilt.image)[box], target[box]))
     assert scores["psnr_box"] < scores["psnr"] < 60
+
+
+def test_an_outline_is_off_by_as_much_as_a_disc_is_too_wide(tiny_capture) -> None:
+    row, column = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
+    distance = torch.hypot(row - 127.3, column - 127.9)
+
+    def disc(radius: float) -> torch.Tensor:
+        return (radius + 0.5 - distance).clamp(0, 1)  # a soft edge, one pixel wide
+
+    assert outline_length(disc(100)) == pytest.approx(2 * math.pi * 100, rel=OUTLINE)
+    truth = dataclasses.replace(
+        _truth(tiny_capture), image_srgb=np.zeros((256, 256, 3), np.float32), mask=disc(100).numpy(),
+        normal=None, normal_gt=None, albedo_srgb=None,
+    )  # fmt: skip
+    black = torch.zeros(256, 256, 3)
+    for wider in (0.25, -0.25):
+        scores = frame_scores(Rendered(black, black, black, disc(100 + wider)), truth)
+        assert scores["outline_px"] == pytest.approx(0.25, rel=OUTLINE)
+    everywhere = dataclasses.replace(truth, mask=np.ones((256, 256), np.float32))
+    assert "outline_px" not in frame_scores(Rendered(black, black, black, disc(100)), everywhere)
 
 
 def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:

@@ -62,6 +62,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
         ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
+        ("rnd-bench frame --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
         ("rnd-bench peers --threads 999", "--threads: expected 1 to "),
         (
             "rnd-bench --quick --json OUT/grid.json --chart chart.pdf",

@@ -190,8 +190,7 @@ def facing(gaussians: Gaussians, eye: ArrayLike, least: float) -> Floats32:
 
     What faces away from the camera at ``eye`` [3] m lies behind what faces it, if the body is closed and opaque. A
     little below 0 the silhouette's own Gaussians are kept, which are seen from their edge. No trained avatar is quite
-    that: one of 30 000 at 512², shaded by "table", keeps (mean and worst of six views, against the whole picture) 42.5
-    and 38.8 dB at −0.2, 46.8 and 41.3 at −0.5; by "table+sun" 46.7 and 44.6, 51.0 and 49.2.
+    that; what it costs one of 30 000 stands in docs/performance.md (``rnd-bench frame --cull``).
     """
     opacities = np.empty(len(gaussians.means), np.float32)
     arrays = (floats(gaussians.means), floats(gaussians.normals), floats(gaussians.opacities))

@@ -123,6 +123,8 @@ def _label(row: Row) -> str:
     ]
     if row["window"] is not None:
         words.append(f"d={row['window']}")
+    if row["cull"] is not None:
+        words.append(f"n·v ≥ {row['cull']:g}")
     if row["threads"] != USUAL["threads"]:
         words.append(f"{row['threads']} thread")
     return " · ".join(words)

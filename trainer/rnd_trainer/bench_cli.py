@@ -73,13 +73,16 @@ def _raster(options: Raster) -> None:
 
 def _frame(options: Frame) -> None:
     _prepare(options, "n", "size", "threads")
+    check_option(
+        options.cull is None or -1 <= options.cull <= 1, "--cull", "a cosine, from -1 to 1", options.cull
+    )
     from rich.console import Console
 
     from .bench_grid import Setting, measured
 
     setting = Setting(
         options.n, options.size, options.shade, options.encoder, options.window, options.precision,
-        options.raster, options.threads,
+        options.raster, options.threads, options.cull,
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
     console = Console()
@@ -182,9 +185,10 @@ def _step(options: Step) -> None:
 def _line(row: dict[str, Any]) -> str:
     """A row in words."""
     window = "" if row["window"] is None else f" d={row['window']}"
+    cull = "" if row["cull"] is None else f", n·v ≥ {row['cull']:g}"
     words = (
         f"{row['n']:6} {row['size']:4}² {row['shade']:9} {row['encoder']}{window} {row['precision']} {row['raster']} "
-        f"{row['threads']} threads: "
+        f"{row['threads']} threads{cull}: "
     )
     if "failed" in row:
         return words + row["failed"]

@@ -32,7 +32,10 @@ DEADLINE_S = 300.0
 
 @dataclass(frozen=True)
 class Point:
-    """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames."""
+    """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames.
+
+    ``cull`` as of :class:`rnd_runtime.frame.FrameRenderer`.
+    """
 
     avatar: str
     motion: str
@@ -43,6 +46,7 @@ class Point:
     threads: int = 2
     frames: int = 90
     seconds: float = 6.0
+    cull: float | None = None
 
 
 class Drawn(NamedTuple):
@@ -99,7 +103,9 @@ def draw(folder: str, spawned: float) -> None:
     motion = load_motion(Path(point.motion), avatar.skeleton)
     light = load_light(Path(point.hdr))
     raster: Any = point.raster
-    renderer = FrameRenderer(avatar, light, bench_camera(point.size), shade=point.shade, raster=raster)
+    renderer = FrameRenderer(
+        avatar, light, bench_camera(point.size), shade=point.shade, raster=raster, cull=point.cull
+    )
 
     def frame(number: int) -> Any:
         renderer.turn(TURN * number)

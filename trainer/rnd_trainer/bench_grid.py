@@ -22,6 +22,8 @@ from .bench_frame import Point, measure
 from .bench_reference import errors, reference
 
 FULL_N = 30_000
+CULLS = (-0.2, -0.5)
+"""cosines below which n·v is left out"""
 Row = dict[str, Any]
 
 
@@ -37,6 +39,7 @@ class Setting:
     precision: str = "f32"
     raster: str = "cpu"
     threads: int = 2
+    cull: float | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,7 @@ def settings(quick: bool = False) -> list[Setting]:
         "window": (2, 5),
         "raster": ("gl-egl", "gl-osmesa"),
         "threads": (1,),
+        "cull": CULLS,
     }
     if quick:
         factors = {"n": (4_000,), "shade": ("ao", "table"), "encoder": ("coarse", "static"), "threads": (1,),
@@ -104,6 +108,7 @@ def settings(quick: bool = False) -> list[Setting]:
     if not quick:
         crossed = product((8_000, 15_000, FULL_N), ("full", "coarse", "static"), ("table", "table+sun"))
         points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in crossed]
+        points += [Setting(shade="table", cull=cull) for cull in CULLS]
     return list(dict.fromkeys(points))
 
 
@@ -119,7 +124,7 @@ def measured(
     file, which = inputs.avatar(setting.n, encoders)
     point = Point(
         str(file), str(inputs.motion), str(inputs.hdr), setting.size, setting.shade, setting.raster,
-        setting.threads, seconds=seconds,
+        setting.threads, seconds=seconds, cull=setting.cull,
     )  # fmt: skip
     drawn = measure(point)
     row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}

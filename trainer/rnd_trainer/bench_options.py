@@ -63,6 +63,8 @@ class Frame:
     """what splats"""
     threads: int = 2
     """of onnxruntime and of the kernels"""
+    cull: float | None = None
+    """leave out Gaussians whose n·v is below this cosine, such as -0.5: the back of the body; by default none"""
     compare: bool = True
     """measure the error too: the reference takes half a minute the first time"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)

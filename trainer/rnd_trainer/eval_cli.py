@@ -29,6 +29,7 @@ COLUMNS = {
     "ssim_n": ("SSIM_n", "{:.4f}"),
     "normal_deg": ("normals °", "{:.1f}"),
     "psnr_albedo": ("albedo", "{:.2f}"),
+    "outline_px": ("outline px", "{:.2f}"),
 }
 """what the terminal's table shows of a row: heading and format"""
 OF_ONE_RUN = ("pictures", "method")

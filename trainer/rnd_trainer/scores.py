@@ -29,6 +29,8 @@ def frame_scores(
     ``psnr, ssim, lpips`` of the sRGB picture on black, in the full frame and (``*_box``) in the mask's bounding
     box: the full frame is nine tenths background, so its figures flatter everybody. ``psnr_n, ssim_n`` of normal
     pictures (n + 1)/2, ``normal_deg`` the mean angle; ``psnr_albedo`` in the mask, sRGB, after ``scale`` [3].
+    ``lpips_inner`` has the outline from the truth; ``outline_px`` is the area that coverage is wrong by, per length
+    of outline.
     """
     target, mask = torch.from_numpy(truth.image_srgb).float(), torch.from_numpy(truth.mask)
     image = to_srgb8(rendered.image)
@@ -40,6 +42,9 @@ def frame_scores(
         "psnr_box": psnr(image[box], target[box]),
         "ssim_box": ssim(image[box], target[box]),
     }
+    length = outline_length(mask)
+    if length > 0:
+        scores["outline_px"] = float((rendered.alpha - mask).abs().sum()) / length
     if perceptual is not None:
         scores["lpips"] = float(perceptual(image, target))
         scores["lpips_inner"] = float(perceptual(torch.where(silhouette(mask), target, image), target))
@@ -73,6 +78,12 @@ def silhouette(mask: Tensor) -> Tensor:
         for side in (covered, 1 - covered)
     )
     return (near_person * near_nothing)[0, ..., None] > 0
+
+
+def outline_length(mask: Tensor) -> float:
+    """Length in pixels of the outline of coverage [H, W]: its total variation ∫|∇m| (the coarea formula)."""
+    down, right = torch.gradient(mask)
+    return float(torch.hypot(down, right).sum())
 
 
 def normal_picture(normals: Tensor, coverage: Tensor) -> Tensor:

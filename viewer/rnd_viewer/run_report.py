@@ -35,7 +35,7 @@ METRICS = {
     "lpips_box": ("LPIPS in the box", "{:.4f}"), "lpips_inner": ("LPIPS but for the outline", "{:.4f}"),
     "psnr_n": ("PSNR of normals", "{:.2f}"),
     "ssim_n": ("SSIM of normals", "{:.4f}"), "normal_deg": ("normals °", "{:.1f}"),
-    "psnr_albedo": ("PSNR of albedo", "{:.2f}"),
+    "psnr_albedo": ("PSNR of albedo", "{:.2f}"), "outline_px": ("outline off by px", "{:.2f}"),
 }  # fmt: skip
 FACTS = {
     "capture": "capture {}", "gaussians": "{} Gaussians", "steps": "{} steps", "minutes": "{:.1f} minutes",
