@@ -28,13 +28,15 @@ from rnd_trainer.ablate import (
     time_encoders,
 )
 from rnd_trainer.charts import draw_lengths
-from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.checkpoint import load_checkpoint, write_tensors
+from rnd_trainer.config import to_dict
 from rnd_trainer.eval_cli import _is_of
 from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
 from rnd_trainer.judge import Rendered
 from rnd_trainer.metrics import psnr, ssim_map
 from rnd_trainer.scores import EDGE, frame_scores, normal_picture, outline_length, silhouette, to_srgb8
+from rnd_trainer.training_state import STATE_FILE, STATE_SCHEMA
 
 OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
 CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
@@ -259,6 +261,37 @@ def test_runs_done_before_are_looked_at_before_any_is_trained(
         write_json(file, usable)
         with pytest.raises(AssertionError, match="trained"):
             go()
+
+
+def test_runs_begun_before_are_looked_at_before_any_is_trained(
+    tiny_capture, tiny_config, tmp_path, monkeypatch
+) -> None:
+    def train(*_: object) -> None:
+        raise AssertionError("trained")
+
+    def begin(steps: int) -> None:
+        """A state of the second variant, LBS with plain colours, that was to have ``steps``."""
+        model = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
+        others = {"light": "none", "weight_consistency": 0.0, "unseen_fraction": 0.0, "steps": steps}
+        config = to_dict(dataclasses.replace(tiny_config, model=model, **others))
+        header = {"schema": STATE_SCHEMA, "config": config, "perceptual_sha256": None}
+        folder = tmp_path / "lbs__plain_colour-0"
+        folder.mkdir(exist_ok=True)
+        write_tensors(folder / STATE_FILE, {"generator": torch.zeros(1)}, header)
+
+    def go() -> object:
+        return ablate(tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None,
+                      on_run=lambda *call: None)  # fmt: skip
+
+    monkeypatch.setattr(rnd_trainer.ablate, "_train", train)
+    begin(tiny_config.steps + 1)
+    with pytest.raises(
+        InputError, match=r"training\.state: a run begun before: expected .* other \['steps'\]"
+    ):
+        go()
+    begin(tiny_config.steps)
+    with pytest.raises(AssertionError, match="trained"):
+        go()
 
 
 def test_what_a_study_needs_is_looked_for_before_it_begins(tiny_capture) -> None:

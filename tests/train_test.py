@@ -26,7 +26,8 @@ from rnd_trainer.eval_cli import EvalOptions
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
-from rnd_trainer.train import MAX_BAD_STEPS, STATE_SCHEMA, Training, run
+from rnd_trainer.train import MAX_BAD_STEPS, Training, run
+from rnd_trainer.training_state import STATE_SCHEMA
 
 
 def _nothing(*_: object) -> None:

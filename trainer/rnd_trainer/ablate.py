@@ -29,6 +29,7 @@ from .model import AvatarModel
 from .perceptual import Perceptual
 from .pose_refinement import joint_error_degrees
 from .train import Step, Training, run
+from .training_state import STATE_FILE, read_state
 
 ROWS = "rows.json"
 """of one run, in its folder"""
@@ -141,7 +142,7 @@ def ablate(
     ``rows.json`` in ``folder/NAME-SEED``, and is not done again where that exists. ``on_run`` is called with the
     variant's name, the seed, how many runs are done (that in hand by its share of steps) and how many there are.
 
-    Raises :class:`InputError`, before anything is trained, where a run done before is not of this study.
+    Raises :class:`InputError`, before anything is trained, where a run done or begun before is not of this study.
     """
     motion = Path(capture.motion.source).name
 
@@ -159,7 +160,15 @@ def ablate(
     for seed in seeds:
         for variant in variants:
             config = _config(base, variant, seed)
-            jobs.append((variant, seed, config, _done_before(_place(folder, variant, seed), same(config))))
+            place = _place(folder, variant, seed)
+            found = _done_before(place, same(config))
+            if not found and (place / STATE_FILE).exists():
+                begun, weights = (
+                    read_state(place / STATE_FILE),
+                    None if perceptual is None else perceptual.sha256,
+                )
+                begun.refuse_other(config, weights, what="a run begun before", hint=ELSEWHERE)
+            jobs.append((variant, seed, config, found))
     for done, (variant, seed, config, found) in enumerate(jobs):
 
         def tell(share: float, name: str = variant.name, seed: int = seed, before: int = done) -> None:
@@ -310,8 +319,8 @@ def _train(
     """Train on ``seen``; what the poses were off by before and after, in degrees, where they were not exact."""
     place.mkdir(parents=True, exist_ok=True)
     training = Training(seen, config, perceptual)
-    if (place / "training.state").exists():
-        training.resume(place / "training.state")
+    if (place / STATE_FILE).exists():
+        training.resume(place / STATE_FILE)
 
     def on_step(step: Step) -> None:
         on_share((step.index + 1) / training.total_steps)

@@ -87,6 +87,7 @@ def _train(options: TrainOptions) -> None:
     from .live_view import live_view
     from .perceptual import load_lpips
     from .train import Training, run
+    from .training_state import STATE_FILE
 
     config = resized(preset(options.preset), options.gaussians, options.steps)
     model = dataclasses.replace(config.model, visibility=options.visibility)
@@ -109,7 +110,7 @@ def _train(options: TrainOptions) -> None:
 
     capture = load_capture(options.capture, motion_file=options.motion)
     folder = output_folder(options.out)
-    state = folder / "training.state"
+    state = folder / STATE_FILE
     if state.exists() and not options.resume:
         raise InputError(
             "holds a training already", file=folder, hint="--resume continues it; or choose another --out"

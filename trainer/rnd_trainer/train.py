@@ -29,8 +29,8 @@ from rnd_runtime.light import texel_directions
 from rnd_runtime.motion import Motion, save_motion
 
 from . import light_start
-from .checkpoint import read_tensors, save_checkpoint, write_tensors
-from .config import TrainConfig, from_dict, to_dict
+from .checkpoint import save_checkpoint, write_tensors
+from .config import TrainConfig, to_dict
 from .data import View, load_views, pose_input, training_light
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
@@ -38,9 +38,9 @@ from .objective import Objective, noisy
 from .perceptual import Perceptual
 from .pose_refinement import PoseRefinement
 from .template import sample_template
+from .training_state import STATE_FILE, STATE_SCHEMA, read_state
 from .unseen import UnseenPoses
 
-STATE_SCHEMA = "rnd-training/1"
 REFINED_MOTION = "refined_motion.npz"
 """beside the checkpoint: the capture's motion, its training frames corrected"""
 MAX_BAD_STEPS = 10
@@ -300,7 +300,7 @@ class Training:
             "perceptual_sha256": self._perceptual_sha256(),
             "learned_from_sha256": self._learned_from_sha256,
         }
-        write_tensors(folder / "training.state", tensors, header)
+        write_tensors(folder / STATE_FILE, tensors, header)
         save_checkpoint(
             folder / "avatar.ckpt",
             self.model,
@@ -315,38 +315,27 @@ class Training:
 
         The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
         """
-        tensors, header = read_tensors(path, STATE_SCHEMA)
-        taught = _strip(tensors, "taught.")
-        before, now = to_dict(_trained_with(header, path)), to_dict(self.config)
-        free = {"save_every", "preview_every"} | (set() if taught else {"unseen_fraction", "weight_edges"})
-        wrong = sorted(name for name, value in now.items() if before[name] != value and name not in free)
-        if wrong:
-            raise InputError(
-                "--resume", expected="the configuration it was started with", got=f"other {wrong}", file=path
-            )
-        if header.get("perceptual_sha256") != self._perceptual_sha256():
-            raise InputError(
-                "--resume", expected=f"the perceptual weights {header.get('perceptual_sha256')}",
-                got=self._perceptual_sha256(), file=path,
-            )  # fmt: skip
+        saved = read_state(path)
+        saved.refuse_other(self.config, self._perceptual_sha256())
+        header, taught = saved.header, saved.part("taught")
         if header.get("learned_from_sha256", self._learned_from_sha256) != self._learned_from_sha256:
             raise InputError(
                 "--resume", expected="the pictures and poses it was started with", got="others", file=path
             )
         try:
-            self.model.load_state_dict(_strip(tensors, "model."))
-            self.probe.load_state_dict(_strip(tensors, "probe."))
+            self.model.load_state_dict(saved.part("model"))
+            self.probe.load_state_dict(saved.part("probe"))
             if self.refinement is not None:
-                self.refinement.load_state_dict(_strip(tensors, "poses."))
+                self.refinement.load_state_dict(saved.part("poses"))
             if taught:
                 self.unseen = self._unseen()
                 self.unseen.taught.load_state_dict(taught)
             moments: dict[int, dict[str, Tensor]] = {}
-            for name, value in _strip(tensors, "adam.").items():
+            for name, value in saved.part("adam").items():
                 index, key = name.split(".")
                 moments.setdefault(int(index), {})[key] = value
             self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
-            self.generator.set_state(tensors["generator"])
+            self.generator.set_state(saved.tensors["generator"])
             self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
             self.bad_steps = int(header["bad_steps"])
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
@@ -428,13 +417,6 @@ def run(
         return interrupted()
 
 
-def _trained_with(header: dict[str, Any], path: Path) -> TrainConfig:
-    try:
-        return from_dict(header["config"])
-    except (KeyError, TypeError, InputError) as error:
-        raise InputError("not a training state of this version", got=str(error), file=path) from error
-
-
 def _keep_until(path: Path, step: int) -> TextIO:
     """The metrics log, without rows at or after ``step``: those steps will be done again."""
     kept = []
@@ -472,7 +454,3 @@ def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
 def _rounded(values: ArrayLike) -> NDArray[np.float32]:
     """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
     return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)
-
-
-def _strip(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

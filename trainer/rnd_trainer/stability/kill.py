@@ -17,7 +17,7 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors
-from rnd_trainer.train import STATE_SCHEMA
+from rnd_trainer.training_state import STATE_SCHEMA
 
 from .commands import EXPORT, PLAY, TRAIN, environment
 from .figures import Figure, at_most, holds

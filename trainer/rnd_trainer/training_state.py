@@ -1,0 +1,66 @@
+"""A training that was saved: which one it is, and its tensors by part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from rnd_runtime.errors import InputError
+
+from .checkpoint import read_tensors
+from .config import TrainConfig, from_dict, to_dict
+
+STATE_SCHEMA = "rnd-training/1"
+STATE_FILE = "training.state"
+"""in a run's folder"""
+_OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges"}
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """What :meth:`rnd_trainer.train.Training.save` wrote: ``tensors`` by dotted name, the first word their part."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    header: dict[str, Any]
+
+    def part(self, name: str) -> dict[str, Tensor]:
+        """Tensors of one part, by the rest of their names."""
+        prefix = f"{name}."
+        return {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
+
+    def refuse_other(
+        self,
+        config: TrainConfig,
+        perceptual_sha256: str | None,
+        *,
+        what: str = "--resume",
+        hint: str | None = None,
+    ) -> None:
+        """Raise :class:`InputError` where another configuration, or other perceptual weights, began this training.
+
+        What concerns the third stage alone may differ before that has begun. ``what`` and ``hint`` as of the error.
+        """
+        try:
+            before = to_dict(from_dict(self.header["config"]))
+        except (KeyError, TypeError, InputError) as error:
+            got = str(error)
+            raise InputError("not a training state of this version", got=got, file=self.path) from error
+        free = {"save_every", "preview_every"} | (set() if self.part("taught") else _OF_THE_THIRD_STAGE)
+        now = to_dict(config).items()
+        wrong = sorted(name for name, value in now if before[name] != value and name not in free)
+        if wrong:
+            expected = "the configuration it was started with"
+            raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
+        weights = self.header.get("perceptual_sha256")
+        if weights != perceptual_sha256:
+            expected = f"the perceptual weights {weights}"
+            raise InputError(what, expected=expected, got=perceptual_sha256, file=self.path, hint=hint)
+
+
+def read_state(path: Path) -> TrainingState:
+    """The state in ``path``. Raises :class:`InputError` where it is none."""
+    return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
