@@ -37,6 +37,8 @@ from tiny import ASSETS
 
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
 HERE = {"machine": "this one", "ms_median": 1.0}
+LAST_BITS = 1e-5
+"""of radiance in float32: kernels that a process compiled itself differ by an ulp from the same ones out of numba's cache"""
 BRUTE_DB = 65.0
 """the fastest exact path against the reference: float32 against float64, numba against numpy"""
 
@@ -111,7 +113,7 @@ def test_a_point_may_leave_the_back_out(tiny_avatar) -> None:
     renderer = FrameRenderer(avatar, load_light(SKY), bench_camera(48), shade="table", cull=0.5)
     renderer.turn(TURN * COMPARED[0])
     drawn = renderer.render(load_motion(WALK, avatar.skeleton), STEP_S * COMPARED[0]).radiance
-    assert np.array_equal(culled[0], drawn) and np.abs(culled - whole).max() > 0.01
+    assert np.abs(culled[0] - drawn).max() < LAST_BITS and np.abs(culled - whole).max() > 0.01
 
 
 def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
