@@ -38,7 +38,7 @@ from tiny import ASSETS
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
 HERE = {"machine": "this one", "ms_median": 1.0}
 LAST_BITS = 1e-5
-"""of radiance in float32: kernels that a process compiled itself differ by an ulp from the same ones out of numba's cache"""
+"""of radiance in float32: a kernel that a process compiled itself and the same out of numba's cache differ by an ulp"""
 BRUTE_DB = 65.0
 """the fastest exact path against the reference: float32 against float64, numba against numpy"""
 
