@@ -16,6 +16,8 @@ import rnd_trainer.ablate
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import write_json
 from rnd_runtime.images import srgb_to_linear
+from rnd_runtime.light import Light
+from rnd_runtime.shading import Shader
 from rnd_trainer.ablate import (
     CAUSES,
     LENGTHS,
@@ -29,13 +31,16 @@ from rnd_trainer.ablate import (
 )
 from rnd_trainer.charts import draw_lengths
 from rnd_trainer.checkpoint import load_checkpoint, write_tensors
-from rnd_trainer.config import to_dict
+from rnd_trainer.config import ModelConfig, to_dict
+from rnd_trainer.data import pose_input
 from rnd_trainer.eval_cli import _is_of
 from rnd_trainer.evaluate import Judge, evaluate, flicker
 from rnd_trainer.held_out import score
-from rnd_trainer.judge import Rendered
+from rnd_trainer.judge import Rendered, render_runtime
 from rnd_trainer.metrics import psnr, ssim_map
+from rnd_trainer.model import AvatarModel
 from rnd_trainer.scores import EDGE, frame_scores, normal_picture, outline_length, silhouette, to_srgb8
+from rnd_trainer.template import sample_template
 from rnd_trainer.training_state import STATE_FILE, STATE_SCHEMA
 
 OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
@@ -108,6 +113,30 @@ def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
     _, similarity = cv2.quality.QualitySSIM_compute(a, b)
     ours = ssim_map(first, second).numpy()
     assert np.abs(ours - similarity[5:-5, 5:-5, :3]).mean() < CV2_SSIM
+
+
+@pytest.mark.parametrize(("visibility", "shadows"), [("pose", True), ("paper", False), ("none", False)])
+def test_a_model_that_learned_without_shadows_is_judged_without(
+    tiny_capture, monkeypatch, visibility, shadows
+):
+    body = tiny_capture.body
+    config = ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, visibility=visibility)
+    model = AvatarModel(config, sample_template(body, 800, 200, seed=1))
+    overhead = np.zeros((32, 64, 3), np.float32)
+    overhead[1] = 1e3  # the head's shadow falls on the shoulders
+    shader = Shader(Light(overhead), "table+sun")
+    assert shader.suns
+
+    def picture() -> torch.Tensor:
+        pose = pose_input(tiny_capture.motion, body.skeleton, 0.0, config)
+        return render_runtime(model, pose, tiny_capture.cameras["front"], shader).image
+
+    played = picture()
+    monkeypatch.setattr(
+        "rnd_runtime.shading.directional_visibility",
+        lambda points, normals, ways, **_: np.ones((len(points), len(ways)), np.float32),
+    )
+    assert torch.equal(played, picture()) is not shadows
 
 
 def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:

@@ -98,26 +98,34 @@ class Shader:
         return shader
 
     def shade(
-        self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None
+        self,
+        gaussians: Gaussians,
+        camera_position: ArrayLike,
+        seen: ArrayLike | None = None,
+        *,
+        sun_shadows: bool = True,
     ) -> Floats32:
         """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m.
 
         Gaussians that face away from the camera are shaded too: at a silhouette they are seen. Those that are
-        not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same.
+        not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same. Without
+        ``sun_shadows`` nothing stands in the way of the suns, as for models that know of no shadows.
         """
         light_to_world = self.light_to_world
         seen = mask(seen, len(gaussians.means))
         radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
         if self.suns and len(radiance):
             directions = np.array([sun.direction for sun in self.suns]) @ light_to_world.T
-            visibility = directional_visibility(
-                gaussians.means,
-                gaussians.normals,
-                directions,
-                radii=shadow_radii(gaussians),
-                resolution=SHADOW_RESOLUTION,
-                receivers=seen,
-            )
+            visibility = np.ones((len(radiance), len(directions)), np.float32)
+            if sun_shadows:
+                visibility = directional_visibility(
+                    gaussians.means,
+                    gaussians.normals,
+                    directions,
+                    radii=shadow_radii(gaussians),
+                    resolution=SHADOW_RESOLUTION,
+                    receivers=seen,
+                )
             _add_suns(
                 floats(gaussians.means),
                 floats(gaussians.normals),
