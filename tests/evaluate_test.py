@@ -102,6 +102,23 @@ def test_an_outline_is_off_by_as_much_as_a_disc_is_too_wide(tiny_capture) -> Non
     assert "outline_px" not in frame_scores(Rendered(black, black, black, disc(100)), everywhere)
 
 
+@pytest.mark.parametrize(("wrong", "degrees"), [("hole", 0.0), ("beside", math.degrees(math.acos(1 / 3)))])
+def test_normals_without_data_are_not_scored(tiny_capture, wrong, degrees) -> None:
+    """Where the truth has no normal ours may be anything: it counts neither as wrong nor as right."""
+    truth = _truth(tiny_capture)
+    tilted = np.full_like(truth.image_srgb, [-(3**-0.5)] * 3)
+    turned = tilted * [1, 1, -1]
+    normal, half = tilted.copy(), len(tilted) // 2
+    normal[:half] = 0
+    ours = tilted.copy()
+    rows = slice(half) if wrong == "hole" else slice(half, None)
+    ours[rows] = turned[rows]
+    rendered = dataclasses.replace(_perfect(truth), normals=torch.from_numpy(ours))
+    scores = frame_scores(rendered, dataclasses.replace(truth, normal=normal, normal_gt=None))
+    assert scores["normal_deg"] == pytest.approx(degrees, abs=0.1)
+    assert (scores["psnr_n"] > 120) is (scores["ssim_n"] > 0.9999) is (wrong == "hole")
+
+
 def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
     first, second = (
         torch.from_numpy(tiny_capture.load_frame(f).image_srgb) for f in tiny_capture.split("train")[:2]

@@ -41,12 +41,35 @@ def test_targets_composite_light_not_bytes(tiny_capture) -> None:
 
 def test_normals_are_unit_inside_and_zero_outside(tiny_capture) -> None:
     view = load_views(tiny_capture, "train")[0][0]
-    normals = view.normals()
-    assert normals is not None
+    estimate = view.normals()
+    assert estimate is not None
+    normals, known = estimate
+    assert known.all()
     solid = torch.from_numpy(view.mask) == 255
     assert (normals[solid].norm(dim=-1).median() - 1).abs() < 0.05
     assert (normals[torch.from_numpy(view.mask) == 0] == 0).all()
     assert normals[solid][:, 2].mean() < -0.5  # towards the camera
+
+
+def test_normals_without_data_are_asked_of_nobody(tiny_capture, monkeypatch) -> None:
+    original = type(tiny_capture).load_frame
+
+    def holed(capture, frame):
+        images = original(capture, frame)
+        normal = images.normal.copy()
+        normal[: len(normal) // 2] = 0
+        return dataclasses.replace(images, normal=normal)
+
+    whole = load_views(tiny_capture, "train")[0][0]
+    monkeypatch.setattr(type(tiny_capture), "load_frame", holed)
+    view = load_views(tiny_capture, "train")[0][0]
+    (all_normals, _), (normals, known) = whole.normals(), view.normals()
+    middle = tiny_capture.cameras["front"].height // 2
+    top = int(whole.camera.K[1, 2] - tiny_capture.cameras["front"].K[1, 2]) + middle  # where the hole ends
+    person = torch.from_numpy(view.mask > 127)
+    rows = (torch.arange(len(person)) < top)[:, None].expand_as(person)
+    assert torch.equal(~known[..., 0], person & rows) and 0 < (~known).sum() < person.sum()
+    assert torch.equal(normals[known[..., 0]], all_normals[known[..., 0]])
 
 
 def test_shrinking_keeps_light_and_view(tiny_capture) -> None:

@@ -38,7 +38,8 @@ _TO_LINEAR = torch.as_tensor(srgb_to_linear(np.arange(256) / 255), dtype=torch.f
 class View:
     """One training picture: a crop, kept in 8 bits until it is used.
 
-    image [h, w, 3] sRGB premultiplied on black, mask [h, w], normal [h, w, 3] as (n + 1)/2 or None.
+    image [h, w, 3] sRGB premultiplied on black, mask [h, w], normal [h, w, 3] as (n + 1)/2, or black where the
+    estimate has no data inside the mask, or None.
     """
 
     frame: Frame
@@ -52,12 +53,16 @@ class View:
         mask = torch.from_numpy(self.mask).float() / 255
         return _TO_LINEAR[torch.from_numpy(self.image).int()] + (1 - mask[..., None]) * background, mask
 
-    def normals(self) -> Tensor | None:
-        """Estimated normals [h, w, 3], camera axes, zero outside the mask; None where there are none."""
+    def normals(self) -> tuple[Tensor, Tensor] | None:
+        """Estimated normals [h, w, 3], camera axes, zero outside the mask, and where they are known [h, w, 1].
+
+        Outside the mask they are, by being none. None where the view has no estimate at all.
+        """
         if self.normal is None:
             return None
-        covered = torch.from_numpy(self.mask > 127)[..., None]
-        return (torch.from_numpy(self.normal).float() / 127.5 - 1) * covered
+        covered = torch.from_numpy(_covered(self.mask))[..., None]
+        coded = torch.from_numpy(self.normal)
+        return (coded.float() / 127.5 - 1) * covered, (coded > 0).any(-1, keepdim=True) | ~covered
 
 
 def load_views(
@@ -132,13 +137,16 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
     crop = replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
-    return View(
-        frame,
-        crop,
-        np.round(image[rows, columns] * 255).astype(np.uint8),
-        np.round(mask[rows, columns] * 255).astype(np.uint8),
-        None if normal is None else np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8),
-    )
+    coverage = np.round(mask[rows, columns] * 255).astype(np.uint8)
+    if normal is not None:
+        unknown = _covered(coverage) & ~normal[rows, columns].any(-1)
+        normal = np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8)
+        normal[unknown] = 0  # which is nobody's normal
+    return View(frame, crop, np.round(image[rows, columns] * 255).astype(np.uint8), coverage, normal)
+
+
+def _covered(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    return mask > 127
 
 
 def _shrink(image, mask, normal, camera: Camera, scale: float):

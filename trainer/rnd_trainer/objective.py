@@ -90,9 +90,10 @@ class Objective:
         image_srgb, target_srgb = _over(picture, background), linear_to_srgb(target)
         terms |= self._image_terms(image_srgb, target_srgb, step)
         terms["mask"] = config.weight_mask * (picture.alpha - mask).abs().mean()
-        normals = view.normals()
-        if normals is not None:
-            terms["normal"] = config.weight_normal * (picture.normals - normals.to(device)).abs().mean()
+        estimate = view.normals()
+        if estimate is not None:
+            normals, known = (x.to(device) for x in estimate)
+            terms["normal"] = config.weight_normal * ((picture.normals - normals).abs() * known).mean()
         due = _due(step, config.weight_consistency, config.consistency_every)
         if due and texels is not None and self._network_for(target) is not None:
             agreement = self._consistency(model, posed, pose, texels, view.camera, image_srgb, background)

@@ -28,7 +28,7 @@ def frame_scores(
 
     ``psnr, ssim, lpips`` of the sRGB picture on black, in the full frame and (``*_box``) in the mask's bounding
     box: the full frame is nine tenths background, so its figures flatter everybody. ``psnr_n, ssim_n`` of normal
-    pictures (n + 1)/2, ``normal_deg`` the mean angle; ``psnr_albedo`` in the mask, sRGB, after ``scale`` [3].
+    pictures (n + 1)/2, ``normal_deg`` the mean angle, both where the truth has normals; ``psnr_albedo`` in the mask, sRGB, after ``scale`` [3].
     ``lpips_inner`` has the outline from the truth; ``outline_px`` is the area that coverage is wrong by, per length
     of outline.
     """
@@ -54,10 +54,12 @@ def frame_scores(
     normal = truth.normal_gt if truth.normal_gt is not None else truth.normal
     if normal is not None:
         expected = torch.from_numpy(normal).float()
-        if inside.any():
-            scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside)
-        ours = normal_picture(rendered.normals, rendered.alpha)
-        theirs = normal_picture(expected, mask)
+        known = expected.any(-1)
+        if (inside & known).any():
+            scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside & known)
+        hole = ((mask > COVERED) & ~known)[..., None]
+        ours = normal_picture(rendered.normals, rendered.alpha).masked_fill(hole, 0)
+        theirs = normal_picture(expected, mask).masked_fill(hole, 0)
         scores |= {
             "psnr_n": psnr(ours, theirs),
             "ssim_n": ssim(ours, theirs),
