@@ -230,6 +230,23 @@ def test_an_arah_camera_without_jpegs_is_named(tmp_path) -> None:
     assert refusal() == f"{source / '2'}: pictures: expected .jpg or .jpeg files, got none"
 
 
+@pytest.mark.parametrize("name", ["ARAH", "RANA"])
+def test_what_a_source_lacks_is_named(tmp_path, name) -> None:
+    write = LAYOUTS[name][1]
+    source = tmp_path / "source"
+    source.mkdir()
+    write(source)
+    if name == "ARAH":
+        record, lacking = json.loads((source / "cam_params.json").read_text()), "D"
+        del record["1"]["D"]
+        (source / "cam_params.json").write_text(json.dumps(record))
+    else:
+        file, lacking = sorted(source.glob("frame_*.json"))[1], "skeleton_0"
+        file.write_text(json.dumps({"frame": 1}))
+    with pytest.raises(InputError, match=f"'{lacking}'"):
+        import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
+
+
 @pytest.mark.parametrize("inner", ["models/shape.npz", "1/cover.jpg"])
 def test_an_arah_file_without_a_number_is_named(tmp_path, inner) -> None:
     source, refusal = _arah(tmp_path)

@@ -23,7 +23,7 @@ class Film:
     Attributes:
         width, height: pixels, after the file's rotation.
         fps: frames per second, on average.
-        count: frames, counted by decoding where the container does not say.
+        count: frames, as its packets say without being decoded.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -60,6 +60,10 @@ class Film:
                 self._kept = {k: v for k, v in self._kept.items() if place - _KEPT < k <= place}
                 return pixels
         raise InputError("video ends", expected=f"frame {number}", got=f"{self._next} frames", file=self.path)
+
+    def name(self, number: int) -> str:
+        """Of the file of frame ``number``: it has none of its own."""
+        return ""
 
     def _open(self) -> Any:
         import av

@@ -49,7 +49,7 @@ def read(source: Path) -> Recording:
             lenses[names[key]] = lens
         mask = beside(picture, source / "masks")
         read_it = None if mask is None else partial(read_mask, mask)
-        shots.append(Shot(names[key], frame, partial(read_rgb, picture), read_it))
+        shots.append(Shot(names[key], frame, partial(read_rgb, picture), read_it, name=picture.stem))
         kept.append(
             (frame, _numbers(meshes[picture.stem], ("poses", "Rh", "Th"), source / "mesh_infos.pkl", frame))
         )

@@ -45,6 +45,8 @@ LAYOUTS: dict[str, Any] = {
 }
 """modules with ``detect`` and ``read``, the particular before the general: a folder of pictures may be anything"""
 _CONVENTIONS: dict[str, RootConvention] = {"smpl": "smpl", "easymocap": "easymocap"}
+_COEFFICIENTS = (0, 4, 5, 8, 12, 14)
+"""numbers that OpenCV takes as a lens's distortion"""
 _POSES_FROM_ELSEWHERE = ("video", "nerfstudio", "easymocap")
 
 
@@ -114,7 +116,11 @@ def import_source(
         )
     _refuse_unused(layout, options)
     model = load_body_model(options.body)
-    recording = _read(layout, source, model, options)
+    try:
+        recording = _read(layout, source, model, options)
+    except (LookupError, TypeError, ValueError) as error:
+        got = f"{type(error).__name__}: {error}"
+        raise InputError(f"{layout} cannot be read", expected=_needs(layout), got=got, file=source) from error
     convention = _CONVENTIONS.get(options.layout or "")
     if convention is not None:
         recording = replace(recording, poses=read_as(recording.poses, convention))
@@ -137,6 +143,10 @@ def _check_numbers(options: ImportOptions) -> None:
     choice = options.choice
     check_option(choice.every >= 1, "--every", "at least 1", choice.every)
     check_option(choice.held_out_every >= 1, "--held-out-every", "at least 1", choice.held_out_every)
+    check_option(
+        len(options.distortion) in _COEFFICIENTS and all(map(math.isfinite, options.distortion)),
+        "--distortion", "k1 k2 p1 p2 [k3 …], as OpenCV has them", " ".join(map(str, options.distortion)),
+    )  # fmt: skip
     if options.fps is not None:
         check_option(0 < options.fps < math.inf, "--fps", "more than 0", options.fps)
 
@@ -187,7 +197,7 @@ def _read(layout: str, source: Path, model: BodyModel, options: ImportOptions) -
         poses = read_poses(options.poses, person=options.person)
         return video.read(
             source, model, poses, intrinsics=options.intrinsics, distortion=options.distortion,
-            count=options.count, fps=options.fps,
+            count=options.count, fps=options.fps, choice=options.choice,
         )  # fmt: skip
     if layout == "nerfstudio":
         return nerfstudio.read(source, poses=options.poses, person=options.person)

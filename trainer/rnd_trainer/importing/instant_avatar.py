@@ -68,7 +68,8 @@ def read(source: Path) -> Recording:
             continue
         mask = _mask_of(source, picture)
         read_it = None if mask is None else partial(read_mask, mask)
-        shots.append(Shot("0", frame, partial(read_rgb, picture), read_it, split=split_of.get(frame)))
+        image, split = partial(read_rgb, picture), split_of.get(frame)
+        shots.append(Shot("0", frame, image, read_it, split=split, name=picture.stem))
     return Recording("PeopleSnapshot as InstantAvatar ships it", {"0": lens}, shots, poses, FPS, notes)
 
 

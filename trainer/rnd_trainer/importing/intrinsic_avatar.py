@@ -86,7 +86,7 @@ def _shot(source: Path, camera: str, folder: str, frame: int, picture: Path) -> 
     return Shot(
         camera, frame, partial(read_rgb, picture),
         None if mask is None else partial(read_mask, mask),
-        None if normal is None else partial(opengl_normals, normal),
+        None if normal is None else partial(opengl_normals, normal), name=picture.stem,
     )  # fmt: skip
 
 

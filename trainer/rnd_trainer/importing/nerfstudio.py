@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,13 +59,15 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
         lens, key = _lens({**record, **entry}, picture, file)
         name = names.setdefault(key, f"{len(names):04d}")
         lenses.setdefault(name, lens)
-        number = next((int(entry[k]) for k in ("time_index", "frame") if k in entry), seen.get(name, 0))
+        number = next(
+            (int(entry[k]) for k in ("time_index", "frame") if entry.get(k) is not None), seen.get(name, 0)
+        )
         seen[name] = number + 1
         mask = entry.get("mask_path")
         read_it = partial(read_mask, file.parent / mask) if mask else _alpha(picture)
-        shots.append(Shot(name, number, partial(read_rgb, picture), read_it))
+        shots.append(Shot(name, number, partial(read_rgb, picture), read_it, name=picture.stem))
     if len(names) == len(shots) > 1 and not any("time_index" in e or "frame" in e for e in entries):
-        shots = [Shot(s.camera, k, s.image, s.mask) for k, s in enumerate(shots)]  # one camera that moves
+        shots = [replace(shot, frame=k) for k, shot in enumerate(shots)]  # one camera that moves
     pose_file = poses or next((file.parent / name for name in _POSES if (file.parent / name).is_file()), None)
     if pose_file is None:
         raise InputError(

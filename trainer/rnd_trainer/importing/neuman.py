@@ -53,7 +53,8 @@ def read(source: Path) -> Recording:
         lenses[name] = Lens(camera, entry.distortion)
         picture = source / "images" / entry.name
         mask = _mask(source, picture, sam[k] if len(sam) == len(posed) else None)
-        shots.append(Shot(name, int(frame), partial(read_rgb, picture), mask, split=splits[k]))
+        image = partial(read_rgb, picture)
+        shots.append(Shot(name, int(frame), image, mask, split=splits[k], name=picture.stem))
     rotations = axis_angle_to_matrix(angles)
     rotations[:, 0] = turns @ rotations[:, 0]
 

@@ -26,6 +26,16 @@ class Choice:
     stop: int | None = None
     """frame number to stop before"""
 
+    def keeps(self, frame: int) -> bool:
+        """Whether the frame of this number may be taken."""
+        return (
+            self.start <= frame < (frame + 1 if self.stop is None else self.stop) and frame % self.every == 0
+        )
+
+
+ALL = Choice()
+"""every frame that there is"""
+
 
 @dataclass(frozen=True)
 class ImportOptions:
@@ -40,12 +50,13 @@ class ImportOptions:
     person: int | None = None
     """track number in --poses"""
     masks: Path | None = None
-    """folder of masks (.png, .npy), numbered like the frames, in a folder a camera where there are several; without
-    one, rough masks are made"""
+    """folder of masks (.png, .npy), called or numbered like the frames (a video's first is 0), in a folder a
+    camera where there are several; without one, rough masks are made"""
     mask_net: Path | None = None
     """segmentation network (.onnx) to make masks with, instead of the source's"""
     normals: Path | None = None
-    """folder of normal maps (.npy, .png), numbered like the frames, in a folder a camera where there are several"""
+    """folder of normal maps (.npy, .png), called or numbered like the frames, in a folder a camera where there are
+    several"""
     normal_net: Path | None = None
     """normal network (.onnx) to make normals with, instead of the source's"""
     normal_axes: str | None = None

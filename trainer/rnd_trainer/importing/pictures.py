@@ -123,6 +123,15 @@ def nearest_rotation(matrix: Floats) -> Floats:
     return rotation if np.abs(rotation - matrix).max() < 1e-2 else matrix
 
 
+def fitting(pixels: NDArray[Any], camera: Camera, what: str) -> NDArray[Any]:
+    """``pixels`` if they are of the camera's size."""
+    height, width = pixels.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        expected = f"{camera.width} x {camera.height} as the camera"
+        raise InputError(f"size of {what}", expected=expected, got=f"{width} x {height}")
+    return pixels
+
+
 def undistorted(
     pixels: NDArray[Any], camera: Camera, distortion: tuple[float, ...], interpolation: int = cv2.INTER_LINEAR
 ) -> NDArray[Any]:

@@ -38,8 +38,8 @@ def read(source: Path) -> Recording:
         picture = file.with_suffix(".png")
         frame = int(file.stem.split("_")[1])
         record = read_json(file)
-        data = record["skeleton_0"]["smpl_data"]
         try:
+            data = record["skeleton_0"]["smpl_data"]
             body = np.asarray(data["pose"], np.float64).reshape(-1).copy()
             body[_HANDS_FROM:] = 0
             angles.append(np.concatenate([np.asarray(data["global_orient"], np.float64).reshape(3), body]))

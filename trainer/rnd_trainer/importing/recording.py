@@ -16,7 +16,7 @@ from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import SMPL_NAMES
 
-from .pictures import undistorted
+from .pictures import fitting, undistorted
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -51,6 +51,7 @@ class Shot:
         mask: gives [H, W] uint8 coverage; None where there is none.
         normals: gives [H, W, 3] in OpenCV's camera axes, zero where unknown; None where there are none.
         split: None to have it chosen.
+        name: of the picture's file, without its suffix: what masks may be called by. Empty for a video's frame.
     """
 
     camera: str
@@ -59,6 +60,7 @@ class Shot:
     mask: Callable[[], Bytes] | None = None
     normals: Callable[[], NDArray[np.float32]] | None = None
     split: Split | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,17 +128,22 @@ class Recording:
 def straightened(recording: Recording) -> Recording:
     """``recording`` with every lens's distortion undone, once, in pictures, masks and normals as they are read."""
 
-    def straight(read: Callable[[], NDArray] | None, lens: Lens) -> Callable[[], NDArray] | None:
-        return None if read is None else lambda: undistorted(read(), lens.camera, lens.distortion)
+    def straight(read: Callable[[], NDArray] | None, lens: Lens, what: str) -> Callable[[], NDArray] | None:
+        if read is None:
+            return None
+        return lambda: undistorted(fitting(read(), lens.camera, what), lens.camera, lens.distortion)
 
     shots = []
     for shot in recording.shots:
         lens = recording.lenses[shot.camera]
         if any(lens.distortion):
-            image = straight(shot.image, lens)
+            image = straight(shot.image, lens, "image")
             assert image is not None
             shot = replace(
-                shot, image=image, mask=straight(shot.mask, lens), normals=straight(shot.normals, lens)
+                shot,
+                image=image,
+                mask=straight(shot.mask, lens, "mask"),
+                normals=straight(shot.normals, lens, "normals"),
             )
         shots.append(shot)
     lenses = {name: Lens(lens.camera, (), lens.distortion) for name, lens in recording.lenses.items()}

@@ -28,7 +28,7 @@ Turn = Callable[[Normals], Normals]
 
 
 def attached(recording: Recording, masks: Path | None, normals: Path | None) -> Recording:
-    """``recording`` with masks and normals from the folders that the user names, by frame number."""
+    """``recording`` with masks and normals from the folders that the user names, by the picture's name or number."""
 
     def replaced(shot: Shot) -> Shot:
         if masks is not None:
@@ -42,21 +42,29 @@ def attached(recording: Recording, masks: Path | None, normals: Path | None) -> 
 
 
 def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...]) -> Path:
-    """The file of ``shot``: by its number at the end of the name, in the camera's folder where there is one."""
+    """The file of ``shot`` in the camera's folder, where there is one.
+
+    It is called like the picture, or has the number at its end that the picture has there; of a picture without
+    either, such as a video's, the number of its frame.
+    """
     inner = folder / shot.camera if (folder / shot.camera).is_dir() else folder
     files = listed(inner, suffixes)
-    numbered = {}
-    for k, file in enumerate(files):
-        digits = file.stem[len(file.stem.rstrip("0123456789")) :]
-        numbered[int(digits) if digits else k] = file
-    if shot.frame not in numbered:
+    named = {file.stem: file for file in files}
+    if shot.name in named:
+        return named[shot.name]
+    numbered = {k if (n := _last_number(file.stem)) is None else n: file for k, file in enumerate(files)}
+    number = _last_number(shot.name)
+    number = shot.frame if number is None else number
+    if number not in numbered:
         raise InputError(
-            "file",
-            expected=f"one numbered {shot.frame}",
-            got=f"{files[0].name} … {files[-1].name}",
-            file=inner,
+            "file", expected=f"one numbered {number}", got=f"{files[0].name} … {files[-1].name}", file=inner
         )
-    return numbered[shot.frame]
+    return numbered[number]
+
+
+def _last_number(name: str) -> int | None:
+    digits = name[len(name.rstrip("0123456789")) :]
+    return int(digits) if digits else None
 
 
 class _Lazy(Sequence[Any]):

@@ -16,6 +16,7 @@ from rnd_trainer.silhouette import posed_vertices, silhouette
 
 from .body_models import BodyModel
 from .frames import Film
+from .options import ALL, Choice
 from .pictures import PICTURES, Bytes, camera_of, listed, read_rgb, sized
 from .pose_files import FoundPoses
 from .recording import Floats, Lens, Recording, Shot
@@ -47,8 +48,18 @@ class _Folder:
         self.path, self.fps, self.count = path, fps, len(self.pictures)
         self.width, self.height = sized(self.pictures[0])
 
+    def name(self, number: int) -> str:
+        return self.pictures[number].stem
+
     def frame(self, number: int) -> Bytes:
-        return read_rgb(self.pictures[number])
+        pixels, path = read_rgb(self.pictures[number]), self.pictures[number]
+        if pixels.shape[:2] != (self.height, self.width):
+            expected, got = (
+                f"{self.width} x {self.height} as the first",
+                f"{pixels.shape[1]} x {pixels.shape[0]}",
+            )
+            raise InputError("size of image", expected=expected, got=got, file=path, frame=number)
+        return pixels
 
 
 def read(
@@ -60,11 +71,12 @@ def read(
     distortion: Sequence[float] = (),
     count: int = 100,
     fps: float | None = None,
+    choice: Choice = ALL,
 ) -> Recording:
-    """Read a video; of its frames, keep the sharpest of each pose.
+    """Read a video; of the frames that ``choice`` may take, keep the sharpest of each pose.
 
     The lens is ``intrinsics`` (fx, fy, cx, cy in pixels), else the pose file's, else what its program assumed. Poses
-    fit the pictures through the lens they were estimated with; another one is noted. The first 4/5 of the frames give
+    fit the pictures through the lens they were estimated with; another one is noted. The first 4/5 of those frames give
     ``count`` training pictures, the last 1/5 a quarter of that as novel poses.
     """
     film = Film(source) if source.is_file() else _Folder(source, FPS)
@@ -79,10 +91,10 @@ def read(
     recording = Recording(
         f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes)
     )
-    chosen = _choose(film, placed(recording, model), recording, count)
+    chosen = _choose(film, placed(recording, model), recording, count, choice)
     stills = _stills(film, [frame for frame, _ in chosen])
     shots = [
-        Shot(CAMERA, frame, partial(stills.__getitem__, k), split=split)
+        Shot(CAMERA, frame, partial(stills.__getitem__, k), split=split, name=film.name(frame))
         for k, (frame, split) in enumerate(chosen)
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
@@ -112,16 +124,20 @@ def _lens(
     return own, (f"focal length {own[0, 0]:.0f} pixels, as {found.kind} has it",)
 
 
-def _choose(film: Film | _Folder, scene: Scene, recording: Recording, count: int) -> list[tuple[int, Split]]:
+def _choose(
+    film: Film | _Folder, scene: Scene, recording: Recording, count: int, choice: Choice
+) -> list[tuple[int, Split]]:
     """(frame, split) of the frames to keep, ascending."""
     first = int(recording.poses.frames[0])
     frames = min(scene.motion.frame_count, film.count - first)
-    given = {int(frame) - first for frame in recording.poses.frames}
+    given = {int(frame) - first for frame in recording.poses.frames if choice.keeps(int(frame))}
+    start = max(0, choice.start - first)
+    stop = frames if choice.stop is None else min(frames, choice.stop - first)
     camera = scene.cameras[CAMERA]
     factor = min(1.0, _SMALL / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
     sharp = np.full(scene.motion.frame_count, -np.inf)
-    for k in range(frames):
+    for k in range(start, stop):
         if k not in given:
             continue
         picture = cv2.resize(film.frame(first + k), (small.width, small.height), interpolation=cv2.INTER_AREA)
@@ -129,7 +145,7 @@ def _choose(film: Film | _Folder, scene: Scene, recording: Recording, count: int
         covered = silhouette(vertices, scene.body.faces, small)
         if covered.any():
             sharp[k] = sharpness(picture, np.where(covered, 255, 0).astype(np.uint8))
-    border = max(1, round(TRAIN_SHARE * frames))
+    border = start + max(1, round(TRAIN_SHARE * (stop - start)))
     early, late = sharp.copy(), sharp.copy()
     early[border:], late[:border] = -np.inf, -np.inf
     if not np.isfinite(early).any():

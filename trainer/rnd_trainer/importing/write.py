@@ -21,6 +21,7 @@ from rnd_runtime.rotations import slerp_matrices
 
 from .body_models import BodyModel
 from .options import Choice
+from .pictures import fitting
 from .recording import Poses, Recording, Shot
 
 Floats = NDArray[np.float64]
@@ -93,14 +94,7 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
             cameras where there is no choice between them.
     """
     first, last = int(recording.poses.frames[0]), int(recording.poses.frames[-1])
-    stop = last + 1 if choice.stop is None else choice.stop
-    kept = [
-        shot
-        for shot in recording.shots
-        if first <= shot.frame <= last
-        and choice.start <= shot.frame < stop
-        and shot.frame % choice.every == 0
-    ]
+    kept = [shot for shot in recording.shots if first <= shot.frame <= last and choice.keeps(shot.frame)]
     if not kept:
         raise InputError(
             "pictures", expected=f"some in the {last - first + 1} frames that have poses", got="none"
@@ -180,8 +174,8 @@ def _write_shot(folder: Path, shot: Shot, camera: Camera, frame: int) -> Frame:
     try:
         if shot.mask is None:
             raise InputError("mask", expected="one for every picture", got="none")
-        image, mask = _fitting(shot.image(), camera, "image"), _fitting(shot.mask(), camera, "mask")
-        normals = None if shot.normals is None else _fitting(shot.normals(), camera, "normals")
+        image, mask = fitting(shot.image(), camera, "image"), fitting(shot.mask(), camera, "mask")
+        normals = None if shot.normals is None else fitting(shot.normals(), camera, "normals")
     except InputError as error:
         raise error.at(frame=shot.frame) from error
     light = _TO_LINEAR[image] * (mask[..., None] / 255.0)  # half a pixel on black is half its light
@@ -197,15 +191,6 @@ def _write_shot(folder: Path, shot: Shot, camera: Camera, frame: int) -> Frame:
         f"images/{name}", f"masks/{name}", shot.camera, frame, shot.split,
         normal=None if normals is None else f"normals/{name}",
     )  # fmt: skip
-
-
-def _fitting(pixels: NDArray, camera: Camera, what: str) -> NDArray:
-    """``pixels`` if they are of the camera's size."""
-    height, width = pixels.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        expected = f"{camera.width} x {camera.height} as the camera"
-        raise InputError(f"size of {what}", expected=expected, got=f"{width} x {height}")
-    return pixels
 
 
 def _by_name(poses: Poses, body: Body) -> Floats:
