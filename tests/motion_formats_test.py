@@ -739,3 +739,14 @@ def test_real_recordings_stand_bend_and_face_forward(name):
         forward = posed[:, SMPL_NAMES.index(f"{side}_hip"), :3, 2]
         bend = ((shin - thigh) * forward).sum(-1)
         assert bend.max() < 0.15
+
+
+@pytest.mark.parametrize("protocol", [2, 5])
+def test_a_pickle_that_is_cut_short_is_refused_wherever_it_is_cut(tmp_path, protocol) -> None:
+    content = {"smpl_poses": _flat(POSES)[:2], "smpl_trans": PELVIS[:2], "smpl_scaling": np.ones(1)}
+    whole = _pickle(tmp_path / "whole.pkl", content, protocol).read_bytes()
+    cut = tmp_path / "cut.pkl"
+    for length in range(len(whole) - 1):
+        cut.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            load_motion(cut, SKELETON)

@@ -21,6 +21,7 @@ from rnd_viewer.background import Background
 from rnd_viewer.cameras import View, frame_motion, front_path
 from rnd_viewer.options import parse_frames, parse_size
 from rnd_viewer.player import Frame, Player
+from rnd_viewer.run_folder import claim
 from rnd_viewer.timing import StageTimes
 
 MOTION = fake_motion()
@@ -208,3 +209,15 @@ def test_stage_times_summary():
     for seconds in (0.001, 0.002, 0.009):
         times.add("a", seconds)
     assert times.summary() == {"a": {"runs": 3, "median_ms": 2.0, "p95_ms": 8.3, "total_s": 0.012}}
+
+
+def test_pictures_that_no_run_left_stay(tmp_path) -> None:
+    """Names such as 000001.png are ffmpeg's, too; those of another run are taken away."""
+    own, inner = tmp_path / "frames" / "000001.png", tmp_path / "frames" / "cam01" / "000001.png"
+    inner.parent.mkdir(parents=True)
+    for file in (own, inner, tmp_path / "play.mp4"):
+        file.write_bytes(b"mine")
+    claim(tmp_path, {"size": 1}, [])
+    assert own.exists() and inner.exists() and (tmp_path / "play.mp4").exists()
+    claim(tmp_path, {"size": 2}, [])
+    assert not own.exists() and len(list(tmp_path.glob(".run-*"))) == 1

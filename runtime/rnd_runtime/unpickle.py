@@ -13,6 +13,8 @@ import gzip
 import io
 import lzma
 import pickle  # noqa: TID251  # only its stack machine, with every call taken out
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -29,6 +31,7 @@ _READ_ERRORS = (
     *(ValueError, OSError, EOFError, KeyError, IndexError, TypeError, AttributeError, AssertionError),
     *(OverflowError, MemoryError, RecursionError, NotImplementedError, UnicodeError, ImportError),
     *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, pickle.UnpicklingError, RuntimeError),
+    *(struct.error, tokenize.TokenError, SyntaxError, LookupError),
 )
 _TORCH_DTYPES = {
     **{"Double": "f8", "Float": "f4", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1"},

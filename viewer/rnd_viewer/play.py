@@ -105,7 +105,8 @@ def play(options: PlayOptions) -> int:
         now = perf_counter()
         times.add(LATENCY, now - asked)
         if governor:
-            governor.observe(encoding + now - started)
+            drawing = now - started
+            governor.observe(max(encoding, drawing) if options.pipeline else encoding + drawing)
         return frame, camera
 
     name = part_name("play", frames, count)

@@ -2,7 +2,7 @@
 
 A run is known by its settings and inputs. The process that finds no mark of its run in the folder leaves one and takes
 away what other runs left, but nothing that is younger than the mark: that is of processes that render other parts of
-the same run.
+the same run. Where no other run left a mark, pictures are the user's own.
 """
 
 from __future__ import annotations
@@ -28,15 +28,20 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) 
         mark.touch(exist_ok=False)
     except FileExistsError:
         return
-    for other in folder.glob(f"{_MARK}*"):
-        if other != mark:
-            other.unlink(missing_ok=True)
-    oldest = mark.stat().st_mtime_ns
+    others = [other for other in folder.glob(f"{_MARK}*") if other != mark]
+    if not others:
+        return
+    try:
+        oldest = mark.stat().st_mtime_ns
+    except FileNotFoundError:  # another run has claimed the folder since
+        return
     frames = (file for kind in _FOLDERS for file in (folder / kind).rglob("*") if _FRAME.fullmatch(file.name))
     whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
     for file in [*frames, *whole]:
         if file.is_file() and file.stat().st_mtime_ns < oldest:
             file.unlink(missing_ok=True)
+    for other in others:
+        other.unlink(missing_ok=True)
 
 
 def part_name(stem: str, frames: range, count: int) -> str:
