@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.avatar_file import METADATA_KEY
+from rnd_runtime.avatar_file import METADATA_KEY, encode_light
 from rnd_runtime.brdf import LARGEST_ALBEDO
 from rnd_runtime.errors import InputError
 from tiny import body, motion
@@ -55,6 +55,11 @@ def test_threads_do_not_change_a_frame(tiny_avatar) -> None:
         ({"window_poses": 6}, "graph inputs: expected"),
         ({"trained_light": "AAAA"}, "trained_light: expected float32 of shape"),
         ({"trained_light": "?"}, "trained_light: expected float32 of shape"),
+        ({"trained_light": encode_light(np.full((32, 64, 3), np.nan))}, "trained_light: expected finite"),
+        ({"trained_light": encode_light(np.full((32, 64, 3), -1.0))}, "trained_light: expected finite"),
+        ({"window_seconds": 0.0}, "Expected `float` > 0.0"),
+        ({"spacing_m": -0.01}, "Expected `float` > 0.0"),
+        ({"window_poses": 0}, "Expected `int` >= 1"),
     ],
 )
 def test_metadata_we_do_not_know_is_refused(tiny_avatar, tmp_path, changes, line) -> None:

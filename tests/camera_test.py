@@ -74,10 +74,16 @@ def _with(matrix: np.ndarray, row: int, column: int, value: float) -> np.ndarray
         ((640, 480, K[:2], np.eye(4)), "camera K"),
         ((640, 480, _with(K, 0, 0, -500), np.eye(4)), "positive focal"),
         ((640, 480, _with(K, 1, 2, np.nan), np.eye(4)), "camera K"),
+        ((640, 480, _with(K, 0, 1, 2.0), np.eye(4)), "fx 0 cx, 0 fy cy, 0 0 1"),
+        ((640, 480, _with(K, 1, 0, 2.0), np.eye(4)), "fx 0 cx, 0 fy cy, 0 0 1"),
+        ((640, 480, K.T, np.eye(4)), "fx 0 cx, 0 fy cy, 0 0 1"),
+        ((640, 480, 2 * K, np.eye(4)), "fx 0 cx, 0 fy cy, 0 0 1"),
         ((640, 480, K, np.eye(4)[:3]), "4 x 4 rigid"),
         ((640, 480, K, np.diag([2.0, 2, 2, 1])), "4 x 4 rigid"),
         ((640, 480, K, np.diag([1.0, 1, -1, 1])), "4 x 4 rigid"),
         ((640, 480, K, _with(np.eye(4), 0, 3, np.inf)), "4 x 4 rigid"),
+        ((640, 480, K, _with(np.eye(4), 3, 2, 1.5)), "4 x 4 rigid"),
+        ((640, 480, K, _with(np.eye(4), 3, 3, 2.0)), "4 x 4 rigid"),
     ],
 )
 def test_what_is_no_camera_is_refused(arguments, words):

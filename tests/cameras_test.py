@@ -14,6 +14,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_viewer.cameras import View, file_path, frame_motion, front_path, orbit_path
 
+ONE = range(1)
 VIEW = View(width=320, height=200, fov_y=0.6, elevation=0.1)
 
 
@@ -94,34 +95,33 @@ def _write(tmp_path, document) -> str:
 
 
 def test_camera_file_with_one_camera_serves_every_frame(tmp_path):
-    camera_at = file_path(_write(tmp_path, _record()), None)
+    camera_at = file_path(_write(tmp_path, _record()), None, range(100))
     assert camera_at(0, 0.0) is camera_at(99, 3.3)
     np.testing.assert_array_equal(camera_at(0, 0.0).K, _record()["K"])
 
 
 @pytest.mark.parametrize(("size", "expected"), [((80, None), (80, 40)), ((20, 10), (20, 10))])
 def test_size_resamples_a_camera_file(tmp_path, size, expected):
-    camera = file_path(_write(tmp_path, _record()), size)(0, 0.0)
+    camera = file_path(_write(tmp_path, _record()), size, ONE)(0, 0.0)
     assert (camera.width, camera.height) == expected
     np.testing.assert_allclose(camera.K[:2], np.array(_record()["K"])[:2] * expected[0] / 40)
 
 
 def test_camera_file_with_a_list_has_one_for_each_frame(tmp_path):
     file = _write(tmp_path, {"cameras": [_record(shift=0), _record(shift=1)]})
-    camera_at = file_path(file, None)
+    camera_at = file_path(file, None, range(2))
     assert camera_at(1, 0.0).world_to_camera[0, 3] == 1
-    with pytest.raises(
-        InputError, match=r"cameras\.json: frame 2: cameras: expected one for each frame, got 2"
-    ):
-        camera_at(2, 0.0)
+    message = r"cameras\.json: cameras: expected one, or one for each of 3 frames, got 2"
+    with pytest.raises(InputError, match=message):
+        file_path(file, None, range(2, 3))
 
 
 def test_cameras_of_a_capture_are_chosen_by_name(tmp_path):
     file = _write(tmp_path, {"schema": "x", "cameras": {"a": _record(shift=1), "b": _record(shift=2)}})
-    assert file_path(f"{file}:b", None)(0, 0.0).world_to_camera[0, 3] == 2
+    assert file_path(f"{file}:b", None, ONE)(0, 0.0).world_to_camera[0, 3] == 2
     for name in ("", ":c"):
         with pytest.raises(InputError, match="one of a, b"):
-            file_path(file + name, None)
+            file_path(file + name, None, ONE)
 
 
 @pytest.mark.parametrize(
@@ -133,29 +133,32 @@ def test_cameras_of_a_capture_are_chosen_by_name(tmp_path):
         (_record() | {"fov": 3}, "fov"),
         (_record() | {"K": [[1, 0], [0, 1, 0], [0, 0, 1]]}, "rows of one length"),
         (_record() | {"world_to_camera": (2 * np.eye(4)).tolist()}, "rigid"),
+        (_record() | {"K": [[50, 3, 21], [0, 50, 9], [0, 0, 1]]}, "fx 0 cx, 0 fy cy, 0 0 1"),
+        (_record(16385, 4), "at most 16384 a side, got 16385 x 4"),
         ({"cameras": []}, "no camera"),
+        ('{"cameras":' + "[" * 100_000, "cannot be read"),
     ],
 )
 def test_broken_camera_file_is_refused_in_one_line(tmp_path, document, message):
     with pytest.raises(InputError, match=message) as caught:
-        file_path(_write(tmp_path, document), None)
+        file_path(_write(tmp_path, document), None, ONE)
     assert "cameras.json" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_name_is_refused_where_cameras_have_none(tmp_path):
     for document in (_record(), {"cameras": [_record()]}):
         with pytest.raises(InputError, match="its cameras have no names, got left"):
-            file_path(_write(tmp_path, document) + ":left", None)
+            file_path(_write(tmp_path, document) + ":left", None, ONE)
 
 
 def test_a_folder_may_be_called_json(tmp_path):
     (tmp_path / "shots.json.d").mkdir()
     text = _write(tmp_path / "shots.json.d", _record(40, 20))
-    assert file_path(text, None)(3, 0.1).width == 40
+    assert file_path(text, None, range(4))(3, 0.1).width == 40
 
 
 def test_missing_camera_file_and_other_aspect_are_refused(tmp_path):
     with pytest.raises(InputError, match="camera file not found"):
-        file_path(str(tmp_path / "none.json"), None)
+        file_path(str(tmp_path / "none.json"), None, ONE)
     with pytest.raises(InputError, match="aspect, 40x20, got 30x30"):
-        file_path(_write(tmp_path, _record()), (30, 30))
+        file_path(_write(tmp_path, _record()), (30, 30), ONE)

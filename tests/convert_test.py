@@ -120,8 +120,8 @@ def played():
     return player.render(walk, FRAME / walk.fps, _camera())
 
 
-def _splats(folder: Path, *words: str) -> Path:
-    line = ["splats", str(AVATAR), "--motion", str(WALK), "--hdr", str(SKY), "--out", str(folder)]
+def _splats(folder: Path, *words: str, light: tuple[str, ...] = ("--hdr", str(SKY))) -> Path:
+    line = ["splats", str(AVATAR), "--motion", str(WALK), "--out", str(folder), *light]
     assert main([*line, "--frames", f"{FRAME}:{FRAME + 1}", *words]) == 0
     return folder / f"{FRAME:06d}.ply"
 
@@ -220,7 +220,7 @@ def test_gltf_splats_show_the_players_picture(played, tmp_path):
 
 
 def test_albedo_is_the_materials(tmp_path):
-    ply = _ply(_splats(tmp_path, "--colour", "albedo", "--coding", "linear"))
+    ply = _ply(_splats(tmp_path, "--colour", "albedo", "--coding", "linear", light=()))
     albedo = Avatar.load(AVATAR, threads=1).pose(load_motion(WALK, body().skeleton), 0.0).albedo
     for k in range(3):
         np.testing.assert_allclose(0.5 + 0.28209479177387814 * ply[f"f_dc_{k}"], albedo[:, k], atol=1e-6)
@@ -453,6 +453,37 @@ def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):
             "--sh-degree: expected 0 for visionary, got 1",
         ),
         (["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--camera", "above"], "--camera"),
+        (
+            [
+                "splats",
+                AVATAR,
+                "--motion",
+                WALK,
+                "--out",
+                "OUT",
+                "--format",
+                "visionary",
+                "--coding",
+                "linear",
+            ],
+            "--coding: expected srgb for visionary",
+        ),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--colour", "albedo", "--exposure", "1"],
+            "--exposure: expected the default, got 1.0",
+        ),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--sh-degree", "1", "--camera", "a.json"],
+            "--camera: expected the default, got a.json",
+        ),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--format", "glb", "--ply-axes", "y-up"],
+            "--ply-axes: expected the default, got y-up",
+        ),
+        (
+            ["mesh", ASSETS / "body.npz", "--motion", WALK, "--out", "OUT", "--frames", "0:2"],
+            "--frames: expected the default, got 0:2 (a .glb has the whole motion)",
+        ),
         (
             ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--exposure", "2000"],
             "--exposure: expected -30 to 30, got 2000",

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import pytest
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
+from rnd_runtime.files import write_json
 
 
 @pytest.mark.parametrize(
@@ -126,3 +128,51 @@ def test_a_reader_who_has_gone_ends_the_command_in_silence(lines, ending):
     )
     os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+_COMMAND = """
+import os, signal, sys, time
+from rnd_runtime.errors import run_command
+from rnd_runtime.files import atomic_path
+
+def main():
+    with atomic_path(sys.argv[1]) as file:
+        file.write_text("half")
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(30)
+
+sys.exit(run_command("rnd-x", main))
+"""
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_program_that_is_ended_takes_its_half_files_away(tmp_path, ignored):
+    """SIGTERM, also where a shell that put the command into the background has switched Ctrl-C off."""
+    ignore = (lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None
+    command = [sys.executable, "-c", _COMMAND, str(tmp_path / "a.txt")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=25, preexec_fn=ignore)
+    assert (done.returncode, done.stderr) == (130, "rnd-x: interrupted\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminal_without_our_letters_still_shows_the_rest():
+    words = (
+        "from rnd_runtime.errors import run_command; run_command('rnd-x', lambda: print('\u03b1 \u2264 1'))"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, env=environment)
+    assert (done.stdout, done.stderr) == ("? ? 1\n", "")
+
+
+def test_a_name_that_the_file_system_takes_is_written_and_a_longer_one_is_one_line(tmp_path, capsys):
+    longest = os.pathconf(tmp_path, "PC_NAME_MAX")
+
+    def write(letters: int) -> int:
+        name = "a" * (letters - 4) + ".txt"
+        return run_command("rnd-x", lambda: write_json(tmp_path / name, []))
+
+    assert write(longest) == 0 and len(list(tmp_path.iterdir())) == 1
+    assert write(longest + 1) == 2
+    error = capsys.readouterr().err
+    assert error.endswith("File name too long\n") and error.count("\n") == 1
+    assert len(list(tmp_path.iterdir())) == 1

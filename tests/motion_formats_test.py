@@ -283,6 +283,12 @@ def test_gaps_are_filled_and_others_named(tmp_path, write):
     assert "2 frames without the person" in notes and "left out: " in notes and "frame rate" in notes
 
 
+@pytest.mark.parametrize("write", [_phalp, _easymocap_json])
+def test_numbers_that_leave_out_hours_are_refused(tmp_path, write):
+    with pytest.raises(InputError, match="frame numbers: expected at most 18000 left out, got 9999"):
+        load_motion(write(tmp_path, [*range(FRAMES - 1), 99_999_999]), SKELETON)
+
+
 def test_a_folder_that_is_no_motion_is_refused_in_one_line(tmp_path):
     def refusal(text=None) -> str:
         if text is not None:
@@ -690,6 +696,11 @@ def test_acclaim_bones_keep_their_lengths(tmp_path):
     skeleton.write_text(before[:at] + before[at:].replace("dof rx ry rz", "dof rx ry rq", 1))
     with pytest.raises(InputError, match=r"02\.asf: skeleton: .* freedom rq of lfemur"):
         load_motion(file, SKELETON)
+    for number in ("nan", "inf"):
+        words = before[:at] + before[at:].replace("length 0", f"length {number}", 1)
+        skeleton.write_text(words)
+        with pytest.raises(InputError, match=r"02\.asf: skeleton: .* not finite: " + number):
+            load_motion(file, SKELETON)
 
 
 def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -225,6 +226,22 @@ def test_light_options_reach_the_light(files, tmp_path):
     assert (pictures["hdr_upz"] != pictures["exposure0"]).any()
 
 
+@pytest.mark.parametrize(("flag", "seconds"), [("--pipeline", 1), ("--no-pipeline", 2)])
+def test_a_floor_goes_by_what_a_frame_takes(files, tmp_path, monkeypatch, flag, seconds):
+    """By a clock that ticks when it is read, both take a second; where they overlap, a frame takes one."""
+    ticks = threading.local()
+
+    def clock() -> float:
+        ticks.now = getattr(ticks, "now", 0) + 1
+        return ticks.now
+
+    observed = []
+    monkeypatch.setattr(rnd_viewer.play, "perf_counter", clock)
+    monkeypatch.setattr(rnd_viewer.play.Governor, "observe", lambda self, took: observed.append(took))
+    assert main([*_arguments(files, tmp_path / "out", fps_floor=30), flag]) == 0
+    assert observed == [seconds] * FRAMES
+
+
 def test_background_colour_fills_the_corner(files, tmp_path):
     assert main(_arguments(files, tmp_path / "out", background="#204060", frames=":1")) == 0
     picture = read_image(tmp_path / "out/frames/000000.png")
@@ -252,6 +269,10 @@ def test_warnings_name_what_was_found(files, tmp_path, capsys):
         ({"fov": "180"}, "--fov"),
         ({"fps": "nan"}, "--fps"),
         ({"orbit_seconds": "0"}, "--orbit-seconds"),
+        ({"orbit_seconds": "4"}, "--orbit-seconds: expected the default, got 4.0 (needs --camera orbit)"),
+        ({"camera": "a.json", "fov": "40"}, "--fov: expected the default, got 40.0 (the camera's file"),
+        ({"hdr": None, "hdr_up": "z"}, "--hdr-up: expected the default, got z (needs --hdr)"),
+        ({"motion_fps": "inf"}, "--motion-fps: expected 0.001 to 10000, got inf"),
         ({"background": "blue"}, "--background"),
         ({"aov": "albedo,beauty"}, "--aov"),
         ({"format": "gif"}, "--format"),

@@ -221,3 +221,4 @@ def test_pictures_that_no_run_left_stay(tmp_path) -> None:
     assert own.exists() and inner.exists() and (tmp_path / "play.mp4").exists()
     claim(tmp_path, {"size": 2}, [])
     assert not own.exists() and len(list(tmp_path.glob(".run-*"))) == 1
+    assert inner.exists()  # no run writes there

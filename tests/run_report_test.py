@@ -151,6 +151,17 @@ def test_pictures_are_shown_once(run, tmp_path):
         assert sum(tag == "img" for tag, _ in page.tags) == 5 * len(expected)
 
 
+def test_pictures_that_nobody_asked_for_are_not_missed(run):
+    assert "--pictures" not in _write(run, "--pictures", "0")[1].text
+
+
+def test_a_loss_that_was_no_number_is_left_out_of_its_curve(run):
+    rows = [{"step": k, "image": None if k == 1 else 0.5, "normal": None} for k in range(3)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    _, page = _write(run)
+    assert "image, last 0.5" in page.text and "normal, last" not in page.text
+
+
 def test_a_curve_goes_through_the_points():
     figure = curve(range(100), [10.0 ** (-k / 99) for k in range(100)], "image", 25)
     (path,) = re.findall(r'<path d="([^"]+)"', figure)
@@ -170,7 +181,18 @@ def test_a_curve_goes_through_the_points():
         ("eval.json", "{", "eval.json: not JSON"),
         ("metrics.jsonl", '{"step": 0', "metrics.jsonl: not JSON lines"),
         ("metrics.jsonl", "3", "metrics.jsonl: expected a step in every line"),
+        ("metrics.jsonl", '{"step": "1"}', 'metrics.jsonl: step: expected a number, got "1"'),
+        ("metrics.jsonl", '{"step": null}', "metrics.jsonl: step: expected a number, got null"),
+        (
+            "metrics.jsonl",
+            '{"step": 0, "image": [1]}',
+            "metrics.jsonl: image: expected a number, got [1]",
+        ),
         ("config.json", "[]", "config.json of rnd-train: expected an object"),
+        ("config.json", '{"steps": "all"}', 'config.json: steps: expected a number, got "all"'),
+        ("config.json", "[" * 100_000, "config.json: not JSON"),
+        ("eval.json", '[{"split": 3}]', "eval.json: split: expected a text, got 3"),
+        ("eval.json", '[{"split": "a", "psnr": "?"}]', 'eval.json: psnr: expected a number, got "?"'),
         (
             "eval.json",
             '{"summary": [], "rows": []}',
@@ -199,6 +221,14 @@ def test_options_of_a_motion_that_is_not_there_are_refused(run, words, message, 
     assert main([str(run), *words]) == 2
     error = capsys.readouterr().err
     assert f"{message} (needs --motion" in error and error.count("\n") == 1
+    assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize("option", ["--hdr", "--motion"])
+def test_what_only_an_avatar_can_show_needs_one(run, option, capsys):
+    (run / "avatar.onnx").unlink()
+    assert main([str(run), option, str(ASSETS / "sky.exr")]) == 2
+    assert f"{option}: expected an avatar.onnx in RUN, got none" in capsys.readouterr().err
     assert not (run / "report.html").exists()
 
 

@@ -28,7 +28,7 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Mapping
-from typing import Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -53,6 +53,10 @@ REST_OUTPUTS = (
 
 _SIZES: dict[int | str, range] = {"M": range(1, 2**31), "K": range(1, 2**31), "1 to 16": range(1, 17)}
 """what a size may be that no other one tells"""
+
+
+_Count = Annotated[int, msgspec.Meta(ge=1)]
+_Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class SkeletonMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,10 +89,10 @@ class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """
 
     schema: str
-    gaussians: int
-    spacing_m: float
-    window_poses: int
-    window_seconds: float
+    gaussians: _Count
+    spacing_m: _Positive
+    window_poses: _Count
+    window_seconds: _Positive
     skeleton: SkeletonMetadata
     trained_light: str
     body_license: str
@@ -159,9 +163,12 @@ def _check_posing_shapes(outputs: Mapping[str, list[int]], n: int, joints: int) 
 def decode_light(metadata: AvatarMetadata) -> NDArray[np.float32]:
     try:
         values = np.frombuffer(base64.b64decode(metadata.trained_light, validate=True), "<f4")
-        return values.reshape(PROBE_SHAPE)
+        light = values.reshape(PROBE_SHAPE)
     except (binascii.Error, ValueError) as error:
         raise InputError("trained_light", expected=f"float32 of shape {PROBE_SHAPE}", got=error) from error
+    if not (np.isfinite(light) & (light >= 0)).all():
+        raise InputError("trained_light", expected="finite radiance, not negative")
+    return light
 
 
 def encode_light(radiance: NDArray[np.float32]) -> str:

@@ -12,6 +12,8 @@ from .errors import InputError
 
 Floats = NDArray[np.float64]
 
+_NO_SKEW = 1e-6  # of the focal length: what rounding leaves, not a thousandth of a pixel across a picture
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -19,8 +21,11 @@ class Camera:
 
     Attributes:
         width, height: image size in pixels.
-        K: intrinsics [3, 3] in pixels; the principal point may be off-centre.
+        K: intrinsics [3, 3] in pixels, (fx 0 cx; 0 fy cy; 0 0 1); the principal point may be off-centre.
         world_to_camera: [4, 4] rigid transform, metres.
+
+    Raises:
+        InputError: for any other matrix, such as one with skew or one that is transposed.
     """
 
     width: int
@@ -37,11 +42,15 @@ class Camera:
             raise InputError(
                 "camera K", expected="finite 3 x 3 with positive focal lengths", got=self.K.tolist()
             )
+        focal = max(self.K[0, 0], self.K[1, 1])
+        if max(abs(self.K[0, 1]), abs(self.K[1, 0])) > _NO_SKEW * focal or not _ends(self.K, [0, 0, 1]):
+            raise InputError("camera K", expected="fx 0 cx, 0 fy cy, 0 0 1", got=self.K.tolist())
         rotation = self.world_to_camera[:3, :3] if self.world_to_camera.shape == (4, 4) else np.zeros((3, 3))
         if (
             not np.isfinite(self.world_to_camera).all()
             or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
             or np.linalg.det(rotation) < 0
+            or not _ends(self.world_to_camera, [0, 0, 0, 1])
         ):
             raise InputError(
                 "camera world_to_camera",
@@ -92,3 +101,8 @@ class Camera:
         focal = 0.5 * height / np.tan(0.5 * fov_y)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return cls(width, height, K, world_to_camera)
+
+
+def _ends(matrix: Floats, row: list[int]) -> bool:
+    """Whether the last row of ``matrix`` is ``row``, but for rounding."""
+    return np.allclose(matrix[-1], row, rtol=0, atol=1e-6)

@@ -7,14 +7,18 @@ import errno
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Callable, Iterable
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TypeVar
 
 Parsed = TypeVar("Parsed")
-# No permission, a file system that is read-only, full, or full for this user: nobody's mistake in the program.
-_OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT}
+# No permission, a file system that is read-only, full, full for this user, or that takes no such name: nobody's
+# mistake in the program.
+_OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
 
 
 class InputError(Exception):
@@ -86,12 +90,16 @@ def check_option(good: bool, name: str, expected: str, got: object) -> None:
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 
-    2 for an :class:`InputError` and for a file that the machine withholds (one line on stderr), 130 for Ctrl-C, 141 in
-    silence where nobody reads the output to its end (``rnd-play --help | head``), otherwise what ``main`` returns.
+    2 for an :class:`InputError` and for a file that the machine withholds (one line on stderr), 130 for Ctrl-C and for
+    SIGTERM, which is the same to us, 141 in silence where nobody reads the output to its end
+    (``rnd-play --help | head``), otherwise what ``main`` returns. A terminal that cannot show a letter shows a ?.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
     try:
         try:
-            return main() or 0
+            with _ended_as_interrupted():
+                return main() or 0
         finally:
             sys.stdout.flush()  # not only when Python ends, who would complain of a closed pipe
     except InputError as error:
@@ -110,6 +118,26 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
         place = "" if error.filename is None else f"{error.filename}: "
         print(f"{name}: {place}{error.strerror}", file=sys.stderr)  # noqa: T201
         return 2
+
+
+@contextlib.contextmanager
+def _ended_as_interrupted() -> Iterator[None]:
+    """Take SIGTERM, by which queues and systems end a program, for Ctrl-C: what is begun is saved or taken away."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        on_interrupt = signal.getsignal(signal.SIGINT)
+        if not callable(on_interrupt):  # Ctrl-C is ignored, as in the background of a shell
+            raise KeyboardInterrupt
+        on_interrupt(signal.SIGINT, frame)
+
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def parse_options(parse: Callable[[], Parsed]) -> Parsed:

@@ -13,6 +13,10 @@ from typing import Any, TypeGuard
 
 from .errors import InputError
 
+_NAMED = (
+    40  # letters of a temporary's name that tell whose it is; with all of them it might be too long a name
+)
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
@@ -25,7 +29,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     output_folder(path.parent)
     if path.is_dir():
         raise InputError("cannot be written: it is a folder", file=path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+    begin = path.stem[:_NAMED]
+    handle, name = tempfile.mkstemp(prefix=f".{begin}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:

@@ -277,7 +277,7 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
     degrees = units.get("angle", "deg").lower().startswith("deg")
     root_lines = {words[0].lower(): words[1:] for words in sections["root"] if words}
     root = _Bone("root", freedoms=tuple(word.lower() for word in root_lines["order"]))
-    orientation = [float(word) for word in root_lines.get("orientation", ["0", "0", "0"])]
+    orientation = _finite(root_lines.get("orientation", ["0", "0", "0"]))
     root.axes = _axes(orientation, root_lines.get("axis", ["XYZ"])[0], degrees)
     bones = {"root": root}
     bone = root
@@ -286,11 +286,11 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
         if key == "name":
             bone = bones[rest[0]] = _Bone(rest[0])
         elif key == "direction":
-            bone.reach = np.array([float(word) for word in rest[:3]])
+            bone.reach = np.array(_finite(rest[:3]))
         elif key == "length":
-            bone.reach = bone.reach / max(float(np.linalg.norm(bone.reach)), 1e-12) * float(rest[0])
+            bone.reach = bone.reach / max(float(np.linalg.norm(bone.reach)), 1e-12) * _finite(rest[:1])[0]
         elif key == "axis":
-            bone.axes = _axes([float(word) for word in rest[:3]], rest[3], degrees)
+            bone.axes = _axes(_finite(rest[:3]), rest[3], degrees)
         elif key == "dof":
             bone.freedoms = tuple(word.lower() for word in rest)
     for bone in bones.values():
@@ -303,6 +303,13 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
                 bones[child].parent = words[0]
                 ordered.append(bones[child])
     return ordered, degrees
+
+
+def _finite(words: Sequence[str]) -> list[float]:
+    numbers = [float(word) for word in words]
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"not finite: {' '.join(words)}")
+    return numbers
 
 
 def _axes(angles: Sequence[float], order: str, degrees: bool) -> Floats:

@@ -24,6 +24,7 @@ PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
 _PHONE_FOCAL = 1.2  # of the picture's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
+_MOST_FILLED = 18_000  # frames, ten minutes: more of a person who is away are a mistake in the numbers
 _LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
@@ -126,7 +127,7 @@ def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
     frames = np.asarray(person.get("frame_ids", np.arange(len(poses)))).reshape(-1)
     if len(frames) != len(poses) or (np.diff(frames) <= 0).any():
         raise InputError("frame_ids", expected=f"{len(poses)} that ascend", got=f"{len(frames)}", file=path)
-    poses, trans, filled = _without_gaps(frames, poses.reshape(len(poses), -1), trans)
+    poses, trans, filled = _without_gaps(frames, poses.reshape(len(poses), -1), trans, path)
     if not world:
         poses, trans, turned = _before_the_camera(poses, trans)
         filled += turned
@@ -136,7 +137,7 @@ def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
 
 
 def _phalp(fits: VideoFits, path: str | Path) -> Track:
-    poses, trans, filled = _without_gaps(fits.frames, fits.axis_angles, fits.translations)
+    poses, trans, filled = _without_gaps(fits.frames, fits.axis_angles, fits.translations, path)
     trans = (SMPL_REST_ROOT + trans) * [1, 1, _PHONE_FOCAL / PHALP_FOCAL] - SMPL_REST_ROOT
     poses, trans, turned = _before_the_camera(poses, trans)
     notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled, *turned)
@@ -149,7 +150,7 @@ def _easymocap(fits: VideoFits, path: str | Path) -> Track:
     rest_root = SMPLX_REST_ROOT if fits.family == "SMPL-X" else SMPL_REST_ROOT
     turns, poses = axis_angle_to_matrix(fits.turns), fits.axis_angles.copy()
     poses[:, :3] = matrix_to_axis_angle(turns @ axis_angle_to_matrix(poses[:, :3]))
-    poses, places, filled = _without_gaps(fits.frames, poses, turns @ rest_root + fits.translations)
+    poses, places, filled = _without_gaps(fits.frames, poses, turns @ rest_root + fits.translations, path)
     arrays = _with_fps({"poses": poses, "trans": places - rest_root, "up_axis": "z"})
     notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled)
     return Track(Members(arrays, path), rest_root, notes)
@@ -162,13 +163,16 @@ def _left_out(person: Any, others: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 def _without_gaps(
-    frames: NDArray[np.int64], turns: Floats, places: Floats
+    frames: NDArray[np.int64], turns: Floats, places: Floats, path: str | Path
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
     """Axis-angles ``turns`` [F, 3J] and ``places`` [F, 3] of ascending ``frames`` at every frame between the ends."""
-    wanted = np.arange(frames[0], frames[-1] + 1)
-    missing = len(wanted) - len(frames)
+    missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
     if missing == 0:
         return turns, places, ()
+    if missing > (most := max(len(frames), _MOST_FILLED)):
+        got = f"{missing} missing between {frames[0]} and {frames[-1]}"
+        raise InputError("frame numbers", expected=f"at most {most} left out", got=got, file=path)
+    wanted = np.arange(frames[0], frames[-1] + 1)
     after = np.clip(np.searchsorted(frames, wanted), 1, len(frames) - 1)
     t = (wanted - frames[after - 1]) / (frames[after] - frames[after - 1])
     matrices = axis_angle_to_matrix(turns.reshape(len(turns), -1, 3))

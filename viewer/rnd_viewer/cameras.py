@@ -22,6 +22,8 @@ from rnd_runtime.files import existing_file
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton
 
+from .options import LARGEST_SIDE
+
 Floats = NDArray[np.float64]
 CameraPath = Callable[[int, float], Camera]
 
@@ -136,6 +138,9 @@ class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
     world_to_camera: list[list[float]]
 
     def camera(self, file: Path) -> Camera:
+        if max(self.width, self.height) > LARGEST_SIDE:
+            got = f"{self.width} x {self.height}"
+            raise InputError("camera size", expected=f"at most {LARGEST_SIDE} a side", got=got, file=file)
         try:
             return Camera(self.width, self.height, np.array(self.K), np.array(self.world_to_camera))
         except InputError as error:
@@ -150,12 +155,15 @@ class _CameraFile(msgspec.Struct):
     cameras: list[_CameraRecord] | dict[str, _CameraRecord]
 
 
-def file_path(text: str, size: tuple[int, int | None] | None) -> CameraPath:
+def file_path(text: str, size: tuple[int, int | None] | None, frames: range) -> CameraPath:
     """A camera path read from ``FILE.json`` or, for a camera with a name, ``FILE.json:NAME``.
 
     The file holds one camera ``{"width", "height", "K", "world_to_camera"}``, or ``{"cameras": [...]}`` with
     one for each frame, or ``{"cameras": {name: ...}}`` as ``capture.json`` has. ``size`` (width, height) in
     pixels resamples the view; without a height, the width is that of the longer side.
+
+    Raises:
+        InputError: for a file that holds no such cameras, or fewer than the ``frames`` that are asked for.
     """
     path, camera_name = split_camera(text)
     file = existing_file(path, what="camera file")
@@ -163,16 +171,11 @@ def file_path(text: str, size: tuple[int, int | None] | None) -> CameraPath:
     if size is not None:
         cameras = [camera.resized(*_matching_size(camera, size)) for camera in cameras]
 
-    def at(frame: int, time_s: float) -> Camera:
-        if len(cameras) == 1:
-            return cameras[0]
-        if frame >= len(cameras):
-            raise InputError(
-                "cameras", expected="one for each frame", got=len(cameras), file=file, frame=frame
-            )
-        return cameras[frame]
-
-    return at
+    if 1 < len(cameras) < frames.stop:
+        raise InputError(
+            "cameras", expected=f"one, or one for each of {frames.stop} frames", got=len(cameras), file=file
+        )
+    return lambda frame, time_s: cameras[frame if len(cameras) > 1 else 0]
 
 
 def split_camera(text: str) -> tuple[Path, str]:
@@ -210,7 +213,7 @@ def _read_cameras(file: Path, name: str) -> list[Camera]:
         if not chosen:
             raise InputError("camera file holds no camera", file=file)
         return [record.camera(file) for record in chosen]
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError("camera file cannot be read", got=str(error), file=file) from error
 
 

@@ -51,8 +51,7 @@ def convert(options: Options) -> Iterator[str]:
 
 def _splats(options: SplatOptions) -> Iterator[str]:
     formats = _formats(options.format, SPLAT_FORMATS)
-    if "visionary" in formats and options.sh_degree > 0:
-        raise InputError("--sh-degree", expected="0 for visionary", got=options.sh_degree)
+    options.refuse_unfit(formats)
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
     motion = options.read_motion(options.motion, avatar.skeleton)
@@ -61,7 +60,7 @@ def _splats(options: SplatOptions) -> Iterator[str]:
     if "visionary" in formats:
         check_clip(len(frames), avatar.gaussians)
     shader = Shader(_light(options, avatar), mode=options.shade)
-    camera_at = _camera_path(options.camera, avatar.skeleton, motion)
+    camera_at = _camera_path(options.camera, avatar.skeleton, motion, frames)
     out = output_folder(options.out)
     clip: list[Splats] = []
     for number in frames:
@@ -120,6 +119,7 @@ def _transformed(program: str, stem: Path, splats: Splats, formats: tuple[str, .
 
 def _mesh(options: MeshOptions) -> Iterator[str]:
     formats = _formats(options.format, MESH_FORMATS)
+    options.refuse_unfit(formats)
     body = Body.load(options.body)
     motion = options.read_motion(options.motion, body.skeleton)
     yield from _noted(motion)
@@ -159,10 +159,10 @@ def _light(options: SplatOptions, avatar: Avatar) -> Light:
     return load_light(options.hdr, yaw=yaw, exposure=options.exposure)
 
 
-def _camera_path(text: str, skeleton: Skeleton, motion: Motion) -> CameraPath:
+def _camera_path(text: str, skeleton: Skeleton, motion: Motion, frames: range) -> CameraPath:
     if text == "front":
         return front_path(frame_motion(skeleton, motion), FRONT)
-    return file_path(text, None)
+    return file_path(text, None, frames)
 
 
 def _formats(text: str, known: tuple[str, ...]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.errors import check_option, parse_options, refuse_changed, run_command
 
 from .options import MotionOptions
 
@@ -49,6 +49,23 @@ class SplatOptions(MotionOptions):
     ply_axes: Literal["3dgs", "y-up"] = "3dgs"
     """3dgs: Y down, as viewers of .ply, .spz and .sog expect. The .glb is always Y up"""
 
+    def refuse_unfit(self, formats: Sequence[str]) -> None:
+        """Refuse options that files in ``formats`` cannot follow.
+
+        Raises:
+            InputError: naming the first.
+        """
+        if self.colour == "albedo":
+            lit = ("hdr", "hdr_yaw", "exposure", "shade", "camera", "sh_degree")
+            refuse_changed(self, lit, "--colour albedo is the same under every light and from everywhere")
+        if self.sh_degree > 0:
+            refuse_changed(self, ["camera"], "--sh-degree above 0 looks from all around")
+        if set(formats) == {"glb"}:
+            refuse_changed(self, ["ply_axes"], "a .glb is always Y up")
+        if "visionary" in formats:
+            check_option(self.sh_degree == 0, "--sh-degree", "0 for visionary", self.sh_degree)
+            check_option(self.coding == "srgb", "--coding", "srgb for visionary", self.coding)
+
 
 @dataclass(frozen=True)
 class MeshOptions(MotionOptions):
@@ -64,6 +81,15 @@ class MeshOptions(MotionOptions):
     """some of glb,obj"""
     frames: str = "0:1"
     """frames to write as .obj, START:END, END excluded, either may be missing"""
+
+    def refuse_unfit(self, formats: Sequence[str]) -> None:
+        """Refuse options that files in ``formats`` cannot follow.
+
+        Raises:
+            InputError: naming the first.
+        """
+        if "obj" not in formats:
+            refuse_changed(self, ["frames"], "a .glb has the whole motion")
 
 
 @dataclass(frozen=True)

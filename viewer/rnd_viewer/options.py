@@ -15,6 +15,7 @@ from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.skeleton import Skeleton
 
 _EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
+OWN_CAMERAS = ("front", "orbit")
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
 
@@ -30,7 +31,7 @@ class MotionOptions:
     motion_up: Literal["auto", "y", "z"] = "auto"
     """Which axis points up in the motion's file."""
     motion_fps: Annotated[float | None, option("FLOAT")] = None
-    """Frames per second of the motion's recording, where its file does not say. Default: the file's, else 60."""
+    """Frames per second of the motion's recording, whatever its file says. Default: the file's, else 60."""
     joint_map: Annotated[Path | None, option("FILE")] = None
     """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
     smooth: Annotated[float | None, option("HZ")] = None
@@ -66,7 +67,7 @@ class MotionOptions:
         refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 
     def __post_init__(self) -> None:
-        refuse_outside(self, {"smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
+        refuse_outside(self, {"motion_fps": (1e-3, 1e4), "smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
 
 
 def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:
@@ -157,6 +158,12 @@ class PlayOptions(MotionOptions):
         refuse_outside(self, limits)
         if self.orbit_seconds == 0:
             raise InputError("--orbit-seconds", expected="not 0", got=0)
+        if self.camera != "orbit":
+            refuse_changed(self, ["orbit_seconds"], "needs --camera orbit")
+        if self.camera not in OWN_CAMERAS:
+            refuse_changed(self, ["distance", "elevation", "fov"], "the camera's file says where it stands")
+        if self.hdr is None:
+            refuse_changed(self, ["hdr_up"], "needs --hdr")
         if self.fps_floor is not None and self.aov:
             hint = "AOVs are drawn at full quality"
             raise InputError("--fps-floor", expected="no --aov beside it", got=self.aov, hint=hint)

@@ -33,7 +33,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
-from .options import PlayOptions, parse_frames, parse_size
+from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
 from .report import FRAME, LATENCY, print_summary, warn, with_progress
@@ -48,7 +48,6 @@ OWN_TO_A_PROCESS = (
     "format",
     "pipeline",
 )  # options that do not tell one run from another
-OWN_CAMERAS = ("front", "orbit")
 DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 
@@ -76,7 +75,7 @@ def play(options: PlayOptions) -> int:
     count = motion.frames_at(fps)
     frames = parse_frames(options.frames, count)
     framing = frame_motion(avatar.skeleton, motion)
-    camera_at = _camera_path(options, size, framing)
+    camera_at = _camera_path(options, size, framing, frames)
     notes = [*motion.notes, *_light_notes(light)]
     for note in notes:
         warn(note)
@@ -204,9 +203,11 @@ def _light_notes(light: Light) -> list[str]:
     return notes
 
 
-def _camera_path(options: PlayOptions, size: tuple[int, int | None] | None, framing: Framing) -> CameraPath:
+def _camera_path(
+    options: PlayOptions, size: tuple[int, int | None] | None, framing: Framing, frames: range
+) -> CameraPath:
     if options.camera not in OWN_CAMERAS:
-        return file_path(options.camera, size)
+        return file_path(options.camera, size, frames)
     width, height = size or (DEFAULT_SIZE, None)
     view = View(
         width, height or width, math.radians(options.fov), math.radians(options.elevation), options.distance

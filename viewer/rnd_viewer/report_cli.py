@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, flag, parse_options, run_command
 
 from .options import MotionOptions
 
@@ -44,6 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError("--pictures", expected="0 or more", got=options.pictures)
         if options.motion is None:
             options.refuse_unread("needs --motion: the rest pose does not move")
+        if not (options.run / "avatar.onnx").is_file():
+            for name in ("motion", "hdr"):  # played and lit by the avatar alone
+                check_option(not getattr(options, name), flag(name), "an avatar.onnx in RUN", "none")
         from .report import say
         from .run_report import write_run_report
 

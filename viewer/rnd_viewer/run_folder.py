@@ -17,7 +17,7 @@ _MARK = ".run-"
 _FRAME = re.compile(
     r"\d{6,}\.(png|exr)"
 )  # a picture as writers.py names it, and nothing that a user put there
-_FOLDERS = ("frames", "frames_exr", "aov")
+_PICTURES = ("frames/*", "frames_exr/*", "aov/*/*")  # and nothing deeper, see writers.py
 _WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4)")  # beside them, see part_name
 
 
@@ -35,7 +35,7 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) 
         oldest = mark.stat().st_mtime_ns
     except FileNotFoundError:  # another run has claimed the folder since
         return
-    frames = (file for kind in _FOLDERS for file in (folder / kind).rglob("*") if _FRAME.fullmatch(file.name))
+    frames = (file for place in _PICTURES for file in folder.glob(place) if _FRAME.fullmatch(file.name))
     whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
     for file in [*frames, *whole]:
         if file.is_file() and file.stat().st_mtime_ns < oldest:

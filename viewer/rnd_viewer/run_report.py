@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 from collections.abc import Callable, Sequence
 from html import escape
 from importlib.resources import files
@@ -15,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import are_rows, atomic_path, existing_file
+from rnd_runtime.files import atomic_path
 from rnd_runtime.images import read_image
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton
 
 from .html_parts import compare, curve, data_uri, figure, png, rows_table, table
 from .report_shots import Shots
+from .run_files import read_config, read_losses, read_rows, read_scores
 from .video import INSTALL
 
 Bytes = NDArray[np.uint8]
@@ -42,6 +42,7 @@ FACTS = {
     "seed": "seed {}", "file_mb": "avatar.onnx {:.1f} MB", "fps": "plays at {:.0f} frames a second",
     "flicker": "flicker {:.2f} of 255", "machine": "{}",
 }  # fmt: skip
+WORDS = ("split", "capture", "machine")  # of these, those that are no numbers
 
 
 def write_run_report(
@@ -64,18 +65,12 @@ def write_run_report(
     Raises:
         InputError: ``run`` holds no training, or a file of it is damaged.
     """
-    config = _json(existing_file(run / "config.json", what="config.json of rnd-train"))
-    if not isinstance(config, dict):
-        raise InputError(
-            "config.json of rnd-train", expected="an object", got="another", file=run / "config.json"
-        )
-    rows = _rows(run / "eval.json", "rows of rnd-eval", "split") if (run / "eval.json").is_file() else []
+    config = read_config(run)
+    rows = read_scores(run, WORDS, (METRICS.keys() | FACTS.keys()) - {*WORDS})
     name = run.resolve().name
-    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(run / "metrics.jsonl", config)]
-    read += [
-        _bench(bench),
-        _configuration(config),
-    ]  # before the avatar is filmed: what is damaged is found at once
+    # before the avatar is filmed: what is damaged is found at once
+    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run), config)]
+    read += [_bench(bench), _configuration(config)]
     sections = [f"<h1>{escape(name)}</h1>", _facts(rows), _turntable_and_relights(run, motion, hdrs), *read]
     page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
@@ -124,8 +119,10 @@ def _metrics(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _comparisons(folder: Path, count: int) -> str:
+    if count == 0:
+        return ""
     splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
-    if not splits or count == 0:
+    if not splits:
         return _missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
     how = "Drag across a picture: truth to the left, render to the right; then normals, albedo, error × 4."
     parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
@@ -156,19 +153,17 @@ def _shot(strip: Path) -> str:
     return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
 
 
-def _curves(path: Path, config: dict[str, Any]) -> str:
-    rows = _json_lines(path) if path.is_file() else []
+def _curves(rows: Sequence[dict[str, Any]], config: dict[str, Any]) -> str:
     if not rows:
         return _missing("Losses", "no metrics.jsonl in the run")
     terms = dict.fromkeys(name for row in rows for name in row)
     terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
     for name in ("step", "stage", "seconds", "skipped"):
         terms.pop(name, None)
-    steps = config.get("steps", 0)
-    mark = round(config["stage1_fraction"] * steps) if "stage1_fraction" in config else None
+    mark = round((config.get("stage1_fraction") or 0) * (config.get("steps") or 0)) or None
     figures = []
     for term in terms:
-        having = [row for row in rows if term in row]
+        having = [row for row in rows if row.get(term) is not None]
         if having:
             figures.append(curve([row["step"] for row in having], [row[term] for row in having], term, mark))
     skipped = sum(bool(row.get("skipped")) for row in rows)
@@ -190,7 +185,7 @@ def _bench(folder: Path | None) -> str:
     parts = [f'<img class="chart" alt="{escape(name)}" src="{chart}">' for name, chart in charts]
     stability = folder / "stability.json"
     if stability.is_file():
-        rows = _rows(stability, "rows of rnd-bench --stability", "id", "what")
+        rows = read_rows(stability, "rows of rnd-bench --stability", "id", "what")
         parts.append("<h3>Stability</h3>" + rows_table(rows))
     if not parts:
         return _missing("Speed, accuracy, stability", f"neither *.svg nor stability.json in {folder}")
@@ -208,28 +203,3 @@ def _configuration(config: dict[str, Any]) -> str:
 
 def _missing(title: str, reason: str) -> str:
     return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError("not JSON", got=error, file=path) from error
-
-
-def _rows(path: Path, what: str, *names: str) -> list[dict[str, Any]]:
-    return _checked(_json(path), path, what, *names)
-
-
-def _json_lines(path: Path) -> list[dict[str, Any]]:
-    try:
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError("not JSON lines", got=error, file=path) from error
-    return _checked(rows, path, "a step in every line", "step")
-
-
-def _checked(rows: Any, path: Path, what: str, *names: str) -> list[dict[str, Any]]:
-    if not are_rows(rows, names):
-        raise InputError(path.name, expected=what, got="something else", file=path)
-    return rows

@@ -228,9 +228,11 @@ class Scene:
         background = Background.parse(state.background)
         if background.kind != "hdr":
             return np.array(background.colour, np.float32)
-        light = self._shader(self._light_name(state), state.shade).light
-        key = (id(light), state.yaw, camera.width, camera.K.tobytes(), camera.world_to_camera.tobytes())
+        name = self._light_name(state)
+        size = camera.width, camera.height
+        key = (name, state.yaw, size, camera.K.tobytes(), camera.world_to_camera.tobytes())
         if self._behind is None or self._behind[0] != key:
+            light = self._shader(name, state.shade).light
             turned = light.turned(light.yaw + state.yaw)
             self._behind = key, background.radiance(camera, turned)
         return self._behind[1] * np.float32(2.0**state.exposure)
@@ -267,7 +269,10 @@ def _probes(paths: tuple[Path, ...]) -> list[Path]:
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            files += sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
+            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
+            if not inside:
+                raise InputError("--hdr", expected="light probes, .exr or .hdr", got="none", file=path)
+            files += inside
         elif path.is_file():
             files.append(path)
         else:

@@ -1,0 +1,87 @@
+"""The files of a training's folder that are JSON, held against what a report makes of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.files import are_rows, existing_file
+
+Row = dict[str, Any]
+
+
+def read_config(run: Path) -> Row:
+    """``config.json``: the options of the training in ``run``.
+
+    Raises:
+        InputError: there is none, or it is not one; as all functions here, naming the file.
+    """
+    file = existing_file(run / "config.json", what="config.json of rnd-train")
+    config = _json(file)
+    if not isinstance(config, dict):
+        raise InputError("config.json of rnd-train", expected="an object", got="another", file=file)
+    _check_numbers([config], ("steps", "stage1_fraction"), file)
+    return config
+
+
+def read_scores(run: Path, words: Sequence[str], numbers: Iterable[str]) -> list[Row]:
+    """``eval.json``: rows of rnd-eval, none where there is no such file.
+
+    ``words`` and ``numbers`` are what a row may say; each may be missing or null.
+    """
+    file = run / "eval.json"
+    if not file.is_file():
+        return []
+    rows = read_rows(file, "rows of rnd-eval", "split")
+    _check_numbers(rows, numbers, file)
+    for row in rows:
+        for name in words:
+            if not isinstance(row.get(name), str | None):
+                raise InputError(name, expected="a text", got=json.dumps(row[name]), file=file)
+    return rows
+
+
+def read_losses(run: Path) -> list[Row]:
+    """``metrics.jsonl``: one row of numbers for each step, none where there is no such file."""
+    file = run / "metrics.jsonl"
+    if not file.is_file():
+        return []
+    try:
+        rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line]
+    except (ValueError, RecursionError) as error:
+        raise InputError("not JSON lines", got=error, file=file) from error
+    _check_rows(rows, file, "a step in every line", "step")
+    _check_numbers(rows, {name for row in rows for name in row}, file)
+    if any(row["step"] is None for row in rows):
+        raise InputError("step", expected="a number", got="null", file=file)
+    return rows
+
+
+def read_rows(file: Path, what: str, *names: str) -> list[Row]:
+    """A list of objects that have all of ``names``; ``what`` such a file is."""
+    rows = _json(file)
+    _check_rows(rows, file, what, *names)
+    return rows
+
+
+def _json(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # not UTF-8 is a ValueError too
+        raise InputError("not JSON", got=error, file=file) from error
+
+
+def _check_rows(rows: Any, file: Path, what: str, *names: str) -> None:
+    if not are_rows(rows, names):
+        raise InputError(file.name, expected=what, got="something else", file=file)
+
+
+def _check_numbers(rows: Iterable[Row], names: Iterable[str], file: Path) -> None:
+    wanted = set(names)
+    for row in rows:
+        for name in row.keys() & wanted:
+            if not isinstance(row[name], int | float | None):  # a bool is an int here: "skipped"
+                raise InputError(name, expected="a number", got=json.dumps(row[name])[:80], file=file)
