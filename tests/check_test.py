@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 
+import rnd_trainer.checking.report
 from known_scene import write_true_capture
 from rnd_runtime.capture import load_capture, save_capture
 from rnd_runtime.errors import InputError
@@ -18,6 +19,7 @@ from rnd_trainer.checking.check import check_capture
 from rnd_trainer.checking.normals import judge, parse_axes
 from rnd_trainer.checking.overlay import CAPTION, TILE
 from rnd_trainer.checking.report import check_and_report
+from rnd_trainer.data_cli import check
 
 SOUND = 0.97  # IoU of the silhouette with a mask that the same mesh made: pixels on the edge when scaled
 
@@ -48,6 +50,14 @@ def _move(folder, change) -> None:
 def _wrong(folder) -> dict[str, str]:
     """Subject and sentence of everything that is wrong."""
     return {f.subject: f.sentence for f in check_capture(folder).findings if f.level == "wrong"}
+
+
+def test_a_capture_may_be_named_by_its_file(folder, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(rnd_trainer.checking.report, "check_and_report", lambda *paths: asked.append(paths))
+    for place in (folder, folder / "capture.json"):
+        check(place)
+    assert asked == [(folder, folder / "check"), (folder / "capture.json", folder / "check")]
 
 
 def test_a_sound_capture_passes(folder) -> None:

@@ -13,6 +13,8 @@ import torch
 from msgspec import structs
 
 import rnd_trainer.ablate
+import rnd_trainer.held_out
+from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import write_json
 from rnd_runtime.images import srgb_to_linear
@@ -33,14 +35,15 @@ from rnd_trainer.charts import draw_lengths
 from rnd_trainer.checkpoint import load_checkpoint, write_tensors
 from rnd_trainer.config import ModelConfig, to_dict
 from rnd_trainer.data import pose_input
-from rnd_trainer.eval_cli import _is_of
+from rnd_trainer.eval_cli import EvalOptions, _is_of, evaluate_run
 from rnd_trainer.evaluate import Judge, evaluate, flicker
-from rnd_trainer.held_out import score
+from rnd_trainer.held_out import picture_names, score
 from rnd_trainer.judge import Rendered, render_runtime
 from rnd_trainer.metrics import psnr, ssim_map
 from rnd_trainer.model import AvatarModel
 from rnd_trainer.scores import EDGE, frame_scores, normal_picture, outline_length, silhouette, to_srgb8
 from rnd_trainer.template import sample_template
+from rnd_trainer.train import Training
 from rnd_trainer.training_state import STATE_FILE, STATE_SCHEMA
 
 OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
@@ -207,6 +210,42 @@ def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_pat
     assert (tmp_path / "novel_view.png").exists() and len(list((tmp_path / "novel_view").glob("*.png"))) == 2
 
 
+def test_strips_have_names_of_their_own_and_are_no_jpegs() -> None:
+    assert picture_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
+    cameras = ["cam0/000001.jpg", "cam1/000001.jpg", "cam1/000002.jpg"]
+    assert list(picture_names(cameras).values()) == ["cam0_000001", "cam1_000001", "000002"]
+
+
+def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, refine_poses=True, steps=2))
+    for _ in range(2):
+        training.step()
+    run = tmp_path / "run"
+    training.save(run)
+    scored: list[Capture] = []
+
+    def score(checkpoint, capture, **_):
+        scored.append(capture)
+        return [{"split": "novel_view", "frames": 1}]
+
+    monkeypatch.setattr(rnd_trainer.held_out, "score", score)
+    for place, motion in (
+        (tiny_capture.folder, None),
+        (tiny_capture.file, None),
+        (tiny_capture.folder, "motion.npz"),
+    ):
+        evaluate_run(EvalOptions(run, place, motion=motion))
+    refined = str((run / "refined_motion.npz").resolve())
+    assert [str(capture.motion.source) for capture in scored] == [
+        refined,
+        refined,
+        tiny_capture.motion.source,
+    ]
+    (run / "refined_motion.npz").unlink()
+    evaluate_run(EvalOptions(run, tiny_capture.folder))
+    assert str(scored[-1].motion.source) == str(tiny_capture.motion.source)
+
+
 def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:
     judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
     seen = []
@@ -303,6 +342,9 @@ def test_runs_done_before_are_looked_at_before_any_is_trained(
             InputError, match=r"rows\.json: a run done before: expected rows of a study, got an"
         ):
             go()
+    write_json(file, [row | {"capture_sha256": "of another capture.json"}])
+    with pytest.raises(InputError, match="capture_sha256 of a run done before"):
+        go()
     for usable in ([row], [row | {"motion": "motion.npz"}], []):  # older rows do not name their motion
         write_json(file, usable)
         with pytest.raises(AssertionError, match="trained"):

@@ -29,13 +29,23 @@ COMMANDS = {
     "rnd-data": rnd_trainer.data_cli.main,
     "rnd-stage": rnd_trainer.stage.cli.main,
 }
-IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
+BODY = ASSETS / "body.npz"
+IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         (f"rnd-train {CAPTURE} --out OUT --seed -1", "--seed: expected at least 0, got -1"),
+        (f"rnd-train {CAPTURE} --out OUT --seed {2**64}", "--seed: expected less than 2^63, got 184467"),
+        (
+            f"rnd-train {CAPTURE} --out OUT --light none --probe-channels 1",
+            "--probe-channels: expected the default, got 1 (--light none learns no light)",
+        ),
+        (
+            f"rnd-train {CAPTURE} --out OUT --light none --visibility paper",
+            "--visibility: expected the default, got paper",
+        ),
         (f"rnd-train {CAPTURE} --out OUT --steps 0", "--steps: expected at least 1, got 0"),
         (
             f"rnd-train {CAPTURE} --out OUT --image-scale 0",
@@ -53,6 +63,11 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
             "--chart: expected --study lengths beside it, got ablations",
         ),
         (f"rnd-eval OUT {CAPTURE} --ablate --method me", "--method: expected the default, got me"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 101", "--seeds: expected at most 100, got 101"),
+        (
+            f"rnd-eval OUT {CAPTURE} --ablate --shade lights:K",
+            "shading mode: expected one of ao, table, table+sun",
+        ),
         (f"rnd-eval OUT {CAPTURE} --seeds 2", "--seeds: expected the default, got 2"),
         (f"rnd-eval OUT {CAPTURE} --ablate --study causes", "variant 'true normals': expected normal_gt"),
         (
@@ -61,6 +76,8 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {ASSETS / 'body.npz'}"
         ),
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
+        (f"rnd-export {BODY} --out {BODY}", "--out: expected another file than the checkpoint, got"),
+        ("rnd-export .", ".: checkpoint not found: got a folder"),
         ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
         ("rnd-bench frame --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
         ("rnd-bench peers --threads 999", "--threads: expected 1 to "),

@@ -222,6 +222,12 @@ def test_a_track_is_chosen_by_number(tmp_path) -> None:
         read_poses(path, person=7)
 
 
+@pytest.mark.parametrize("write", [write_gvhmr, write_romp])
+def test_people_without_numbers_are_not_chosen_among(tmp_path, write) -> None:
+    with pytest.raises(InputError, match=r"--person: expected none, as .* has no numbers of people, got 3"):
+        read_poses(write(tmp_path), person=3)
+
+
 def test_an_npz_is_read_by_its_keys_or_as_told(tmp_path) -> None:
     world = layouts.World(layouts.Z_UP)
     rest = shaped_body().skeleton.rest_joints[0]
@@ -423,6 +429,12 @@ def test_what_a_video_needs_is_asked_for(tmp_path) -> None:
     world = layouts.camera_world()
     np.savez(tmp_path / "p.npz", thetas=world.thetas, transl=world.trans)
     assert "--intrinsics" in refusal(body=body, poses=tmp_path / "p.npz")
+    for name in ("motion.npz", "body.npz"):  # somebody's own, which a capture's would replace
+        (tmp_path / "out").mkdir(exist_ok=True)
+        (tmp_path / "out" / name).write_bytes(b"mine")
+        assert f"holds a {name}" in refusal(body=body, poses=tmp_path / "p.npz")
+        (tmp_path / "out" / name).unlink()
+    (tmp_path / "out").rmdir()
     assert "source not found" in refusal(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "known layout" in refusal(tmp_path / "empty")

@@ -74,14 +74,17 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
+    from rnd_runtime.files import existing_file
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
 
-    out = options.out or options.checkpoint.with_suffix(".onnx")
     check_option(options.frames >= 2, "--frames", "at least 2", options.frames)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     _refuse_idle(options, bounded=bool(given))
+    checkpoint = existing_file(options.checkpoint, what="checkpoint")
+    out = options.out or checkpoint.with_suffix(".onnx")
+    check_option(out.resolve() != checkpoint.resolve(), "--out", "another file than the checkpoint", out)
     skeleton = load_checkpoint(options.checkpoint).skeleton
     if options.motion is not None:
         motion = load_motion(options.motion, skeleton)

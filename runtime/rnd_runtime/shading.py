@@ -144,6 +144,12 @@ class Shader:
         return np.array([sun.irradiance for sun in self.suns]), np.array([sun.spread**2 for sun in self.suns])
 
 
+def check_mode(mode: str) -> None:
+    """Raise :class:`InputError` unless ``mode`` is one that a :class:`Shader` knows."""
+    if mode not in SHADE_MODES or mode == "lights:K":
+        _light_count(mode)
+
+
 def _light_count(mode: str) -> int:
     name, _, count = mode.partition(":")
     if name != "lights" or not count.isdecimal() or not 1 <= int(count) <= _MOST_LIGHTS:

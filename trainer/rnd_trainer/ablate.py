@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ from .training_state import STATE_FILE, read_state
 ROWS = "rows.json"
 """of one run, in its folder"""
 MOTION = "motion"
-"""of a row: the file of the poses that were learned from and scored in; older rows do not say"""
+"""of a row: the file of the poses that were learned from and scored in"""
+CAPTURE = "capture_sha256"
+"""of a row: the digest of capture.json, which has the pictures of every split"""
+OLDER_LACK = (MOTION, CAPTURE)
 ELSEWHERE = "another folder for RUN, or delete this one"
 POSE_SECONDS = 0.3 / 9
 """between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
@@ -144,15 +148,15 @@ def ablate(
 
     Raises :class:`InputError`, before anything is trained, where a run done or begun before is not of this study.
     """
-    motion = Path(capture.motion.source).name
+    told = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256(capture.file.read_bytes()).hexdigest()}
 
     def same(config: TrainConfig) -> dict[str, Any]:
         """What rows of a run with ``config`` say of themselves."""
         return {
-            "capture": capture.folder.name, "steps": config.steps, "gaussians": config.model.gaussians,
+            "capture": capture.folder.resolve().name, "steps": config.steps, "gaussians": config.model.gaussians,
             "image_scale": config.image_scale, "shade": mode,
             "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
-            MOTION: motion,
+            **told,
         }  # fmt: skip
 
     rows: list[dict[str, Any]] = []
@@ -182,7 +186,7 @@ def ablate(
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
-            write_json(place / ROWS, [row | cost | extra | {MOTION: motion} for row in scored])
+            write_json(place / ROWS, [row | cost | extra | told for row in scored])
             found = _rows(place)
         rows += found
     return rows
@@ -217,7 +221,7 @@ def _done_before(place: Path, same: dict[str, Any]) -> list[dict[str, Any]]:
     """
     rows = _rows(place)
     for name, value in same.items() if rows else ():
-        got = rows[0].get(name, value if name == MOTION else None)
+        got = rows[0].get(name, value if name in OLDER_LACK else None)
         if got != value:
             what = f"{name} of a run done before"
             raise InputError(what, expected=value, got=got, file=place / ROWS, hint=ELSEWHERE)

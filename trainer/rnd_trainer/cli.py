@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, parse_options, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
 from rnd_runtime.files import output_folder, write_json
 
 from .eval_cli import EvalOptions, evaluate_run, need_extra
@@ -104,6 +104,11 @@ def _train(options: TrainOptions) -> None:
         save_every=config.save_every if options.save_every is None else options.save_every,
     )
     check_option(options.seed >= 0, "--seed", "at least 0", options.seed)
+    check_option(options.seed < 2**63, "--seed", "less than 2^63", options.seed)
+    if options.light != "learn":
+        refuse_changed(options, ["probe_channels"], f"--light {options.light} learns no light")
+    if options.light == "none":
+        refuse_changed(options, ["visibility"], "--light none has plain colours, which no shadow falls on")
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     device = _device(options.device)

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.files import is_folder
 
 from .eval_cli import need_extra
 from .importing.options import ImportOptions
@@ -39,13 +40,14 @@ def check(capture: Annotated[Path, tyro.conf.Positional], out: Path | None = Non
     """Check a capture against itself: units, cameras, masks, silhouettes, normals, timing. Exit 1: something is wrong.
 
     Args:
-        capture: folder with capture.json
+        capture: folder with capture.json, or that file
         out: folder for check.json (IoU of every frame) and check.png (overlay); CAPTURE/check when not given
     """
     need_extra()
     from .checking.report import check_and_report
 
-    return check_and_report(capture, capture / "check" if out is None else out)
+    folder = capture if is_folder(capture) else capture.parent
+    return check_and_report(capture, folder / "check" if out is None else out)
 
 
 def convert_body(

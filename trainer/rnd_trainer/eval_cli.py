@@ -18,6 +18,8 @@ from rnd_runtime.files import is_folder, write_json
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from .checkpoint import Checkpoint
+
 COLUMNS = {
     "psnr": ("PSNR", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
@@ -34,6 +36,7 @@ COLUMNS = {
 """what the terminal's table shows of a row: heading and format"""
 OF_ONE_RUN = ("pictures", "method")
 OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds")
+MOST_SEEDS = 100
 WIDTH = 140
 """characters of the widest table"""
 
@@ -55,7 +58,8 @@ class EvalOptions:
     shade: str = "table+sun"
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
     motion: str | None = None
-    """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones"""
+    """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones. Default: the
+    poses that the training corrected (--refine-poses), else the capture's own"""
     method: str | None = None
     """name of the rows in the JSON; the run folder's unless given"""
     ablate: bool = False
@@ -116,7 +120,9 @@ def evaluate_run(options: EvalOptions) -> None:
 
     path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
-    capture = load_capture(options.capture, motion_file=options.motion)
+    capture = load_capture(
+        options.capture, motion_file=options.motion or _corrected(path, checkpoint, options)
+    )
     exported = path.with_suffix(".onnx")
     rows = score(
         checkpoint,
@@ -140,6 +146,19 @@ def evaluate_run(options: EvalOptions) -> None:
         console.print(f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second")
     if options.json is not None:
         write_json(options.json, rows)
+
+
+def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
+    """The poses that the training corrected, where it did and on this capture; says so."""
+    from .train import REFINED_MOTION
+
+    file = path.with_name(REFINED_MOTION).resolve()
+    folder = options.capture if is_folder(options.capture) else options.capture.parent
+    same = checkpoint.info.get("capture") == folder.resolve().name
+    if not (checkpoint.config.refine_poses and file.is_file() and same):
+        return None
+    print(f"rnd-eval: poses of {file}, corrected in training; --motion takes others", file=sys.stderr)  # noqa: T201
+    return str(file)
 
 
 def _is_of(exported: Path, checkpoint: Path) -> bool:
@@ -167,6 +186,7 @@ def ablate_run(options: EvalOptions) -> None:
     from rich.table import Table
 
     from rnd_runtime.capture import load_capture
+    from rnd_runtime.shading import check_mode
 
     from .ablate import STUDIES, ablate, check_needs, chosen, summarise, time_encoders
     from .charts import check_chart, draw_lengths
@@ -180,6 +200,8 @@ def ablate_run(options: EvalOptions) -> None:
         check_chart(options.chart)
         check_option(options.study == "lengths", "--chart", "--study lengths beside it", options.study)
     check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
+    check_option(options.seeds <= MOST_SEEDS, "--seeds", f"at most {MOST_SEEDS}", options.seeds)
+    check_mode(options.shade)
     check_sizes(config)
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)

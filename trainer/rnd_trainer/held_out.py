@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import statistics
-from pathlib import Path
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from torch import Tensor
@@ -64,6 +66,7 @@ def score(
         **({} if avatar is None else playback(avatar, judge)),
         **_provenance(checkpoint),
     }
+    names = picture_names([frame.image for split, _ in jobs for frame in capture.split(split)])
     rows = []
     for split, factor in jobs:
         name = split if factor is None else f"{split}, albedo scaled"
@@ -75,7 +78,7 @@ def score(
         ) -> None:
             if folder is not None:
                 kept.append(strip(rendered, target.numpy()))
-                write_image(folder / Path(frame.image).name, kept[-1])
+                write_image(folder / f"{names[frame.image]}.png", kept[-1])
 
         result = evaluate(
             judge, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep
@@ -84,6 +87,18 @@ def score(
             contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
         rows.append({"split": name, "method": method, "frames": result.frames, **result.scores, **whole})
     return rows
+
+
+def picture_names(images: Iterable[str]) -> dict[str, str]:
+    """A name without folder and suffix for each of ``images``, paths in a capture.
+
+    The picture's own where no other has it, else with the folders before it.
+    """
+    paths = {image: PurePosixPath(image).with_suffix("") for image in images}
+    stems = Counter(path.name for path in paths.values())
+    return {
+        image: path.name if stems[path.name] == 1 else "_".join(path.parts) for image, path in paths.items()
+    }
 
 
 def playback(avatar: Path, judge: Judge) -> dict[str, Any]:

@@ -373,7 +373,7 @@ class Training:
     def info(self) -> dict[str, Any]:
         """Provenance for the checkpoint."""
         return {
-            "capture": self.capture.folder.name,
+            "capture": self.capture.folder.resolve().name,
             "body_license": self.capture.body.license,
             "step": self.step_index,
             "minutes": round(self.seconds / 60, 3),

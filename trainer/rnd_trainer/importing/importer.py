@@ -108,8 +108,7 @@ def import_source(
     _check_numbers(options)
     layout, found = find_layout(source, options.layout)
     on_found(f"{layout}: {found}")
-    if (out / "capture.json").exists():
-        raise InputError("holds a capture already", file=out, hint="choose another folder")
+    _refuse_full(out, source)
     if options.body is None:
         raise InputError(
             "--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none"
@@ -137,6 +136,16 @@ def import_source(
     )  # fmt: skip
     write_capture(out, recording, scene, shots, on_shot, normal_axes=axes)
     return scene
+
+
+def _refuse_full(out: Path, source: Path) -> None:
+    """Refuse a folder ``out`` with files whose place a capture's would take."""
+    if out.resolve() == source.resolve():
+        raise InputError("OUT", expected="another folder than the source", got=out)
+    for name in ("capture.json", "motion.npz", "body.npz"):
+        if (out / name).exists():
+            what = "holds a capture already" if name == "capture.json" else f"holds a {name}"
+            raise InputError(what, file=out, hint="choose another folder")
 
 
 def _check_numbers(options: ImportOptions) -> None:

@@ -73,15 +73,20 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
 
     Args:
         person: track or person number; the one with most frames when None.
+
+    Raises:
+        InputError: for any other file, and for a ``person`` where people have no numbers.
     """
     if path.is_dir():
         files = listed(path, (".json", ".npz"))
         if files[0].suffix == ".json":
             return _fitted("EasyMocap", read_easymocap_folder(path, person))
+        _refuse_number(person, "ROMP")
         return _romp(files)
     if path.suffix.lower() == ".npz":
         with Npz(path, what="body poses") as archive:
             names = archive.names
+        _refuse_number(person, path.name)
         try:
             return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
         except InputError as error:
@@ -90,6 +95,7 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     if isinstance(content, dict):
         try:
             if "smpl_params_incam" in content:
+                _refuse_number(person, "GVHMR")
                 return _gvhmr(content)
             values = [value for value in content.values() if isinstance(value, dict)]
             if values and all("frame_ids" in value and "pose" in value for value in values):
@@ -108,6 +114,12 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     raise InputError(
         "body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys, file=path
     )
+
+
+def _refuse_number(person: int | None, of: str) -> None:
+    """Refuse ``--person`` where a file has one person, or several without numbers."""
+    if person is not None:
+        raise InputError("--person", expected=f"none, as {of} has no numbers of people", got=person)
 
 
 def _fitted(kind: str, fits: VideoFits) -> FoundPoses:
