@@ -74,6 +74,12 @@ class Page:
         for kind in ("keyDown", "keyUp"):
             self.call("Input.dispatchKeyEvent", type=kind, code=code)
 
+    def drop(self, path: Path) -> None:
+        """Drop a file or a folder of this machine on the middle of the page."""
+        data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+        for kind in ("dragEnter", "dragOver", "drop"):
+            self.call("Input.dispatchDragEvent", type=kind, x=300, y=300, data=data)
+
     def drag(self, start: tuple[float, float], by: tuple[float, float], *, shift: bool = False) -> None:
         """Drag with the left button."""
         end = (start[0] + by[0], start[1] + by[1])

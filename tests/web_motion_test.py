@@ -346,6 +346,13 @@ def _damaged(name: str) -> Callable[[Path], None]:
     return write
 
 
+def _flip(path: Path) -> None:
+    """The archive with one bit of a number changed, which only a checksum tells."""
+    content, number = bytearray(path.read_bytes()), TRANS.astype(np.float64).tobytes()[:8]
+    content[content.index(number)] ^= 1
+    path.write_bytes(content)
+
+
 DAMAGED: dict[str, Callable[[Path], Any]] = {
     "torn": lambda path: path.write_bytes(path.read_bytes()[:-200]),
     "empty": lambda path: path.write_bytes(b""),
@@ -355,6 +362,7 @@ DAMAGED: dict[str, Callable[[Path], Any]] = {
     "poses cut": _damaged("poses.npy"),
     "trans cut": _damaged("trans.npy"),
     "rate cut": _damaged("fps.npy"),
+    "a bit flipped": _flip,
 }
 
 

@@ -6,6 +6,7 @@ import base64
 import http.server
 import json
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from browser import CHROMIUM, Page, chromium
+from browser import CHROMIUM, PATIENCE, Page, chromium
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.images import read_image, write_image
 from rnd_runtime.light import load_light
@@ -94,6 +95,8 @@ def site(tmp_path_factory) -> Path:
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
     _write_avatar(folder / "other.onnx", _raise_and_dim)
     _write_avatar(folder / "stranger.onnx", _rename)
+    _write_avatar(folder / "later.onnx", lambda about: about.update(hair=1))
+    _write_avatar(folder / "joined.onnx", lambda about: about["skeleton"].pop("parents"))
     broken_trans = first.translations.copy()
     broken_trans[7, 1] = np.nan
     np.savez(folder / "nan.npz", poses=np.zeros((31, 72)), trans=broken_trans)
@@ -191,16 +194,26 @@ def fresh(address, tmp_path):
 
 
 def _drop(page: Page, *names: str) -> str:
-    """Drop files of the site on the page, as from a folder, and wait until they are in ("") or what it says of them."""
+    """Drop files of the site on the page, and wait until they are in ("") or what it says of them."""
+    page.run("window.before = rnd.scene()")
+    asked = _let_go(page, *names)  # "reading …"
+    page.run(f"""(async () => {{
+        const message = document.getElementById("message");
+        const unanswered = ["", {json.dumps(asked)}];  // a picture takes it away
+        while (rnd.scene() === before && unanswered.includes(message.textContent))
+            await new Promise((done) => setTimeout(done, 20));
+    }})()""")
+    return page.run("rnd.scene() === before ? document.getElementById('message').textContent : ''")
+
+
+def _let_go(page: Page, *names: str) -> str:
+    """Drop files of the site on the page, as from a folder; what it says at once."""
     return page.run(f"""(async () => {{
-        const data = new DataTransfer(), message = document.getElementById("message"), before = rnd.scene();
+        const data = new DataTransfer();
         for (const name of {json.dumps(names)})
             data.items.add(new File([await (await fetch(`/${{name}}`)).blob()], name));
         document.getElementById("stage").dispatchEvent(new DragEvent("drop", {{ dataTransfer: data, bubbles: true }}));
-        const asked = message.textContent;  // "reading …"
-        while (rnd.scene() === before && ["", asked].includes(message.textContent))  // a picture takes it away
-            await new Promise((done) => setTimeout(done, 20));
-        return rnd.scene() === before ? message.textContent : "";
+        return document.getElementById("message").textContent;
     }})()""")
 
 
@@ -335,10 +348,10 @@ def test_the_clip_is_a_download(loaded, tmp_path):
     loaded.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     loaded.run("Object.assign(rnd.state, {width: 128, height: 128}); document.getElementById('clip').click()")
     loaded.wait("!document.getElementById('clip').disabled")
-    for _ in range(100):
-        if files := [file for file in tmp_path.iterdir() if file.stem == "clip"]:
-            break
-        loaded.wait("new Promise(done => setTimeout(() => done(true), 50))")
+    until = time.monotonic() + PATIENCE
+    while not (files := [file for file in tmp_path.iterdir() if file.stem == "clip"]):
+        assert time.monotonic() < until, loaded.run("document.getElementById('message').textContent")
+        time.sleep(0.05)
     assert files[0].suffix in (".webm", ".mp4") and files[0].stat().st_size > 5_000
 
 
@@ -346,6 +359,8 @@ def test_the_clip_is_a_download(loaded, tmp_path):
     ("name", "reason"),
     [
         ("torn.onnx", "torn.onnx: the .onnx file is cut short"),
+        ("later.onnx", "later.onnx: metadata: got unknown field `hair`"),
+        ("joined.onnx", "joined.onnx: metadata.skeleton: got no field `parents`"),
         ("torn.hdr", "torn.hdr: the .hdr file is cut short"),
         ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),
         ("nobodys.npz", "expected some of the avatar's"),
@@ -356,6 +371,51 @@ def test_a_file_that_is_none_of_ours_is_refused_in_one_line(loaded, name, reason
     message = _drop(loaded, "window.hdr", name)  # of several files it is named
     assert reason in message and "\n" not in message and _is_refusal(loaded)
     assert _picture(loaded).any()  # what was there still plays
+
+
+def test_what_is_no_file_is_refused_in_one_line(loaded, tmp_path):
+    folder = tmp_path / "probes"
+    folder.mkdir()
+    loaded.drop(folder)
+    loaded.wait(
+        "document.getElementById('message').textContent.startsWith('probes: expected a file, got a folder')"
+    )
+    assert _is_refusal(loaded)
+    loaded.run(
+        """document.dispatchEvent(new DragEvent("drop", { dataTransfer: new DataTransfer(), bubbles: true }))"""
+    )
+    assert (
+        loaded.run("document.getElementById('message').textContent") == "expected files, got something else"
+    )
+
+
+def test_files_that_are_dropped_while_a_clip_is_made_wait_for_its_end(fresh, tmp_path):
+    fresh.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "clips"))
+    _drop(fresh, "avatar.onnx", "walk.npz")
+    fresh.run("""
+        Object.assign(rnd.state, { width: 64, height: 64 });
+        const message = document.getElementById("message"), clip = document.getElementById("clip");
+        window.said = [];
+        const listen = () => said.push([message.textContent, clip.disabled]);
+        new MutationObserver(listen).observe(message, { childList: true });
+        clip.click();
+        1;
+    """)
+    _let_go(fresh, "nan.npz")
+    fresh.wait("document.getElementById('message').classList.contains('wrong')")
+    said = fresh.run("said")
+    assert all(busy for text, busy in said if text.startswith("making a clip")), said
+    reading = next(k for k, (text, _) in enumerate(said) if text.startswith("reading"))
+    assert not any(text.startswith("making a clip") for text, _ in said[reading:])  # it was done
+    assert not fresh.run("document.getElementById('clip').disabled")
+
+
+def test_a_clip_that_fails_says_so_and_frees_its_button(fresh):
+    _drop(fresh, "avatar.onnx", "walk.npz")
+    fresh.run("rnd.state.light = 99; document.getElementById('clip').click()")
+    fresh.wait("document.getElementById('message').classList.contains('wrong')")
+    assert not fresh.run("document.getElementById('clip').disabled")
+    assert _picture(fresh, light=0, width=64, height=64).any()
 
 
 def test_a_motion_is_refused_before_there_is_an_avatar(fresh):

@@ -15,6 +15,7 @@ const state = {
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
 let waiting = [];  // {number, done, failed} of those who want a picture for themselves
+let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [];
 
 function redraw() { wanted = true; }
@@ -147,7 +148,8 @@ function setScene(description) {
   $("time").max = scene.motion.duration || 1;
   $("time").step = 1 / scene.motion.fps;
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
-  $("clip").disabled = $("play").disabled = scene.motion.duration === 0;
+  $("play").disabled = scene.motion.duration === 0;
+  freeClip();
   state.time = Math.min(state.time, scene.motion.duration);
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
   if (first) Object.assign(state, { width: scene.size, height: scene.size });
@@ -201,12 +203,22 @@ async function screenshot() {
 
 function clip() {
   play(false);
-  $("clip").disabled = true;
+  clipMade = {};
+  clipMade.promise = new Promise((done) => { clipMade.resolve = done; });
+  freeClip();
   say("making a clip …");
   const turn = $("turntable").checked ? 2 * Math.PI : 0;
   const fps = Math.min(Math.max(scene.motion.fps, 1), 240);
   engine.clip({ ...state }, fps, turn, scene.motion.duration);
 }
+
+function endClip() {
+  clipMade?.resolve();
+  clipMade = null;
+  freeClip();
+}
+
+function freeClip() { $("clip").disabled = clipMade !== null || !scene?.motion.duration; }
 
 function slider(id, apply) {
   $(id).addEventListener("input", () => { apply(Number($(id).value)); redraw(); });
@@ -250,8 +262,11 @@ function bind() {
 function bindFiles() {
   $("files").hidden = false;
   const load = async (files) => {
-    say(`reading ${[...files].map((file) => file.name).join(", ")} …`);
-    await engine.load([...files]);
+    const list = [...files];  // the browser takes its own list away when this function waits
+    if (!list.length) return say("expected files, got something else", true);
+    if (clipMade) await clipMade.promise;  // which is of one scene
+    say(`reading ${list.map((file) => file.name).join(", ")} …`);
+    await engine.load(list);
   };
   $("choose").addEventListener("change", () => load($("choose").files));
   document.addEventListener("dragover", (event) => { event.preventDefault(); document.body.classList.add("over"); });
@@ -263,9 +278,9 @@ function bindFiles() {
   });
 }
 
-function fail(text) {
+function fail(text, endsClip = true) {
   say(text, true);
-  $("clip").disabled = !scene?.motion.duration;
+  if (endsClip) endClip();
   flying.clear();
   for (const one of waiting) one.failed(new Error(text));
   waiting = [];
@@ -277,7 +292,8 @@ const handlers = {
   truth: showTruth,
   message: (text) => say(text),
   progress: (done, of) => say(`making a clip: ${done} of ${of}`),
-  clip: (blob, name) => { $("clip").disabled = false; say(""); download(blob, name); },
+  clip: (blob, name) => { endClip(); say(""); download(blob, name); },
+  refused: (text) => say(text, true),
   error: fail,
 };
 

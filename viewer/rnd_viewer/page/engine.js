@@ -5,7 +5,7 @@ const UNREACHABLE = "rnd-view does not answer; is it still running?";
 
 /**
  * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap),
- * progress(done, of), clip(blob, name), error(text).
+ * progress(done, of), clip(blob, name), error(text, ends): of a picture or of a clip, which ends with it unless told otherwise.
  */
 export async function connect(on) {
   const address = new URL("socket", location.href);

@@ -4,42 +4,55 @@ const MOST_CLIP_FRAMES = 900;
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
- * Start the worker. `on` gets: scene, picture, progress, clip, error as from rnd-view, and message(text).
+ * Start the worker. `on` gets: scene, picture, progress, clip, error as from rnd-view, message(text), and refused(text) of
+ * files that cannot be used.
  * Files named in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
  */
 export async function connect(on) {
   const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
-  const taken = new Map();  // pictures that are not for the page: number → resolve
-  worker.onerror = (event) => on.error(event.message || "the worker cannot start");
+  const taken = new Map();  // pictures that are not for the page: number → {done, failed}
+  worker.onerror = (event) => {
+    const what = event.message || "the worker cannot start";
+    for (const { failed } of taken.values()) failed(new Error(what));
+    taken.clear();
+    on.error(what, false);
+  };
   worker.onmessage = ({ data }) => {
     if (data.kind === "scene") on.scene(data.scene);
     else if (data.kind === "message") on.message(data.text);
-    else if (data.kind === "error") on.error(data.message);
-    else if (taken.has(data.number)) take(taken, data);
+    else if (taken.has(data.number)) settle(taken, data);
+    else if (data.kind === "error") (data.number === undefined ? on.refused : on.error)(data.message, false);
     else on.picture(data);
   };
   const render = (number, state) => worker.postMessage({ ask: "render", number, state });
   const load = async (files) => {
-    const contents = await Promise.all(files.map(async (file) => ({ name: file.name, bytes: new Uint8Array(await file.arrayBuffer()) })));
-    worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
+    const contents = await Promise.all(files.map(read)).catch((error) => on.refused(error.message));
+    if (contents) worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
   };
   let clipNumber = 0;
-  const picture = (state) => new Promise((done) => {
+  const picture = (state) => new Promise((done, failed) => {
     clipNumber -= 1;  // the page's own numbers are positive
-    taken.set(clipNumber, done);
+    taken.set(clipNumber, { done, failed });
     render(clipNumber, state);
   });
   const clip = (state, fps, turn, duration) => record(picture, state, { fps, turn, duration }, on).catch((error) => on.error(error.message));
 
   const named = addressed();
-  if (named.length) fetchFiles(named).then(load).catch((error) => on.error(error.message));
+  if (named.length) fetchFiles(named).then(load).catch((error) => on.refused(error.message));
   else on.message("drop an avatar (.onnx), a motion (.npz) and a light (.hdr, .exr) here");
   return { render, clip, load, truth() {} };
 }
 
-function take(taken, data) {
-  taken.get(data.number)(data);
+function settle(taken, data) {
+  const { done, failed } = taken.get(data.number);
   taken.delete(data.number);
+  if (data.kind === "error") failed(new Error(data.message));
+  else done(data);
+}
+
+async function read(file) {
+  const content = await file.arrayBuffer().catch(() => { throw new Error(`${file.name}: expected a file, got a folder, or one that cannot be read`); });
+  return { name: file.name, bytes: new Uint8Array(content) };
 }
 
 function addressed() {

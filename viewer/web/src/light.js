@@ -1,9 +1,11 @@
 // Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/light.py).
 
-import parseExr from "parse-exr";
+import { refusal } from "./errors.js";
+import { readExr } from "./exr.js";
 
-const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
 const LARGEST_FLOAT = 3.4028234663852886e38;
+
+const RGBE = "FORMAT=32-bit_rle_rgbe";
 
 /** Rec.709. */
 export const luminance = (r, g, b) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
@@ -15,18 +17,6 @@ export function readLight(bytes, name) {
   return repair({ ...image, name });
 }
 
-function readExr(bytes) {
-  const { width, height, data } = parseExr(bytes.slice().buffer, FLOAT_TYPE);
-  const channels = data.length / (width * height);
-  if (channels < 3) throw new Error("the .exr needs channels R, G and B");
-  const radiance = new Float32Array(width * height * 3);
-  for (let row = 0; row < height; row++)  // the reader's rows run bottom to top
-    for (let column = 0; column < width; column++)
-      for (let c = 0; c < 3; c++)
-        radiance[3 * (row * width + column) + c] = data[channels * ((height - 1 - row) * width + column) + c];
-  return { width, height, radiance };
-}
-
 /** Radiance's RGBE, run-length coded or flat (Ward 1991, "Real Pixels"). */
 function readHdr(bytes) {
   let at = 0;
@@ -35,10 +25,11 @@ function readHdr(bytes) {
     if (end < 0) throw new Error("the .hdr file has no header");
     const text = new TextDecoder("latin1").decode(bytes.subarray(at, end));
     at = end + 1;
-    return text;
+    return text.replace(/\r$/, "");
   };
   if (!line().startsWith("#?")) throw new Error("not a Radiance .hdr file");
-  while (line() !== "");
+  for (let text = line(); text !== ""; text = line())
+    if (/^FORMAT=/.test(text) && text !== RGBE) throw refusal("the .hdr file", { expected: RGBE, got: text });
   const size = /^-Y (\d+) \+X (\d+)/.exec(line());
   if (!size) throw new Error("the .hdr file must be stored top to bottom, left to right");
   const height = Number(size[1]), width = Number(size[2]);

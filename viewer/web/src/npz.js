@@ -1,6 +1,7 @@
 // .npz archives: zip (fflate) of .npy, one member at a time when asked for, numbers and strings only (rnd_runtime/npz.py).
 
 import { unzipSync } from "fflate";
+import { crc32, crcs } from "./crc.js";
 import { refusal, short } from "./errors.js";
 
 const READERS = {  // bytes, and the number at a place of a view
@@ -32,6 +33,7 @@ export class Npz {
       throw refusal(`${what} cannot be read`, wrong);
     }
     this.names = [...this.entries.keys()];
+    this.crcs = crcs(bytes);
   }
 
   has(name) { return this.entries.has(name); }
@@ -69,7 +71,8 @@ export class Npz {
     if (!this.has(name)) throw refusal(`${name} is missing`, { got: `only ${names.join(", ") || "nothing"}`, file });
     let array = null;
     try {
-      array = readHeader(unzipSync(this.bytes, { filter: (one) => one.name === entry })[entry]);
+      const data = unzipSync(this.bytes, { filter: (one) => one.name === entry })[entry];
+      if (crc32(data) === (this.crcs.get(entry) ?? crc32(data))) array = readHeader(data);
     } catch { /* cut short, or no .npy at all */ }
     if (!array) throw refusal(name, { expected: "an array", got: "data that is cut short or damaged", file });
     if (array.type === "O") throw refusal(name, { expected: "an array", got: "Python objects", file });

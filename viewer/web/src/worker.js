@@ -173,5 +173,5 @@ function lap() {
 let queue = Promise.resolve();  // one at a time, in order
 onmessage = ({ data }) => {
   queue = queue.then(() => (data.ask === "load" ? load(data.files) : render(data)))
-    .catch((error) => postMessage({ kind: "error", message: error.message ?? String(error) }));
+    .catch((error) => postMessage({ kind: "error", number: data.number, message: error.message ?? String(error) }));
 };

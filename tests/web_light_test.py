@@ -1,0 +1,152 @@
+"""The page for static hosts reads the light probes that Python reads, to the same radiance, or says why it does not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from numpy.testing import assert_array_equal
+
+from rnd_runtime.errors import InputError
+from rnd_runtime.light import load_light
+
+WEB = Path(__file__).parent.parent / "viewer/web"
+NODE = shutil.which("node")
+HEIGHT = 37  # whole blocks of no compression: the last one is shorter
+RADIANCE = np.random.default_rng(4).uniform(0.01, 3, (HEIGHT, 2 * HEIGHT, 3)).astype(np.float16)
+LOSSLESS = ("none", "rle", "zips", "zip", "piz", "pxr24")  # of half floats
+
+pytestmark = [
+    pytest.mark.skipif(NODE is None, reason="needs Node.js"),
+    pytest.mark.skipif(not (WEB / "node_modules/parse-exr").is_dir(), reason="needs npm ci in viewer/web"),
+]
+
+_READER = """
+import { readFileSync } from "node:fs";
+const { readLight } = await import(process.argv[1] + "/light.js");
+let answer;
+try {
+    const { height, width, radiance } = readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]);
+    answer = { height, width, radiance: [...radiance] };
+} catch (error) { answer = { refused: error.message }; }
+console.log(JSON.stringify(answer));
+"""
+
+
+def _page(file: Path) -> Any:
+    """What the page's code makes of a probe, in Node.js."""
+    assert NODE is not None
+    command = [NODE, "--input-type=module", "--eval", _READER, WEB.as_uri() + "/src", str(file)]
+    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+
+
+def _exr(
+    path: Path, pixels: np.ndarray, *, kind: str = "half", window: tuple[int, int] = (0, 0), **said: Any
+) -> Path:
+    """An EXR of ``pixels`` [H, W, C]; ``window``: where its first pixel stands on a canvas that is as large."""
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, kind)
+    spec.full_width, spec.full_height = width + window[0], height + window[1]
+    spec.x, spec.y = window
+    spec.channelnames = said.pop("names", ("R", "G", "B", "A")[:channels])
+    if "kinds" in said:
+        spec.channelformats = said.pop("kinds")
+    tile = said.pop("tile", 0)
+    spec.tile_width = spec.tile_height = tile
+    for name, value in said.items():
+        spec.attribute({"order": "openexr:lineOrder"}.get(name, name), value)
+    target = oiio.ImageOutput.create(str(path))
+    assert target.open(str(path), spec), target.geterror()
+    write = target.write_tiles if tile else target.write_scanlines
+    top, left = window[1], window[0]
+    rows = (left, left + width, top, top + height, 0, 1) if tile else (top, top + height, 0)
+    assert write(*rows, np.ascontiguousarray(pixels.astype(np.float32))), target.geterror()
+    assert target.close()
+    return path
+
+
+def _assert_the_same(file: Path) -> None:
+    got, expected = _page(file), load_light(file).radiance
+    assert "refused" not in got, got
+    assert (got["height"], got["width"]) == expected.shape[:2]
+    assert_array_equal(np.array(got["radiance"], np.float32).reshape(expected.shape), expected)
+
+
+@pytest.mark.parametrize("order", ["increasingY", "decreasingY"])
+@pytest.mark.parametrize("compression", LOSSLESS)
+def test_lines_may_be_stored_from_the_bottom(tmp_path, compression, order):
+    file = _exr(tmp_path / "sky.exr", RADIANCE, compression=compression, order=order)
+    assert_array_equal(load_light(file).radiance, RADIANCE.astype(np.float32))
+    _assert_the_same(file)
+
+
+@pytest.mark.parametrize("kind", ["half", "float"])
+@pytest.mark.parametrize("said", [{}, {"tile": 16}, {"tile": 16, "order": "decreasingY"}])
+def test_tiles_and_an_alpha(tmp_path, kind, said):
+    pixels = np.concatenate([RADIANCE, np.ones_like(RADIANCE[..., :1])], axis=2)
+    _assert_the_same(_exr(tmp_path / "sky.exr", pixels, kind=kind, compression="zip", **said))
+
+
+FIVE = np.concatenate([RADIANCE, np.ones((HEIGHT, 2 * HEIGHT, 2), np.float16)], axis=2)
+RGB_AND = ("R", "G", "B", "A", "id")
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"names": ("view.R", "view.G", "view.B")}, "expected channels R, G and B, of no layer, got view.B, view.G"),
+        ({"window": (3, 0)}, "image layout: expected one flat picture that fills its canvas, got pixels 3,0,76,36 of"),
+        ({"kind": "uint"}, "pixels: expected half or float in all channels, got B of whole numbers"),
+        ({"compression": "b44"}, "compression: expected none, RLE, ZIPS, ZIP, PIZ, PXR24, DWAA, DWAB, got B44"),
+    ],
+)  # fmt: skip
+def test_what_would_be_read_wrongly_is_refused(tmp_path, said, message):
+    answer = _page(_exr(tmp_path / "sky.exr", RADIANCE, **said))
+    assert message in answer["refused"]
+
+
+def test_other_channels_do_not_shift_the_colours(tmp_path):
+    half = ("half",) * 4
+    _assert_the_same(_exr(tmp_path / "a.exr", FIVE, names=RGB_AND, kinds=(*half, "float")))
+    answer = _page(_exr(tmp_path / "b.exr", FIVE, names=RGB_AND, kinds=(*half, "uint")))
+    assert "got id of whole numbers" in answer["refused"]
+    answer = _page(_exr(tmp_path / "c.exr", FIVE[..., :3], kinds=("half", "float", "half")))
+    assert "half or float in all channels, got both" in answer["refused"]
+
+
+@pytest.mark.parametrize("order", ["increasingY", "decreasingY"])
+def test_files_cut_anywhere_are_refused(tmp_path, order):
+    whole = _exr(tmp_path / "sky.exr", RADIANCE, compression="zip", order=order).read_bytes()
+    for length in (*range(0, 400, 7), 700, 3000, len(whole) - 1):
+        (tmp_path / "cut.exr").write_bytes(whole[:length])
+        assert "refused" in _page(tmp_path / "cut.exr"), length
+
+
+def _hdr(path: Path) -> bytes:
+    target = oiio.ImageOutput.create(str(path))
+    assert target.open(str(path), oiio.ImageSpec(2 * HEIGHT, HEIGHT, 3, "float"))
+    assert target.write_image(RADIANCE.astype(np.float32)) and target.close()
+    return path.read_bytes()
+
+
+def test_radiance_files_with_the_line_ends_of_windows(tmp_path):
+    file = tmp_path / "sky.hdr"
+    whole = _hdr(file)
+    _assert_the_same(file)
+    end = whole.index(b"\n", whole.index(b"\n\n") + 2) + 1
+    file.write_bytes(whole[:end].replace(b"\n", b"\r\n") + whole[end:])
+    _assert_the_same(file)
+
+
+def test_radiance_files_of_another_colour_space_are_refused(tmp_path):
+    file = tmp_path / "sky.hdr"
+    file.write_bytes(_hdr(file).replace(b"rle_rgbe", b"rle_xyze"))
+    with pytest.raises(InputError):
+        load_light(file)
+    assert "expected FORMAT=32-bit_rle_rgbe, got FORMAT=32-bit_rle_xyze" in _page(file)["refused"]
