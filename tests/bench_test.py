@@ -20,6 +20,7 @@ from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
 from rnd_trainer import (
     bench_avatars,
+    bench_chart,
     bench_cli,
     bench_frame,
     bench_grid,
@@ -262,6 +263,25 @@ def test_the_grid_is_what_rnd_bench_does_unless_told_otherwise(words, tmp_path, 
     with pytest.raises(SystemExit) as ended:
         bench_cli.main()
     assert not ended.value.code and asked[0].quick and asked[0].json == tmp_path / "grid.json"
+
+
+def test_points_of_earlier_grids_stay_in_the_file_and_are_counted(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(
+        bench_grid, "measured", lambda setting, inputs, **_: dataclasses.asdict(setting) | HERE
+    )
+    monkeypatch.setattr(bench_chart, "draw_chart", lambda rows, files: None)
+    monkeypatch.setattr(bench_cli, "_line", lambda row: "")
+    out = tmp_path / "grid.json"
+    old = [dataclasses.asdict(Setting(n=n)) | HERE for n in (1, 2)]
+    out.write_text(json.dumps(old))
+    words = ["rnd-bench", "--quick", "--json", str(out), "--work", str(tmp_path / "work")]
+    for more, kept in (([], 2), (["--fresh"], 0)):
+        monkeypatch.setattr(sys, "argv", [*words, *more])
+        with pytest.raises(SystemExit) as ended:
+            bench_cli.main()
+        said = capsys.readouterr().out
+        assert not ended.value.code and len(json.loads(out.read_text())) == len(settings(True)) + kept
+        assert (f"{kept} points of earlier grids" in said.replace("\n", " ")) == bool(kept)
 
 
 def test_the_front_is_what_nothing_beats() -> None:
