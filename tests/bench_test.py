@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 
@@ -22,8 +23,10 @@ from rnd_trainer import (
     bench_avatars,
     bench_chart,
     bench_cli,
+    bench_clock,
     bench_frame,
     bench_grid,
+    bench_growth,
     bench_peers,
     bench_reference,
     bench_shards,
@@ -338,9 +341,8 @@ def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
     ]  # fmt: skip
 
 
-def test_peers_say_the_same_and_growth_is_measured(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:
-    monkeypatch.setattr(bench_peers, "REPEATS", 3)
-    monkeypatch.setattr(bench_peers, "COPIED", 1 << 20)
+def test_peers_say_the_same(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:
+    monkeypatch.setattr(bench_clock, "REPEATS", 3)
     monkeypatch.setattr(torch, "compile", lambda run: run)  # the compiler takes half a minute
     rows = bench_peers.encoders(tiny_checkpoint, tiny_avatar, 1)
     assert [row["peer"] for row in rows] == ["onnxruntime", "torch eager", "torch.compile"]
@@ -352,14 +354,54 @@ def test_peers_say_the_same_and_growth_is_measured(tiny_checkpoint, tiny_avatar,
         for peer in ("the CPU", "compute shaders")
     ]
     assert all(row["ms_median"] > 0 and "llvmpipe" in row["renderer"] for row in orders)
-    amounts = bench_peers.Amounts((300, 600, 1200), (16, 32), (5, 24), (2, 4))
-    grown = bench_peers.growth(amounts, 32, 1)
-    assert {(row["stage"], row["of"]) for row in grown} == {
-        ("raster", "Gaussians"), ("raster", "picture side"), ("shading, table", "Gaussians"),
-        ("shading, lights", "lights"), ("posing", "joints"),
-    }  # fmt: skip
+
+
+def test_growth_is_measured_beside_a_floor(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(bench_clock, "REPEATS", 3)
+    monkeypatch.setattr(bench_growth, "COPIED", 1 << 20)
+    monkeypatch.setattr(bench_growth, "SECONDS", 0.2)
+    inputs = Inputs(ASSETS / "body.npz", WALK, SKY, tmp_path)
+    amounts = bench_growth.Amounts(gaussians=(300, 600), sides=(16, 32), lights=(2, 4), joints=(5, 24))
+    grown = bench_growth.growth(inputs, amounts, 32, 1)
+    assert [(row["stage"], row["of"]) for row in grown] == [
+        *(
+            (stage, "Gaussians")
+            for stage in ("encoders", "posing", "projection", "shading", "sort", "raster")
+        ),
+        *((stage, "picture side") for stage in ("sort", "raster", "tone map")),
+        ("shading", "lights"),
+        ("posing", "joints"),
+    ]
     for row in grown:
-        assert len(row["ms"]) == len(row["amounts"]) and np.isfinite(row["exponent"]) and row["floor_ms"] > 0
+        assert len(row["ms"]) == len(row["amounts"]) == 2 and np.isfinite(row["exponent"])
+        assert 0 < row["floor_ms"] < row["ms"][-1], row
+
+
+def test_the_floor_counts_the_products_of_the_exported_networks(tiny_checkpoint, tiny_avatar) -> None:
+    model = load_checkpoint(tiny_checkpoint).model
+    nodes = len(model.encoded_nodes())
+    inferred = onnx.shape_inference.infer_shapes(onnx.load(tiny_avatar), data_prop=True).graph
+    shapes = {
+        value.name: [axis.dim_value for axis in value.type.tensor_type.shape.dim]
+        for value in (*inferred.value_info, *inferred.input, *inferred.output)
+    } | {value.name: list(value.dims) for value in inferred.initializer}
+    constant = (
+        "position/",
+        "from_position",
+        "position_part",
+    )  # what onnxruntime does once, when it loads the file
+    counted = 0
+    for node in inferred.node:
+        a, b = ([*(shapes.get(name, []) for name in node.input), [], []])[:2]
+        of_networks = node.output[0].startswith(("skinning/", "offsets/", "visibility/"))
+        if (
+            node.op_type == "MatMul"
+            and a[:1] == [nodes]
+            and of_networks
+            and not any(c in node.output[0] for c in constant)
+        ):
+            counted += 2 * nodes * b[0] * b[1]
+    assert bench_growth.encoder_operations(model) == counted
 
 
 def test_a_clip_is_spread_over_processes(tiny_avatar, monkeypatch) -> None:

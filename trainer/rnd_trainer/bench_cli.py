@@ -122,7 +122,8 @@ def _peers(options: Peers) -> None:
     from rich.table import Table
 
     from .bench_avatars import Encoders, exported
-    from .bench_peers import Amounts, bench_peers, growth
+    from .bench_growth import Amounts, growth
+    from .bench_peers import bench_peers
 
     inputs = _inputs(options.files)
     checkpoint = inputs.source(options.n)[0]
@@ -133,7 +134,7 @@ def _peers(options: Peers) -> None:
         timed = "ms_median" in row
         cells = [f"{row[key]:.2f}" for key in ("ms_median", "ms_p95")] if timed else [str(row["failed"]), ""]
         table.add_row(str(row["stage"]), str(row["peer"]), *cells)
-    slopes = growth(Amounts(), options.size, options.threads)
+    slopes = growth(inputs, Amounts(), options.size, options.threads)
     grown = Table("stage", "grows with", "ms", "exponent", "floor ms at the last")
     for row in slopes:
         times = ", ".join(f"{a}: {ms:.2f}" for a, ms in zip(row["amounts"], row["ms"]))

@@ -52,9 +52,8 @@ class Point:
 class Drawn(NamedTuple):
     """Times of a point, and what it drew at the frames ``COMPARED``.
 
-    ``row``: ms_median, ms_p95, stages (median ms), cold_start_ms (from the start of the process to its first frame),
-    peak_mb, file_mb, frames. ``radiance``
-    [K, H, W, 3] linear, premultiplied; ``means`` [K, N, 3] m.
+    ``row``: ms_median, ms_p95, stages (median ms), stages_p95, cold_start_ms (from the start of the process to its
+    first frame), peak_mb, file_mb, frames. ``radiance`` [K, H, W, 3] linear, premultiplied; ``means`` [K, N, 3] m.
     """
 
     row: dict[str, Any]
@@ -132,6 +131,7 @@ def draw(folder: str, spawned: float) -> None:
         "ms_p95": float(np.percentile(taken, 95)),
         "ms_min": float(np.min(taken)),
         "stages": {name: float(np.median(values)) for name, values in stages.items()},
+        "stages_p95": {name: float(np.percentile(values, 95)) for name, values in stages.items()},
         "cold_start_ms": cold_ms,
         "peak_mb": peak_mb,
         "file_mb": Path(point.avatar).stat().st_size / 1e6,

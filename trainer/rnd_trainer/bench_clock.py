@@ -1,0 +1,25 @@
+"""The time of one call, repeated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+REPEATS = 15
+WARMUP = 2
+
+
+def times(run: Callable[[], Any]) -> dict[str, float]:
+    """Median, 95th percentile and least milliseconds of a call."""
+    taken = []
+    for _ in range(WARMUP + REPEATS):
+        start = perf_counter()
+        run()
+        taken.append(1e3 * (perf_counter() - start))
+    timed = taken[WARMUP:]
+    return {
+        "ms_median": float(np.median(timed)), "ms_p95": float(np.percentile(timed, 95)), "ms_min": float(np.min(timed)),
+    }  # fmt: skip

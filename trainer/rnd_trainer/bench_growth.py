@@ -1,0 +1,208 @@
+"""How the stages of a frame grow with Gaussians, pixels, lights and joints, and the floor beside each.
+
+Growth is the exponent p of time ~ amount^p, by least squares over logarithms. The floor is what no program could beat
+at the largest amount: the bytes that a stage must read and write once over the bandwidth measured here, or its
+operations over the rate measured here, whichever takes longer. A stage far above its floor spends its time on
+something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from rnd_runtime.doctor import machine
+from rnd_runtime.posing import RestPose
+
+from .bench_avatars import Encoders
+from .bench_clock import times
+from .bench_frame import Point, measure
+from .bench_grid import Inputs
+from .bench_raster import Row
+from .checkpoint import load_checkpoint
+from .model import AvatarModel
+
+SECONDS = 3.0  # of frames at each amount
+COPIED = 64 << 20  # bytes: past every cache
+MULTIPLIED = 1024  # side of the matrices that the rate is measured with
+PER_GAUSSIAN = ("encoders", "posing", "projection", "shading", "sort", "raster")
+PER_PIXEL = ("sort", "raster", "tone map")
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """What is varied; the usual amounts, or fewer for a quick look. The last but one of ``gaussians`` is the usual."""
+
+    gaussians: tuple[int, ...] = (4_000, 8_000, 15_000, 30_000, 60_000)
+    sides: tuple[int, ...] = (256, 512, 1024)
+    lights: tuple[int, ...] = (8, 32, 128)
+    joints: tuple[int, ...] = (12, 24, 48)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A frame: its Gaussians, the picture's side, and how many lights shade it (0: by table)."""
+
+    gaussians: int
+    side: int
+    lights: int = 0
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What this machine can do on the threads used: bytes and float32 operations per second."""
+
+    bandwidth: float
+    operations: float
+
+    def seconds(self, moved: float, operations: float = 0.0) -> float:
+        """The least time for both."""
+        return max(moved / self.bandwidth, operations / self.operations)
+
+
+def growth(inputs: Inputs, amounts: Amounts, size: int, threads: int) -> list[Row]:
+    """A row for each stage and amount: ``exponent``, ``ms`` at each of ``amounts``, ``floor_ms`` at the last.
+
+    Frames are those of :func:`rnd_trainer.bench_frame.measure`, of seeded avatars. Joints are varied in a rest pose
+    made up for it: an avatar has those of its body.
+    """
+    rates = measured_rates(threads)
+    known = {
+        "bandwidth_gb_s": rates.bandwidth / 1e9, "rate_gflop_s": rates.operations / 1e9, "threads": threads,
+        "machine": machine(),
+    }  # fmt: skip
+    return [
+        row | known
+        for row in (*_frames(inputs, amounts, size, threads, rates), _joints(amounts, threads, rates))
+    ]
+
+
+def _frames(inputs: Inputs, amounts: Amounts, size: int, threads: int, rates: Rates) -> Iterator[Row]:
+    seeded, usual = replace(inputs, checkpoint=None), Case(amounts.gaussians[-2], size)
+    series: tuple[tuple[str, Sequence[int], Sequence[str], list[Case]], ...] = (
+        (
+            "Gaussians",
+            amounts.gaussians,
+            PER_GAUSSIAN,
+            [replace(usual, gaussians=a) for a in amounts.gaussians],
+        ),
+        ("picture side", amounts.sides, PER_PIXEL, [replace(usual, side=a) for a in amounts.sides]),
+        ("lights", amounts.lights, ("shading",), [replace(usual, lights=a) for a in amounts.lights]),
+    )
+    measured: dict[Case, dict[str, float]] = {}
+    for what, values, stages, cases in series:
+        for case in cases:
+            if case not in measured:
+                measured[case] = _stages(seeded, case, threads)
+        model = load_checkpoint(seeded.source(cases[-1].gaussians)[0]).model
+        floor = floors(cases[-1], model, rates)
+        for stage in stages:
+            yield _row(stage, what, values, [measured[case][stage] for case in cases], floor[stage])
+
+
+def _stages(inputs: Inputs, case: Case, threads: int) -> dict[str, float]:
+    """Median ms of each stage of ``case``."""
+    shade = f"lights:{case.lights}" if case.lights else "table"
+    file, _ = inputs.avatar(case.gaussians, Encoders())
+    point = Point(
+        str(file), str(inputs.motion), str(inputs.hdr), case.side, shade, threads=threads, seconds=SECONDS
+    )
+    stages: dict[str, float] = measure(point).row["stages"]
+    return stages
+
+
+def floors(case: Case, model: AvatarModel, rates: Rates) -> dict[str, float]:
+    """Seconds that each stage of a frame of ``model`` takes at least.
+
+    Bytes are those of the runtime's arrays: a Gaussian's mean, covariance and opacity are 40, its centre, shape, box,
+    depth and slot on the screen 64, all that is shaded 116; a pixel's radiance and coverage 16, its colour 3.
+    """
+    n, pixels = case.gaussians, case.side**2
+    return {
+        "encoders": rates.seconds(0.0, encoder_operations(model)),
+        "posing": posing_floor(n, len(model.encoded_nodes()), model.log_weights.shape[1], rates),
+        "projection": rates.seconds(104 * n),
+        "shading": rates.seconds(116 * n, 90 * n * case.lights),
+        "sort": rates.seconds(36 * n),
+        "raster": rates.seconds(44 * n + 16 * pixels),
+        "tone map": rates.seconds(19 * pixels),
+    }
+
+
+def posing_floor(n: int, nodes: int, joints: int, rates: Rates) -> float:
+    """Seconds to blend ``joints`` bones at ``n`` Gaussians, with what the networks said at ``nodes``."""
+    return rates.seconds(4 * n * (joints + 58) + 4 * nodes * (joints + 22), n * (34 * joints + 600))
+
+
+def encoder_operations(model: AvatarModel) -> float:
+    """Multiplications and additions at the nodes in one frame, without what depends on a node's place alone.
+
+    The skinning's two attentions are two products over all joints and heads (:mod:`rnd_export.graph_networks`); what
+    is done once per joint is left out.
+    """
+    weights = dict(model.named_parameters())
+    heads = 2 * model.config.heads * (model.log_weights.shape[1] - 1)
+    per_node = 2 * model.config.width * heads
+    names = ("skinning.hidden", "skinning.logits", "offsets.hidden", "offsets.out",
+             "visibility.from_extra", "visibility.hidden", "visibility.out")  # fmt: skip
+    per_node += sum(weights[f"{name}.weight"].numel() for name in names)
+    return 2.0 * per_node * len(model.encoded_nodes())
+
+
+def _joints(amounts: Amounts, threads: int, rates: Rates) -> Row:
+    """Posing of the usual number of Gaussians by skeletons of several sizes."""
+    n = amounts.gaussians[-2]
+    nodes, before = n // 4, numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        taken = []
+        for joints in amounts.joints:
+            rest, *arguments = _rest(n, nodes, joints)
+            taken.append(times(partial(rest.pose, *arguments))["ms_median"])
+    finally:
+        numba.set_num_threads(before)
+    return _row("posing", "joints", amounts.joints, taken, posing_floor(n, nodes, amounts.joints[-1], rates))
+
+
+def _row(stage: str, what: str, values: Sequence[int], milliseconds: list[float], floor: float) -> Row:
+    exponent = float(np.polyfit(np.log(values), np.log(milliseconds), 1)[0])
+    return {
+        "stage": stage, "of": what, "amounts": list(values), "ms": milliseconds, "exponent": exponent,
+        "floor_ms": 1e3 * floor,
+    }  # fmt: skip
+
+
+def measured_rates(threads: int) -> Rates:
+    """A copy that no cache holds, and a large product of matrices."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        source, target = torch.ones(COPIED // 4), torch.empty(COPIED // 4)
+        copied = times(lambda: target.copy_(source))["ms_min"]
+        a = torch.ones(MULTIPLIED, MULTIPLIED)
+        multiplied = times(lambda: a @ a)["ms_min"]
+    finally:
+        torch.set_num_threads(before)
+    return Rates(2e3 * COPIED / copied, 2e3 * MULTIPLIED**3 / multiplied)
+
+
+def _rest(count: int, nodes: int, joints: int) -> tuple[Any, ...]:
+    """A rest pose of any number of joints, with node fields and bones, as :meth:`RestPose.pose` takes them."""
+    rng = np.random.default_rng(0)
+
+    def normal(*shape: int) -> Any:
+        return rng.normal(size=shape).astype(np.float32)
+
+    neighbours = rng.integers(0, nodes, (count, 4)).astype(np.int32)
+    rest = RestPose(
+        neighbours, np.full((count, 4), 0.25, np.float32), normal(count, joints), normal(count, 3),
+        0.01 * normal(count, 9), normal(count, 3), normal(count, 7), 0.06, 1e-8, 1e-3,
+    )  # fmt: skip
+    bones = np.tile(np.eye(3, 4, dtype=np.float32), (joints, 1, 1))
+    return rest, normal(nodes, joints), normal(nodes, 6), normal(nodes, 16), bones
