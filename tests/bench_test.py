@@ -343,6 +343,7 @@ def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
 
 def test_peers_say_the_same(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:
     monkeypatch.setattr(bench_clock, "REPEATS", 3)
+    monkeypatch.setattr(bench_clock, "SECONDS", 0.0)
     monkeypatch.setattr(torch, "compile", lambda run: run)  # the compiler takes half a minute
     rows = bench_peers.encoders(tiny_checkpoint, tiny_avatar, 1)
     assert [row["peer"] for row in rows] == ["onnxruntime", "torch eager", "torch.compile"]
@@ -358,6 +359,7 @@ def test_peers_say_the_same(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:
 
 def test_growth_is_measured_beside_a_floor(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(bench_clock, "REPEATS", 3)
+    monkeypatch.setattr(bench_clock, "SECONDS", 0.0)
     monkeypatch.setattr(bench_growth, "COPIED", 1 << 20)
     monkeypatch.setattr(bench_growth, "SECONDS", 0.2)
     inputs = Inputs(ASSETS / "body.npz", WALK, SKY, tmp_path)

@@ -126,6 +126,9 @@ def measured(
         str(file), str(inputs.motion), str(inputs.hdr), setting.size, setting.shade, setting.raster,
         setting.threads, seconds=seconds, cull=setting.cull,
     )  # fmt: skip
+    measure(
+        replace(point, frames=1)
+    )  # compiles what numba's cache lacks: a cold start is one of a machine that has it
     drawn = measure(point)
     row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
     if compare:
