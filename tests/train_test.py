@@ -251,7 +251,9 @@ def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path)
 
 def test_the_log_forgets_steps_that_are_done_again(tiny_capture, tiny_config, tmp_path) -> None:
     training = Training(tiny_capture, dataclasses.replace(tiny_config, steps=2))
-    (tmp_path / "metrics.jsonl").write_text('{"step": 0}\n{"step": 1}\n{"step": 2}\n')
+    (tmp_path / "metrics.jsonl").write_text(
+        '{"step": 0}\n{"step": 0, "ima\n[0]\n3\n{"steps": 0}\n{"step": "0"}\n{}}\n{"step": 1}\n{"step": 2}\n{"st'
+    )
     training.step_index = 1
     run(training, tmp_path, on_step=_nothing, on_preview=_nothing)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]

@@ -222,6 +222,17 @@ def test_cut_files_are_refused(tmp_path):
             read_pickle(_file(tmp_path, content[:size]))
 
 
+@pytest.mark.parametrize("held", [np.arange(6.0), np.array([{"a": 1}, None], object)])
+def test_cut_and_foreign_npy_files_are_refused(tmp_path, held):
+    stream = io.BytesIO()
+    np.save(stream, held, allow_pickle=True)
+    content = stream.getvalue()
+    strange = content.replace(b"'descr'", b"'desc\xff'", 1), content[:6] + b"\x09\x00" + content[8:]
+    for damaged in (*(content[:size] for size in range(7, len(content))), *strange):
+        with pytest.raises(InputError, match=r"a\.pkl"):
+            read_pickle(_file(tmp_path, damaged))
+
+
 def test_shared_parts_are_read_once(tmp_path):
     """Thirty doublings: a reader that follows every path would need a thousand million steps."""
     value: list = [1]

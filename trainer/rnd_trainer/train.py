@@ -418,16 +418,23 @@ def run(
 
 
 def _keep_until(path: Path, step: int) -> TextIO:
-    """The metrics log, without rows at or after ``step``: those steps will be done again."""
+    """The metrics log, without rows at or after ``step``: those steps will be done again. Damaged rows go too."""
     kept = []
     if path.exists():
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        kept = [
-            line for line in lines if line.endswith("}") and json.loads(line)["step"] < step
-        ]  # one may be cut
+        kept = [line for line in lines if (done := _step_of(line)) is not None and done < step]
     with atomic_path(path) as temporary:
         temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
     return path.open("a", encoding="utf-8", buffering=1)  # line by line: --view reads along
+
+
+def _step_of(line: str) -> int | None:
+    """Of a row of the metrics log; None for a line that is cut, or no row at all."""
+    try:
+        step = json.loads(line)["step"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+    return step if isinstance(step, int) else None
 
 
 @contextmanager
