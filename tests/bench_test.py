@@ -387,11 +387,8 @@ def test_the_floor_counts_the_products_of_the_exported_networks(tiny_checkpoint,
         value.name: [axis.dim_value for axis in value.type.tensor_type.shape.dim]
         for value in (*inferred.value_info, *inferred.input, *inferred.output)
     } | {value.name: list(value.dims) for value in inferred.initializer}
-    constant = (
-        "position/",
-        "from_position",
-        "position_part",
-    )  # what onnxruntime does once, when it loads the file
+    # what onnxruntime does once, when it loads the file
+    constant = ("position/", "from_position", "position_part")
     counted = 0
     for node in inferred.node:
         a, b = ([*(shapes.get(name, []) for name in node.input), [], []])[:2]

@@ -1,8 +1,8 @@
-"""The time of one call, repeated."""
+"""The time of a call, repeated, and what is told of many times."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any
 
@@ -22,7 +22,11 @@ def times(run: Callable[[], Any]) -> dict[str, float]:
         start = perf_counter()
         run()
         taken.append(1e3 * (perf_counter() - start))
-    timed = taken[WARMUP:]
+    return summary(taken[WARMUP:])
+
+
+def summary(taken: Sequence[float]) -> dict[str, float]:
+    """Median, 95th percentile and least of milliseconds, as rows name them."""
     return {
-        "ms_median": float(np.median(timed)), "ms_p95": float(np.percentile(timed, 95)), "ms_min": float(np.min(timed)),
+        "ms_median": float(np.median(taken)), "ms_p95": float(np.percentile(taken, 95)), "ms_min": float(np.min(taken)),
     }  # fmt: skip

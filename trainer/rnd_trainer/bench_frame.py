@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError
 
+from .bench_clock import summary
+
 Floats32 = NDArray[np.float32]
 
 WARMUP = 5
@@ -127,9 +129,7 @@ def draw(folder: str, spawned: float) -> None:
     compared = [frame(number).radiance for number in COMPARED]
     means = [avatar.pose(motion, STEP_S * number).means for number in COMPARED]
     row = {
-        "ms_median": float(np.median(taken)),
-        "ms_p95": float(np.percentile(taken, 95)),
-        "ms_min": float(np.min(taken)),
+        **summary(taken),
         "stages": {name: float(np.median(values)) for name, values in stages.items()},
         "stages_p95": {name: float(np.percentile(values, 95)) for name, values in stages.items()},
         "cold_start_ms": cold_ms,

@@ -126,9 +126,8 @@ def measured(
         str(file), str(inputs.motion), str(inputs.hdr), setting.size, setting.shade, setting.raster,
         setting.threads, seconds=seconds, cull=setting.cull,
     )  # fmt: skip
-    measure(
-        replace(point, frames=1)
-    )  # compiles what numba's cache lacks: a cold start is one of a machine that has it
+    # a cold start is one of a machine whose numba cache has the kernels: compile what it lacks
+    measure(replace(point, frames=1))
     drawn = measure(point)
     row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
     if compare:

@@ -20,10 +20,8 @@ import torch
 from rnd_runtime.doctor import machine
 from rnd_runtime.posing import RestPose
 
-from .bench_avatars import Encoders
 from .bench_clock import times
-from .bench_frame import Point, measure
-from .bench_grid import Inputs
+from .bench_grid import Inputs, Setting, measured
 from .bench_raster import Row
 from .checkpoint import load_checkpoint
 from .model import AvatarModel
@@ -46,15 +44,6 @@ class Amounts:
 
 
 @dataclass(frozen=True)
-class Case:
-    """A frame: its Gaussians, the picture's side, and how many lights shade it (0: by table)."""
-
-    gaussians: int
-    side: int
-    lights: int = 0
-
-
-@dataclass(frozen=True)
 class Rates:
     """What this machine can do on the threads used: bytes and float32 operations per second."""
 
@@ -69,7 +58,7 @@ class Rates:
 def growth(inputs: Inputs, amounts: Amounts, size: int, threads: int) -> list[Row]:
     """A row for each stage and amount: ``exponent``, ``ms`` at each of ``amounts``, ``floor_ms`` at the last.
 
-    Frames are those of :func:`rnd_trainer.bench_frame.measure`, of seeded avatars. Joints are varied in a rest pose
+    Frames are the grid's (:func:`rnd_trainer.bench_grid.measured`), of seeded avatars. Joints are varied in a rest pose
     made up for it: an avatar has those of its body.
     """
     rates = measured_rates(threads)
@@ -84,51 +73,37 @@ def growth(inputs: Inputs, amounts: Amounts, size: int, threads: int) -> list[Ro
 
 
 def _frames(inputs: Inputs, amounts: Amounts, size: int, threads: int, rates: Rates) -> Iterator[Row]:
-    seeded, usual = replace(inputs, checkpoint=None), Case(amounts.gaussians[-2], size)
-    series: tuple[tuple[str, Sequence[int], Sequence[str], list[Case]], ...] = (
-        (
-            "Gaussians",
-            amounts.gaussians,
-            PER_GAUSSIAN,
-            [replace(usual, gaussians=a) for a in amounts.gaussians],
-        ),
-        ("picture side", amounts.sides, PER_PIXEL, [replace(usual, side=a) for a in amounts.sides]),
-        ("lights", amounts.lights, ("shading",), [replace(usual, lights=a) for a in amounts.lights]),
-    )
-    measured: dict[Case, dict[str, float]] = {}
-    for what, values, stages, cases in series:
-        for case in cases:
-            if case not in measured:
-                measured[case] = _stages(seeded, case, threads)
-        model = load_checkpoint(seeded.source(cases[-1].gaussians)[0]).model
-        floor = floors(cases[-1], model, rates)
+    seeded = replace(inputs, checkpoint=None)
+    usual = Setting(n=amounts.gaussians[-2], size=size, shade="table", threads=threads)
+    series = (
+        ("Gaussians", amounts.gaussians, PER_GAUSSIAN, [replace(usual, n=n) for n in amounts.gaussians]),
+        ("picture side", amounts.sides, PER_PIXEL, [replace(usual, size=side) for side in amounts.sides]),
+        ("lights", amounts.lights, ("shading",), [replace(usual, shade=f"lights:{k}") for k in amounts.lights]),
+    )  # fmt: skip
+    taken: dict[Setting, dict[str, float]] = {}
+    for what, values, stages, settings in series:
+        for setting in settings:
+            if setting not in taken:
+                taken[setting] = measured(setting, seeded, seconds=SECONDS, compare=False)["stages"]
+        model = load_checkpoint(seeded.source(settings[-1].n)[0]).model
+        floor = floors(settings[-1], model, rates)
         for stage in stages:
-            yield _row(stage, what, values, [measured[case][stage] for case in cases], floor[stage])
+            yield _row(stage, what, values, [taken[setting][stage] for setting in settings], floor[stage])
 
 
-def _stages(inputs: Inputs, case: Case, threads: int) -> dict[str, float]:
-    """Median ms of each stage of ``case``."""
-    shade = f"lights:{case.lights}" if case.lights else "table"
-    file, _ = inputs.avatar(case.gaussians, Encoders())
-    point = Point(
-        str(file), str(inputs.motion), str(inputs.hdr), case.side, shade, threads=threads, seconds=SECONDS
-    )
-    stages: dict[str, float] = measure(point).row["stages"]
-    return stages
-
-
-def floors(case: Case, model: AvatarModel, rates: Rates) -> dict[str, float]:
-    """Seconds that each stage of a frame of ``model`` takes at least.
+def floors(setting: Setting, model: AvatarModel, rates: Rates) -> dict[str, float]:
+    """Seconds that each stage of a frame of ``model`` takes at least, by table or ``lights:K``.
 
     Bytes are those of the runtime's arrays: a Gaussian's mean, covariance and opacity are 40, its centre, shape, box,
     depth and slot on the screen 64, all that is shaded 116; a pixel's radiance and coverage 16, its colour 3.
     """
-    n, pixels = case.gaussians, case.side**2
+    n, pixels = setting.n, setting.size**2
+    lights = int(setting.shade.partition(":")[2] or 0)
     return {
         "encoders": rates.seconds(0.0, encoder_operations(model)),
         "posing": posing_floor(n, len(model.encoded_nodes()), model.log_weights.shape[1], rates),
         "projection": rates.seconds(104 * n),
-        "shading": rates.seconds(116 * n, 90 * n * case.lights),
+        "shading": rates.seconds(116 * n, 90 * n * lights),
         "sort": rates.seconds(36 * n),
         "raster": rates.seconds(44 * n + 16 * pixels),
         "tone map": rates.seconds(19 * pixels),

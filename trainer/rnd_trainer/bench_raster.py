@@ -29,6 +29,8 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
+from .bench_clock import summary
+
 Array = NDArray[np.float64]
 Row = dict[str, Any]
 
@@ -165,15 +167,12 @@ def measure(
                     times[k].append(1e3 * (time.perf_counter() - start))
         rows = []
         for (kernel, _, warm, wanted_times, wanted), taken, result in zip(cases, times, results):
-            timed = taken[warm:]
             row = {
                 "kernel": kernel,
                 "pass": "forward" if wanted is None else "forward+backward",
                 "n": len(scene.means),
                 "size": camera.width,
-                "ms_median": float(np.median(timed)),
-                "ms_p95": float(np.percentile(timed, 95)),
-                "ms_min": float(np.min(timed)),
+                **summary(taken[warm:]),
                 "psnr_db": _psnr(result, truth.image, truth.alpha),
                 "grad_rel_l2": None if wanted is None else _worst(result.grads, gradients),
                 "threads": threads,
