@@ -20,6 +20,7 @@ TABLE = re.compile(r"(<!-- table: (\S+) \| (.+?) -->\n).*?(<!-- end -->)", re.DO
 PAGES = {
     ROOT / "README.md": "assets/bench",
     ROOT / "docs" / "performance.md": "../assets/bench",
+    ROOT / "docs" / "quality.md": "../assets/bench",
     ROOT / "docs" / "light-stage.md": "../assets/bench",
 }
 """the pages with tables, and where their pictures lie as seen from them"""
