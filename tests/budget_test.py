@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import onnx
 import pytest
 from scipy.spatial import cKDTree
 
@@ -15,7 +16,7 @@ from rnd_export.cli import main
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
 from rnd_export.stopwatch import Stopwatch
-from rnd_export.variant import Variant, static_where
+from rnd_export.variant import OWN_NODES, Variant, static_where
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.errors import InputError
 from rnd_runtime.light import Light
@@ -203,12 +204,53 @@ def test_dynamic_skinning_stays_where_it_moves_something(bench) -> None:
     """By its own measure: nothing in the poses searched moves by more than the limit."""
     limit = float(np.median(bench._moves))
     model = bench.model(Recipe(dynamic_mm=limit))
-    dynamic = next(o for o in model.graph.node if o.name == "skinning/dynamic_nodes")
-    assert dynamic is not None
+    assert _sites(model) == {"skinning": round(len(bench._moves) * (1 - bench.still_share(limit)))}
     assert 0.4 < bench.still_share(limit) < 0.6
     whole, less = (bench.measure(bench.model(r), bench.seen) for r in (Recipe(), Recipe(dynamic_mm=limit)))
     static = bench.measure(bench.model(Recipe(Variant("static"))), bench.seen)
     assert static.psnr + 3 < less.psnr < whole.psnr
+
+
+def _sites(model: onnx.ModelProto) -> dict[str, int]:
+    """At how many nodes each network is evaluated that is not at all of them."""
+    stored = [tensor for tensor in model.graph.initializer if tensor.name.endswith("/sites_rows")]
+    return {tensor.name.partition("/")[0]: tensor.dims[0] for tensor in stored}
+
+
+def test_dynamic_skinning_at_fewer_nodes_stays_where_it_moves_something(bench) -> None:
+    """Both at once: of the nodes in farthest-point order the first hundred, and of these what moves."""
+    limit, variant = float(np.median(bench._moves)), Variant(skinning_nodes=100)
+    model = bench.model(Recipe(variant, dynamic_mm=limit))
+    moving = int((bench._moves[:100] >= limit).sum())
+    assert 30 < moving < 70 and _sites(model) == {"skinning": moving}
+    both, fewer, static = (
+        bench.measure(bench.model(recipe), bench.seen)
+        for recipe in (Recipe(variant, dynamic_mm=limit), Recipe(variant), Recipe(Variant("static")))
+    )
+    assert static.psnr < both.psnr < fewer.psnr
+
+
+class _OwnRates(_Formula):
+    """Offsets may be coarse for nothing and visibility for very little; skinning may not."""
+
+    def measure(self, recipe: Recipe, shots: str) -> Measured:
+        what, variant = super().measure(recipe, shots), recipe.variant
+        most = variant.nodes or self.config.nodes
+        skinning, offsets, visibility = (
+            1 - (count or most) / most
+            for count in (variant.skinning_nodes, variant.offset_nodes, variant.visibility_nodes)
+        )
+        square = 10 ** (-what.psnr / 10) + 1e-4 * skinning + 1e-7 * visibility
+        saved = 2.0 * skinning + 1.0 * offsets + 1.0 * visibility
+        return Measured(float(-10 * np.log10(square)), what.ms - saved, what.mb)
+
+
+def test_each_network_gets_as_few_nodes_as_it_can_do_with() -> None:
+    bench = _OwnRates()
+    found = search(bench, Bound("ms", 13.5), lambda found: None)
+    assert found.plan.offset_nodes == found.plan.visibility_nodes == 2 and found.plan.skinning_nodes == 0
+    assert found.plan.nodes == 0 and found.measured.psnr > 65
+    assert given_up(bench, found.plan)[0] == "offsets at 1875 of 7500 nodes"
 
 
 def test_rows_of_nodes_may_be_reordered(tiny_checkpoint) -> None:
@@ -279,7 +321,13 @@ def test_every_rung_is_a_file(bench) -> None:
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
     what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
     assert 5 < what.psnr < 60
-    assert len(given_up(bench, deepest)) == len(LADDERS) - 1  # no window where nothing is dynamic
+    # no window where nothing is dynamic, no fewer nodes for one network where there are as few for all
+    assert len(given_up(bench, deepest)) == len(LADDERS) - 1 - len(OWN_NODES)
+    own = Plan(**dict.fromkeys(OWN_NODES, 3))
+    assert given_up(bench, own) == [
+        f"{name} at 25 of 200 nodes" for name in ("skinning", "offsets", "visibility")
+    ]
+    assert 5 < bench.measure(bench.model(own.recipe(bench.config)), bench.seen).psnr < 60
 
 
 def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:

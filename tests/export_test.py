@@ -30,7 +30,7 @@ from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 from rnd_trainer.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
 from rnd_trainer.model import AvatarModel
-from rnd_trainer.template import along_curve, sample_template
+from rnd_trainer.template import along_curve, node_interpolation, sample_template
 from tiny import body, motion
 
 
@@ -145,6 +145,41 @@ def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
         coarse, truth = (_output(path, motion(body()), checkpoint, name) for path in (half, whole))
         same, others = truth[np.argsort(many)[few]], truth[:50]
         assert np.abs(coarse - same).max() < MAX_WEIGHT_ERROR / 10 < np.abs(coarse - others).max()
+
+
+@pytest.mark.parametrize("network", ["skinning", "offset", "visibility"])
+def test_each_network_may_have_fewer_nodes_of_its_own(
+    network, tiny_checkpoint, tiny_avatar, tmp_path
+) -> None:
+    """It says the same at those, what they say lies between them, and the other networks say what they said."""
+    checkpoint, fewer = load_checkpoint(tiny_checkpoint), tmp_path / "fewer.onnx"
+    export(tiny_checkpoint, fewer, motion(body()), Variant(**{f"{network}_nodes": 50}))
+    codes = bake(checkpoint.model).all_codes[:200]
+    order = along_curve(codes)  # the file's, of nodes that stand farthest first
+    area = checkpoint.config.model.gaussians * float(checkpoint.model.spacing) ** 2
+    neighbours, shares = node_interpolation(codes[order], codes[:50], area)
+    fields = {"skinning": "node_logits", "offset": "node_offsets", "visibility": "node_visibility"}
+    for name, field in fields.items():
+        ours, whole = (_output(path, motion(body()), checkpoint, field) for path in (fewer, tiny_avatar))
+        at_sites = whole[np.argsort(order)[:50]]
+        wanted = np.einsum("mk,mkc->mc", shares, at_sites[neighbours]) if name == network else whole
+        assert np.abs(ours - wanted).max() < MAX_WEIGHT_ERROR / 10
+        assert name != network or np.abs(ours - whole).max() > MAX_WEIGHT_ERROR
+
+
+def test_networks_with_as_many_nodes_are_interpolated_together(tiny_checkpoint, tmp_path) -> None:
+    both = tmp_path / "both.onnx"
+    export(
+        tiny_checkpoint,
+        both,
+        motion(body()),
+        Variant(offset_nodes=50, visibility_nodes=50, skinning_nodes=100),
+    )
+    joined = [node for node in onnx.load(both).graph.node if node.name.endswith("_nodes/fields")]
+    assert [(node.name, len(node.input)) for node in joined] == [
+        ("from_50_nodes/fields", 2),
+        ("from_100_nodes/fields", 1),
+    ]
 
 
 def _weights(path, moves: Motion, checkpoint) -> np.ndarray:

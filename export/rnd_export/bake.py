@@ -48,6 +48,16 @@ class BakedSkinning:
     heads: int
 
 
+@dataclass(frozen=True)
+class Rates:
+    """At how many nodes each network is evaluated: the first so many in farthest-point order; between them its values
+    are interpolated."""
+
+    skinning: int
+    offsets: int
+    visibility: int
+
+
 @dataclass(frozen=True, eq=False)
 class BakedAvatar:
     """The constants of an avatar. N Gaussians, M nodes, J joints.
@@ -57,13 +67,16 @@ class BakedAvatar:
     ``all_codes`` [N, 3] m belong to the Gaussians;
     ``factors`` [N, 3, 3] m is R S in the rest pose; ``offsets`` and ``visibility`` are a
     :class:`PoseConditioned` each, ``skinning`` None where the template's weights are used as they are. Skinning is
-    dynamic at the first ``dynamic_nodes`` nodes, the template's at the others.
+    dynamic at the first ``dynamic_nodes`` nodes, the template's at the others. ``node_ranks`` [M] are the nodes'
+    places in the farthest-point order, by which ``rates`` counts; ``area`` is the template's, m².
     """
 
     codes: Floats
     all_codes: Floats
     frequencies: int
     node_rows: NDArray[np.int64]
+    node_ranks: NDArray[np.int64]
+    rates: Rates
     dynamic_nodes: int
     skinning: BakedSkinning | None
     offsets: dict[str, Floats]
@@ -82,6 +95,7 @@ class BakedAvatar:
     roughness: Floats
     rows: NDArray[np.int64]
     max_offset: float
+    area: float
 
 
 @torch.no_grad()
@@ -96,6 +110,8 @@ def bake(model: AvatarModel) -> BakedAvatar:
         all_codes=_array(model.codes),
         frequencies=config.frequencies,
         node_rows=np.arange(config.nodes),
+        node_ranks=np.arange(config.nodes),
+        rates=Rates(config.nodes, config.nodes, config.nodes),
         dynamic_nodes=config.nodes if config.dynamic_skinning else 0,
         skinning=_skinning(model) if config.dynamic_skinning else None,
         offsets=_weights(model.offsets),
@@ -114,6 +130,7 @@ def bake(model: AvatarModel) -> BakedAvatar:
         roughness=_array(static.roughness),
         rows=np.arange(len(model.codes)),
         max_offset=config.max_offset,
+        area=config.gaussians * float(model.spacing) ** 2,
     )
 
 

@@ -19,13 +19,16 @@ from rnd_runtime.errors import InputError
 from rnd_trainer.config import ModelConfig
 
 from .candidates import Measured, Recipe, Workbench
-from .variant import Variant
+from .variant import OWN_NODES, Variant
 
 PRECISIONS: tuple[Literal["f32", "f16", "int8"], ...] = ("f32", "f16", "int8")
 LADDERS: dict[str, tuple[float, ...]] = {
     "precision": (1, 2),
     "dynamic_mm": (0.05, 0.2, 0.5, 1.0, 2.0, np.inf),
     "nodes": (0.5, 0.25, 0.125),
+    "skinning_nodes": (0.5, 0.25, 0.125),
+    "offset_nodes": (0.5, 0.25, 0.125),
+    "visibility_nodes": (0.5, 0.25, 0.125),
     "gaussians": (0.85, 0.7, 0.55, 0.4, 0.3, 0.2),
     "visibility_degree": (2, 1, 0),
     "window": (0.5, 0.3, 0.2),
@@ -57,6 +60,9 @@ class Plan:
     precision: int = 0
     dynamic_mm: int = 0
     nodes: int = 0
+    skinning_nodes: int = 0
+    offset_nodes: int = 0
+    visibility_nodes: int = 0
     gaussians: int = 0
     visibility_degree: int = 0
     window: int = 0
@@ -72,16 +78,25 @@ class Plan:
             rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree")
         )
         static = rung("dynamic_mm") == np.inf
+        most = _nodes(nodes, config) or config.nodes
+        own = {name: _nodes(rung(name), config) for name in OWN_NODES}
+        if static:
+            own["skinning_nodes"] = None
         variant = Variant(
             encoder="coarse" if nodes else "full",
             precision=PRECISIONS[self.precision],
-            nodes=max(16, int(nodes * config.nodes)) if nodes else None,
+            nodes=_nodes(nodes, config),
+            **{name: count for name, count in own.items() if count and count < most},
             window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
             visibility_degree=3 if degree is None else int(degree),
         )
-        least = variant.nodes or config.nodes  # nodes stay
-        count = max(int(gaussians * config.gaussians), least) if gaussians else None
+        count = max(int(gaussians * config.gaussians), most) if gaussians else None  # nodes stay
         return Recipe(variant, count, rung("dynamic_mm") or 0.0)
+
+
+def _nodes(share: float | None, config: ModelConfig) -> int | None:
+    """That share of the checkpoint's nodes."""
+    return None if share is None else max(16, int(share * config.nodes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +193,10 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
         )
     if recipe.variant.nodes is not None:
         lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
+    for name in OWN_NODES:
+        if count := getattr(recipe.variant, name):
+            network = {"offset_nodes": "offsets"}.get(name, name.removesuffix("_nodes"))
+            lines.append(f"{network} at {count} of {recipe.variant.node_count(config)} nodes")
     if recipe.dynamic_mm == np.inf:
         lines.append("dynamic skinning nowhere")
     elif recipe.dynamic_mm:

@@ -24,7 +24,7 @@ from rnd_runtime.raster_cpu import rasterize
 from rnd_trainer.checkpoint import load_checkpoint
 
 from .bake import BakedAvatar, bake
-from .export import refuse_ablations, surface_area, written
+from .export import refuse_ablations, written
 from .merge import contributions, fitted_albedo, merged
 from .places import gaussians_by_place
 from .stopwatch import Stopwatch
@@ -100,7 +100,7 @@ class Workbench:
 
     def model(self, recipe: Recipe) -> onnx.ModelProto:
         """The file of ``recipe``."""
-        baked = reduced(self._baked, self.config, recipe.variant, surface_area(self.checkpoint))
+        baked = reduced(self._baked, self.config, recipe.variant)
         if recipe.dynamic_mm and baked.skinning is not None:
             baked = static_where(baked, self._moves[: len(baked.codes)] < recipe.dynamic_mm)
         if recipe.gaussians is not None:

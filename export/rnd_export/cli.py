@@ -31,6 +31,12 @@ class Options:
     """how constants are stored; f16 must keep 99 % of all places within 1 mm, int8 within 3 mm"""
     nodes: int | None = None
     """nodes of --encoder coarse; by default a quarter of the checkpoint's"""
+    skinning_nodes: int | None = None
+    """of these, at how many the skinning network is evaluated; between them it is interpolated"""
+    offset_nodes: int | None = None
+    """the same of the pose offsets"""
+    visibility_nodes: int | None = None
+    """the same of the visibility"""
     window_poses: int | None = None
     """poses in the motion window; fewer span the same time"""
     visibility_degree: int = 3
@@ -52,7 +58,10 @@ class Options:
 BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
 SEARCHES = ("size", "hdr", "json")
 """options that say how a bound's search goes"""
-CHOICES = ("encoder", "precision", "nodes", "window_poses", "visibility_degree")
+CHOICES = (
+    "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
+    "visibility_degree",
+)  # fmt: skip
 """options that say what a file leaves out, which a search finds by itself"""
 
 
@@ -95,9 +104,7 @@ def _export(options: Options) -> None:
 
         export_bounded(options, out, motion, given)
         return
-    variant = Variant(
-        options.encoder, options.precision, options.nodes, options.window_poses, options.visibility_degree
-    )
+    variant = Variant(**{name: getattr(options, name) for name in CHOICES})
     drift = export(options.checkpoint, out, motion, variant)
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "

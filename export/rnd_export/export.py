@@ -76,7 +76,7 @@ def export(
     variant = variant or Variant()
     variant.check(checkpoint.config.model)
     baked = gaussians_by_place(bake(checkpoint.model))
-    baked = reduced(baked, checkpoint.config.model, variant, surface_area(checkpoint))
+    baked = reduced(baked, checkpoint.config.model, variant)
     model = written(checkpoint, checkpoint_path, baked, variant)
     if motion is None:
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
@@ -111,11 +111,6 @@ def written(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: Var
     poses = variant.window_poses or checkpoint.config.model.window_poses
     metadata = _metadata(checkpoint, path, baked, variant)
     return build_model(nodes_by_place(baked), variant.precision, poses, {METADATA_KEY: metadata})
-
-
-def surface_area(checkpoint: Checkpoint) -> float:
-    """Of the template, m²."""
-    return checkpoint.config.model.gaussians * float(checkpoint.model.spacing) ** 2
 
 
 def _bounds(drift: Drift, variant: Variant) -> list[tuple[str, float, float]]:

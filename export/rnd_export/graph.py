@@ -7,12 +7,14 @@ import onnx
 
 from rnd_runtime.avatar_file import Precision
 from rnd_runtime.sh import SH_COUNT
+from rnd_trainer.template import NEIGHBOURS, node_interpolation
 
 from .bake import BakedAvatar
 from .graph_builder import GraphBuilder
 from .graph_networks import Networks
 from .graph_posing import Posing
 from .graph_rest import STORAGE, RestConstants
+from .places import Integers, node_sites
 
 PRODUCER = "rnd-avatar"
 
@@ -28,20 +30,12 @@ def build_model(
     bones = graph.input("bone_transforms", (joints, 3, 4))
     rest = RestConstants(graph, baked, precision)
 
-    fields = _node_fields(
-        graph, baked, rest, (window, velocity, bones), Networks(graph, STORAGE[precision][2])
-    )
+    networks = Networks(graph, STORAGE[precision][2])
+    sizes = {"node_logits": joints, "node_offsets": 6, "node_visibility": len(baked.visibility["out.bias"])}
+    fields = _node_fields(graph, baked, rest, (window, velocity, bones), networks)
+    fields = _at_all_nodes(graph, baked, fields, sizes)
     with graph.scope("interpolate"):
-        values = _interpolated(
-            graph, baked, rest, graph.op("Concat", *fields.values(), name="fields", axis=1)
-        )
-        sizes = {
-            "node_logits": joints,
-            "node_offsets": 6,
-            "node_visibility": len(baked.visibility["out.bias"]),
-        }
-        split = graph.split(values, {name: sizes[name] for name in fields}, axis=1)
-        parts = dict(zip(fields, split))
+        parts = _interpolated(graph, fields, sizes, rest["neighbours"], rest["neighbour_weights"])
         visibility = _padded(graph, parts["node_visibility"], count, SH_COUNT - sizes["node_visibility"])
     with graph.scope("pose_gaussians"):
         logits = rest["log_template"]
@@ -67,36 +61,53 @@ def _node_fields(
     inputs: tuple[str, str, str],
     networks: Networks,
 ) -> dict[str, str]:
-    """What the networks say at the nodes, by name; no logits where skinning is the template's."""
+    """What the networks say at their nodes, by name; no logits where skinning is the template's."""
     window, velocity, bones = inputs
     fields = {}
     encoded = networks.encoded(baked.codes, baked.frequencies)
-    if baked.skinning is not None:
+
+    def at(sites: Integers) -> str:
+        """Their rows of what is encoded."""
+        return encoded if len(sites) == len(baked.codes) else graph.rows(encoded, sites, "sites")
+
+    sites = node_sites(baked, baked.rates.skinning)
+    moving = sites[sites < baked.dynamic_nodes]
+    if baked.skinning is not None and len(moving):
         with graph.scope("skinning"):
-            fields["node_logits"] = _logits(graph, baked, encoded, (window, velocity), networks)
+            logits = networks.skinning(baked.skinning, at(moving), window, velocity)
+            if still := len(sites) - len(moving):  # the template's there
+                zeros = graph.filled("static_logits", (still, baked.weights.shape[1]), 0.0)
+                logits = graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
+            fields["node_logits"] = logits
     with graph.scope("pose"):
         now = graph.op("Gather", window, graph.constant("last", np.int64(-1)), name="now", axis=0)
         now = graph.reshape(now, (1, -1), "now_flat")
     with graph.scope("offsets"):
-        fields["node_offsets"] = networks.conditioned(baked.offsets, encoded, now, None)
+        sites = node_sites(baked, baked.rates.offsets)
+        fields["node_offsets"] = networks.conditioned(baked.offsets, at(sites), now, None)
     with graph.scope("visibility"):
-        normals = _root_normals(graph, baked, rest, bones)
-        fields["node_visibility"] = networks.conditioned(baked.visibility, encoded, now, normals)
+        sites = node_sites(baked, baked.rates.visibility)
+        normals = _root_normals(graph, baked, rest, bones, sites)
+        fields["node_visibility"] = networks.conditioned(baked.visibility, at(sites), now, normals)
     return fields
 
 
-def _logits(
-    graph: GraphBuilder, baked: BakedAvatar, encoded: str, inputs: tuple[str, str], networks: Networks
-) -> str:
-    """Δ logits [M, J], zero at the nodes whose skinning is the template's."""
-    assert baked.skinning is not None
-    static = len(baked.codes) - baked.dynamic_nodes
-    if not static:
-        return networks.skinning(baked.skinning, encoded, *inputs)
-    encoded = graph.rows(encoded, np.arange(baked.dynamic_nodes), "dynamic_nodes")
-    logits = networks.skinning(baked.skinning, encoded, *inputs)
-    zeros = graph.filled("static_logits", (static, baked.weights.shape[1]), 0.0)
-    return graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
+def _at_all_nodes(
+    graph: GraphBuilder, baked: BakedAvatar, fields: dict[str, str], sizes: dict[str, int]
+) -> dict[str, str]:
+    """``fields`` at all nodes, those of networks with fewer interpolated: all that have as many together."""
+    rates, whole = baked.rates, dict(fields)
+    counts = {
+        "node_logits": rates.skinning, "node_offsets": rates.offsets, "node_visibility": rates.visibility,
+    }  # fmt: skip
+    for count in sorted({counts[name] for name in fields} - {len(baked.codes)}):
+        with graph.scope(f"from_{count}_nodes"):
+            sites = node_sites(baked, count)
+            neighbours, weights = node_interpolation(baked.codes, baked.codes[sites], baked.area)
+            coarse = {name: value for name, value in fields.items() if counts[name] == count}
+            read, shares = graph.packed("neighbours", neighbours), graph.constant("shares", weights)
+            whole |= _interpolated(graph, coarse, sizes, read, shares)
+    return whole
 
 
 def _posed(
@@ -127,10 +138,12 @@ def _posed(
     return posing.points(blend, linear, points), covariances, posing.by_gaussian(normals, "normals")
 
 
-def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, bones: str) -> str:
-    """The nodes' normals [M, 3], posed by the template's weights, in the root's frame."""
+def _root_normals(
+    graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, bones: str, sites: Integers
+) -> str:
+    """Normals of the nodes ``sites`` [m, 3], posed by the template's weights, in the root's frame."""
     posing = Posing(graph)
-    weights = graph.rows(rest["log_template"], baked.node_rows, "nodes")
+    weights = graph.rows(rest["log_template"], baked.node_rows[sites], "nodes")
     weights = graph.op("Softmax", weights, name="weights", axis=1)
     root = graph.rows(graph.rows(bones, [0], "root_bone"), [0, 1, 2], "root_columns", axis=2)
     root = graph.reshape(root, (3, 3), "root")
@@ -138,22 +151,24 @@ def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, 
     to_root = graph.op("Transpose", root, name="to_root", perm=[1, 0])
     in_root = graph.op("MatMul", to_root, bones, name="bones_in_root")
     linear = posing.linear(posing.blend(weights, in_root))
-    normals = graph.rows(rest.by_component("rest_normals"), baked.node_rows, "rest_normals", axis=1)
+    normals = graph.rows(rest.by_component("rest_normals"), baked.node_rows[sites], "rest_normals", axis=1)
     return posing.by_gaussian(posing.normals(linear, posing.cofactors(linear), normals), "root_normals")
 
 
-def _interpolated(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, fields: str) -> str:
-    """Σ_k weight_k · fields[neighbour_k]: [M, C] → [N, C]."""
-    total = ""
-    for k in range(baked.neighbours.shape[1]):
+def _interpolated(
+    graph: GraphBuilder, fields: dict[str, str], sizes: dict[str, int], neighbours: str, weights: str
+) -> dict[str, str]:
+    """Σ_k weight_k · field[neighbour_k] of each field [m, size], by name: [n, size] for n rows of neighbours."""
+    joined, total = graph.op("Concat", *fields.values(), name="fields", axis=1), ""
+    for k in range(NEIGHBOURS):
         row = graph.op(
-            "Gather", rest["neighbours"], graph.constant(f"k{k}", np.int64(k)), name=f"neighbour{k}", axis=1
+            "Gather", neighbours, graph.constant(f"k{k}", np.int64(k)), name=f"neighbour{k}", axis=1
         )
-        weight = graph.rows(rest["neighbour_weights"], [k], f"weight{k}", axis=1)
-        part = graph.op("Gather", fields, row, name=f"gathered{k}", axis=0)
+        weight = graph.rows(weights, [k], f"weight{k}", axis=1)
+        part = graph.op("Gather", joined, row, name=f"gathered{k}", axis=0)
         part = graph.op("Mul", part, weight, name=f"weighted{k}")
         total = graph.op("Add", total, part, name=f"sum{k}") if total else part
-    return total
+    return dict(zip(fields, graph.split(total, {name: sizes[name] for name in fields}, axis=1)))
 
 
 def _padded(graph: GraphBuilder, visibility: str, count: int, missing: int) -> str:

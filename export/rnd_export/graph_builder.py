@@ -77,6 +77,13 @@ class GraphBuilder:
         spread = self.op("Mul", counts, self.constant(f"{name}_step", step), name=f"{name}_spread")
         return self.op("Add", spread, self.constant(f"{name}_low", low), name=name)
 
+    def packed(self, name: str, value: Any) -> str:
+        """An int32 constant of what is not negative, kept in 8 or 16 bits where they hold it."""
+        array: NDArray[Any] = np.asarray(value)
+        least = next(kind for kind in (np.uint8, np.uint16, np.int32) if array.max() <= np.iinfo(kind).max)
+        packed = self.constant(f"{name}_packed", array.astype(least))
+        return self.op("Cast", packed, name=name, to=TensorProto.INT32)
+
     def op(self, kind: str, *inputs: str, name: str, **attributes: Any) -> str:
         """One node with one output, called ``name``."""
         full = self._unique(name)

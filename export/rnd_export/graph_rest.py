@@ -48,10 +48,7 @@ class RestConstants:
         ):
             self._add(name, self._stored(name, values, storage), values.shape)
         self._add("log_template", self._log_template(baked.weights, networks), baked.weights.shape)
-        kind = np.uint16 if len(baked.codes) <= 65536 else np.int32
-        packed = graph.constant("rest/neighbours_packed", baked.neighbours.astype(kind))
-        neighbours = graph.op("Cast", packed, name="rest/neighbours", to=TensorProto.INT32)
-        self._add("neighbours", neighbours, baked.neighbours.shape)
+        self._add("neighbours", graph.packed("rest/neighbours", baked.neighbours), baked.neighbours.shape)
         limits = np.array([baked.max_offset, THICKNESS_FLOOR**2, NORMAL_FALLBACK])
         self._add("posing_limits", graph.constant("rest/posing_limits", limits), (3,))
 
@@ -94,8 +91,7 @@ class RestConstants:
             flat = (logs - logs.min(axis=1, keepdims=True)).reshape(-1)
             entries = np.flatnonzero(flat > SMALLEST_LOG)
             steps = np.diff(entries, prepend=0)
-            packed = graph.constant("steps_packed", steps.astype(np.uint8 if steps.max() < 256 else np.int32))
-            places = graph.op("Cast", packed, name="steps", to=TensorProto.INT32)
+            places = graph.packed("steps", steps)
             places = graph.op("CumSum", places, graph.constant("step_axis", np.int64(0)), name="places")
             values = graph.stored("log_weights", flat[entries], storage)
             zeros = graph.filled("zeros", (flat.size,), 0.0)

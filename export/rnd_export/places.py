@@ -44,8 +44,14 @@ def nodes_in_order(baked: BakedAvatar, order: Integers) -> BakedAvatar:
         baked,
         codes=baked.codes[order],
         node_rows=baked.node_rows[order],
+        node_ranks=baked.node_ranks[order],
         neighbours=_inverse(order)[baked.neighbours],
     )
+
+
+def node_sites(baked: BakedAvatar, count: int) -> Integers:
+    """The nodes that are the first ``count`` in farthest-point order, as they stand in the file."""
+    return np.flatnonzero(baked.node_ranks < count)
 
 
 def _inverse(order: Integers) -> Integers:

@@ -15,11 +15,15 @@ from rnd_runtime.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.template import NEIGHBOURS, node_interpolation
 
-from .bake import BakedAvatar, BakedSkinning
+from .bake import BakedAvatar, BakedSkinning, Rates
 from .places import nodes_in_order
 
 COARSE_SHARE = 4
 """``coarse`` evaluates the networks at one of this many nodes: 16 mm apart become 32 mm on a person"""
+
+
+OWN_NODES = ("skinning_nodes", "offset_nodes", "visibility_nodes")
+"""fields of :class:`Variant` that concern one network each"""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,7 @@ class Variant:
             ``static``: the template's skinning weights, no attention.
         precision: how constants are stored; arithmetic is float32 always.
         nodes: M, a prefix of the farthest-point order; for ``coarse``.
+        skinning_nodes, offset_nodes, visibility_nodes: of these M, at how many that network alone is evaluated.
         window_poses: d; fewer poses span the same seconds, those between are interpolated.
         visibility_degree: 0 to 3; higher coefficients are left out.
     """
@@ -38,6 +43,9 @@ class Variant:
     encoder: EncoderKind = "full"
     precision: Precision = "f32"
     nodes: int | None = None
+    skinning_nodes: int | None = None
+    offset_nodes: int | None = None
+    visibility_nodes: int | None = None
     window_poses: int | None = None
     visibility_degree: int = SH_DEGREE
 
@@ -47,14 +55,24 @@ class Variant:
             return config.nodes
         return self.nodes or max(NEIGHBOURS, config.nodes // COARSE_SHARE)
 
+    def rates(self, config: ModelConfig) -> Rates:
+        """Nodes of each network, of the M of the file."""
+        own = (self.skinning_nodes, self.offset_nodes, self.visibility_nodes)
+        return Rates(*(self.node_count(config) if count is None else count for count in own))
+
     def check(self, config: ModelConfig) -> None:
         """Raise :class:`InputError` for what no file of this checkpoint can be."""
         least = {
-            "nodes": NEIGHBOURS,
+            **dict.fromkeys(("nodes", *OWN_NODES), NEIGHBOURS),
             "window_poses": 2 if config.window_poses > 1 else 1,
             "visibility_degree": 0,
         }
-        most = {"nodes": config.nodes, "window_poses": config.window_poses, "visibility_degree": SH_DEGREE}
+        most = {
+            "nodes": config.nodes,
+            **dict.fromkeys(OWN_NODES, self.node_count(config)),
+            "window_poses": config.window_poses,
+            "visibility_degree": SH_DEGREE,
+        }
         for name, low in least.items():
             value = getattr(self, name)
             if value is not None and not low <= value <= most[name]:
@@ -62,16 +80,19 @@ class Variant:
                 raise InputError(option, expected=f"{low} to {most[name]}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
+        if self.skinning_nodes is not None and self.encoder == "static":
+            raise InputError("--skinning-nodes", expected="dynamic skinning", got="--encoder static")
 
 
-def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant, area: float) -> BakedAvatar:
-    """``baked`` without what ``variant`` leaves out; ``area`` [m²] is that of the template's surface."""
-    changes: dict[str, Any] = {}
+def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:
+    """``baked`` without what ``variant`` leaves out."""
+    changes: dict[str, Any] = {"rates": variant.rates(config)}
     nodes, skinning = variant.node_count(config), baked.skinning
     if nodes < len(baked.codes):
-        neighbours, weights = node_interpolation(baked.all_codes, baked.codes[:nodes], area)
+        neighbours, weights = node_interpolation(baked.all_codes, baked.codes[:nodes], baked.area)
         changes |= {
             "codes": baked.codes[:nodes], "node_rows": baked.node_rows[:nodes],
+            "node_ranks": baked.node_ranks[:nodes],
             "neighbours": neighbours, "neighbour_weights": weights,
             "dynamic_nodes": nodes if skinning else 0,
         }  # fmt: skip
