@@ -132,6 +132,32 @@ def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
     assert len(settings(quick=True)) < len(points) / 2
 
 
+def test_factors_that_are_crossed_come_in_all_combinations() -> None:
+    points = settings(cross=("n", "size", "shade", "encoder"))
+    assert points[0] == Setting() and len(points) == len(set(points)) == 5 * 3 * 5 * 3
+    assert Setting(n=60_000, size=1024, shade="brute", encoder="static") in points
+    windows = settings(cross=("encoder", "window"))
+    assert [(p.encoder, p.window) for p in windows].count(("static", None)) == 1
+    assert {p.window for p in windows if p.encoder == "static"} == {None} and len(windows) == 7
+    with pytest.raises(InputError, match=r"--cross: expected of n, size, .*cull, got colour"):
+        settings(cross=("n", "colour"))
+
+
+def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(
+        bench_grid, "measured", lambda setting, inputs, **_: dataclasses.asdict(setting) | HERE
+    )
+    monkeypatch.setattr(bench_grid, "machine", lambda: HERE["machine"])
+    monkeypatch.setattr(bench_chart, "draw_chart", lambda rows, files: None)
+    monkeypatch.setattr(bench_cli, "_line", lambda row: "")
+    words = ["rnd-bench", "grid", "--cross", "threads, shade", "--json", str(tmp_path / "grid.json")]
+    monkeypatch.setattr(sys, "argv", [*words, "--work", str(tmp_path / "work")])
+    for state in ("(10/10, 0 min left)", "(10/10, kept)"):
+        with pytest.raises(SystemExit) as ended:
+            bench_cli.main()
+        assert not ended.value.code and state in capsys.readouterr().out
+
+
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
     calls: list[Setting] = []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import tyro
@@ -97,16 +98,29 @@ def _grid(options: Grid) -> None:
     from rich.console import Console
 
     from .bench_chart import draw_chart
-    from .bench_grid import grid
+    from .bench_grid import grid, settings
     from .charts import check_chart
 
     check_chart(*options.chart)
-    console = Console()
+    cross = [name.strip() for name in options.cross.split(",") if name.strip()]
+    points = len(settings(options.quick, cross))
+    console, started, shown, measured = Console(), perf_counter(), 0, 0
 
     def show(row: dict[str, Any], new: bool) -> None:
-        console.print(_line(row) + ("" if new else "  (kept)"), highlight=False)
+        nonlocal shown, measured
+        shown, measured = shown + 1, measured + new
+        left = (perf_counter() - started) / measured * (points - shown) if measured else 0
+        state = f"{shown}/{points}, {left / 60:.0f} min left" if new else f"{shown}/{points}, kept"
+        console.print(f"{_line(row)}  ({state})", highlight=False)
 
-    rows = grid(_inputs(options.files), options.json, quick=options.quick, fresh=options.fresh, on_row=show)
+    rows = grid(
+        _inputs(options.files),
+        options.json,
+        quick=options.quick,
+        cross=cross,
+        fresh=options.fresh,
+        on_row=show,
+    )
     draw_chart(rows, list(options.chart))
     console.print(f"{options.json}, {', '.join(map(str, options.chart))}")
     others = len(read_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)

@@ -1,4 +1,5 @@
-"""The grid of the speed–accuracy chart: one factor at a time around the usual case, and a crossed core.
+"""The grid of the speed–accuracy chart: one factor at a time around the usual case and a crossed core, or factors that
+are crossed with one another.
 
 Every point is one row of JSON. Rows that are there already, measured on this machine, of the same files and by the same
 version, are not measured again: an interrupted run goes on where it stopped.
@@ -6,7 +7,7 @@ version, are not measured again: an interrupted run goes on where it stopped.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import existing_file, output_folder, read_rows, write_json
 
 from .bench_avatars import Encoders, content_key, exported, forget, seeded_checkpoint
@@ -84,20 +85,34 @@ class Inputs:
         return int(read_tensors(self.checkpoint, SCHEMA)[1]["config"]["model"]["gaussians"])
 
 
-def settings(quick: bool = False) -> list[Setting]:
-    """The points, the usual case first, none twice."""
+FACTORS: dict[str, tuple[Any, ...]] = {
+    "n": (4_000, 8_000, 15_000, FULL_N, 60_000),
+    "size": (256, 512, 1024),
+    "shade": ("ao", "table", "table+sun", "lights:32", "brute"),
+    "encoder": ("full", "coarse", "static"),
+    "precision": ("f32", "f16", "int8"),
+    "window": (None, 2, 5),
+    "raster": ("cpu", "gl-egl", "gl-osmesa"),
+    "threads": (2, 1),
+    "cull": (None, *CULLS),
+}
+"""what each field of a :class:`Setting` is varied over"""
+
+
+def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
+    """The points, the usual case first, none twice; with ``cross`` all combinations of those factors and no others.
+
+    Raises :class:`InputError` for a factor that does not exist.
+    """
     usual = Setting(n=8_000, size=256) if quick else Setting()
-    factors: dict[str, tuple[Any, ...]] = {
-        "n": (4_000, 8_000, 15_000, 60_000),
-        "size": (256, 1024),
-        "shade": ("ao", "table", "lights:32", "brute"),
-        "encoder": ("coarse", "static"),
-        "precision": ("f16", "int8"),
-        "window": (2, 5),
-        "raster": ("gl-egl", "gl-osmesa"),
-        "threads": (1,),
-        "cull": CULLS,
-    }
+    factors = FACTORS
+    for name in cross:
+        check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
+    if cross:
+        combinations = product(*(FACTORS[name] for name in cross))
+        points = [usual, *(replace(usual, **dict(zip(cross, values))) for values in combinations)]
+        # template skinning has no window: such points would be one and the same
+        return list(dict.fromkeys(p for p in points if p.encoder != "static" or p.window is None))
     if quick:
         factors = {"n": (4_000,), "shade": ("ao", "table"), "encoder": ("coarse", "static"), "threads": (1,),
                    "raster": ("gl-egl",)}  # fmt: skip
@@ -106,8 +121,8 @@ def settings(quick: bool = False) -> list[Setting]:
         *(replace(usual, **{name: value}) for name, values in factors.items() for value in values),
     ]
     if not quick:
-        crossed = product((8_000, 15_000, FULL_N), ("full", "coarse", "static"), ("table", "table+sun"))
-        points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in crossed]
+        core = product((8_000, 15_000, FULL_N), FACTORS["encoder"], ("table", "table+sun"))
+        points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in core]
         points += [Setting(shade="table", cull=cull) for cull in CULLS]
     return list(dict.fromkeys(points))
 
@@ -145,6 +160,7 @@ def grid(
     out: Path,
     *,
     quick: bool = False,
+    cross: Sequence[str] = (),
     fresh: bool = False,
     on_row: Callable[[Row, bool], None],
 ) -> list[Row]:
@@ -156,7 +172,7 @@ def grid(
     if fresh:
         forget(inputs.work)
     rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
-    wanted, key = settings(quick), inputs.key()
+    wanted, key = settings(quick, cross), inputs.key()
     here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
     done: list[Row] = []
     for setting in wanted:

@@ -76,6 +76,9 @@ class Grid:
 
     quick: bool = False
     """the small grid, in two minutes"""
+    cross: Annotated[str, tyro.conf.arg(metavar="LIST")] = ""
+    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (225 points, half an
+    hour); also precision, window, raster, threads, cull: all nine are days"""
     json: Path = Path("assets/bench/grid.json")
     """rows; those measured on this machine, of the same files, are not measured again"""
     fresh: bool = False
