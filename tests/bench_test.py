@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import subprocess
 import sys
@@ -150,12 +151,30 @@ def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> Non
     monkeypatch.setattr(bench_grid, "machine", lambda: HERE["machine"])
     monkeypatch.setattr(bench_chart, "draw_chart", lambda rows, files: None)
     monkeypatch.setattr(bench_cli, "_line", lambda row: "")
-    words = ["rnd-bench", "grid", "--cross", "threads, shade", "--json", str(tmp_path / "grid.json")]
-    monkeypatch.setattr(sys, "argv", [*words, "--work", str(tmp_path / "work")])
-    for state in ("(10/10, 0 min left)", "(10/10, kept)"):
+    moments = itertools.count(0.0, 60.0)  # a minute between two looks at the clock
+    monkeypatch.setattr(bench_cli, "perf_counter", lambda: next(moments))
+    words = ["rnd-bench", "grid", "--cross", "threads, shade", "--work", str(tmp_path / "work")]
+
+    def said(*more: str) -> tuple[int, list[str]]:
+        monkeypatch.setattr(sys, "argv", [*words, *more])
         with pytest.raises(SystemExit) as ended:
             bench_cli.main()
-        assert not ended.value.code and state in capsys.readouterr().out
+        out, err = capsys.readouterr()
+        return int(ended.value.code or 0), (out + err).splitlines()
+
+    files = ["--json", str(tmp_path / "grid.json"), "--chart", str(tmp_path / "grid.svg")]
+    code, lines = said(*files)
+    assert code == 0 and [line.strip() for line in lines[:10:4]] == [
+        "(9 left, about 9 min)", "(5 left, about 5 min)", "(1 left, about 1 min)"
+    ]  # fmt: skip
+    rows = json.loads((tmp_path / "grid.json").read_text())
+    (tmp_path / "grid.json").write_text(json.dumps(rows[:7]))
+    lines = said(*files)[1]
+    assert [line.strip() for line in lines[5:10]] == [
+        "(kept)", "(kept)", "(2 left, about 16 min)", "(1 left, about 4 min)", "(0 left, about 0 min)"
+    ]  # fmt: skip
+    code, lines = said(*files[:2])
+    assert code == 2 and "--chart: expected files of its own beside --cross" in lines[-1]
 
 
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
@@ -175,13 +194,13 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     out = tmp_path / "grid.json"
     seen: list[bool] = []
     with pytest.raises(KeyboardInterrupt):
-        grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
+        grid(inputs, out, quick=True, on_row=lambda row, new, left: seen.append(new))
     assert len(json.loads(out.read_text())) == 3 == len(seen)
     calls.clear()
     monkeypatch.setattr(
         bench_grid, "measured", lambda s, i, **k: pretend(s, i) if calls.clear() is None else {}
     )
-    rows = grid(inputs, out, quick=True, on_row=lambda row, new: seen.append(new))
+    rows = grid(inputs, out, quick=True, on_row=lambda row, new, left: seen.append(new))
     assert seen == [True] * 3 + [False] * 3 + [True] * (len(settings(True)) - 3)
     assert [row for row in rows if "failed" in row] == [next(r for r in rows if r["raster"] == "gl-egl")]
     seen.clear()
@@ -194,7 +213,7 @@ def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> 
     mine = ("walk.npz", "avatar.ckpt", "avatar.onnx")
     for name in (*kept, *mine):
         (tmp_path / "work" / name).touch()
-    grid(inputs, out, quick=True, fresh=True, on_row=lambda row, new: seen.append(new))
+    grid(inputs, out, quick=True, fresh=True, on_row=lambda row, new, left: seen.append(new))
     assert all(seen) and len(seen) == len(settings(True))
     assert {file.name for file in (tmp_path / "work").iterdir()} == set(mine)
     assert {json.dumps(row, sort_keys=True) for row in json.loads(out.read_text())} == {
@@ -212,7 +231,7 @@ def test_rows_of_other_files_are_measured_again(tmp_path, monkeypatch) -> None:
 
     def new_rows(given: Inputs = inputs) -> set[bool]:
         seen: set[bool] = set()
-        grid(given, out, quick=True, on_row=lambda row, new: seen.add(new))
+        grid(given, out, quick=True, on_row=lambda row, new, left: seen.add(new))
         return seen
 
     body.write_bytes(b"one")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -10,13 +12,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rnd_export.bake import BakedAvatar, bake
-from rnd_export.budget import LADDERS, Bound, Plan, given_up, search
+from rnd_export.budget import LADDERS, Bound, Found, Plan, given_up, search
 from rnd_export.candidates import Measured, Recipe, Scene, Workbench
 from rnd_export.cli import main
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
+from rnd_export.places import moving_sites
 from rnd_export.stopwatch import Stopwatch
-from rnd_export.variant import OWN_NODES, Variant, static_where
+from rnd_export.variant import OWN_NODES, Variant, reduced, static_where
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.errors import InputError
 from rnd_runtime.light import Light
@@ -122,7 +125,7 @@ class _Formula:
         mb = bits * (1 + n / 10_000)
         return Measured(float(-10 * np.log10(square)), 4 + n / 5_000 + m / 1_500 * dynamic, mb)
 
-    def still_share(self, limit_mm: float) -> float:
+    def still_share(self, recipe: Recipe) -> float:
         return 0.5
 
 
@@ -184,7 +187,8 @@ def test_what_no_step_reaches_is_refused_at_the_last() -> None:
     steps = []
     with pytest.raises(InputError, match="no file keeps the bound of ms"):
         search(_Formula(), Bound("ms", 1.0), steps.append)
-    assert steps[-1].plan == Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
+    deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
+    assert steps[-1].plan.recipe(ModelConfig()) == deepest.recipe(ModelConfig())
 
 
 def test_what_cannot_be_kept_is_refused() -> None:
@@ -203,10 +207,10 @@ def test_a_file_that_fails_unseen_is_given_up_for_the_one_before() -> None:
 def test_dynamic_skinning_stays_where_it_moves_something(bench) -> None:
     """By its own measure: nothing in the poses searched moves by more than the limit."""
     limit = float(np.median(bench._moves))
-    model = bench.model(Recipe(dynamic_mm=limit))
-    assert _sites(model) == {"skinning": round(len(bench._moves) * (1 - bench.still_share(limit)))}
-    assert 0.4 < bench.still_share(limit) < 0.6
-    whole, less = (bench.measure(bench.model(r), bench.seen) for r in (Recipe(), Recipe(dynamic_mm=limit)))
+    some = Recipe(dynamic_mm=limit)
+    model, share = bench.model(some), bench.still_share(some)
+    assert 0.4 < share < 0.6 and _sites(model) == {"skinning": round(len(bench._moves) * (1 - share))}
+    whole, less = (bench.measure(bench.model(r), bench.seen) for r in (Recipe(), some))
     static = bench.measure(bench.model(Recipe(Variant("static"))), bench.seen)
     assert static.psnr + 3 < less.psnr < whole.psnr
 
@@ -217,17 +221,38 @@ def _sites(model: onnx.ModelProto) -> dict[str, int]:
     return {tensor.name.partition("/")[0]: tensor.dims[0] for tensor in stored}
 
 
-def test_dynamic_skinning_at_fewer_nodes_stays_where_it_moves_something(bench) -> None:
-    """Both at once: of the nodes in farthest-point order the first hundred, and of these what moves."""
-    limit, variant = float(np.median(bench._moves)), Variant(skinning_nodes=100)
-    model = bench.model(Recipe(variant, dynamic_mm=limit))
-    moving = int((bench._moves[:100] >= limit).sum())
-    assert 30 < moving < 70 and _sites(model) == {"skinning": moving}
+def _saved(model: onnx.ModelProto, folder) -> Path:
+    onnx.save_model(model, str(folder / "avatar.onnx"))
+    return folder / "avatar.onnx"
+
+
+def test_dynamic_skinning_at_fewer_nodes_stays_where_it_moves_something(bench, tmp_path) -> None:
+    """Both at once: of the nodes in farthest-point order the first hundred, and of these those whose readers move."""
+    limit, variant = float(np.quantile(bench._moves, 0.7)), Variant(skinning_nodes=100)
+    some = Recipe(variant, dynamic_mm=limit)
+    model, share = bench.model(some), bench.still_share(some)
+    moving = round(100 * (1 - share))
+    alone = int((bench._moves[:100] >= limit).sum())
+    assert alone < moving < 100 and _sites(model) == {
+        "skinning": moving
+    }  # a site has readers among other nodes
+    assert Avatar.load(_saved(model, tmp_path)).metadata.variant.dynamic_nodes == moving
     both, fewer, static = (
         bench.measure(bench.model(recipe), bench.seen)
-        for recipe in (Recipe(variant, dynamic_mm=limit), Recipe(variant), Recipe(Variant("static")))
+        for recipe in (some, Recipe(variant), Recipe(Variant("static")))
     )
     assert static.psnr < both.psnr < fewer.psnr
+
+
+def test_where_no_node_of_its_own_moves_the_file_is_static(tiny_checkpoint) -> None:
+    config = ModelConfig(gaussians=800, nodes=200)
+    baked = reduced(bake(load_checkpoint(tiny_checkpoint).model), config, Variant(skinning_nodes=50))
+    still = np.ones(200, bool)
+    still[60:90] = False  # of the nodes that are not sites
+    assert static_where(baked, still).skinning is None
+    still[40] = False
+    some = static_where(baked, still)
+    assert some.skinning is not None and len(moving_sites(some)) == 1
 
 
 class _OwnRates(_Formula):
@@ -251,6 +276,30 @@ def test_each_network_gets_as_few_nodes_as_it_can_do_with() -> None:
     assert found.plan.offset_nodes == found.plan.visibility_nodes == 2 and found.plan.skinning_nodes == 0
     assert found.plan.nodes == 0 and found.measured.psnr > 65
     assert given_up(bench, found.plan)[0] == "offsets at 1875 of 7500 nodes"
+
+
+class _NodesFirst(_OwnRates):
+    """Fewer nodes for all networks cost nothing down to half of them, and very much below."""
+
+    def measure(self, recipe: Recipe, shots: str) -> Measured:
+        what, nodes = super().measure(recipe, shots), recipe.variant.nodes or self.config.nodes
+        below = max(0.5 - nodes / self.config.nodes, 0)
+        return what._replace(psnr=float(-10 * np.log10(10 ** (-what.psnr / 10) + below)))
+
+
+def test_nodes_of_its_own_are_looked_for_below_those_of_all() -> None:
+    found = search(_NodesFirst(), Bound("psnr", 45.0), lambda found: None)
+    variant = found.plan.recipe(ModelConfig()).variant
+    assert variant.nodes == 3750 and variant.offset_nodes < 3750 > variant.visibility_nodes
+
+
+def test_a_step_that_makes_the_same_file_is_none() -> None:
+    """Not taken for one that costs nothing: no window where nothing is dynamic, nor nodes of skinning's own."""
+    steps: list[Found] = []
+    with pytest.raises(InputError, match="no file keeps the bound of ms"):
+        search(_Formula(), Bound("ms", 1.0), steps.append)
+    recipes = [step.plan.recipe(ModelConfig()) for step in steps]
+    assert all(before != after for before, after in itertools.pairwise(recipes))
 
 
 def test_rows_of_nodes_may_be_reordered(tiny_checkpoint) -> None:
@@ -321,8 +370,8 @@ def test_every_rung_is_a_file(bench) -> None:
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
     what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
     assert 5 < what.psnr < 60
-    # no window where nothing is dynamic, no fewer nodes for one network where there are as few for all
-    assert len(given_up(bench, deepest)) == len(LADDERS) - 1 - len(OWN_NODES)
+    # no window and no nodes of skinning's own where nothing is dynamic
+    assert len(given_up(bench, deepest)) == len(LADDERS) - 2
     own = Plan(**dict.fromkeys(OWN_NODES, 3))
     assert given_up(bench, own) == [
         f"{name} at 25 of 200 nodes" for name in ("skinning", "offsets", "visibility")

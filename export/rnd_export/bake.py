@@ -50,8 +50,8 @@ class BakedSkinning:
 
 @dataclass(frozen=True)
 class Rates:
-    """At how many nodes each network is evaluated: the first so many in farthest-point order; between them its values
-    are interpolated."""
+    """At how many nodes each network is evaluated: the first so many in farthest-point order. All nodes read these as
+    Gaussians read nodes, by :func:`rnd_trainer.template.node_interpolation`."""
 
     skinning: int
     offsets: int

@@ -33,7 +33,8 @@ LADDERS: dict[str, tuple[float, ...]] = {
     "visibility_degree": (2, 1, 0),
     "window": (0.5, 0.3, 0.2),
 }
-"""steps of each choice away from the whole; nodes, Gaussians and window poses as shares of the checkpoint's"""
+"""steps of each choice away from the whole; nodes, Gaussians and window poses as shares of the checkpoint's, nodes of
+one network as shares of the file's"""
 MARGIN_DB = 0.3
 """that the search keeps from a least PSNR: shots it has not seen are a little worse"""
 LEAST_GAIN = 0.01
@@ -78,15 +79,15 @@ class Plan:
             rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree")
         )
         static = rung("dynamic_mm") == np.inf
-        most = _nodes(nodes, config) or config.nodes
-        own = {name: _nodes(rung(name), config) for name in OWN_NODES}
+        most = _nodes(nodes, config.nodes) or config.nodes
+        own = {name: _nodes(rung(name), most) for name in OWN_NODES}
         if static:
             own["skinning_nodes"] = None
         variant = Variant(
             encoder="coarse" if nodes else "full",
             precision=PRECISIONS[self.precision],
-            nodes=_nodes(nodes, config),
-            **{name: count for name, count in own.items() if count and count < most},
+            nodes=_nodes(nodes, config.nodes),
+            **own,
             window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
             visibility_degree=3 if degree is None else int(degree),
         )
@@ -94,9 +95,9 @@ class Plan:
         return Recipe(variant, count, rung("dynamic_mm") or 0.0)
 
 
-def _nodes(share: float | None, config: ModelConfig) -> int | None:
-    """That share of the checkpoint's nodes."""
-    return None if share is None else max(16, int(share * config.nodes))
+def _nodes(share: float | None, most: int) -> int | None:
+    """That share of ``most`` nodes."""
+    return None if share is None else min(max(16, int(share * most)), most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,10 +156,11 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
             return None
         if name in made:
             return made[name]
-        if getattr(now.plan, name) == len(LADDERS[name]):
+        plan = _further(bench, now.plan, name)
+        if plan is None:
             worths[name] = 0
             continue
-        found = _made(bench, replace(now.plan, **{name: getattr(now.plan, name) + 1}))
+        found = _made(bench, plan)
         saved = 1 - getattr(found.measured, cost) / getattr(now.measured, cost)
         allowed = bound.kind != "psnr" or found.measured.psnr >= bound.value + MARGIN_DB
         worths[name] = (
@@ -169,9 +171,17 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
 
 def _mildest_step(bench: Workbench, now: Found) -> Found | None:
     """Of the steps further down, the one that costs least in the picture."""
-    left = [name for name, rungs in LADDERS.items() if getattr(now.plan, name) < len(rungs)]
-    steps = [_made(bench, replace(now.plan, **{name: getattr(now.plan, name) + 1})) for name in left]
-    return min(steps, key=_square, default=None)
+    plans = [_further(bench, now.plan, name) for name in LADDERS]
+    return min((_made(bench, plan) for plan in plans if plan is not None), key=_square, default=None)
+
+
+def _further(bench: Workbench, plan: Plan, name: str) -> Plan | None:
+    """The next rung of ``name`` that makes another file; None at the end of the ladder."""
+    for rung in range(getattr(plan, name) + 1, len(LADDERS[name]) + 1):
+        further = replace(plan, **{name: rung})
+        if further.recipe(bench.config) != plan.recipe(bench.config):
+            return further
+    return None
 
 
 def _made(bench: Workbench, plan: Plan) -> Found:
@@ -193,16 +203,15 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
         )
     if recipe.variant.nodes is not None:
         lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
-    for name in OWN_NODES:
+    for name, network in OWN_NODES.items():
         if count := getattr(recipe.variant, name):
-            network = {"offset_nodes": "offsets"}.get(name, name.removesuffix("_nodes"))
             lines.append(f"{network} at {count} of {recipe.variant.node_count(config)} nodes")
     if recipe.dynamic_mm == np.inf:
         lines.append("dynamic skinning nowhere")
     elif recipe.dynamic_mm:
-        share = bench.still_share(recipe.dynamic_mm)
+        share = bench.still_share(recipe)
         lines.append(
-            f"dynamic skinning where it moves less than {recipe.dynamic_mm:g} mm ({share:.0%} of the nodes)"
+            f"dynamic skinning where it moves less than {recipe.dynamic_mm:g} mm ({share:.0%} of its nodes)"
         )
     if recipe.variant.visibility_degree < 3:
         lines.append(f"visibility above degree {recipe.variant.visibility_degree}")

@@ -22,6 +22,7 @@ from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.raster_cpu import rasterize
 from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.template import node_interpolation
 
 from .bake import BakedAvatar, bake
 from .export import refuse_ablations, written
@@ -53,8 +54,8 @@ class Scene:
 class Recipe:
     """What a file leaves out, beyond its :class:`Variant`.
 
-    ``gaussians``: N, or None for all. ``dynamic_mm``: nodes whose dynamic skinning moves nothing by more than this
-    are given the template's.
+    ``gaussians``: N, or None for all. ``dynamic_mm``: nodes whose dynamic skinning moves nothing by as much are given
+    the template's.
     """
 
     variant: Variant = field(default_factory=Variant)
@@ -102,7 +103,7 @@ class Workbench:
         """The file of ``recipe``."""
         baked = reduced(self._baked, self.config, recipe.variant)
         if recipe.dynamic_mm and baked.skinning is not None:
-            baked = static_where(baked, self._moves[: len(baked.codes)] < recipe.dynamic_mm)
+            baked = static_where(baked, self._site_moves(baked) < recipe.dynamic_mm)
         if recipe.gaussians is not None:
             baked = merged(baked, recipe.gaussians, self._shares)
             fewer = _loaded(self._written(baked, recipe.variant))
@@ -118,9 +119,10 @@ class Workbench:
         psnr = -10 * np.log10(max(float(max(squares)), 1e-12))
         return Measured(float(psnr), self._clock(avatar), model.ByteSize() / 1e6)
 
-    def still_share(self, limit_mm: float) -> float:
-        """Share of the nodes at which dynamic skinning moves nothing by more than ``limit_mm``."""
-        return float((self._moves < limit_mm).mean())
+    def still_share(self, recipe: Recipe) -> float:
+        """Share of the skinning network's nodes that ``recipe`` gives the template's weights."""
+        baked = reduced(self._baked, self.config, recipe.variant)
+        return float((self._site_moves(baked)[: baked.rates.skinning] < recipe.dynamic_mm).mean())
 
     def _written(self, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
         return written(self.checkpoint, self._path, baked, variant)
@@ -158,6 +160,17 @@ class Workbench:
 
     def _posed(self, avatar: Avatar) -> list[tuple[Gaussians, Camera]]:
         return [(avatar.pose(self._scene.motion, shot.time), shot.camera) for shot in self._fit]
+
+    def _site_moves(self, baked: BakedAvatar) -> Floats:
+        """By how many mm dynamic skinning moves what reads each of ``baked``'s nodes [M], through other nodes too where
+        the network is evaluated at fewer; 0 at those where it is not."""
+        moves = self._moves[: len(baked.codes)]
+        if baked.rates.skinning == len(moves):
+            return moves
+        sites = baked.codes[: baked.rates.skinning]
+        most: Floats = np.zeros(len(moves))
+        np.maximum.at(most, node_interpolation(baked.codes, sites, baked.area)[0], moves[:, None])
+        return most
 
     def _node_moves(self) -> Floats:
         """By how many mm dynamic skinning moves what reads each node [M], at most over the poses of the search."""

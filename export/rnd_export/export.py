@@ -34,7 +34,7 @@ from rnd_trainer.data import pose_input
 
 from .bake import BakedAvatar, bake
 from .graph import build_model
-from .places import gaussians_by_place, nodes_by_place
+from .places import gaussians_by_place, moving_sites, nodes_by_place
 from .variant import Variant, reduced
 
 MAX_WEIGHT_ERROR = 1e-4
@@ -184,7 +184,7 @@ def _metadata(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: V
             encoder=variant.encoder if baked.skinning is not None else "static",
             precision=variant.precision,
             nodes=len(baked.codes),
-            dynamic_nodes=baked.dynamic_nodes,
+            dynamic_nodes=len(moving_sites(baked)),
             visibility_degree=variant.visibility_degree,
         ),
     )

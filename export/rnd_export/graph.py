@@ -10,11 +10,11 @@ from rnd_runtime.sh import SH_COUNT
 from rnd_trainer.template import NEIGHBOURS, node_interpolation
 
 from .bake import BakedAvatar
-from .graph_builder import GraphBuilder
+from .graph_builder import GraphBuilder, Storage
 from .graph_networks import Networks
 from .graph_posing import Posing
 from .graph_rest import STORAGE, RestConstants
-from .places import Integers, node_sites
+from .places import Integers, moving_sites, node_sites
 
 PRODUCER = "rnd-avatar"
 
@@ -33,7 +33,7 @@ def build_model(
     networks = Networks(graph, STORAGE[precision][2])
     sizes = {"node_logits": joints, "node_offsets": 6, "node_visibility": len(baked.visibility["out.bias"])}
     fields = _node_fields(graph, baked, rest, (window, velocity, bones), networks)
-    fields = _at_all_nodes(graph, baked, fields, sizes)
+    fields = _at_all_nodes(graph, baked, fields, sizes, networks.storage)
     with graph.scope("interpolate"):
         parts = _interpolated(graph, fields, sizes, rest["neighbours"], rest["neighbour_weights"])
         visibility = _padded(graph, parts["node_visibility"], count, SH_COUNT - sizes["node_visibility"])
@@ -70,12 +70,11 @@ def _node_fields(
         """Their rows of what is encoded."""
         return encoded if len(sites) == len(baked.codes) else graph.rows(encoded, sites, "sites")
 
-    sites = node_sites(baked, baked.rates.skinning)
-    moving = sites[sites < baked.dynamic_nodes]
-    if baked.skinning is not None and len(moving):
+    if baked.skinning is not None:
         with graph.scope("skinning"):
+            moving = moving_sites(baked)
             logits = networks.skinning(baked.skinning, at(moving), window, velocity)
-            if still := len(sites) - len(moving):  # the template's there
+            if still := baked.rates.skinning - len(moving):  # the template's there, and they come last
                 zeros = graph.filled("static_logits", (still, baked.weights.shape[1]), 0.0)
                 logits = graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
             fields["node_logits"] = logits
@@ -93,19 +92,20 @@ def _node_fields(
 
 
 def _at_all_nodes(
-    graph: GraphBuilder, baked: BakedAvatar, fields: dict[str, str], sizes: dict[str, int]
+    graph: GraphBuilder, baked: BakedAvatar, fields: dict[str, str], sizes: dict[str, int], storage: Storage
 ) -> dict[str, str]:
-    """``fields`` at all nodes, those of networks with fewer interpolated: all that have as many together."""
+    """``fields`` at all nodes, those of networks with fewer interpolated: all that have as many together.
+
+    Shares of the interpolation are kept as ``storage``.
+    """
     rates, whole = baked.rates, dict(fields)
-    counts = {
-        "node_logits": rates.skinning, "node_offsets": rates.offsets, "node_visibility": rates.visibility,
-    }  # fmt: skip
+    counts = dict(zip(sizes, (rates.skinning, rates.offsets, rates.visibility)))
     for count in sorted({counts[name] for name in fields} - {len(baked.codes)}):
         with graph.scope(f"from_{count}_nodes"):
             sites = node_sites(baked, count)
             neighbours, weights = node_interpolation(baked.codes, baked.codes[sites], baked.area)
             coarse = {name: value for name, value in fields.items() if counts[name] == count}
-            read, shares = graph.packed("neighbours", neighbours), graph.constant("shares", weights)
+            read, shares = graph.packed("neighbours", neighbours), graph.stored("shares", weights, storage)
             whole |= _interpolated(graph, coarse, sizes, read, shares)
     return whole
 

@@ -54,6 +54,13 @@ def node_sites(baked: BakedAvatar, count: int) -> Integers:
     return np.flatnonzero(baked.node_ranks < count)
 
 
+def moving_sites(baked: BakedAvatar) -> Integers:
+    """The nodes at which the skinning network is evaluated; between them stand the template's weights, or what is
+    interpolated."""
+    sites = node_sites(baked, baked.rates.skinning)
+    return sites[sites < baked.dynamic_nodes]
+
+
 def _inverse(order: Integers) -> Integers:
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))

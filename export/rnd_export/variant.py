@@ -16,14 +16,14 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.template import NEIGHBOURS, node_interpolation
 
 from .bake import BakedAvatar, BakedSkinning, Rates
-from .places import nodes_in_order
+from .places import moving_sites, nodes_in_order
 
 COARSE_SHARE = 4
 """``coarse`` evaluates the networks at one of this many nodes: 16 mm apart become 32 mm on a person"""
 
 
-OWN_NODES = ("skinning_nodes", "offset_nodes", "visibility_nodes")
-"""fields of :class:`Variant` that concern one network each"""
+OWN_NODES = {"skinning_nodes": "skinning", "offset_nodes": "offsets", "visibility_nodes": "visibility"}
+"""fields of :class:`Variant` that concern one network each, and which of :class:`Rates` that is"""
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ class Variant:
 
     def rates(self, config: ModelConfig) -> Rates:
         """Nodes of each network, of the M of the file."""
-        own = (self.skinning_nodes, self.offset_nodes, self.visibility_nodes)
-        return Rates(*(self.node_count(config) if count is None else count for count in own))
+        most = self.node_count(config)
+        return Rates(**{network: getattr(self, name) or most for name, network in OWN_NODES.items()})
 
     def check(self, config: ModelConfig) -> None:
         """Raise :class:`InputError` for what no file of this checkpoint can be."""
         least = {
-            **dict.fromkeys(("nodes", *OWN_NODES), NEIGHBOURS),
+            **dict.fromkeys(["nodes", *OWN_NODES], NEIGHBOURS),
             "window_poses": 2 if config.window_poses > 1 else 1,
             "visibility_degree": 0,
         }
@@ -80,8 +80,8 @@ class Variant:
                 raise InputError(option, expected=f"{low} to {most[name]}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
-        if self.skinning_nodes is not None and self.encoder == "static":
-            raise InputError("--skinning-nodes", expected="dynamic skinning", got="--encoder static")
+        if self.skinning_nodes is not None and (self.encoder == "static" or not config.dynamic_skinning):
+            raise InputError("--skinning-nodes", expected="dynamic skinning", got="the template's weights")
 
 
 def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:
@@ -109,9 +109,11 @@ def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedA
 
 def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
     """The template's skinning at the nodes ``still`` [M]; the others come first in the file's order."""
-    moving = int((~still).sum())
     moved = nodes_in_order(baked, np.argsort(still, kind="stable"))
-    return dataclasses.replace(moved, dynamic_nodes=moving, skinning=baked.skinning if moving else None)
+    moved = dataclasses.replace(moved, dynamic_nodes=int((~still).sum()))
+    if len(moving_sites(moved)):
+        return moved
+    return dataclasses.replace(moved, dynamic_nodes=0, skinning=None)
 
 
 def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:

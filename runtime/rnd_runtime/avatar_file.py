@@ -71,8 +71,8 @@ class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a file has left out for speed or size. The defaults are the whole avatar.
 
     ``encoder``: networks at every node, at fewer (``coarse``), or the template's skinning (``static``).
-    ``precision``: how constants are stored. ``nodes``: where networks are evaluated, 0 when not stated.
-    ``dynamic_nodes``: those of them with dynamic skinning. ``visibility_degree``: of the harmonics that are kept.
+    ``precision``: how constants are stored. ``nodes``: M, where networks are evaluated at most, 0 when not stated.
+    ``dynamic_nodes``: those of them where the skinning network is. ``visibility_degree``: of the harmonics kept.
     """
 
     encoder: EncoderKind = "full"

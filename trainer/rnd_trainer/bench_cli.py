@@ -98,19 +98,21 @@ def _grid(options: Grid) -> None:
     from rich.console import Console
 
     from .bench_chart import draw_chart
-    from .bench_grid import grid, settings
+    from .bench_grid import grid
     from .charts import check_chart
 
     check_chart(*options.chart)
-    cross = [name.strip() for name in options.cross.split(",") if name.strip()]
-    points = len(settings(options.quick, cross))
-    console, started, shown, measured = Console(), perf_counter(), 0, 0
+    cross = [name.strip() for name in options.cross.split(",")] if options.cross else []
+    for name in ("json", "chart"):  # theirs are the tables and the chart of the documentation
+        own = not cross or getattr(options, name) != getattr(Grid(), name)
+        check_option(own, flag(name), "files of its own beside --cross", "the usual ones")
+    console, started, measured = Console(), perf_counter(), 0
 
-    def show(row: dict[str, Any], new: bool) -> None:
-        nonlocal shown, measured
-        shown, measured = shown + 1, measured + new
-        left = (perf_counter() - started) / measured * (points - shown) if measured else 0
-        state = f"{shown}/{points}, {left / 60:.0f} min left" if new else f"{shown}/{points}, kept"
+    def show(row: dict[str, Any], new: bool, left: int) -> None:
+        nonlocal measured
+        measured += new
+        minutes = (perf_counter() - started) / 60 * left / max(measured, 1)
+        state = f"{left} left, about {minutes:.0f} min" if new else "kept"
         console.print(f"{_line(row)}  ({state})", highlight=False)
 
     rows = grid(

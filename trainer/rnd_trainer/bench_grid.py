@@ -162,11 +162,11 @@ def grid(
     quick: bool = False,
     cross: Sequence[str] = (),
     fresh: bool = False,
-    on_row: Callable[[Row, bool], None],
+    on_row: Callable[[Row, bool, int], None],
 ) -> list[Row]:
     """Measure what ``out`` does not hold yet, or with ``fresh`` everything; writes after each point.
 
-    ``on_row(row, new)`` is called for every point.
+    ``on_row(row, new, left)`` is called for every point; ``left`` are still to be measured.
     """
     inputs.checked()
     if fresh:
@@ -175,6 +175,7 @@ def grid(
     wanted, key = settings(quick, cross), inputs.key()
     here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
     done: list[Row] = []
+    left = sum(_key(asdict(setting)) not in here for setting in wanted)
     for setting in wanted:
         row = here.get(_key(asdict(setting)))
         new = row is None
@@ -183,9 +184,9 @@ def grid(
                 row = measured(setting, inputs, seconds=2.0 if quick else 4.0, full_n=wanted[0].n)
             except InputError as error:  # no such rasteriser here: say so and go on
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
-            row["inputs"] = key
+            row["inputs"], left = key, left - 1
         done.append(row)
-        on_row(row, new)
+        on_row(row, new, left)
         write_json(out, [*{_key(r): r for r in (*rows, *done)}.values()])
     return done
 
