@@ -128,18 +128,22 @@ def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
     assert values["n"] == {4_000, 8_000, 15_000, 30_000, 60_000} and values["size"] == {256, 512, 1024}
     assert values["raster"] == {"cpu", "gl-egl", "gl-osmesa"} and values["threads"] == {1, 2}
     assert values["cull"] == {None, *bench_grid.CULLS}
-    assert values["encoder"] == {"full", "coarse", "static"} and values["precision"] == {"f32", "f16", "int8"}
+    assert values["encoder"] == {"full", "rates", "coarse", "static"} and values["precision"] == {
+        "f32",
+        "f16",
+        "int8",
+    }
     assert {"ao", "table", "table+sun", "brute"} < values["shade"] and len(values["window"]) == 3
     assert len(settings(quick=True)) < len(points) / 2
 
 
 def test_factors_that_are_crossed_come_in_all_combinations() -> None:
     points = settings(cross=("n", "size", "shade", "encoder"))
-    assert points[0] == Setting() and len(points) == len(set(points)) == 5 * 3 * 5 * 3
+    assert points[0] == Setting() and len(points) == len(set(points)) == 5 * 3 * 5 * 4
     assert Setting(n=60_000, size=1024, shade="brute", encoder="static") in points
     windows = settings(cross=("encoder", "window"))
     assert [(p.encoder, p.window) for p in windows].count(("static", None)) == 1
-    assert {p.window for p in windows if p.encoder == "static"} == {None} and len(windows) == 7
+    assert {p.window for p in windows if p.encoder == "static"} == {None} and len(windows) == 10
     with pytest.raises(InputError, match=r"--cross: expected of n, size, .*cull, got colour"):
         settings(cross=("n", "colour"))
 
@@ -381,9 +385,11 @@ def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
     close = distances.min(1) < 0.01
     ours, theirs = looks[0][close], looks[1][near[close]]
     assert close.sum() > 10 and np.median(np.abs(ours - theirs)) < 0.05
-    assert Encoders("coarse", "f16", 5).words() == [
+    assert Encoders("coarse", "f16", 5).words(tmp_path) == [
         "--encoder", "coarse", "--precision", "f16", "--window-poses", "5",
     ]  # fmt: skip
+    rates = Encoders("rates").words(seeded_checkpoint(800, ASSETS / "body.npz", tmp_path))
+    assert rates[4:] == ["--skinning-nodes", "50", "--offset-nodes", "25"] and rates[1] == "full"
 
 
 def test_peers_say_the_same(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:

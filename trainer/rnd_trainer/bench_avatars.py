@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,15 +34,22 @@ KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz")
 
 @dataclass(frozen=True)
 class Encoders:
-    """What of an avatar's encoders a file holds; options of ``rnd-export``."""
+    """What of an avatar's encoders a file holds; options of ``rnd-export``.
+
+    ``encoder`` may also be ``rates``: everything, but skinning at a quarter of the nodes, offsets at an eighth.
+    """
 
     encoder: str = "full"
     precision: str = "f32"
     window: int | None = None
 
-    def words(self) -> list[str]:
-        """As on the command line."""
+    def words(self, checkpoint: Path) -> list[str]:
+        """As on the command line, for an avatar.ckpt."""
         words = ["--encoder", self.encoder, "--precision", self.precision]
+        if self.encoder == "rates":
+            nodes = checkpoint_model(checkpoint)["nodes"]
+            words[1] = "full"
+            words += ["--skinning-nodes", str(nodes // 4), "--offset-nodes", str(nodes // 8)]
         return words + (["--window-poses", str(self.window)] if self.window else [])
 
 
@@ -64,7 +72,8 @@ def forget(folder: Path) -> None:
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
     """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless this exporter has made it."""
     key = content_key(checkpoint, *_exporter())
-    name = "_".join(["exported", key, *(w for w in encoders.words() if not w.startswith("--"))])
+    words = encoders.words(checkpoint)
+    name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
     out = folder / f"{name}.onnx"
     if not out.exists():
         code = "from rnd_export.cli import main; main()"
@@ -77,12 +86,20 @@ def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
             str(out),
             "--frames",
             "2",
-            *encoders.words(),
+            *words,
         ]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError("rnd-export", got=(done.stderr.strip().splitlines() or ["failed"])[-1])
     return out
+
+
+def checkpoint_model(checkpoint: Path) -> dict[str, Any]:
+    """The fields of its :class:`rnd_trainer.config.ModelConfig`, by name."""
+    from .checkpoint import SCHEMA, read_tensors
+
+    model: dict[str, Any] = read_tensors(checkpoint, SCHEMA)[1]["config"]["model"]
+    return model
 
 
 def _exporter() -> list[Path]:

@@ -14,7 +14,7 @@ from .charts import chart
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
 USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
-MARKERS = {"full": "o", "coarse": "s", "static": "^"}
+MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
 CEILING_DB = 60.0
 """points above it are drawn on it with their figure beside them: a picture that is the reference's has a hundred"""
 LEAST_SPAN = 5.0

@@ -18,7 +18,7 @@ from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import existing_file, output_folder, read_rows, write_json
 
-from .bench_avatars import Encoders, content_key, exported, forget, seeded_checkpoint
+from .bench_avatars import Encoders, checkpoint_model, content_key, exported, forget, seeded_checkpoint
 from .bench_frame import Point, measure
 from .bench_reference import errors, reference
 
@@ -69,7 +69,7 @@ class Inputs:
 
     def source(self, n: int) -> tuple[Path, str]:
         """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
-        if self.checkpoint is not None and self._checkpoint_size() == n:
+        if self.checkpoint is not None and checkpoint_model(self.checkpoint)["gaussians"] == n:
             return self.checkpoint, "trained"
         return seeded_checkpoint(n, self.body, self.work), "seeded"
 
@@ -78,18 +78,12 @@ class Inputs:
         checkpoint, which = self.source(n)
         return exported(checkpoint, encoders, self.work), which
 
-    def _checkpoint_size(self) -> int:
-        from .checkpoint import SCHEMA, read_tensors
-
-        assert self.checkpoint is not None
-        return int(read_tensors(self.checkpoint, SCHEMA)[1]["config"]["model"]["gaussians"])
-
 
 FACTORS: dict[str, tuple[Any, ...]] = {
     "n": (4_000, 8_000, 15_000, FULL_N, 60_000),
     "size": (256, 512, 1024),
     "shade": ("ao", "table", "table+sun", "lights:32", "brute"),
-    "encoder": ("full", "coarse", "static"),
+    "encoder": ("full", "rates", "coarse", "static"),
     "precision": ("f32", "f16", "int8"),
     "window": (None, 2, 5),
     "raster": ("cpu", "gl-egl", "gl-osmesa"),

@@ -53,8 +53,8 @@ class Frame:
     """picture side in pixels"""
     shade: str = "table+sun"
     """ao, table, table+sun, lights:K or brute"""
-    encoder: Literal["full", "coarse", "static"] = "full"
-    """as of rnd-export"""
+    encoder: Literal["full", "rates", "coarse", "static"] = "full"
+    """as of rnd-export; 'rates': skinning at a quarter of the nodes, offsets at an eighth, the rest in full"""
     precision: Literal["f32", "f16", "int8"] = "f32"
     """as of rnd-export"""
     window: int | None = None
@@ -77,8 +77,8 @@ class Grid:
     quick: bool = False
     """the small grid, in two minutes"""
     cross: Annotated[str, tyro.conf.arg(metavar="LIST")] = ""
-    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (225 points, half an
-    hour); also precision, window, raster, threads, cull: all nine are days"""
+    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (300 points, an hour);
+    also precision, window, raster, threads, cull: all nine are days"""
     json: Path = Path("assets/bench/grid.json")
     """rows; those measured on this machine, of the same files, are not measured again"""
     fresh: bool = False
