@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 
 from rnd_runtime.images import read_image, write_image
 
-TILES = 5
-"""pictures side by side in a strip"""
-SHOWN = (270, 150)
+TILES = ("truth", "render", "normals", "albedo", "error x 4")
+"""the pictures side by side in a strip"""
+SHOWN = (330, 150)
 """height and width of a tile in the sheet, pixels"""
+MARGIN = 0.04
+"""around the person, of the height"""
+HEADER = 24
+"""pixels for the words above the first row"""
 
 
 def main(folder: Path, out: Path, names: list[str]) -> None:
@@ -27,20 +31,33 @@ def main(folder: Path, out: Path, names: list[str]) -> None:
     if len(strips) > 1 and len(strips) % 2:
         strips.append(np.zeros_like(strips[-1]))
     rows = [np.concatenate(strips[k : k + 2], axis=1) for k in range(0, len(strips), 2)]
-    write_image(out, np.concatenate(rows, axis=0))
+    write_image(out, np.concatenate([_header(rows[0].shape[1]), *rows], axis=0))
 
 
 def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The tiles of a strip, each cut to the columns around the person in the first."""
-    tiles = np.split(strip, TILES, axis=1)
-    height, width = tiles[0].shape[:2]
-    wide = round(height * SHOWN[1] / SHOWN[0])
-    middle = int(np.median(np.nonzero(tiles[0].any(axis=2))[1]))
-    left = int(np.clip(middle - wide // 2, 0, width - wide))
-    small = [
-        cv2.resize(tile[:, left : left + wide], SHOWN[::-1], interpolation=cv2.INTER_AREA) for tile in tiles
-    ]
+    """The tiles of a strip, each cut to the person in the first, whose middle is the tile's."""
+    tiles = np.split(strip, len(TILES), axis=1)
+    rows, columns = np.nonzero(tiles[0].any(axis=2))
+    high = (np.ptp(rows) + 1) * (1 + 2 * MARGIN)
+    wide = (np.ptp(columns) + 1) * (1 + 2 * MARGIN)
+    scale = min(SHOWN[0] / high, SHOWN[1] / wide)
+    middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+    to_tile = np.array([[scale, 0, 0], [0, scale, 0]])
+    to_tile[:, 2] = (np.array(SHOWN[::-1]) - 1) / 2 - scale * middle
+    smooth = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    small = [cv2.warpAffine(tile, to_tile, SHOWN[::-1], flags=smooth) for tile in tiles]
     return np.concatenate(small, axis=1)
+
+
+def _header(width: int) -> NDArray[np.uint8]:
+    """What each column shows, in grey."""
+    header = np.zeros((HEADER, width, 3), np.uint8)
+    for number in range(width // SHOWN[1]):
+        word = TILES[number % len(TILES)]
+        (wide, _), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
+        place = (number * SHOWN[1] + (SHOWN[1] - wide) // 2, HEADER - 8)
+        cv2.putText(header, word, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (170, 170, 170), 1, cv2.LINE_AA)
+    return header
 
 
 if __name__ == "__main__":
