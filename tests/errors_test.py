@@ -58,6 +58,9 @@ def test_commands_report_in_one_line_and_by_exit_code(capsys):
 @dataclass
 class Options:
     size: int = 3
+    least: float = 0.0
+    most: float | None = None
+    count: int | None = None
 
 
 @pytest.mark.parametrize(
@@ -67,8 +70,11 @@ class Options:
         (["--size"], "missing value for argument '--size'. Expected 1 values (see rnd-x y --help)"),
         (
             ["--size", "5x"],
-            "error parsing --size: invalid literal for int() with base 10: '5x' (see rnd-x y --help)",
+            "--size: expected a whole number, got 5x (see rnd-x y --help)",
         ),
+        (["--least", "5x"], "--least: expected a number, got 5x (see rnd-x y --help)"),
+        (["--most", "5x"], "--most: expected a number, got 5x (see rnd-x y --help)"),
+        (["--count", "5x"], "--count: expected a whole number, got 5x (see rnd-x y --help)"),
     ],
 )
 def test_what_tyro_has_against_a_command_line_is_one_line(words, line, capsys):
@@ -77,6 +83,20 @@ def test_what_tyro_has_against_a_command_line_is_one_line(words, line, capsys):
 
     assert run_command("rnd-x", command) == 2
     assert capsys.readouterr() == ("", f"rnd-x: {line}\n")
+
+
+@dataclass
+class Places:
+    run: tyro.conf.Positional[Path]
+    """folder of rnd-x"""
+    to: tyro.conf.Positional[Path]
+    """another"""
+
+
+def test_what_is_missing_is_told_with_what_it_is(capsys):
+    run_command("rnd-x", lambda: parse_options(lambda: tyro.cli(Places, prog="rnd-x", args=[])))
+    line = "rnd-x: missing from rnd-x: PATH folder of rnd-x; PATH another (see rnd-x --help)\n"
+    assert capsys.readouterr() == ("", line)
 
 
 @dataclass

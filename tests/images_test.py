@@ -183,6 +183,8 @@ def test_broken_files_say_why_in_one_line(tmp_path):
         message = str(caught.value)
         assert str(tmp_path / name) in message and "\n" not in message
         assert len(message) > len(str(tmp_path / name)) + len(": image cannot be read: got "), message
+        said = {"not_an.exr": "something else than a .exr file", "empty.png": "an empty file"}
+        assert message.endswith(said.get(name, ""))
 
 
 def test_missing_file_and_folder(tmp_path):

@@ -29,7 +29,7 @@ COMMANDS = {
     "rnd-data": rnd_trainer.data_cli.main,
     "rnd-stage": rnd_trainer.stage.cli.main,
 }
-BODY = ASSETS / "body.npz"
+BODY, AVATAR = ASSETS / "body.npz", ASSETS / "avatar.onnx"
 IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 
 
@@ -77,7 +77,8 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
         (f"rnd-export {BODY} --out {BODY}", "--out: expected another file than the checkpoint, got"),
-        ("rnd-export .", ".: checkpoint not found: got a folder"),
+        ("rnd-export .", "avatar.ckpt: checkpoint not found"),
+        (f"rnd-export {AVATAR}", "not a checkpoint: expected an avatar.ckpt of rnd-train, got .onnx"),
         ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
         ("rnd-bench frame --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
         ("rnd-bench peers --threads 999", "--threads: expected 1 to "),

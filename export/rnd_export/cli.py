@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ class Options:
     """Freeze a trained avatar to one ONNX file that plays without torch."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """avatar.ckpt of rnd-train"""
+    """avatar.ckpt of rnd-train, or the folder that it is in"""
     out: Path | None = None
     """where to write; by default avatar.onnx beside the checkpoint"""
     motion: Path | None = None
@@ -91,10 +92,16 @@ def _export(options: Options) -> None:
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     _refuse_idle(options, bounded=bool(given))
+    if options.checkpoint.is_dir():
+        options = dataclasses.replace(options, checkpoint=options.checkpoint / "avatar.ckpt")
     checkpoint = existing_file(options.checkpoint, what="checkpoint")
+    if options.out is None and checkpoint.suffix == ".onnx":
+        raise InputError(
+            "not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=checkpoint
+        )
     out = options.out or checkpoint.with_suffix(".onnx")
     check_option(out.resolve() != checkpoint.resolve(), "--out", "another file than the checkpoint", out)
-    skeleton = load_checkpoint(options.checkpoint).skeleton
+    skeleton = load_checkpoint(checkpoint).skeleton
     if options.motion is not None:
         motion = load_motion(options.motion, skeleton)
     else:

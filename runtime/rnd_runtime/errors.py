@@ -158,12 +158,21 @@ def parse_options(parse: Callable[[], Parsed]) -> Parsed:
     return options
 
 
+_NOT_A_NUMBER = re.compile(r"^Error parsing (\S+): .*?\b(int|float)\b.*?'(.*)'\]?$", re.IGNORECASE)
+
+
+def _no_number(found: re.Match[str]) -> str:
+    kind = "a whole number" if found[2].lower() == "int" else "a number"
+    return f"{found[1]}: expected {kind}, got {found[3]}"
+
+
 def _refusal(page: str) -> InputError:
     """A page of tyro's: a title, what is wrong, perhaps what was meant, where to read more, with rules between them."""
     lines = [line.strip(" │╭╮╰╯") for line in page.splitlines()][1:]
     parts = re.split(r"^[-─]+$", "\n".join(lines), flags=re.MULTILINE)
     parts = [part.strip() for part in parts if part.strip()] or [page]
-    what = parts[0].split("\n\n")[0].removesuffix(".")
+    what = parts[0].split("\n\n")[0].removesuffix(".").replace(" (required)", ";").rstrip(";")
+    what = _NOT_A_NUMBER.sub(_no_number, " ".join(what.split()))
     meant = next((part.splitlines()[1].split()[0] for part in parts if part.startswith("Perhaps")), None)
     hint = [f"perhaps {meant.rstrip(',')}"] if meant else []
     hint += [f"see {command}" for command in re.findall(r"[\w-]+(?: \w+)* --help", parts[-1])]

@@ -131,7 +131,8 @@ def _opened(path: str | Path) -> Iterator[Any]:
     try:
         source = oiio.ImageInput.open(str(path), settings)
         if source is None:
-            raise InputError("image cannot be read", got=_reason(oiio.geterror()), file=path)
+            reason = _reason(oiio.geterror())
+            raise InputError("image cannot be read", got=_other_format(Path(path)) or reason, file=path)
         yield source
     except UnicodeDecodeError as error:  # names and complaints of a damaged file need not be text
         raise InputError("image is damaged", got="names that are not text", file=path) from error
@@ -167,6 +168,25 @@ def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
             "image is cut short or damaged", expected=expected, got=f"{file_bytes} stored", file=path
         )
     return ImageHeader(spec.width, spec.height, tuple(spec.channelnames), str(spec.format))
+
+
+_BEGINNINGS = {
+    ".png": b"\x89PNG",
+    ".exr": b"\x76\x2f\x31\x01",
+    ".hdr": b"#?",
+    ".jpg": b"\xff\xd8",
+    ".jpeg": b"\xff\xd8",
+}
+
+
+def _other_format(path: Path) -> str | None:
+    """What ``path`` is, if its first bytes are not those of the format that its name says."""
+    suffix = path.suffix.lower()
+    with path.open("rb") as file:
+        head = file.read(4)
+    if not head:
+        return "an empty file"
+    return None if head.startswith(_BEGINNINGS.get(suffix, b"")) else f"something else than a {suffix} file"
 
 
 def _reason(message: str) -> str:

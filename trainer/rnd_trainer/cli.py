@@ -34,11 +34,11 @@ class TrainOptions:
     out: Path = Path("runs/avatar")
     """folder for avatar.ckpt, previews/, metrics.jsonl and config.json"""
     preset: Literal["quick", "standard", "full"] = "standard"
-    """schedule: minutes, half an hour, hours"""
+    """schedule: some seven minutes, half an hour, hours on two cores"""
     resume: bool = False
     """continue a stopped training in OUT"""
     steps: int | None = None
-    """instead of the preset's"""
+    """with pictures, instead of the preset's 4500 (quick: 2000); the third stage, of unseen poses, adds 30 % to them"""
     gaussians: int | None = None
     """instead of the preset's; a quarter of them are nodes"""
     save_every: int | None = None
@@ -114,7 +114,7 @@ def _train(options: TrainOptions) -> None:
     device = _device(options.device)
 
     capture = load_capture(options.capture, motion_file=options.motion)
-    folder = output_folder(options.out)
+    folder = options.out
     state = folder / STATE_FILE
     if state.exists() and not options.resume:
         raise InputError(
@@ -130,9 +130,10 @@ def _train(options: TrainOptions) -> None:
         training = Training(capture, config, perceptual, device)
     if options.resume:
         training.resume(state)
-    write_json(folder / "config.json", to_dict(config))
+    write_json(output_folder(folder) / "config.json", to_dict(config))
     for frame in training.bad_masks:
         print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
+    print(f"rnd-train: {folder}: {training.total_steps} steps in all", file=sys.stderr)  # noqa: T201
     with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
         if page:
             print(f"rnd-train: {page}", file=sys.stderr)  # noqa: T201
@@ -193,8 +194,8 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
     shown = [(training.views[k], training.poses[k]) for k in dict.fromkeys(chosen)]
     columns = (
         TextColumn("stage {task.fields[stage]}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("image loss {task.fields[loss]:.4f}"), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
+        TextColumn("image loss {task.fields[loss]:.4f}"), TimeElapsedColumn(), TextColumn("gone,"),
+        TimeRemainingColumn(), TextColumn("left"),
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=60) as progress:
         task = progress.add_task(

@@ -102,7 +102,7 @@ def load_websockets() -> ModuleType:
     try:
         import websockets.sync.server
     except ImportError as error:
-        raise InputError("rnd-view needs websockets, which is not installed", hint=INSTALL) from error
+        raise InputError("websockets is not installed", hint=INSTALL) from error
     return websockets.sync.server
 
 

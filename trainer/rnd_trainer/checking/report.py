@@ -17,9 +17,15 @@ from .overlay import save_overlay
 _MARKS = {"ok": "[green]ok[/]", "note": "[yellow]note[/]", "wrong": "[red]wrong[/]"}
 
 
+def passing_progress() -> Progress:
+    """Bars that are taken away at the end; none where nobody sees them go, and an empty line would be left."""
+    console = Console(stderr=True)
+    return Progress(console=console, transient=True, disable=not console.is_terminal)
+
+
 def check_and_report(capture: Path, out: Path) -> int:
     """Check ``capture``, print the findings, write ``check.json`` and ``check.png`` into ``out``; 1 when wrong."""
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with passing_progress() as progress:
         task = progress.add_task("checking")
         report = check_capture(
             capture, on_frame=lambda done, total: progress.update(task, completed=done, total=total)

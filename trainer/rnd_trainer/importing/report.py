@@ -6,9 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import Progress
 
-from rnd_trainer.checking.report import check_and_report
+from rnd_trainer.checking.report import check_and_report, passing_progress
 
 from .importer import import_source
 from .options import ImportOptions
@@ -17,7 +16,7 @@ from .options import ImportOptions
 def import_and_report(source: Path, out: Path, options: ImportOptions) -> int:
     """Import, print what was found and assumed, check the result; 1 when the check finds something wrong."""
     console = Console()
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with passing_progress() as progress:
         task = progress.add_task("writing")
         scene = import_source(
             source, out, options,
