@@ -21,6 +21,7 @@ PAGES = {
     ROOT / "README.md": "assets/bench",
     ROOT / "docs" / "performance.md": "../assets/bench",
     ROOT / "docs" / "quality.md": "../assets/bench",
+    ROOT / "docs" / "tried.md": "../assets/bench",
     ROOT / "docs" / "light-stage.md": "../assets/bench",
 }
 """the pages with tables, and where their pictures lie as seen from them"""

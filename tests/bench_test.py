@@ -358,7 +358,8 @@ def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
         "raster",
         "30 000 Gaussians",
         "encoder coarse",
-        "8k · 512",
+        "front of 8 000 at 512²:",
+        " 1  table+sun: 8.0 ms, 40.8 dB",
     ):
         assert words in svg, words
     assert files[1].read_bytes()[:4] == b"\x89PNG"

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 NEAR = 0.1
 # px² added to both variances, so that little falls between pixels' centres. 3DGS has 0.3, Mip-Splatting (Yu et al.
 # 2024) 0.1, a pixel's box 1/12. It makes an opaque body wider, the more the smaller the picture is, whatever was
-# learned: docs/quality.md
+# learned: docs/tried.md
 DILATION = 0.05
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99

@@ -87,7 +87,7 @@ def _frame(options: Frame) -> None:
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
     console = Console()
-    console.print(_line(row))
+    console.print(_line(row), highlight=False, soft_wrap=True)
     for name, milliseconds in row["stages"].items():
         console.print(f"  {name:16} {milliseconds:6.2f} ms")
     _write(options.json, row)
@@ -113,7 +113,7 @@ def _grid(options: Grid) -> None:
         measured += new
         minutes = (perf_counter() - started) / 60 * left / max(measured, 1)
         state = f"{left} left, about {minutes:.0f} min" if new else "kept"
-        console.print(f"{_line(row)}  ({state})", highlight=False)
+        console.print(f"{_line(row)}  ({state})", highlight=False, soft_wrap=True)
 
     rows = grid(
         _inputs(options.files),

@@ -166,7 +166,7 @@ class Objective:
 
     def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
         """Repulsion of the points, which moves each by its own residual alone: where it also moved the network that
-        all of them share, held-out pictures lost 0.1 to 0.2 dB (docs/quality.md)."""
+        all of them share, held-out pictures lost 0.1 to 0.2 dB (docs/tried.md)."""
         strays = model.strays()
         points = posed.attributes.points.detach() + strays - strays.detach()
         return repulsion(points, self.config.least_distance * float(model.spacing))
