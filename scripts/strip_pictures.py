@@ -44,8 +44,7 @@ def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
     middle = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
     to_tile = np.array([[scale, 0, 0], [0, scale, 0]])
     to_tile[:, 2] = (np.array(SHOWN[::-1]) - 1) / 2 - scale * middle
-    smooth = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    small = [cv2.warpAffine(tile, to_tile, SHOWN[::-1], flags=smooth) for tile in tiles]
+    small = [cv2.warpAffine(tile, to_tile, SHOWN[::-1], flags=cv2.INTER_CUBIC) for tile in tiles]
     return np.concatenate(small, axis=1)
 
 

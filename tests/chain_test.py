@@ -97,6 +97,12 @@ def test_training_refuses_senseless_options(tiny_capture, tmp_path) -> None:
     for option, value in senseless.items():
         line = _refused("rnd-train", tiny_capture.folder, "--out", tmp_path / "run", option, value)
         assert option in line and str(value) in line
+    weights = tmp_path / "weights.pth"
+    weights.write_text("none")
+    assert str(weights) in _refused(
+        "rnd-train", tiny_capture.folder, "--out", tmp_path / "run", "--perceptual-weights", weights
+    )
+    assert not (tmp_path / "run").exists()
 
 
 def test_export_refuses_what_is_no_checkpoint(tiny_checkpoint, tmp_path) -> None:

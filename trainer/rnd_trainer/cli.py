@@ -121,16 +121,16 @@ def _train(options: TrainOptions) -> None:
             "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
         )
     perceptual = load_lpips(options.perceptual_weights)
-    if perceptual is None:
-        print(  # noqa: T201
-            "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
-            file=sys.stderr,
-        )
     with _memory_runs_out():
         training = Training(capture, config, perceptual, device)
     if options.resume:
         training.resume(state)
     write_json(output_folder(folder) / "config.json", to_dict(config))
+    if perceptual is None:
+        print(  # noqa: T201
+            "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
+            file=sys.stderr,
+        )
     for frame in training.bad_masks:
         print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
     print(f"rnd-train: {folder}: {training.total_steps} steps in all", file=sys.stderr)  # noqa: T201
