@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.images import read_image, write_image
+from rnd_trainer.preview import TILES, captions
 
-TILES = ("truth", "render", "normals", "albedo", "error x 4")
-"""the pictures side by side in a strip"""
 SHOWN = (330, 150)
 """height and width of a tile in the sheet, pixels"""
 MARGIN = 0.04
 """around the person, of the height"""
-HEADER = 24
-"""pixels for the words above the first row"""
 
 
 def main(folder: Path, out: Path, names: list[str]) -> None:
@@ -31,7 +28,8 @@ def main(folder: Path, out: Path, names: list[str]) -> None:
     if len(strips) > 1 and len(strips) % 2:
         strips.append(np.zeros_like(strips[-1]))
     rows = [np.concatenate(strips[k : k + 2], axis=1) for k in range(0, len(strips), 2)]
-    write_image(out, np.concatenate([_header(rows[0].shape[1]), *rows], axis=0))
+    words = captions(SHOWN[1], len(strips[:2]))
+    write_image(out, np.concatenate([words, *rows], axis=0))
 
 
 def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -46,17 +44,6 @@ def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
     to_tile[:, 2] = (np.array(SHOWN[::-1]) - 1) / 2 - scale * middle
     small = [cv2.warpAffine(tile, to_tile, SHOWN[::-1], flags=cv2.INTER_CUBIC) for tile in tiles]
     return np.concatenate(small, axis=1)
-
-
-def _header(width: int) -> NDArray[np.uint8]:
-    """What each column shows, in grey."""
-    header = np.zeros((HEADER, width, 3), np.uint8)
-    for number in range(width // SHOWN[1]):
-        word = TILES[number % len(TILES)]
-        (wide, _), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, 0.45, 1)
-        place = (number * SHOWN[1] + (SHOWN[1] - wide) // 2, HEADER - 8)
-        cv2.putText(header, word, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (170, 170, 170), 1, cv2.LINE_AA)
-    return header
 
 
 if __name__ == "__main__":

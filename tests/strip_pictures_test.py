@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rnd_runtime.images import read_image, write_image
+from rnd_trainer.preview import CAPTION
 
 SCRIPT = runpy.run_path(str(Path(__file__).parent.parent / "scripts/strip_pictures.py"))
 SIDE = 54
@@ -26,7 +27,7 @@ def test_strips_are_laid_out_two_to_a_row_and_cut_to_the_person(tmp_path, count,
         write_image(tmp_path / f"{name}.png", strip)
     SCRIPT["main"](tmp_path, tmp_path / "sheet.png", names)
     sheet = read_image(tmp_path / "sheet.png").astype(int)
-    (height, width), header, margin = SCRIPT["SHOWN"], SCRIPT["HEADER"], SCRIPT["MARGIN"]
+    (height, width), margin, header = SCRIPT["SHOWN"], SCRIPT["MARGIN"], CAPTION
     assert sheet.shape == (header + rows * height, columns * 5 * width, 3)
     words, sheet = sheet[:header], sheet[header:]
     assert all(words[:, k * width : (k + 1) * width].any() for k in range(5 * columns))

@@ -1,9 +1,10 @@
-"""Contact strips: input, render, normals, albedo and error side by side."""
+"""Contact strips: truth, render, normals, albedo and error side by side."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 
@@ -17,10 +18,15 @@ from .model import AvatarModel, PoseInput
 
 ERROR_GAIN = 4
 """of the error picture: an error of 64/255 is white"""
+TILES = ("truth", "render", "normals", "albedo", f"error x {ERROR_GAIN}")
+"""the pictures side by side in a strip"""
+CAPTION = 24
+"""pixels of the words above strips"""
+FONT, LETTERS = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 
 
 def strip(rendered: Rendered, target_srgb: np.ndarray) -> np.ndarray:
-    """[H, 5·W, 3] uint8: target | render | normals (n + 1)/2 | albedo | ERROR_GAIN × error, in sRGB."""
+    """[H, 5·W, 3] uint8: ``TILES`` side by side in sRGB; normals as (n + 1)/2."""
     covered = rendered.alpha.numpy()[..., None]
     image = linear_to_srgb(rendered.image.numpy())
     tiles = [
@@ -45,15 +51,28 @@ def save_preview(
     for view, pose in views:
         target = view.image.astype(np.float32) / 255
         rows.append(strip(render_runtime(model, pose, view.camera, shader), target))
-    width = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
-    write_image(path, np.concatenate(padded, axis=0))
+    _write_sheet(path, rows)
 
 
 def contact_sheet(path: Path, strips: list[np.ndarray], rows: int = 6) -> None:
     """``rows`` of the strips [H, 5·W, 3], evenly chosen, under one another."""
     count = min(rows, len(strips))
-    chosen = [strips[k * len(strips) // count] for k in range(count)]
-    width = max(strip.shape[1] for strip in chosen)
-    padded = [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0))) for strip in chosen]
-    write_image(path, np.concatenate(padded, axis=0))
+    _write_sheet(path, [strips[k * len(strips) // count] for k in range(count)])
+
+
+def captions(tile: int, strips: int = 1) -> np.ndarray:
+    """[CAPTION, 5·tile·strips, 3] uint8: above each tile of so many pixels what it shows, in grey on black."""
+    picture = np.zeros((CAPTION, tile * len(TILES) * strips, 3), np.uint8)
+    for number, word in enumerate(TILES * strips):
+        (wide, _), _ = cv2.getTextSize(word, FONT, LETTERS, 1)
+        scale = LETTERS * min(1.0, 0.9 * tile / wide)
+        left = number * tile + round((tile - wide * scale / LETTERS) / 2)
+        cv2.putText(picture, word, (left, CAPTION - 8), FONT, scale, (170, 170, 170), 1, cv2.LINE_AA)
+    return picture
+
+
+def _write_sheet(path: Path, strips: list[np.ndarray]) -> None:
+    """Strips under one another, narrower ones with black beside them, and words above."""
+    width = max(strip.shape[1] for strip in strips)
+    padded = [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0))) for strip in strips]
+    write_image(path, np.concatenate([captions(width // len(TILES)), *padded], axis=0))
