@@ -99,7 +99,11 @@ def _at_all_nodes(
     Shares of the interpolation are kept as ``storage``.
     """
     rates, whole = baked.rates, dict(fields)
-    counts = dict(zip(sizes, (rates.skinning, rates.offsets, rates.visibility)))
+    counts = {
+        "node_logits": rates.skinning,
+        "node_offsets": rates.offsets,
+        "node_visibility": rates.visibility,
+    }
     for count in sorted({counts[name] for name in fields} - {len(baked.codes)}):
         with graph.scope(f"from_{count}_nodes"):
             sites = node_sites(baked, count)
