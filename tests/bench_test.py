@@ -148,6 +148,21 @@ def test_factors_that_are_crossed_come_in_all_combinations() -> None:
         settings(cross=("n", "colour"))
 
 
+def test_a_sample_of_all_combinations_has_each_value_about_as_often_and_grows() -> None:
+    few, many = settings(sample=60), settings(sample=180)
+    assert many[: len(few)] == few and few[0] == Setting() and len(set(many)) == len(many) == 181
+    for name, values in bench_grid.FACTORS.items():
+        if name != "window":  # template skinning has none
+            counts = [sum(getattr(point, name) == value for point in few[1:]) for value in values]
+            assert max(counts) - min(counts) <= 1
+    assert all(point.window is None for point in many if point.encoder == "static")
+    alone = settings(cross=("threads", "shade"), sample=9)
+    assert set(alone) == set(settings(cross=("threads", "shade")))
+    for count in (0, 10):
+        with pytest.raises(InputError, match="--sample: expected 1 to 9 points"):
+            settings(cross=("threads", "shade"), sample=count)
+
+
 def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(
         bench_grid, "measured", lambda setting, inputs, **_: dataclasses.asdict(setting) | HERE
@@ -178,7 +193,7 @@ def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> Non
         "(kept)", "(kept)", "(2 left, about 16 min)", "(1 left, about 4 min)", "(0 left, about 0 min)"
     ]  # fmt: skip
     code, lines = said(*files[:2])
-    assert code == 2 and "--chart: expected files of its own beside --cross" in lines[-1]
+    assert code == 2 and "--chart: expected files of its own beside --cross and --sample" in lines[-1]
 
 
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:

@@ -104,8 +104,8 @@ def _grid(options: Grid) -> None:
     check_chart(*options.chart)
     cross = [name.strip() for name in options.cross.split(",")] if options.cross else []
     for name in ("json", "chart"):  # theirs are the tables and the chart of the documentation
-        own = not cross or getattr(options, name) != getattr(Grid(), name)
-        check_option(own, flag(name), "files of its own beside --cross", "the usual ones")
+        own = not (cross or options.sample) or getattr(options, name) != getattr(Grid(), name)
+        check_option(own, flag(name), "files of its own beside --cross and --sample", "the usual ones")
     console, started, measured = Console(), perf_counter(), 0
 
     def show(row: dict[str, Any], new: bool, left: int) -> None:
@@ -120,6 +120,7 @@ def _grid(options: Grid) -> None:
         options.json,
         quick=options.quick,
         cross=cross,
+        sample=options.sample,
         fresh=options.fresh,
         on_row=show,
     )

@@ -1,5 +1,5 @@
 """The grid of the speed–accuracy chart: one factor at a time around the usual case and a crossed core, or factors that
-are crossed with one another.
+are crossed with one another, all combinations of them or some drawn at random.
 
 Every point is one row of JSON. Rows that are there already, measured on this machine, of the same files and by the same
 version, are not measured again: an interrupted run goes on where it stopped.
@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
@@ -93,20 +95,26 @@ FACTORS: dict[str, tuple[Any, ...]] = {
 """what each field of a :class:`Setting` is varied over"""
 
 
-def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
+def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None = None) -> list[Setting]:
     """The points, the usual case first, none twice; with ``cross`` all combinations of those factors and no others.
 
-    Raises :class:`InputError` for a factor that does not exist.
+    ``sample`` takes so many of these combinations, or of all factors', at random: see :func:`drawn`.
+
+    Raises :class:`InputError` for a factor that does not exist, and more points than there are combinations.
     """
     usual = Setting(n=8_000, size=256) if quick else Setting()
     factors = FACTORS
     for name in cross:
         check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
-    if cross:
-        combinations = product(*(FACTORS[name] for name in cross))
-        points = [usual, *(replace(usual, **dict(zip(cross, values))) for values in combinations)]
-        # template skinning has no window: such points would be one and the same
-        return list(dict.fromkeys(p for p in points if p.encoder != "static" or p.window is None))
+    if cross or sample is not None:
+        names = tuple(cross or FACTORS)
+        combinations = product(*(FACTORS[name] for name in names))
+        points = [usual, *(_of(names, values) for values in combinations)]
+        distinct = list(dict.fromkeys(points))
+        if sample is None:
+            return distinct
+        check_option(0 < sample < len(distinct), "--sample", f"1 to {len(distinct) - 1} points", sample)
+        return [usual, *islice(drawn(names), sample)]
     if quick:
         factors = {"n": (4_000,), "shade": ("ao", "table"), "encoder": ("coarse", "static"), "threads": (1,),
                    "raster": ("gl-egl",)}  # fmt: skip
@@ -119,6 +127,30 @@ def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
         points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in core]
         points += [Setting(shade="table", cull=cull) for cull in CULLS]
     return list(dict.fromkeys(points))
+
+
+def drawn(names: Sequence[str], seed: int = 0) -> Iterator[Setting]:
+    """Combinations of those factors' values at random, none twice and never the usual one.
+
+    Each factor goes through its values again and again, in another order each time, so that every stretch of points has
+    about as many of each; a longer sample begins with a shorter one.
+    """
+    rng = np.random.default_rng(seed)
+    waiting: dict[str, list[Any]] = {name: [] for name in names}
+    seen = {Setting()}
+    while True:
+        for name in names:
+            if not waiting[name]:
+                waiting[name] = [FACTORS[name][k] for k in rng.permutation(len(FACTORS[name]))]
+        point = _of(names, [waiting[name].pop() for name in names])
+        if point not in seen:
+            seen.add(point)
+            yield point
+
+
+def _of(names: Sequence[str], values: Sequence[Any]) -> Setting:
+    point = Setting(**dict(zip(names, values)))
+    return replace(point, window=None) if point.encoder == "static" else point  # which looks at no window
 
 
 def measured(
@@ -155,6 +187,7 @@ def grid(
     *,
     quick: bool = False,
     cross: Sequence[str] = (),
+    sample: int | None = None,
     fresh: bool = False,
     on_row: Callable[[Row, bool, int], None],
 ) -> list[Row]:
@@ -166,7 +199,7 @@ def grid(
     if fresh:
         forget(inputs.work)
     rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
-    wanted, key = settings(quick, cross), inputs.key()
+    wanted, key = settings(quick, cross, sample), inputs.key()
     here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
     done: list[Row] = []
     left = sum(_key(asdict(setting)) not in here for setting in wanted)

@@ -79,6 +79,8 @@ class Grid:
     cross: Annotated[str, tyro.conf.arg(metavar="LIST")] = ""
     """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (300 points, an hour);
     also precision, window, raster, threads, cull: all nine are days"""
+    sample: int | None = None
+    """so many of the combinations of --cross, or of all nine factors, drawn at random; more of them go on with fewer"""
     json: Path = Path("assets/bench/grid.json")
     """rows; those measured on this machine, of the same files, are not measured again"""
     fresh: bool = False

@@ -92,9 +92,9 @@ export function lobeAt(lobes, roughness, nDotV, n, v, out) {
     + s * ((1 - t) * lobes[below + k] + t * lobes[below + VALUES + k]);
   // the tangent away from the camera; in a view along the normal there is none, and none is needed
   const tx = nDotV * n[0] - v[0], ty = nDotV * n[1] - v[1], tz = nDotV * n[2] - v[2];
-  const along = value(1) / Math.max(Math.hypot(tx, ty, tz), 1e-12), normal = value(2);
+  const along = value(1) / Math.max(Math.sqrt(tx * tx + ty * ty + tz * tz), 1e-12), normal = value(2);
   const mx = normal * n[0] + along * tx, my = normal * n[1] + along * ty, mz = normal * n[2] + along * tz;
-  const length = Math.max(Math.hypot(mx, my, mz), 1e-12);
+  const length = Math.max(Math.sqrt(mx * mx + my * my + mz * mz), 1e-12);
   out[0] = value(0);
   out[1] = mx / length;
   out[2] = my / length;

@@ -93,7 +93,7 @@ export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
   const cell = new Float64Array(3), node = new Float64Array(3), level = 3 * SPECULAR * SPECULAR;
   for (let i = 0; i < count; i++) {
     const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
-    const distance = Math.max(Math.hypot(dx, dy, dz), 1e-12);
+    const distance = Math.max(Math.sqrt(dx * dx + dy * dy + dz * dz), 1e-12);
     for (let k = 0; k < 3; k++) {
       n[k] = r[k] * normals[3 * i] + r[3 + k] * normals[3 * i + 1] + r[6 + k] * normals[3 * i + 2];
       v[k] = (r[k] * dx + r[3 + k] * dy + r[6 + k] * dz) / distance;
@@ -106,17 +106,16 @@ export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
     const low = Math.min(Math.floor(place), WIDTHS.length - 2), up = place - low;
     octahedralCell(mx, my, mz, SPECULAR, cell);
     octahedralCell(n[0], n[1], n[2], DIFFUSE, node);
-    const at = node[0] * 48, below = at + DIFFUSE * 48, s = node[1], t = node[2];
-    const w00 = (1 - s) * (1 - t), w01 = s * (1 - t), w10 = (1 - s) * t, w11 = s * t;
-    for (let c = 0; c < 3; c++) {
-      const corner = 3 * cell[0] + c + low * level;
+    const s = node[1], t = node[2], w00 = (1 - s) * (1 - t), w01 = s * (1 - t), w10 = (1 - s) * t, w11 = s * t;
+    let a = node[0] * 48, b = a + 48, c = a + DIFFUSE * 48, d = c + 48;  // the cell's corners
+    for (let channel = 0; channel < 3; channel++) {
+      const corner = 3 * cell[0] + channel + low * level;
       const lower = bilinear(specular, corner, cell[1], cell[2]), upper = bilinear(specular, corner + level, cell[1], cell[2]);
       const shine = lobe[0] * Math.max(seen, 0) * (lower + up * (upper - lower));
       let irradiance = 0;
-      for (let j = 16 * c; j < 16 * c + 16; j++)
-        irradiance += visibility[16 * i + j - 16 * c] *
-          (w00 * diffuse[at + j] + w01 * diffuse[at + 48 + j] + w10 * diffuse[below + j] + w11 * diffuse[below + 48 + j]);
-      radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * irradiance + shine, 0);
+      for (let j = 16 * i; j < 16 * i + 16; j++)
+        irradiance += visibility[j] * (w00 * diffuse[a++] + w01 * diffuse[b++] + w10 * diffuse[c++] + w11 * diffuse[d++]);
+      radiance[3 * i + channel] = Math.max(albedo[3 * i + channel] / Math.PI * irradiance + shine, 0);
     }
   }
 }
@@ -126,16 +125,17 @@ function bilinear(table, corner, s, t) {
   return top + t * (table[next] + s * (table[next + 3] - table[next]) - top);
 }
 
-/** The diffuse tables for coefficients of the root's frame: each of their rows times `turn` [16·16]. */
+/** The diffuse tables for coefficients of the root's frame: each of their rows times `turn` [16·16], degree by degree. */
 function turned(diffuse, turn) {
-  const result = new Float32Array(diffuse.length), sum = new Float64Array(16);
-  for (let row = 0; row < diffuse.length; row += 16) {
-    sum.fill(0);
-    for (let source = 0; source < 16; source++) {
-      const value = diffuse[row + source];
-      for (let target = 0; target < 16; target++) sum[target] += value * turn[16 * source + target];
-    }
-    result.set(sum, row);
+  const result = new Float32Array(diffuse.length);
+  for (let degree = 0; degree < 4; degree++) {
+    const first = degree * degree, last = first + 2 * degree + 1;
+    for (let row = 0; row < diffuse.length; row += 16)
+      for (let target = first; target < last; target++) {
+        let sum = 0;
+        for (let source = first; source < last; source++) sum += diffuse[row + source] * turn[16 * source + target];
+        result[row + target] = sum;
+      }
   }
   return result;
 }
