@@ -71,12 +71,12 @@ def test_gl_draws_what_the_cpu_draws(files, tmp_path):
 
 
 def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
-    arguments = _arguments(files, tmp_path / "out", format="png,exr,mp4", aov="normal,depth")
+    arguments = _arguments(files, tmp_path / "out", format="png,exr,mp4,webp", aov="normal,depth")
     assert main(arguments) == 0
     names = {f"{k:06d}" for k in range(FRAMES)}
     expected = {f"frames/{name}.png" for name in names} | {f"frames_exr/{name}.exr" for name in names}
     expected |= {f"aov/{aov}/{name}.png" for aov in ("normal", "depth") for name in names}
-    assert set(_tree(tmp_path / "out")) == expected | {"play.mp4", "play.json"}
+    assert set(_tree(tmp_path / "out")) == expected | {"play.mp4", "play.webp", "play.json"}
     report = json.loads((tmp_path / "out/play.json").read_text())
     assert report["frames"] == [0, FRAMES] and report["size"] == [48, 48] and report["fps"] == 30
     assert {"load", "encoders", "shading", "tonemap", "write"} <= set(report["times"])
@@ -89,7 +89,7 @@ def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
 def test_the_same_run_gives_the_same_bytes(files, tmp_path):
     trees = []
     for name in ("a", "b"):
-        assert main(_arguments(files, tmp_path / name, format="png,exr,mp4", camera="orbit")) == 0
+        assert main(_arguments(files, tmp_path / name, format="png,exr,mp4,webp", camera="orbit")) == 0
         tree = _tree(tmp_path / name)
         report = json.loads(tree.pop("play.json"))
         del report["times"]
@@ -115,14 +115,28 @@ def test_a_part_of_a_run_has_the_pixels_of_the_whole(files, tmp_path):
     assert part["frames/000003.png"] != part["frames/000004.png"]
 
 
+@pytest.mark.parametrize(("background", "shade"), [("hdr", "table+sun"), ("none", "ao")])
+def test_a_light_that_turns_stands_in_each_frame_as_hdr_yaw_says(files, tmp_path, background, shade):
+    turning = {"background": background, "shade": shade, "hdr_yaw": "30", "hdr_turn": "-0.5"}
+    assert main(_arguments(files, tmp_path / "turning", **turning)) == 0
+    pictures = []
+    for number in (0, 4):
+        still = turning | {"hdr_turn": None, "hdr_yaw": str(30 - 360 * number / 30 / 0.5)}
+        assert main(_arguments(files, tmp_path / "still", frames=f"{number}:{number + 1}", **still)) == 0
+        pictures.append(read_image(tmp_path / f"still/frames/{number:06d}.png").astype(int))
+        turned = read_image(tmp_path / f"turning/frames/{number:06d}.png").astype(int)
+        assert np.abs(turned - pictures[-1]).max() <= 1  # degrees and radians round apart
+    assert np.abs(pictures[1] - pictures[0]).max() > 5
+
+
 def test_one_thread_and_three_leave_the_same_files(files, tmp_path):
     trees = []
     for flag in ("--pipeline", "--no-pipeline"):
         folder = tmp_path / flag.strip("-")
-        assert main([*_arguments(files, folder, format="png,exr,mp4", aov="normal"), flag]) == 0
+        assert main([*_arguments(files, folder, format="png,exr,mp4,webp", aov="normal"), flag]) == 0
         trees.append(_tree(folder))
         del trees[-1]["play.json"]  # has the flag and the times
-    assert trees[0] == trees[1] and len(trees[0]) == 3 * FRAMES + 1
+    assert trees[0] == trees[1] and len(trees[0]) == 3 * FRAMES + 2
 
 
 def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
@@ -269,6 +283,7 @@ def test_warnings_name_what_was_found(files, tmp_path, capsys):
         ({"fov": "180"}, "--fov"),
         ({"fps": "nan"}, "--fps"),
         ({"orbit_seconds": "0"}, "--orbit-seconds"),
+        ({"hdr_turn": "0"}, "--hdr-turn: expected not 0, got 0"),
         ({"orbit_seconds": "4"}, "--orbit-seconds: expected the default, got 4.0 (needs --camera orbit)"),
         ({"camera": "a.json", "fov": "40"}, "--fov: expected the default, got 40.0 (the camera's file"),
         ({"hdr": None, "hdr_up": "z"}, "--hdr-up: expected the default, got z (needs --hdr)"),
@@ -378,7 +393,7 @@ def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
 
     original = Player.draw
     monkeypatch.setattr(Player, "draw", draw)
-    assert main(_arguments(files, tmp_path / "out", format="png,exr,mp4")) == 130
+    assert main(_arguments(files, tmp_path / "out", format="png,exr,mp4,webp")) == 130
     assert "interrupted" in capsys.readouterr().err
     left = _tree(tmp_path / "out")
     assert set(left) == {
@@ -409,4 +424,4 @@ def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):
         ["OpenGL,", "EGL", "missing"],
         ["→", "apt", "install", "libegl1"],
     ]
-    assert lines[3][:2] == ["PyAV", "(mp4)"]
+    assert lines[3][:3] == ["PyAV", "(mp4,", "webp)"]

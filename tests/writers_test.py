@@ -1,22 +1,25 @@
-"""What the player writes: mp4 colours through a decoder, PNG alpha, EXR layers, the pictures of AOVs."""
+"""What the player writes: clips' colours through decoders, PNG alpha, EXR layers, the pictures of AOVs."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 
 import av
 import numpy as np
 import pytest
+from PIL import Image
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb, read_header, read_image, to_bytes
 from rnd_viewer.aov import aov_picture, aov_values
 from rnd_viewer.player import Frame
 from rnd_viewer.timing import StageTimes
-from rnd_viewer.video import mp4_writer, rgb_to_yuv420
+from rnd_viewer.video import clip_writer, rgb_to_yuv420
 from rnd_viewer.writers import frame_writer, parse_formats
 
 PATCH = 24  # pixels; the middle of a patch is far enough from its neighbours' chroma
+DECODED_WEBP = 8  # of 255, inside a patch whose neighbours are of any colour: quality 85 and halved chroma
 DECODED = 3  # of 255: two roundings to limited range (each ±0.5 · 255/219) and x264 at CRF 18
 REACH = (2.0, 4.0)
 
@@ -59,7 +62,7 @@ def test_mp4_gives_back_the_colours(tmp_path):
     colours = np.random.default_rng(3).integers(0, 256, (5, 5, 3), np.uint8)
     colours[0, :3] = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
     image = colours.repeat(PATCH, axis=0).repeat(PATCH, axis=1)[:-1]  # odd height
-    with mp4_writer(tmp_path / "a.mp4", fps=29.97) as append:
+    with clip_writer(tmp_path / "a.mp4", fps=29.97) as append:
         for _ in range(3):
             append(image)
     with av.open(str(tmp_path / "a.mp4")) as container:
@@ -77,6 +80,38 @@ def test_mp4_gives_back_the_colours(tmp_path):
         assert difference.max() <= DECODED
 
 
+def test_webp_moves_forever_in_its_colours_and_is_transparent(tmp_path):
+    """Lossy colour, by patches; alpha to the last bit; as a browser's own library reads it."""
+    rng = np.random.default_rng(4)
+    colours, alphas = (
+        rng.integers(0, 256, (3, 5, 5, 3), np.uint8),
+        rng.integers(64, 256, (3, 5, 5, 1), np.uint8),
+    )
+    images = np.concatenate([colours, alphas], -1).repeat(PATCH, axis=1).repeat(PATCH, axis=2)[:, :-1]
+    contents = set()
+    for _ in range(3):
+        with clip_writer(tmp_path / "a.webp", fps=20) as append:
+            for image in images:
+                append(image)
+        contents.add((tmp_path / "a.webp").read_bytes())
+    assert len(contents) == 1
+    with Image.open(tmp_path / "a.webp") as clip:
+        assert (clip.n_frames, clip.info["loop"], clip.size) == (3, 0, (5 * PATCH, 5 * PATCH - 1))
+        for number, image in enumerate(images):
+            clip.seek(number)
+            decoded = np.asarray(clip.convert("RGBA")).astype(int)
+            assert clip.info["duration"] == 50
+            np.testing.assert_array_equal(decoded[..., 3], image[..., 3])
+            middle = (slice(8, None, PATCH), slice(8, None, PATCH))
+            assert np.abs(decoded[middle][..., :3] - image[middle][..., :3]).max() <= DECODED_WEBP
+
+
+def test_webp_over_a_background_is_opaque(tmp_path, frame):
+    _write(tmp_path, dataclasses.replace(frame, behind=np.ones(3, np.float32)), ("webp",))
+    with Image.open(tmp_path / "play.webp") as clip:
+        assert np.asarray(clip.convert("RGBA"))[..., 3].min() == 255
+
+
 def test_mp4_of_the_same_frames_has_the_same_bytes(tmp_path):
     """Small and in motion: there x264's macroblock tree gave a different file every second time."""
     rows, columns = np.mgrid[:48, :48]
@@ -92,7 +127,7 @@ def test_mp4_of_the_same_frames_has_the_same_bytes(tmp_path):
         scattered = [
             np.random.default_rng(k).random(1000 * k) for k in range(9)
         ]  # memory is not where it was
-        with mp4_writer(tmp_path / "a.mp4", fps=30) as append:
+        with clip_writer(tmp_path / "a.mp4", fps=30) as append:
             for frame in frames:
                 append(frame)
         contents.add((tmp_path / "a.mp4").read_bytes())
@@ -102,7 +137,7 @@ def test_mp4_of_the_same_frames_has_the_same_bytes(tmp_path):
 
 def test_interrupted_mp4_leaves_nothing_and_spares_what_was_there(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"before")
-    with pytest.raises(KeyboardInterrupt), mp4_writer(tmp_path / "a.mp4", fps=30) as append:
+    with pytest.raises(KeyboardInterrupt), clip_writer(tmp_path / "a.mp4", fps=30) as append:
         append(_flat((1, 2, 3), 32, 32))
         raise KeyboardInterrupt
     assert [file.name for file in tmp_path.iterdir()] == ["a.mp4"]
@@ -118,8 +153,9 @@ def test_missing_pyav_names_the_extra(monkeypatch):
 def test_formats():
     assert parse_formats("mp4,png") == ("png", "mp4")
     assert parse_formats(None) == ("png", "mp4")
+    assert parse_formats("webp,png") == ("png", "webp")
     for text in ("gif", "png,tiff", ""):
-        with pytest.raises(InputError, match="png,exr,mp4"):
+        with pytest.raises(InputError, match="png,exr,mp4,webp"):
             parse_formats(text)
 
 
@@ -148,8 +184,9 @@ def test_every_format_has_its_place(tmp_path, frame):
     assert _write(tmp_path / "p", frame, ("png",)) == {"frames/000007.png"} | aovs
     assert _write(tmp_path / "e", frame, ("exr",)) == {"frames_exr/000007.exr"}
     assert _write(tmp_path / "m", frame, ("mp4",)) == {"play.mp4"} | aovs
-    everything = {"frames/000007.png", "frames_exr/000007.exr", "play.mp4"} | aovs
-    assert _write(tmp_path / "a", frame, ("png", "exr", "mp4")) == everything
+    assert _write(tmp_path / "w", frame, ("webp",)) == {"play.webp"} | aovs
+    everything = {"frames/000007.png", "frames_exr/000007.exr", "play.mp4", "play.webp"} | aovs
+    assert _write(tmp_path / "a", frame, ("png", "exr", "mp4", "webp")) == everything
 
 
 def test_png_without_background_has_straight_alpha(tmp_path, frame):

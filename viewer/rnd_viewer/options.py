@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, flag, refuse_changed
+from rnd_runtime.errors import InputError, check_option, flag, refuse_changed
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
 from rnd_runtime.skeleton import Skeleton
@@ -93,7 +93,7 @@ class PlayOptions(MotionOptions):
     hdr: Annotated[Path | None, option("FILE")] = None
     """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
     out: Annotated[Path | None, option("FOLDER")] = None
-    """Folder for frames/, frames_exr/, aov/, play.mp4 and play.json."""
+    """Folder for frames/, frames_exr/, aov/, play.mp4, play.webp and play.json."""
 
     size: Annotated[str | None, option("N|WxH")] = None
     """Picture size: N or WIDTHxHEIGHT pixels. Default: 512, or the camera file's own size."""
@@ -103,7 +103,8 @@ class PlayOptions(MotionOptions):
     """Frames to render, END excluded, either may be missing; same pixels as in the whole run, and processes with
     different parts may share a folder. Default: all."""
     format: Annotated[str | None, option("LIST")] = None
-    """Some of png,exr,mp4. Default: png, and mp4 where PyAV is installed."""
+    """Some of png,exr,mp4,webp; webp moves too, and is transparent where png is. Default: png, and mp4 where PyAV is
+    installed."""
 
     camera: str = "front"
     """front, orbit, FILE.json or FILE.json:NAME. The first two frame the whole motion."""
@@ -118,6 +119,8 @@ class PlayOptions(MotionOptions):
 
     hdr_yaw: float = 0.0
     """Turn the light about the vertical axis, in degrees; positive from +X towards +Z."""
+    hdr_turn: Annotated[float | None, option("SECONDS")] = None
+    """Time in which the light turns once, from --hdr-yaw on; negative turns the other way. Default: it stands still."""
     hdr_up: Literal["y", "z"] = "y"
     """Which axis points up in the probe's file."""
     exposure: float = 0.0
@@ -153,11 +156,12 @@ class PlayOptions(MotionOptions):
             "elevation": (-89, 89),
             "fov": (1, 170),
             "hdr_yaw": (-1e6, 1e6),
+            "hdr_turn": (-1e6, 1e6),
             "exposure": (-30, 30),
         }
         refuse_outside(self, limits)
-        if self.orbit_seconds == 0:
-            raise InputError("--orbit-seconds", expected="not 0", got=0)
+        for name in ("orbit_seconds", "hdr_turn"):
+            check_option(getattr(self, name) != 0, flag(name), "not 0", 0)
         if self.camera != "orbit":
             refuse_changed(self, ["orbit_seconds"], "needs --camera orbit")
         if self.camera not in OWN_CAMERAS:

@@ -94,6 +94,8 @@ def play(options: PlayOptions) -> int:
         asked, encoding, encoded = turn
         started = perf_counter()
         camera = camera_at(number, number / fps)
+        if options.hdr_turn:
+            player.turn(light.yaw + math.tau * number / fps / options.hdr_turn)
         qualities.append(governor.quality if governor else FULL)
         frame = player.draw(encoded, camera, qualities[-1])
         in_view = in_view or bool(frame.alpha.any())

@@ -79,7 +79,8 @@ def coded(linear: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 class Player:
     """An avatar under a light, ready to be rendered at any time of any motion from any camera.
 
-    Frames depend on nothing but the arguments of :meth:`render`. ``times`` collects how long each stage took.
+    Frames depend on nothing but the arguments of :meth:`render` and on :meth:`turn`. ``times`` collects how long each
+    stage took.
     """
 
     avatar: Avatar
@@ -91,6 +92,11 @@ class Player:
     times: StageTimes = field(default_factory=StageTimes)
     _behind: tuple[Camera, Floats32] | None = field(default=None, init=False, repr=False)
     _kept: tuple[KeptRadiance, int] | None = field(default=None, init=False, repr=False)  # and its frames
+
+    def turn(self, yaw: float) -> None:
+        """Turn the light to ``yaw`` radians (as :class:`Light`) from the next :meth:`draw` on; no table is built."""
+        if yaw != self.light.yaw:
+            self.light, self.shader, self._behind = self.light.turned(yaw), self.shader.turned(yaw), None
 
     def render(self, motion: Motion, time_s: float, camera: Camera) -> Frame:
         """The avatar at ``time_s`` seconds of ``motion``, seen by ``camera``."""
@@ -161,7 +167,7 @@ class Player:
         )
 
     def _radiance_behind(self, camera: Camera) -> Floats32 | None:
-        """The background, kept for as long as the camera stands still."""
+        """The background, kept for as long as camera and light stand still."""
         if self.background.kind == "none":
             return None
         if self._behind is None or self._behind[0] is not camera:

@@ -20,7 +20,7 @@ from rnd_runtime.skeleton import Skeleton
 from .aov import aov_picture
 from .cameras import View, frame_motion, front_path, orbit_path
 from .player import Player
-from .video import mp4_writer
+from .video import clip_writer
 
 Bytes = NDArray[np.uint8]
 SIDE, FPS, SECONDS = 448, 24, 5.0
@@ -51,7 +51,7 @@ class Shots:
         with tempfile.TemporaryDirectory() as folder, make_rasterizer("auto") as rasterizer:
             player = Player(self.avatar, self._learned, Shader(self._learned, MODE), rasterizer)
             path = Path(folder) / "turntable.mp4"
-            with mp4_writer(path, fps=FPS) as append:
+            with clip_writer(path, fps=FPS) as append:
                 for number in range(round(SECONDS * FPS)):
                     time_s = number / FPS
                     append(player.render(self.motion, time_s, self._orbit(number, time_s)).srgb)

@@ -18,7 +18,7 @@ _FRAME = re.compile(
     r"\d{6,}\.(png|exr)"
 )  # a picture as writers.py names it, and nothing that a user put there
 _PICTURES = ("frames/*", "frames_exr/*", "aov/*/*")  # and nothing deeper, see writers.py
-_WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4)")  # beside them, see part_name
+_WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp)")  # beside them, see part_name
 
 
 def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> None:

@@ -1,8 +1,8 @@
-"""mp4 files whose colours survive: BT.709 done by our own matrix, and said so in the file.
+"""Clips: mp4 whose colours survive, and WebP, which moves wherever a picture may stand and keeps what is transparent.
 
 A player that finds no tags guesses BT.601 for small pictures, and ffmpeg's converter assumes BT.601 unless
-told; either one alone costs 16 dB. So the conversion is written out here and tested
-through a decoder.
+told; either one alone costs 16 dB. So mp4's conversion to BT.709 is written out here, said in the file and tested
+through a decoder. WebP has one way to keep colours (BT.601, full chroma range halved), which its encoder does itself.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,18 @@ CHROMA_ZERO = np.float32(128)
 # "BT.709" there (QuickTime) show everything brighter.
 PRIMARIES_BT709, TRANSFER_SRGB, MATRIX_BT709, RANGE_LIMITED = 1, 13, 1, 1
 
+BT709 = {
+    "color_primaries": PRIMARIES_BT709,
+    "color_trc": TRANSFER_SRGB,
+    "colorspace": MATRIX_BT709,
+    "color_range": RANGE_LIMITED,
+}
+
 # The same frames must give the same bytes. So one thread: x264's output depends on their number. And no macroblock
 # tree: its vector code reads past the end of pictures narrower than 128 pixels (13 different files in 30 runs).
 # CRF 18 then costs 0.1 dB against 16 at 512², where the halved chroma alone holds everything below 46 dB.
 X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtree=0"}
+WEBP = {"quality": "85", "compression_level": "4"}
 
 
 INSTALL = "pip install 'rnd-avatar[video]'"
@@ -48,17 +56,17 @@ def load_pyav() -> ModuleType:
         import av
     except ImportError as error:
         raise InputError(
-            "mp4 needs PyAV, which is not installed", hint=f"{INSTALL}, or --format png"
+            "mp4 and webp need PyAV, which is not installed", hint=f"{INSTALL}, or --format png"
         ) from error
     return av
 
 
 def finding() -> Finding:
-    """What the doctor says of mp4."""
+    """What the doctor says of clips."""
     try:
-        return Finding("PyAV (mp4)", str(load_pyav().__version__), None)
+        return Finding("PyAV (mp4, webp)", str(load_pyav().__version__), None)
     except InputError:
-        return Finding("PyAV (mp4)", "missing", INSTALL)
+        return Finding("PyAV (mp4, webp)", "missing", INSTALL)
 
 
 def rgb_to_yuv420(image_srgb: Bytes) -> Bytes:
@@ -89,43 +97,73 @@ def _luma(rgb: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     return RED * rgb[..., 0] + GREEN * rgb[..., 1] + BLUE * rgb[..., 2]
 
 
-@contextmanager
-def mp4_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], None]]:
-    """Yield a function that appends one sRGB frame [H, W, 3] uint8; the file appears when the block ends.
+def rgb_to_bgra(image_srgb: Bytes) -> Bytes:
+    """8-bit R'G'B' or R'G'B'A [H, W, 3 or 4], alpha straight → B'G'R'A [H, W, 4]."""
+    opaque = np.full((*image_srgb.shape[:2], 1), 255, np.uint8)
+    return np.ascontiguousarray(
+        np.concatenate([image_srgb[..., 2::-1], image_srgb[..., 3:], opaque], axis=-1)[..., :4]
+    )
 
-    The size is that of the first frame (rounded up to even). The same frames give the same bytes. Raises
+
+class _Kind(NamedTuple):
+    """How a clip is made: ``options`` are the encoder's, ``container`` the file's."""
+
+    codec: str
+    pixels: str
+    planes: Callable[[Bytes], Bytes]
+    options: dict[str, str]
+    container: dict[str, str]
+    tags: dict[str, int]
+
+
+_KINDS = {
+    "mp4": _Kind("libx264", "yuv420p", rgb_to_yuv420, X264, {"movflags": "+faststart"}, BT709),
+    "webp": _Kind("libwebp_anim", "bgra", rgb_to_bgra, WEBP, {"loop": "0"}, {}),
+}
+CLIPS = tuple(_KINDS)
+
+
+@contextmanager
+def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], None]]:
+    """Yield a function that appends one sRGB frame uint8; the file appears when the block ends.
+
+    Args:
+        path: a name in .mp4, which takes frames [H, W, 3], or in .webp, which also takes [H, W, 4], their alpha
+            straight, and plays again and again.
+        fps: frames per second.
+
+    The size is that of the first frame (mp4: rounded up to even). The same frames give the same bytes. Raises
     InputError when PyAV is missing or the encoder refuses the size.
     """
-    av = load_pyav()
-    faststart = {"movflags": "+faststart"}
-    with atomic_path(path) as temporary, av.open(str(temporary), "w", options=faststart) as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=X264)
-
-        def tag(target: object) -> None:
-            for name, value in zip(
-                ("color_primaries", "color_trc", "colorspace", "color_range"),
-                (PRIMARIES_BT709, TRANSFER_SRGB, MATRIX_BT709, RANGE_LIMITED),
-            ):
-                setattr(target, name, value)
+    av, name = load_pyav(), Path(path).suffix[1:]
+    kind = _KINDS[name]
+    with (
+        atomic_path(path) as temporary,
+        av.open(str(temporary), "w", format=name, options=kind.container) as container,
+    ):
+        stream = container.add_stream(
+            kind.codec, rate=Fraction(fps).limit_denominator(1001), options=kind.options
+        )
 
         def write(image_srgb: Bytes) -> None:
-            planes = rgb_to_yuv420(image_srgb)
-            height, width = planes.shape[0] * 2 // 3, planes.shape[1]
+            frame = av.VideoFrame.from_ndarray(kind.planes(image_srgb), format=kind.pixels)
+            size = f"{frame.width}x{frame.height}"
             if not stream.codec_context.is_open:
-                stream.width, stream.height = width, height
-                stream.pix_fmt = "yuv420p"
-                tag(stream.codec_context)
-            if (width, height) != (stream.width, stream.height):
+                stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, kind.pixels
+                _tag(stream.codec_context, kind.tags)
+            if (frame.width, frame.height) != (stream.width, stream.height):
                 expected = f"pictures of one size, {stream.width}x{stream.height}"
-                raise InputError("mp4", expected=expected, got=f"{width}x{height}", file=path)
-            frame = av.VideoFrame.from_ndarray(planes, format="yuv420p")
-            tag(frame)
+                raise InputError(name, expected=expected, got=size, file=path)
+            _tag(frame, kind.tags)
             try:
                 container.mux(stream.encode(frame))
             except av.error.FFmpegError as error:
-                raise InputError(
-                    f"mp4 encoder refuses {width}x{height}", got=error.strerror, file=path
-                ) from error
+                raise InputError(f"{name} encoder refuses {size}", got=error.strerror, file=path) from error
 
         yield write
         container.mux(stream.encode(None))
+
+
+def _tag(target: object, tags: dict[str, int]) -> None:
+    for name, value in tags.items():
+        setattr(target, name, value)

@@ -33,7 +33,7 @@ from msgspec.structs import replace
 from rnd_runtime.errors import InputError
 from rnd_runtime.threads import set_threads
 
-from .video import mp4_writer
+from .video import clip_writer
 from .view_scene import Bytes, Picture, Scene
 from .view_state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, TruthRequest, parse_request
 
@@ -226,7 +226,7 @@ class _Visitor:
             raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
         with TemporaryDirectory() as folder:
             file = Path(folder) / "clip.mp4"
-            with mp4_writer(file, fps=request.fps) as append:
+            with clip_writer(file, fps=request.fps) as append:
                 for number in range(frames):
                     azimuth = state.azimuth + request.turn * number / frames
                     now = replace(state, time=number / request.fps, azimuth=azimuth)

@@ -5,7 +5,7 @@
     out/frames/000010.png        the picture: 8-bit sRGB, with straight alpha when there is no background
     out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV
     out/aov/normal/000010.png    AOVs to look at
-    out/play.mp4
+    out/play.mp4, out/play.webp      clips; the WebP is transparent where the PNG is
     out/play.json                settings, what was found in the inputs, stage times
     out/play_000010-000050.*     the same of a part of a run, see :mod:`rnd_viewer.run_folder`
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,10 @@ from rnd_runtime.images import write_image
 from .aov import CHANNELS, aov_picture
 from .player import Frame
 from .timing import StageTimes
-from .video import load_pyav, mp4_writer
+from .video import CLIPS, clip_writer, load_pyav
 
-FORMATS = ("png", "exr", "mp4")
+FORMATS = ("png", "exr", *CLIPS)
+TRANSPARENT = {"png", "webp"}  # where nothing stands behind the avatar
 FrameWriter = Callable[[int, Frame, tuple[float, float]], None]
 
 
@@ -41,17 +42,21 @@ def parse_formats(text: str | None) -> tuple[str, ...]:
     names = {name.strip() for name in text.split(",") if name.strip()}
     if not names or names - set(FORMATS):
         raise InputError("--format", expected=f"some of {','.join(FORMATS)}", got=text or "nothing")
-    if "mp4" in names:
+    if names & set(CLIPS):
         load_pyav()
     return tuple(name for name in FORMATS if name in names)
 
 
 def tone_map_for(formats: tuple[str, ...], frame: Frame) -> None:
     """Let ``frame`` make the pixels that ``formats`` need, which it keeps: before it goes to a writer's thread."""
-    if "png" in formats and frame.behind is None:
-        frame.srgb_alpha  # noqa: B018
-    if "mp4" in formats or ("png" in formats and frame.behind is not None):
-        frame.srgb  # noqa: B018
+    for name in formats:
+        if name != "exr":
+            _pixels(name, frame)
+
+
+def _pixels(name: str, frame: Frame) -> NDArray[np.uint8]:
+    """The pixels of ``frame`` for one of the formats that have 8 bits."""
+    return frame.srgb_alpha if name in TRANSPARENT and frame.behind is None else frame.srgb
 
 
 @contextmanager
@@ -61,20 +66,23 @@ def frame_writer(
     """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
 
     ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
-    one, and into pictures of their own if PNG is asked for or there is no EXR. The mp4, called ``name``, appears
+    one, and into pictures of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
     at the end.
     """
     output_folder(folder)
-    video = mp4_writer(folder / f"{name}.mp4", fps=fps) if "mp4" in formats else nullcontext(None)
-    with video as append:
+    with ExitStack() as clips:
+        append = {
+            kind: clips.enter_context(clip_writer(folder / f"{name}.{kind}", fps=fps))
+            for kind in formats
+            if kind in CLIPS
+        }
 
         def write(number: int, frame: Frame, reach: tuple[float, float]) -> None:
             files: dict[Path, NDArray[np.uint8]] = {}
             number_name = f"{number:06d}"
             with times.stage("write"):
                 if "png" in formats:
-                    pixels = frame.srgb_alpha if frame.behind is None else frame.srgb
-                    files[folder / f"frames/{number_name}.png"] = pixels
+                    files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
                 if "png" in formats or "exr" not in formats:
                     for aov, values in frame.aovs.items():
                         picture = aov_picture(aov, values, frame.alpha, reach)
@@ -83,8 +91,8 @@ def frame_writer(
                     write_image(path, pixels)
                 if "exr" in formats:
                     _write_exr(folder / f"frames_exr/{number_name}.exr", frame)
-                if append:
-                    append(frame.srgb)
+                for kind, add in append.items():
+                    add(_pixels(kind, frame))
 
         yield write
 
