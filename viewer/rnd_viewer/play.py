@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +17,8 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
 from rnd_runtime.light import Light, load_light
-from rnd_runtime.motion import motion_inputs
-from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.motion import Motion, motion_inputs
+from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.threads import set_threads
 
@@ -57,102 +59,173 @@ def play(options: PlayOptions) -> int:
     Raises:
         InputError: for whatever cannot be used; what was finished before stays.
     """
-    avatar_file, motion_file, out = _required(options)
-    background, aovs = Background.parse(options.background), parse_aovs(options.aov)
-    formats, size = parse_formats(options.format), parse_size(options.size)
-    set_threads(options.threads)
-
-    times = StageTimes()
-    with times.stage("load"):
-        avatar = Avatar.load(avatar_file, threads=options.threads)
-        motion = options.read_motion(motion_file, avatar.skeleton)
-        light = _light(options, avatar)
-        shader = Shader(light, mode=options.shade)
-        rasterizer = make_rasterizer(options.raster)
-    player = Player(avatar, light, shader, rasterizer, background, aovs, times)
-
-    fps = options.fps or motion.fps
-    count = motion.frames_at(fps)
-    frames = parse_frames(options.frames, count)
-    framing = frame_motion(avatar.skeleton, motion)
-    camera_at = _camera_path(options, size, framing, frames)
-    notes = [*motion.notes, *_light_notes(light)]
-    for note in notes:
+    played = _Run.of(options)
+    for note in played.notes:
         warn(note)
+    seconds = played.render()
+    for note in played.afterthoughts():
+        played.notes.append(note)
+        warn(note)
+    played.report(seconds)
+    return 0
 
-    governor = Governor(options.fps_floor) if options.fps_floor else None
-    qualities: list[Quality] = []
-    in_view = False
 
-    def encode(number: int) -> tuple[float, float, Encoded]:
+class _Turn(NamedTuple):
+    """A frame that is encoded and waits to be drawn; ``asked`` is when its turn began, both in seconds."""
+
+    asked: float
+    encoding: float
+    encoded: Encoded
+
+
+@dataclass(eq=False)
+class _Run:
+    """What ``rnd-play`` was asked for, with everything loaded, and what is learnt on the way.
+
+    Attributes:
+        frames: those that this process renders, out of ``count``; frame k shows the motion at k / ``fps`` seconds.
+        notes: what the inputs' readers found, and what the run itself has to say.
+        qualities: of every frame that was drawn, in turn.
+        in_view: whether anything of the avatar was seen yet.
+    """
+
+    options: PlayOptions
+    out: Path
+    formats: tuple[str, ...]
+    player: Player
+    rasterizer: ChosenRasterizer
+    motion: Motion
+    fps: float
+    frames: range
+    count: int
+    framing: Framing
+    camera_at: CameraPath
+    notes: list[str]
+    governor: Governor | None
+    qualities: list[Quality] = field(default_factory=list)
+    in_view: bool = False
+
+    @classmethod
+    def of(cls, options: PlayOptions) -> _Run:
+        """Check the options, the cheap ones first, and load what they name."""
+        avatar_file, motion_file, out = _required(options)
+        background, aovs = Background.parse(options.background), parse_aovs(options.aov)
+        formats, size = parse_formats(options.format), parse_size(options.size)
+        set_threads(options.threads)
+
+        times = StageTimes()
+        with times.stage("load"):
+            avatar = Avatar.load(avatar_file, threads=options.threads)
+            motion = options.read_motion(motion_file, avatar.skeleton)
+            light = _light(options, avatar)
+            shader = Shader(light, mode=options.shade)
+            rasterizer = make_rasterizer(options.raster)
+        fps = options.fps or motion.fps
+        count = motion.frames_at(fps)
+        frames = parse_frames(options.frames, count)
+        framing = frame_motion(avatar.skeleton, motion)
+        return cls(
+            options=options,
+            out=out,
+            formats=formats,
+            player=Player(avatar, light, shader, rasterizer, background, aovs, times),
+            rasterizer=rasterizer,
+            motion=motion,
+            fps=fps,
+            frames=frames,
+            count=count,
+            framing=framing,
+            camera_at=_camera_path(options, size, framing, frames),
+            notes=[*motion.notes, *_light_notes(light)],
+            governor=Governor(options.fps_floor) if options.fps_floor else None,
+        )
+
+    @property
+    def name(self) -> str:
+        """Of the clips and the report."""
+        return part_name("play", self.frames, self.count)
+
+    def camera(self, number: int) -> Camera:
+        return self.camera_at(number, number / self.fps)
+
+    def render(self) -> float:
+        """Leave every frame in the folder; how many seconds it took."""
+        times, overlap = self.player.times, self.options.pipeline
+        clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=times)
+        with self.rasterizer, clips as write:
+            started = before = perf_counter()
+
+            def put(number: int, drawn: tuple[Frame, Camera]) -> None:
+                if number == self.frames.start:  # not before: what fails at once leaves the folder as it was
+                    claim(self.out, _common(self.options), _inputs(self.options))
+                write(number, drawn[0], _reach(self.framing, drawn[1]))
+
+            for _ in with_progress(
+                self.frames, run(self.frames, self._encode, self._draw, put, overlap=overlap)
+            ):
+                now = perf_counter()
+                times.add(FRAME, now - before)
+                before = now
+        return perf_counter() - started
+
+    def _encode(self, number: int) -> _Turn:
+        asked = perf_counter()
+        encoded = self.player.encode(self.motion, number / self.fps)
+        return _Turn(asked, perf_counter() - asked, encoded)
+
+    def _draw(self, number: int, turn: _Turn) -> tuple[Frame, Camera]:
         started = perf_counter()
-        encoded = player.encode(motion, number / fps)
-        return started, perf_counter() - started, encoded
-
-    def draw(number: int, turn: tuple[float, float, Encoded]) -> tuple[Frame, Camera]:
-        nonlocal in_view
-        asked, encoding, encoded = turn
-        started = perf_counter()
-        camera = camera_at(number, number / fps)
-        if options.hdr_turn:
-            player.turn(light.yaw + math.tau * number / fps / options.hdr_turn)
-        qualities.append(governor.quality if governor else FULL)
-        frame = player.draw(encoded, camera, qualities[-1])
-        in_view = in_view or bool(frame.alpha.any())
-        if number == 0 and not in_view:
-            raise _out_of_view(framing, camera, number)
-        with times.stage("tonemap"):
-            tone_map_for(formats, frame)
+        player, camera = self.player, self.camera(number)
+        if self.options.hdr_turn:
+            yaw = math.radians(self.options.hdr_yaw) + math.tau * number / self.fps / self.options.hdr_turn
+            player.turn(yaw)
+        self.qualities.append(self.governor.quality if self.governor else FULL)
+        frame = player.draw(turn.encoded, camera, self.qualities[-1])
+        self.in_view = self.in_view or bool(frame.alpha.any())
+        if number == 0 and not self.in_view:
+            raise _out_of_view(self.framing, camera, number)
+        with player.times.stage("tonemap"):
+            tone_map_for(self.formats, frame)
         now = perf_counter()
-        times.add(LATENCY, now - asked)
-        if governor:
+        player.times.add(LATENCY, now - turn.asked)
+        if self.governor:
             drawing = now - started
-            governor.observe(max(encoding, drawing) if options.pipeline else encoding + drawing)
+            longest = max(turn.encoding, drawing) if self.options.pipeline else turn.encoding + drawing
+            self.governor.observe(longest)
         return frame, camera
 
-    name = part_name("play", frames, count)
-    common = {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
-    inputs = _inputs(options)
-    with rasterizer, frame_writer(out, formats, name=name, fps=fps, times=times) as write:
-        started = before = perf_counter()
+    def afterthoughts(self) -> Iterator[str]:
+        """What can be said of the frames only once they are there."""
+        if lowered := sum(quality != FULL for quality in self.qualities):
+            share = f"{lowered} of {len(self.frames)} frames"
+            yield f"{share} at less than full quality, for {self.options.fps_floor:g} frames/s"
+        if not self.in_view:
+            yield "nothing of the avatar is in view in any of these frames"
 
-        def put(number: int, drawn: tuple[Frame, Camera]) -> None:
-            if number == frames.start:  # not before: what fails at once leaves the folder as it was
-                claim(out, common, inputs)
-            write(number, drawn[0], _reach(framing, drawn[1]))
+    def report(self, seconds: float) -> None:
+        """Write play.json and print the summary of a run of so many seconds."""
+        camera, light = self.camera(self.frames.stop - 1), self.player.light
+        raster, summary = self.rasterizer.name, self.player.times.summary()
+        report = {
+            "version": __version__,
+            "settings": _settings(self.options),
+            "frames": [self.frames.start, self.frames.stop],
+            "fps": self.fps,
+            "size": [camera.width, camera.height],
+            "raster": raster,
+            "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
+            "notes": self.notes,
+            "times": summary,
+        }
+        write_report(self.out / f"{self.name}.json", report)
+        rate = len(self.frames) / seconds
+        headline = f"{len(self.frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
+        print_summary(summary, headline=f"{headline} ({raster}, {self.options.shade}) in {self.out}")
 
-        for _ in with_progress(frames, run(frames, encode, draw, put, overlap=options.pipeline)):
-            now = perf_counter()
-            times.add(FRAME, now - before)
-            before = now
-    seconds = perf_counter() - started
 
-    if lowered := sum(quality != FULL for quality in qualities):
-        notes.append(
-            f"{lowered} of {len(frames)} frames at less than full quality, for {options.fps_floor:g} frames/s"
-        )
-        warn(notes[-1])
-    if not in_view:
-        notes.append("nothing of the avatar is in view in any of these frames")
-        warn(notes[-1])
-    camera = camera_at(frames.stop - 1, (frames.stop - 1) / fps)
-    summary = times.summary()
-    report = {
-        "version": __version__,
-        "settings": _settings(options),
-        "frames": [frames.start, frames.stop],
-        "fps": fps,
-        "size": [camera.width, camera.height],
-        "raster": rasterizer.name,
-        "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
-        "notes": notes,
-        "times": summary,
-    }
-    write_report(out / f"{name}.json", report)
-    rate = len(frames) / seconds
-    headline = f"{len(frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
-    print_summary(summary, headline=f"{headline} ({rasterizer.name}, {options.shade}) in {out}")
-    return 0
+def _common(options: PlayOptions) -> dict[str, object]:
+    """The settings that all processes of one run share."""
+    return {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
 
 
 def _settings(options: PlayOptions) -> dict[str, object]:
