@@ -105,7 +105,7 @@ class Cloth:
         middle = first.mean(axis=0)
         start, start_normals = (start - middle) @ turned.T + middle, start_normals @ turned.T
         points, velocity = start.copy(), np.zeros_like(start)
-        before, before_normals = start, start_normals
+        before = start, start_normals
         result = {}
         for step in range(-warm, len(bones)):
             if step < 0:
@@ -118,11 +118,10 @@ class Cloth:
             else:
                 now, now_normals = self._skinned(bones[step])
                 segments = self._segments(bones[step])
-            _advance(
-                points, velocity, before, now, before_normals, now_normals, *self.springs, self.radius, self.gap,
-                self.hangs, segments, self.capsules.radii, 1.0 / fps,
-            )  # fmt: skip
-            before, before_normals = now, now_normals
+            after = now, now_normals
+            bounds, body = (self.radius, self.gap, self.hangs), (segments, self.capsules.radii)
+            _advance(points, velocity, before, after, self.springs, bounds, body, 1.0 / fps)
+            before = after
             if step in keep:
                 result[step] = points - now
             if step == max(keep):
@@ -211,85 +210,122 @@ def _best_rotation(source: Floats, target: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _advance(
-    x,
-    v,
-    before,
-    now,
-    before_normals,
-    now_normals,
-    pairs,
-    lengths,
-    compliances,
-    radius,
-    gap,
-    hangs,
-    segments,
-    radii,
-    duration,
-):
-    """One frame of ``SUBSTEPS`` small steps, in place."""
+def _advance(x, v, before, now, springs, bounds, body, duration):
+    """One frame of ``SUBSTEPS`` small steps: places ``x`` and velocities ``v`` [P, 3], changed in place.
+
+    Args:
+        before, now: skinned places and normals [P, 3] at the frame's start and end.
+        springs: pairs [S, 2], lengths [S] m, compliances [S].
+        bounds: how far each point may stray m, its gap to the body m, whether it hangs free of a limb, [P] each.
+        body: axes [C, 2, 3] and radii [C] m of the capsules.
+        duration: s.
+    """
     dt = duration / SUBSTEPS
     old = np.empty_like(x)
-    drag = 1.0 - np.exp(-DRAG * dt)
+    radius, gap, hangs = bounds
     for sub in range(SUBSTEPS):
         t = (sub + 1.0) / SUBSTEPS
+        _fall(x, v, old, before[0], now[0], duration, dt)
+        _pull(x, springs, dt)
         for i in range(len(x)):
-            for c in range(3):
-                swept = (now[i, c] - before[i, c]) / duration
-                v[i, c] += drag * (swept - v[i, c])
-                old[i, c] = x[i, c]
-            v[i, 1] -= GRAVITY * dt
-            for c in range(3):
-                x[i, c] += v[i, c] * dt
-        for s in range(len(pairs)):
-            i, j = pairs[s, 0], pairs[s, 1]
-            dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
-            length = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12
-            move = -(length - lengths[s]) / (2.0 + compliances[s] / (dt * dt)) / length
-            x[i, 0] += move * dx
-            x[i, 1] += move * dy
-            x[i, 2] += move * dz
-            x[j, 0] -= move * dx
-            x[j, 1] -= move * dy
-            x[j, 2] -= move * dz
-        for i in range(len(x)):
+            place, normal = _between(before[0], now[0], i, t), _between(before[1], now[1], i, t)
             tie = 1.0 / (1.0 + TIE * (radius[i] / 0.02) ** 2 / (dt * dt))
-            dx = x[i, 0] - (before[i, 0] + t * (now[i, 0] - before[i, 0]))
-            dy = x[i, 1] - (before[i, 1] + t * (now[i, 1] - before[i, 1]))
-            dz = x[i, 2] - (before[i, 2] + t * (now[i, 2] - before[i, 2]))
+            dx, dy, dz = x[i, 0] - place[0], x[i, 1] - place[1], x[i, 2] - place[2]
             px, py, pz = x[i, 0] - dx, x[i, 1] - dy, x[i, 2] - dz
-            dx, dy, dz = dx * (1 - tie), dy * (1 - tie), dz * (1 - tie)
-            nx = before_normals[i, 0] + t * (now_normals[i, 0] - before_normals[i, 0])
-            ny = before_normals[i, 1] + t * (now_normals[i, 1] - before_normals[i, 1])
-            nz = before_normals[i, 2] + t * (now_normals[i, 2] - before_normals[i, 2])
-            deep = -(gap[i] - SKIN_GAP) - (dx * nx + dy * ny + dz * nz)
-            if deep > 0.0:
-                dx += deep * nx
-                dy += deep * ny
-                dz += deep * nz
-            for c in range(len(segments)):
-                ax, ay, az = segments[c, 0, 0], segments[c, 0, 1], segments[c, 0, 2]
-                bx, by, bz = segments[c, 1, 0] - ax, segments[c, 1, 1] - ay, segments[c, 1, 2] - az
-                qx, qy, qz = px + dx - ax, py + dy - ay, pz + dz - az
-                share = (qx * bx + qy * by + qz * bz) / (bx * bx + by * by + bz * bz)
-                share = min(max(share, 0.0), 1.0)
-                ex, ey, ez = qx - share * bx, qy - share * by, qz - share * bz
-                inside = radii[c] * radii[c] - (ex * ex + ey * ey + ez * ez)
-                if inside > 0.0 and hangs[i]:  # sleeves and legs have their planes
-                    # out of the leg and away from the body: straight out of the axis would tear a skirt at a knee
-                    mx, my, mz = ex + 2 * radii[c] * nx, ey + 2 * radii[c] * ny, ez + 2 * radii[c] * nz
-                    norm = np.sqrt(mx * mx + my * my + mz * mz)
-                    mx, my, mz = mx / norm, my / norm, mz / norm
-                    along = ex * mx + ey * my + ez * mz
-                    push = np.sqrt(along * along + inside) - along
-                    dx += push * mx
-                    dy += push * my
-                    dz += push * mz
-            stray = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if stray > radius[i]:
-                shrink = radius[i] / stray
-                dx, dy, dz = dx * shrink, dy * shrink, dz * shrink
-            x[i, 0], x[i, 1], x[i, 2] = px + dx, py + dy, pz + dz
+            away = dx * (1 - tie), dy * (1 - tie), dz * (1 - tie)
+            away = _above_skin(away, normal, gap[i])
+            if hangs[i]:  # sleeves and legs have their planes
+                for c in range(len(body[0])):
+                    away = _out_of(body[0][c], body[1][c], (px, py, pz), away, normal)
+            away = _within(away, radius[i])
+            x[i, 0], x[i, 1], x[i, 2] = px + away[0], py + away[1], pz + away[2]
             for c in range(3):
                 v[i, c] = (x[i, c] - old[i, c]) / dt
+
+
+@njit(inline="always")
+def _fall(x, v, old, before, now, duration, dt):
+    """Air that moves with the body drags, and weight pulls; the places from which the step began go to ``old``."""
+    drag = 1.0 - np.exp(-DRAG * dt)
+    for i in range(len(x)):
+        for c in range(3):
+            swept = (now[i, c] - before[i, c]) / duration
+            v[i, c] += drag * (swept - v[i, c])
+            old[i, c] = x[i, c]
+        v[i, 1] -= GRAVITY * dt
+        for c in range(3):
+            x[i, c] += v[i, c] * dt
+
+
+@njit(inline="always")
+def _pull(x, springs, dt):
+    """Each spring in turn towards its length, as far as its compliance lets it (XPBD, one iteration)."""
+    pairs, lengths, compliances = springs
+    for s in range(len(pairs)):
+        i, j = pairs[s, 0], pairs[s, 1]
+        dx, dy, dz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        length = np.sqrt(dx * dx + dy * dy + dz * dz) + 1e-12
+        move = -(length - lengths[s]) / (2.0 + compliances[s] / (dt * dt)) / length
+        x[i, 0] += move * dx
+        x[i, 1] += move * dy
+        x[i, 2] += move * dz
+        x[j, 0] -= move * dx
+        x[j, 1] -= move * dy
+        x[j, 2] -= move * dz
+
+
+@njit(inline="always")
+def _between(a, b, i, t):
+    return (
+        a[i, 0] + t * (b[i, 0] - a[i, 0]),
+        a[i, 1] + t * (b[i, 1] - a[i, 1]),
+        a[i, 2] + t * (b[i, 2] - a[i, 2]),
+    )
+
+
+@njit(inline="always")
+def _above_skin(away, normal, gap):
+    """A displacement that does not reach through the skin below."""
+    dx, dy, dz = away
+    nx, ny, nz = normal
+    deep = -(gap - SKIN_GAP) - (dx * nx + dy * ny + dz * nz)
+    if deep > 0.0:
+        dx += deep * nx
+        dy += deep * ny
+        dz += deep * nz
+    return dx, dy, dz
+
+
+@njit(inline="always")
+def _out_of(axis, radius, place, away, normal):
+    """A displacement from ``place`` that does not end inside a capsule."""
+    dx, dy, dz = away
+    ax, ay, az = axis[0, 0], axis[0, 1], axis[0, 2]
+    bx, by, bz = axis[1, 0] - ax, axis[1, 1] - ay, axis[1, 2] - az
+    qx, qy, qz = place[0] + dx - ax, place[1] + dy - ay, place[2] + dz - az
+    share = (qx * bx + qy * by + qz * bz) / (bx * bx + by * by + bz * bz)
+    share = min(max(share, 0.0), 1.0)
+    ex, ey, ez = qx - share * bx, qy - share * by, qz - share * bz
+    inside = radius * radius - (ex * ex + ey * ey + ez * ez)
+    if inside > 0.0:
+        # out of the leg and away from the body: straight out of the axis would tear a skirt at a knee
+        mx, my, mz = ex + 2 * radius * normal[0], ey + 2 * radius * normal[1], ez + 2 * radius * normal[2]
+        norm = np.sqrt(mx * mx + my * my + mz * mz)
+        mx, my, mz = mx / norm, my / norm, mz / norm
+        along = ex * mx + ey * my + ez * mz
+        push = np.sqrt(along * along + inside) - along
+        dx += push * mx
+        dy += push * my
+        dz += push * mz
+    return dx, dy, dz
+
+
+@njit(inline="always")
+def _within(away, radius):
+    """A displacement no longer than ``radius``."""
+    dx, dy, dz = away
+    stray = np.sqrt(dx * dx + dy * dy + dz * dz)
+    if stray > radius:
+        shrink = radius / stray
+        dx, dy, dz = dx * shrink, dy * shrink, dz * shrink
+    return dx, dy, dz
