@@ -14,6 +14,7 @@ import onnx
 import pytest
 import torch
 
+from rnd_runtime import raster_cpu
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
@@ -36,6 +37,8 @@ from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
+from rnd_trainer.bench_pass import one_call, three_calls
+from rnd_trainer.bench_raster import body_camera, body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.checkpoint import load_checkpoint
 from tiny import ASSETS
@@ -96,6 +99,17 @@ def test_a_point_is_measured_in_a_process_of_its_own(tiny_avatar) -> None:
     assert drawn.radiance.shape == (len(COMPARED), 48, 48, 3) and drawn.radiance.max() > 0
     with pytest.raises(InputError, match="optix, table"):
         bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table", "optix", 1, 1))
+
+
+def test_one_compiled_function_draws_what_three_kernels_draw() -> None:
+    """And what the rasteriser draws: what their times are compared for is the same work."""
+    scene, camera = body_scene(400), body_camera(64)
+    arrays = [torch.from_numpy(array) for array in scene]
+    truth = raster_cpu.rasterize(*scene, camera, depth=False)
+    for draws in (three_calls, one_call):
+        image, alpha, _ = draws(*arrays, camera)
+        np.testing.assert_array_equal(image.numpy(), truth.image)
+        np.testing.assert_array_equal(alpha.numpy(), truth.alpha)
 
 
 @pytest.mark.parametrize("raster", ["gl-egl", "gl-osmesa"])

@@ -30,6 +30,7 @@ from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
 from .bench_clock import summary
+from .bench_pass import one_call, three_calls
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -156,7 +157,8 @@ def measure(
             ("torch tiles", raster_reference.rasterize, 1, max(3, repeats // 10)),
         ]
         cases = [(*kernel, wanted) for wanted in (None, incoming) for kernel in kernels]
-        cases += [(name, gl, warmup, repeats, None) for name, gl in _gl_rasterizers()]
+        alone = [("numba, three calls", three_calls), ("numba, one call", one_call), *_gl_rasterizers()]
+        cases += [(name, draws, warmup, repeats, None) for name, draws in alone]
         times: list[list[float]] = [[] for _ in cases]
         results: list[Result] = [Result(torch.empty(0), torch.empty(0))] * len(cases)
         for turn in range(max(case[2] + case[3] for case in cases)):
