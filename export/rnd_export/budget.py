@@ -115,22 +115,25 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
 
     Raises :class:`InputError` where no file of the ladders does.
     """
-    now = _made(bench, Plan())
-    path, worths = [now], dict.fromkeys(LADDERS, np.inf)
-    on_step(now)
-    while bound.kind == "psnr" or not _kept(bench, bound, now):
+    path, worths = [_made(bench, Plan())], dict.fromkeys(LADDERS, np.inf)
+    on_step(path[-1])
+    while True:
+        now = path[-1]
+        if bound.kind != "psnr" and bound.held(now.measured):
+            now = path[-1] = _tested(bench, now)
+            if _kept(bound, now):
+                return now
         step = _best_step(bench, bound, now, worths)
         if step is None and bound.kind == "ms":  # each for itself may save too little to be told from noise
             step, worths = _mildest_step(bench, now), dict.fromkeys(LADDERS, np.inf)
         if step is None:
             break
-        now = step
-        path.append(now)
-        on_step(now)
+        path.append(step)
+        on_step(step)
     for found in reversed(path):
-        held_out = bench.measure(found.model, bench.held_out)
-        if bound.held(held_out):
-            return replace(found, held_out=held_out)
+        tested = _tested(bench, found)
+        if _kept(bound, tested):
+            return tested
     raise InputError(
         f"no file keeps the bound of {bound.kind}",
         expected=f"{bound.value:g}",
@@ -138,8 +141,13 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
     )
 
 
-def _kept(bench: Workbench, bound: Bound, found: Found) -> bool:
-    return bound.held(found.measured) and bound.held(bench.measure(found.model, bench.held_out))
+def _tested(bench: Workbench, found: Found) -> Found:
+    """``found``, measured on the shots that the search does not see too: once, as no time is measured twice alike."""
+    return found if found.held_out else replace(found, held_out=bench.measure(found.model, bench.held_out))
+
+
+def _kept(bound: Bound, found: Found) -> bool:
+    return found.held_out is not None and bound.held(found.held_out)
 
 
 def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, float]) -> Found | None:

@@ -93,11 +93,10 @@ class Workbench:
         self.seen, self.held_out = shots[::2], shots[1::2]
         renderer = self._renderer(self._whole)
         self._truth = {shot: self._picture(renderer, shot) for shot in shots}
-        stopwatch = Stopwatch(self._frames(self._whole))
-        self._clock = clock or (lambda avatar: stopwatch.ms(self._frames(avatar)))
+        self._clock = clock or self._stopwatch()
         self._fit = [Shot(shot.time, shot.camera.resized(FIT_SIDE, FIT_SIDE)) for shot in self.seen]
         self._shares = contributions(self._posed(self._whole))
-        self._moves = self._node_moves()
+        self._moves = self._gaussian_moves()
 
     def model(self, recipe: Recipe) -> onnx.ModelProto:
         """The file of ``recipe``."""
@@ -161,10 +160,15 @@ class Workbench:
     def _posed(self, avatar: Avatar) -> list[tuple[Gaussians, Camera]]:
         return [(avatar.pose(self._scene.motion, shot.time), shot.camera) for shot in self._fit]
 
+    def _stopwatch(self) -> Callable[[Avatar], float]:
+        stopwatch = Stopwatch(self._frames(self._whole))
+        return lambda avatar: stopwatch.ms(self._frames(avatar))
+
     def _site_moves(self, baked: BakedAvatar) -> Floats:
         """By how many mm dynamic skinning moves what reads each of ``baked``'s nodes [M], through other nodes too where
         the network is evaluated at fewer; 0 at those where it is not."""
-        moves = self._moves[: len(baked.codes)]
+        moves: Floats = np.zeros(len(baked.codes))
+        np.maximum.at(moves, baked.neighbours, self._moves[:, None])
         if baked.rates.skinning == len(moves):
             return moves
         sites = baked.codes[: baked.rates.skinning]
@@ -172,18 +176,16 @@ class Workbench:
         np.maximum.at(most, node_interpolation(baked.codes, sites, baked.area)[0], moves[:, None])
         return most
 
-    def _node_moves(self) -> Floats:
-        """By how many mm dynamic skinning moves what reads each node [M], at most over the poses of the search."""
-        moves: Floats = np.zeros(len(self._baked.codes))
+    def _gaussian_moves(self) -> Floats:
+        """By how many mm dynamic skinning moves each Gaussian [N], at most over the poses of the search."""
+        most: Floats = np.zeros(len(self._baked.points))
         if self._baked.skinning is None:
-            return moves
+            return most
         static, motion = _loaded(self.model(Recipe(Variant("static")))), self._scene.motion
-        most = np.zeros(len(self._baked.points))
         for shot in self.seen:
             apart = self._whole.pose(motion, shot.time).means - static.pose(motion, shot.time).means
             most = np.maximum(most, 1e3 * np.linalg.norm(apart, axis=1))
-        np.maximum.at(moves, self._baked.neighbours, most[:, None])
-        return moves
+        return most
 
 
 def _albedo_picture(gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:

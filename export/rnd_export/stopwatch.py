@@ -9,10 +9,15 @@ import numpy as np
 
 TIMED, UNTIMED = 12, 2
 """frames that are measured, and those before them that warm up"""
+CALIBRATED = 36
+"""frames of the reference alone, at first, whose calmest sixth says what it takes"""
 
 
 class Stopwatch:
     """Times a player beside a reference, frame by frame in turn, so that a busy moment slows both.
+
+    What is told in milliseconds is a ratio to the reference, times what that took in its calmest moments at the start:
+    one number for all that is timed, so that it can be compared whenever it was.
 
     Args:
         reference: draws frame k by what everything is compared with.
@@ -21,14 +26,14 @@ class Stopwatch:
 
     def __init__(self, reference: Callable[[int], object], clock: Callable[[], float] = perf_counter) -> None:
         self._reference, self._clock = reference, clock
-        self._calmest = np.inf
+        frames = [self._timed(reference, k) for k in range(UNTIMED + CALIBRATED)][UNTIMED:]
+        self._calm = float(np.sort(frames)[: CALIBRATED // 6].mean())
 
     def ms(self, draw: Callable[[int], object]) -> float:
-        """What a frame of ``draw`` takes where the reference takes as little as it ever did here."""
+        """What a frame of ``draw`` takes where the reference takes as little as in its calmest moments."""
         rounds = [(self._timed(draw, k), self._timed(self._reference, k)) for k in range(UNTIMED + TIMED)]
         ours, reference = np.array(rounds[UNTIMED:]).T
-        self._calmest = min(self._calmest, float(np.sort(reference)[: TIMED // 2].mean()))
-        return float(np.median(ours / reference)) * self._calmest
+        return float(np.median(ours / reference)) * self._calm
 
     def _timed(self, draw: Callable[[int], object], frame: int) -> float:
         started = self._clock()
