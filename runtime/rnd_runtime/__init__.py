@@ -17,6 +17,8 @@ Conventions, stated once and tested in ``tests/conventions_test.py``:
 
 import os
 
+from ._kernel_cache import keep_kernels_by_source
+
 # Idle threads of GNU OpenMP spin for milliseconds unless told not to before it is loaded (with torch, or with the first
 # kernel). On two cores at load 8 one forward and backward pass of the rasteriser then took 350 ms instead of 26. But a
 # thread that sleeps at once takes up to half a millisecond to wake on a virtual machine, at each of a frame's nine
@@ -24,5 +26,6 @@ import os
 # processes 33 instead of 35 to 52 (a spin of 0.4 ms: 46 to 51).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "5000")
+keep_kernels_by_source()
 
 __version__ = "0.1.0"

@@ -1,0 +1,75 @@
+"""What is compiled is what the sources say, also of what numba inlines from other files."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import rnd_runtime
+
+KERNEL = """
+from numba import njit
+from .inner import FACTOR, inner
+@njit(cache=True)
+def outer(x):
+    return FACTOR * inner(x)
+"""
+INNER = """
+from numba import njit
+FACTOR = {factor}
+@njit(inline="always")
+def inner(x):
+    return x + {added}
+"""
+
+
+@pytest.fixture
+def clone(tmp_path) -> Path:
+    """A clone of a package of one kernel, with our way of keeping it."""
+    package = tmp_path / "runtime" / "rnd_runtime"
+    package.mkdir(parents=True)
+    (tmp_path / "pyproject.toml").touch()
+    own = Path(rnd_runtime.__file__).parent / "_kernel_cache.py"
+    (package / "_kernel_cache.py").write_text(own.read_text("utf-8"), "utf-8")
+    (package / "__init__.py").write_text(
+        "from ._kernel_cache import keep_kernels_by_source\nkeep_kernels_by_source()\n"
+    )
+    (package / "kernel.py").write_text(KERNEL)
+    return tmp_path
+
+
+def _run(clone: Path, **changes: str) -> str:
+    """What the kernel gives for 1, in a process of its own."""
+    known = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment = known | {"PYTHONPATH": str(clone / "runtime"), **changes}
+    code = "from rnd_runtime.kernel import outer; print(outer(1))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def test_an_edit_of_what_is_inlined_compiles_the_kernel_anew(clone):
+    inner, kept = clone / "runtime/rnd_runtime/inner.py", clone / ".cache/kernels"
+    for folders, (factor, added, value) in enumerate([(2, 1, "4"), (2, 5, "12"), (3, 5, "18")], 1):
+        inner.write_text(INNER.format(factor=factor, added=added))
+        assert _run(clone) == value
+        assert len(list(kept.iterdir())) == folders
+    stamp = {file: file.stat().st_mtime_ns for file in kept.rglob("*.nbc")}
+    assert len(stamp) == 3 and _run(clone) == "18"
+    assert stamp == {file: file.stat().st_mtime_ns for file in kept.rglob("*.nbc")}  # found, not made again
+
+
+def test_few_states_of_the_sources_are_kept_and_a_folder_of_the_users_is_his(clone, tmp_path):
+    inner = clone / "runtime/rnd_runtime/inner.py"
+    for added in range(6):
+        inner.write_text(INNER.format(factor=1, added=added))
+        assert _run(clone) == str(1 + added)
+    assert len(list((clone / ".cache/kernels").iterdir())) == 4
+    inner.write_text(INNER.format(factor=1, added=9))
+    assert _run(clone, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "10"
+    assert (tmp_path / "mine").is_dir() and len(list((clone / ".cache/kernels").iterdir())) == 4
