@@ -39,6 +39,12 @@ def test_field_of_view_is_vertical():
     )
 
 
+def test_look_at_along_its_up():
+    for up in np.eye(3):
+        camera = Camera.look_at(3 * up, [0, 0, 0], width=10, height=10, fov_y=1.0, up=tuple(up))
+        assert np.allclose(camera.world_to_camera[2, :3], -up)
+
+
 def test_look_at_with_another_up():
     camera = Camera.look_at([0, -3, 0], [0, 0, 0], width=10, height=10, fov_y=1.0, up=(0, 0, 1))
     assert _project(camera, np.array([[0.0, 0, 0.1]]))[0, 1] < 5

@@ -7,6 +7,7 @@ import signal
 import pytest
 
 from rnd_runtime import doctor
+from rnd_runtime.raster import make_rasterizer
 
 CRASH = "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)"
 RAISE = "raise OSError('libEGL.so.1: cannot open shared object file')"
@@ -26,9 +27,9 @@ def test_a_well_machine_needs_nothing():
     assert well["numpy"].value == importlib.metadata.version("numpy")
     assert len(well) == len(findings)  # no label twice
     assert [finding.advice for finding in findings] == [None] * len(findings)
-    lines = doctor.described(findings).splitlines()
-    assert len(lines) == len(findings)
-    assert doctor.machine() in doctor.described(findings)
+    with make_rasterizer("auto") as chosen:
+        assert well["rasteriser"].value == chosen.name
+    assert well["CPU"].value == doctor.machine()
 
 
 @pytest.mark.parametrize(
@@ -36,6 +37,7 @@ def test_a_well_machine_needs_nothing():
 )
 def test_without_opengl_it_says_what_to_install(monkeypatch, probe, reason):
     monkeypatch.setattr(doctor, "_GL_PROBE", probe)
+    monkeypatch.setattr(doctor, "_CHOICE_PROBE", probe)
     for quick in ("_ONNX_PROBE", "_NUMBA_PROBE"):
         monkeypatch.setattr(doctor, quick, "print('not asked')")
     ill = _by_label(doctor.report())
@@ -43,7 +45,7 @@ def test_without_opengl_it_says_what_to_install(monkeypatch, probe, reason):
     assert ill["OpenGL, EGL"].advice.startswith("apt-get install libegl1 libgl1-mesa-dri: ")
     assert ill["OpenGL, OSMesa"].advice.startswith("apt-get install libosmesa6: ")
     assert reason in ill["OpenGL, EGL"].advice
-    assert ill["rasteriser"].value == "cpu"
+    assert ill["rasteriser"].value == "cpu" and reason in ill["rasteriser"].advice
 
 
 def test_a_driver_that_hangs_is_given_up(monkeypatch):
@@ -57,9 +59,6 @@ def test_osmesa_is_optional_beside_egl():
     )
 
 
-@pytest.mark.parametrize(
-    ("line", "kind"),
-    [("NVIDIA H200/PCIe/SSE2 | 4.6.0", "gl"), ("llvmpipe (LLVM 15.0.6, 256 bits) | 4.5", "cpu")],
-)
-def test_it_foretells_the_rasteriser(line, kind):
-    assert doctor._rasterizer(True, line) == (kind, None)
+@pytest.mark.parametrize("line", ["gl (egl, NVIDIA H200/PCIe/SSE2)", "gl (window, Apple M3)", "cpu"])
+def test_it_tells_the_rasteriser_that_auto_takes(line):
+    assert doctor._rasterizer(True, line) == (line, None)

@@ -1,5 +1,6 @@
 """A final name never holds half a file."""
 
+import json
 import os
 import signal
 import stat
@@ -113,6 +114,12 @@ def test_existing_file(tmp_path):
     with pytest.raises(InputError, match="motion not found: got File name too long") as refused:
         existing_file(tmp_path / ("x" * 10_000), what="motion")
     assert len(str(refused.value)) < 300
+
+
+def test_a_path_that_is_no_utf_8_stands_in_json(tmp_path):
+    content = {"settings": {"motion": "K\udcf6rper.npz"}}
+    write_json(tmp_path / "a.json", content)
+    assert json.loads((tmp_path / "a.json").read_text("utf-8")) == content
 
 
 def test_rows_to_add_to_are_what_was_written_or_none_yet(tmp_path):

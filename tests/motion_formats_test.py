@@ -2,6 +2,7 @@
 
 import json
 import pickle  # noqa: TID251  # to write what others write
+import re
 from pathlib import Path
 
 import numpy as np
@@ -308,6 +309,16 @@ def test_a_folder_that_is_no_motion_is_refused_in_one_line(tmp_path):
     assert "expected 3 numbers" in refusal(json.dumps([person | {"Th": [0]}]))
 
 
+@pytest.mark.parametrize("columns", [0, 2, 70])
+def test_poses_of_no_whole_joints_are_refused_with_and_without_gaps(tmp_path, columns):
+    person = {"id": 0, "Rh": [0, 0, 0], "Th": [0, 0, 0], "poses": [0.0] * columns, "shapes": [0]}
+    for frame in (0, 1, 4):
+        (tmp_path / f"{frame:06d}.json").write_text(json.dumps([person]))
+        if frame:
+            with pytest.raises(InputError):
+                load_motion(tmp_path, SKELETON)
+
+
 @pytest.mark.parametrize(
     "content", [{}, [1], {"a": 1}, {"smpl_poses": [[0] * 72]}, {0: {"pose": [[0] * 72], "trans": 3}}]
 )
@@ -341,14 +352,23 @@ A_POSE = {"left_shoulder": -0.8, "right_shoulder": 0.8, "left_hip": 0.3, "right_
 
 
 def _bvh(
-    path: Path, names: dict[str, str], *, axes=Y_UP, unit=1.0, spread=A_POSE, order="ZXY", t_pose=False
+    path: Path,
+    names: dict[str, str],
+    *,
+    axes=Y_UP,
+    unit=1.0,
+    spread=A_POSE,
+    order="ZXY",
+    t_pose=False,
+    facing=None,
 ) -> Path:
-    """The known motion on a skeleton whose zero pose, axes, unit and names differ from ours."""
+    """The known motion, turned by ``facing``, on a skeleton whose zero pose, axes, unit and names differ from ours."""
+    facing = np.eye(3) if facing is None else facing
     zero = _zero_pose(spread)
     offsets = np.zeros((24, 3))
     world = np.empty((FRAMES, 24, 3, 3))
     for joint, parent in enumerate(SMPL_PARENTS):
-        world[:, joint] = MATRICES[:, joint] if joint == 0 else world[:, parent] @ MATRICES[:, joint]
+        world[:, joint] = facing @ MATRICES[:, 0] if joint == 0 else world[:, parent] @ MATRICES[:, joint]
         if joint:
             offsets[joint] = (
                 unit * axes @ zero[parent] @ (SKELETON.rest_joints[joint] - SKELETON.rest_joints[parent])
@@ -357,7 +377,7 @@ def _bvh(
     local = turned.copy()
     for joint, parent in enumerate(SMPL_PARENTS[1:], 1):
         local[:, joint] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, joint]
-    places = unit * PELVIS @ axes.T
+    places = unit * PELVIS @ facing.T @ axes.T
     if t_pose:
         local = np.concatenate(
             [(axes @ np.swapaxes(zero, -1, -2) @ axes.T)[None] * 0 + _local_rest(zero, axes), local]
@@ -506,6 +526,17 @@ def test_a_recording_is_turned_to_the_front_and_a_reference_pose_left_out(tmp_pa
     assert_allclose(again.rotations[:, 1:], MATRICES[:, 1:], atol=TEXT)
 
 
+def test_the_motion_begins_facing_the_front_whatever_a_reference_pose_faces(tmp_path):
+    facing = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    for t_pose in (False, True):
+        motion = load_motion(
+            _bvh(tmp_path / "a.bvh", NAMINGS["smpl"], t_pose=t_pose, facing=facing), SKELETON
+        )
+        assert motion.frame_count == FRAMES and any("turned by -90°" in note for note in motion.notes)
+        assert_allclose(motion.rotations, MATRICES, atol=TEXT)
+        assert_allclose(np.diff(motion.translations, axis=0), np.diff(PELVIS, axis=0), atol=TEXT)
+
+
 def test_hips_below_a_root_of_their_own_go_where_they_are_sent(tmp_path):
     """The same motion, its hips moved and turned in the frame of a root that is itself moved and turned."""
     file = _bvh(tmp_path / "a.bvh", NAMINGS["mixamo"], spread={})
@@ -570,6 +601,25 @@ def test_a_joint_map_renames_named_arrays_too(tmp_path):
     (tmp_path / "t.toml").write_text("\n".join(f'{ours} = "B{k}"' for k, ours in enumerate(SMPL_NAMES)))
     motion = load_motion(file, SKELETON, joint_map=tmp_path / "t.toml")
     assert_allclose(motion.rotations, MATRICES, atol=DOUBLE)
+
+
+def test_a_joint_map_counts_where_names_are_known_too(tmp_path):
+    """spine3 shall be what the file calls spine1; what is called spine3 there is nobody's."""
+    file = _npz(tmp_path / "a.npz", poses=POSES, trans=PELVIS, fps=30, joint_names=SMPL_NAMES)
+    (tmp_path / "t.toml").write_text('spine3 = "spine1"')
+    motion = load_motion(file, SKELETON, joint_map=tmp_path / "t.toml")
+    spine1, spine3 = SMPL_NAMES.index("spine1"), SMPL_NAMES.index("spine3")
+    assert_allclose(motion.rotations[:, spine3], MATRICES[:, spine1], atol=DOUBLE)
+    assert_allclose(motion.rotations[:, spine1], np.broadcast_to(np.eye(3), (FRAMES, 3, 3)), atol=DOUBLE)
+    assert any("stay at rest: spine1" in note for note in motion.notes)
+
+
+def test_a_mark_of_utf_8_before_a_text_is_no_part_of_it(tmp_path):
+    file = _bvh(tmp_path / "a.bvh", NAMINGS["smpl"])
+    file.write_text("\ufeff" + file.read_text("utf-8"), "utf-8")
+    table = tmp_path / "t.json"
+    table.write_text("\ufeff" + json.dumps({"spine1": NAMINGS["smpl"]["spine1"]}), "utf-8")
+    assert load_motion(file, SKELETON, joint_map=table).frame_count == FRAMES
 
 
 BROKEN_BVH = {
@@ -710,6 +760,18 @@ def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):
     file.write_text(text.replace("lfemur", "lfemmur"))
     with pytest.raises(InputError, match="lfemmur"):
         load_motion(file, SKELETON)
+    bone = next(line for line in text.splitlines() if line.startswith("lfemur"))
+    for broken, words in (
+        (
+            text.replace(bone, "lfemur nan 0 0", 1),
+            "frame 0: lfemur: expected finite numbers, got not finite: nan 0 0",
+        ),
+        (text.replace(bone, bone + " 1", 1), "frame 0: lfemur: expected 3 numbers, got 4"),
+        (bone + "\n" + text, "AMC motion: expected a frame's number before its bones, got lfemur"),
+    ):
+        file.write_text(broken)
+        with pytest.raises(InputError, match=re.escape(words)):
+            load_motion(file, SKELETON)
     file.write_text(text)
     skeleton.rename(tmp_path / "other.asf")
     assert load_motion(file, SKELETON).frame_count == FRAMES  # the only one there

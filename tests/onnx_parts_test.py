@@ -62,11 +62,6 @@ def test_a_part_computes_its_outputs_and_nothing_else():
     assert {prop.key: prop.value for prop in part.metadata_props} == file.metadata
 
 
-def test_values_are_known_by_name():
-    file = OnnxFile(_model().SerializeToString())
-    assert file.has(["a", "one", "c", "f"]) and not file.has(["a", "z"])
-
-
 def test_an_output_that_nothing_makes_is_refused():
     model = _model()
     del model.graph.node[3]  # f stays among the graph's outputs

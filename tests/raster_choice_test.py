@@ -45,8 +45,6 @@ def test_gl_is_refused_where_no_context_can_be_made(monkeypatch):
 
 @pytest.mark.parametrize("backend", ["egl", "osmesa"])
 def test_gl_is_taken_when_asked_for_and_named(backend):
-    with make_rasterizer("gl", gl_backend=backend) as rasterizer:
-        assert rasterizer.name.startswith(f"gl ({backend}, ")
     with make_rasterizer(f"gl-{backend}") as rasterizer:
         assert rasterizer.name.startswith(f"gl ({backend}, ")
 

@@ -194,6 +194,18 @@ def test_wrong_shapes_are_refused(wrong, name):
         raster_cpu.rasterize(*scene, off_centre_camera(8, 8))
 
 
+def test_shapes_that_kernels_would_read_beyond_are_refused():
+    scene, camera = random_scene(0, 10), off_centre_camera(8, 6)
+    with pytest.raises(InputError, match="features: expected shape"):
+        raster_cpu.Projected(*scene[:3], camera).draw(scene[3][:-1])
+    raster, state = raster_cpu.forward(*scene, camera)
+    for wrong in range(3):
+        grads = [raster.image, raster.alpha, raster.depth]
+        grads[wrong] = grads[wrong][:-1]
+        with pytest.raises(InputError, match="gradient of "):
+            raster_cpu.backward(state, *grads)
+
+
 def test_places_of_a_batch_that_stay_empty_reach_nothing_whatever_memory_held():
     one = np.ones((1, 4), np.float32)  # of a broad Gaussian in the corner
     starts = np.array([0, 1])

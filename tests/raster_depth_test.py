@@ -17,7 +17,7 @@ def _rasterizer(kind: str):
         return nullcontext(raster_oracle.rasterize)
     if kind == "kernel":
         return nullcontext(raster_cpu.rasterize)
-    return make_rasterizer("gl", gl_backend=kind)
+    return make_rasterizer(f"gl-{kind}")
 
 
 @pytest.mark.parametrize("kind", ["oracle", "kernel", "egl", "osmesa"])

@@ -167,6 +167,8 @@ def test_others_than_receivers_cast_and_stay_dark():
     receivers = np.arange(len(points)) % 3 == 0
     some = directional_visibility(points, normals, DIRECTIONS, radii=SPACING, receivers=receivers)
     np.testing.assert_array_equal(some, np.where(receivers[:, None], every, 0))
+    with pytest.raises(InputError, match="chosen Gaussians: expected shape"):
+        directional_visibility(points, normals, DIRECTIONS, radii=SPACING, receivers=receivers[:-1])
 
 
 def test_threads_change_no_bit():

@@ -49,23 +49,19 @@ def test_joint_transforms_of_a_batch_are_those_of_each_pose():
         assert (both[k] == skeleton.joint_transforms(poses[k], moves[k])).all()
 
 
-def test_bone_transforms_of_the_canonical_pose_are_the_identity():
-    skeleton, canonical = smpl_skeleton(REST), _pose(3)
-    identity = np.broadcast_to(np.eye(3, 4), (24, 3, 4))
-    assert_allclose(bone_transforms(skeleton, canonical, np.zeros(3), canonical), identity, atol=1e-6)
-    at_rest = np.broadcast_to(np.eye(3), (24, 3, 3))
-    assert_allclose(bone_transforms(skeleton, at_rest, np.zeros(3)), identity, atol=1e-6)
+def test_bone_transforms_of_the_rest_pose_are_the_identity():
+    at_rest, identity = np.broadcast_to(np.eye(3), (24, 3, 3)), np.broadcast_to(np.eye(3, 4), (24, 3, 4))
+    assert_allclose(bone_transforms(smpl_skeleton(REST), at_rest, np.zeros(3)), identity, atol=1e-6)
 
 
-def test_bone_transforms_take_canonical_points_to_posed_ones():
-    skeleton, canonical, pose, move = smpl_skeleton(REST), _pose(3), _pose(4), np.array([0.5, 0.0, -1.0])
-    bones = bone_transforms(skeleton, pose, move, canonical)
+def test_bone_transforms_take_points_at_rest_to_posed_ones():
+    skeleton, pose, move = smpl_skeleton(REST), _pose(4), np.array([0.5, 0.0, -1.0])
+    bones = bone_transforms(skeleton, pose, move)
     assert bones.dtype == np.float32 and bones.shape == (24, 3, 4)
     for joint in (0, 7, 21):
         point = REST[joint] + [0.1, -0.1, 0.05]
-        start = _posed_point(joint, point, canonical, np.zeros(3))
         end = _posed_point(joint, point, pose, move)
-        assert_allclose(bones[joint] @ [*start, 1], end, atol=3e-6)  # float32 of numbers up to 10
+        assert_allclose(bones[joint] @ [*point, 1], end, atol=3e-6)  # float32 of numbers up to 10
 
 
 def test_turning_the_root_turns_every_bone_about_it():

@@ -75,6 +75,8 @@ def test_joblib_files_plain_and_compressed(tmp_path, monkeypatch, pack, aligned)
     """joblib puts each array's bytes behind a pickled wrapper, since version 1.2 aligned by counted padding."""
     content = {"person": ARRAYS}
     _same(read_pickle(_file(tmp_path, pack(_joblib(content, monkeypatch, aligned))))["person"], ARRAYS)
+    alone = np.arange(6.0).reshape(2, 3)
+    assert_array_equal(read_pickle(_file(tmp_path, pack(_joblib(alone, monkeypatch, aligned)))), alone)
 
 
 def _joblib(content: object, monkeypatch, aligned: bool) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -18,7 +20,17 @@ def floats(array: ArrayLike) -> Floats32:
 
 def mask(chosen: ArrayLike | None, count: int) -> NDArray[np.bool_]:
     """Which of ``count`` Gaussians are ``chosen``, as the kernels are compiled for; all where it is None."""
-    return np.ones(count, np.bool_) if chosen is None else np.require(chosen, np.bool_, ["C", "A", "W"])
+    if chosen is None:
+        return np.ones(count, np.bool_)
+    given = np.require(chosen, np.bool_, ["C", "A", "W"])
+    check_shape("chosen Gaussians", given, (count,))
+    return given
+
+
+def check_shape(what: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Raise :class:`InputError` where ``array`` has another shape: the kernels look at no bounds."""
+    if array.shape != shape:
+        raise InputError(what, expected=f"shape {shape}", got=f"{array.shape}")
 
 
 def checked(
@@ -35,6 +47,5 @@ def checked(
         "features": (count, channels),
     }
     for array, (name, shape) in zip(arrays, shapes.items()):
-        if array.shape != shape:
-            raise InputError(name, expected=f"shape {shape}", got=f"{array.shape}")
+        check_shape(name, array, shape)
     return arrays

@@ -44,7 +44,7 @@ class View(NamedTuple):
 
 
 def view_of(camera: Camera) -> View:
-    """The numbers of ``camera``; skew in K is not modelled."""
+    """The numbers of ``camera``."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     margin_x = FIELD_OF_VIEW_MARGIN * 0.5 * camera.width / fx
     margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * camera.height / fy

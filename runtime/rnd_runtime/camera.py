@@ -92,8 +92,8 @@ class Camera:
             raise InputError("look_at", expected="eye and target apart", got=eye.tolist())
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, np.float64))
-        if np.linalg.norm(right) < 1e-6:  # looking along `up`: any horizontal axis will do
-            right = np.cross(forward, np.array([0.0, 0.0, 1.0]))
+        if np.linalg.norm(right) < 1e-6:  # looking along `up`: any axis across it will do, +Z first
+            right = np.cross(forward, np.eye(3)[2 if abs(forward[2]) < 0.9 else 1])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         world_to_camera = np.eye(4)

@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from .gl_context import INSTALL, SOFTWARE_RENDERERS
+from .gl_context import INSTALL
 
 PROBE_SECONDS = 60.0  # a driver that hangs must not hang us
 PACKAGES = ("numpy", "numba", "onnxruntime", "moderngl", "OpenImageIO")
@@ -20,6 +20,10 @@ _GL_PROBE = """
 from rnd_runtime.gl_context import create_context
 info = create_context({backend!r}).info
 print(info["GL_RENDERER"], "|", info["GL_VERSION"])
+"""
+_CHOICE_PROBE = """
+from rnd_runtime.raster import make_rasterizer
+print(make_rasterizer("auto").name)
 """
 _NUMBA_PROBE = """
 import numba
@@ -49,6 +53,7 @@ def report() -> list[Finding]:
     probes = {
         "egl": _start(_GL_PROBE.format(backend="egl")),
         "osmesa": _start(_GL_PROBE.format(backend="osmesa")),
+        "rasteriser": _start(_CHOICE_PROBE),
         "onnxruntime": _start(_ONNX_PROBE),
         "numba": _start(_NUMBA_PROBE),
     }
@@ -56,7 +61,7 @@ def report() -> list[Finding]:
     return [
         _gl_finding("OpenGL, EGL", "egl", *found["egl"]),
         _gl_finding("OpenGL, OSMesa", "osmesa", *found["osmesa"], needed=not found["egl"][0]),
-        Finding("rasteriser", *_rasterizer(*found["egl"])),
+        Finding("rasteriser", *_rasterizer(*found["rasteriser"])),
         Finding(
             "onnxruntime providers",
             found["onnxruntime"][1],
@@ -67,16 +72,6 @@ def report() -> list[Finding]:
         Finding("system", f"{platform.platform()}, Python {platform.python_version()}", None),
         *(Finding(name, *_version(name)) for name in ("rnd-avatar", *PACKAGES)),
     ]
-
-
-def described(findings: list[Finding]) -> str:
-    """The findings as a table of plain text, advice after an arrow."""
-    width = max(len(finding.label) for finding in findings)
-    lines = [
-        f"{label:{width}}  {value}" + ("" if advice is None else f"  → {advice}")
-        for label, value, advice in findings
-    ]
-    return "\n".join(lines)
 
 
 def machine() -> str:
@@ -113,10 +108,9 @@ def _gl_finding(label: str, backend: str, works: bool, value: str, *, needed: bo
     )
 
 
-def _rasterizer(egl_works: bool, egl_line: str) -> tuple[str, str | None]:
-    if egl_works and not SOFTWARE_RENDERERS.search(egl_line):
-        return "gl", None
-    return "cpu", None if egl_works else "a GPU is used only through EGL"
+def _rasterizer(works: bool, line: str) -> tuple[str, str | None]:
+    """What ``--raster auto`` takes: it asked itself, in a process that a driver may take down."""
+    return (line, None) if works else ("cpu", f"--raster cpu, as looking for a GPU fails: {line}")
 
 
 def _reinstall(package: str, works: bool) -> str | None:

@@ -43,10 +43,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write ``value`` under ``path``, indented, UTF-8; what is no number in JSON (NaN, infinity) as null."""
+    """Write ``value`` under ``path``, indented, UTF-8; what is no number in JSON (NaN, infinity) as null.
+
+    Names of files that are not UTF-8 stand with escapes.
+    """
     text = json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _finite(value: object) -> object:

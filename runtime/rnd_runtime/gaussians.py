@@ -48,8 +48,8 @@ class Raster:
         image: [H, W, C], Σ w_i feature_i.
         alpha: [H, W], Σ w_i.
         depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
-        seconds: how long each stage took, by its name: "sort" and "raster" on the CPU, "projection+sort", "raster" and
-            "read-back" from a GL target; who draws whole frames adds what comes before.
+        seconds: how long each stage took, by its name: "projection+sort", "raster" and, from a GL target, "read-back";
+            who draws whole frames adds what comes before, and on the CPU tells "projection" and "sort" apart.
     """
 
     image: Floats32

@@ -28,7 +28,7 @@ def load_joint_map(path: str | Path) -> JointTable:
     """
     path = existing_file(path, what="joint map")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError("joint map", expected="TOML or JSON", got=str(error), file=path) from error

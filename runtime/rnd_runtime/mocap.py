@@ -87,7 +87,7 @@ def read_bvh(path: str | Path) -> MocapTree:
     """
     path = existing_file(path, what="motion")
     try:
-        words = iter(path.read_text(encoding="utf-8", errors="replace").split())
+        words = iter(path.read_text(encoding="utf-8-sig", errors="replace").split())
         joints = _bvh_hierarchy(words)
         frames, seconds, values = _bvh_motion(words, sum(len(joint.channels) for joint in joints))
     except StopIteration as error:
@@ -330,18 +330,21 @@ def _read_amc(path: Path, bones: list[_Bone]) -> list[dict[str, list[float]]]:
         if len(words) == 1 and words[0].isdigit():
             frames.append({})
             continue
+        if not frames:
+            raise InputError(
+                "AMC motion", expected="a frame's number before its bones", got=words[0], file=path
+            )
+        bone, number = words[0], len(frames) - 1
         try:
-            values = [float(word) for word in words[1:]]
+            values = _finite(words[1:])
         except ValueError as error:
             raise InputError(
-                words[0], expected="numbers", got=str(error), file=path, frame=len(frames) - 1
+                bone, expected="finite numbers", got=str(error), file=path, frame=number
             ) from error
-        if not frames or counts.get(words[0]) != len(values) or not np.isfinite(values).all():
-            expected = (
-                f"{counts[words[0]]} finite numbers" if words[0] in counts else "a bone of the skeleton"
-            )
-            raise InputError(words[0], expected=expected, got=len(values), file=path, frame=len(frames) - 1)
-        frames[-1][words[0]] = values
+        if counts.get(bone) != len(values):
+            expected = f"{counts[bone]} numbers" if bone in counts else "a bone of the skeleton"
+            raise InputError(bone, expected=expected, got=len(values), file=path, frame=number)
+        frames[-1][bone] = values
     if not frames:
         raise InputError("AMC motion", expected="at least one frame", got="none", file=path)
     return frames

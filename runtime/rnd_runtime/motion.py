@@ -180,7 +180,9 @@ def _load_arrays(
     record = read_motion_file(path, joint_names)
     names = list(record.joint_names)
     if table is not None:
-        for ours, place in match_joints(names, skeleton.names, table).items():
+        matched = match_joints(names, skeleton.names, table)
+        names = ["" if name in matched else name for name in names]  # the table's word counts
+        for ours, place in matched.items():
             names[place] = ours
     z_up = (record.up if up == "auto" else up) == "z"
     rotations, notes = _match_joints(record.rotations, tuple(names), skeleton, path)

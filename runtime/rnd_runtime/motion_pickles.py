@@ -66,13 +66,13 @@ def read_track(path: str | Path) -> Track:
     Raises:
         InputError: when it is none of them.
     """
-    if is_folder(path):
-        return _easymocap(read_easymocap_folder(Path(path)), path)
-    content = read_pickle(path, what="motion")
-    if not isinstance(content, Mapping) or not content:
-        kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
-        raise InputError("motion", expected="a dict of arrays", got=kind, file=path)
     try:
+        if is_folder(path):
+            return _easymocap(read_easymocap_folder(Path(path)), path)
+        content = read_pickle(path, what="motion")
+        if not isinstance(content, Mapping) or not content:
+            kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
+            raise InputError("motion", expected="a dict of arrays", got=kind, file=path)
         return _track(content, path)
     except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
         got = f"arrays that do not fit together ({error})"

@@ -89,10 +89,6 @@ class OnnxFile:
             elif number != _GRAPH_VALUE_INFO:  # shapes that onnxruntime infers anyway
                 self._graph_head += whole
 
-    def has(self, names: Iterable[str]) -> bool:
-        """Is every one of ``names`` a value of the graph: a constant, an input or what a node makes?"""
-        return not self._lost(names)
-
     def _lost(self, names: Iterable[str]) -> list[str]:
         """Those of ``names`` that are no value of the graph."""
         made = {name for node in self._nodes for name in node.outputs}

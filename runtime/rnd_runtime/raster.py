@@ -57,11 +57,11 @@ class ChosenRasterizer:
         self.close()
 
 
-def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> ChosenRasterizer:
+def make_rasterizer(kind: Kind = "auto") -> ChosenRasterizer:
     """Make the rasteriser ``kind``.
 
     "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too,
-    five to seven times as slowly. "gl-egl" and "gl-osmesa" name the backend, "gl" leaves it to ``gl_backend``.
+    five to seven times as slowly. "gl-egl" and "gl-osmesa" name the backend; "gl" takes the first that works.
 
     Raises:
         InputError: "gl" and no OpenGL, or no such kind.
@@ -70,12 +70,9 @@ def make_rasterizer(kind: Kind = "auto", *, gl_backend: Backend = "auto") -> Cho
         raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))
     if kind == "cpu":
         return ChosenRasterizer("cpu")
-    if kind == "gl-egl":
-        gl_backend = "egl"
-    elif kind == "gl-osmesa":
-        gl_backend = "osmesa"
+    backends: dict[str, Backend] = {"gl-egl": "egl", "gl-osmesa": "osmesa"}
     try:
-        context = create_context(gl_backend)
+        context = create_context(backends.get(kind, "auto"))
     except InputError:
         if kind != "auto":
             raise

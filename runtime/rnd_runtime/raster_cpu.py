@@ -17,7 +17,7 @@ from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
 from ._raster_blend import blend, blend_backward
-from ._raster_input import checked, floats
+from ._raster_input import check_shape, checked, floats
 from ._raster_project import View, project, project_backward, view_of
 from ._raster_tiles import Splats, sort_into_tiles
 from .camera import Camera
@@ -62,6 +62,7 @@ class Projected:
         """The picture of ``features`` [N, C], of which only rows of ``drawn`` Gaussians matter; no depth."""
         features = floats(features)
         means, covariances, opacities, camera = self._arrays
+        check_shape("features", features, (len(means), features.shape[-1]))
         if not np.isfinite(features).all():  # then who is drawn depends on it
             return rasterize(means, covariances, opacities, features, camera, depth=False)
         started = perf_counter()
@@ -90,7 +91,7 @@ def rasterize(
         covariances: [N, 6] m², world, upper triangle (xx, xy, xz, yy, yz, zz).
         opacities: [N].
         features: [N, C], any C.
-        camera: the view; skew in K is not modelled.
+        camera: the view.
         depth: False leaves the depth picture all zero and saves its time.
 
     Raises:
@@ -142,13 +143,16 @@ def backward(
 
     Zero where α is clamped at 0.99 and for what was not drawn.
     """
-    wanted = floats(grad_image)
+    wanted, wanted_alpha = floats(grad_image), floats(grad_alpha)
+    check_shape("gradient of the picture", wanted, (*state.coverage.shape, state.channels))
+    check_shape("gradient of alpha", wanted_alpha, state.coverage.shape)
     if state.image.shape[2] > state.channels:
         height, width = state.coverage.shape
         depth = np.zeros((height, width), np.float32) if grad_depth is None else floats(grad_depth)
+        check_shape("gradient of the depth", depth, (height, width))
         wanted = np.concatenate([wanted, depth[..., None]], axis=2)
     splats = state.splats
-    slots = blend_backward(splats, state.image, state.coverage, wanted, floats(grad_alpha), get_num_threads())
+    slots = blend_backward(splats, state.image, state.coverage, wanted, wanted_alpha, get_num_threads())
     arrays = state.means, state.covariances, state.opacities
     grads: tuple[Floats32, Floats32, Floats32, Floats32] = project_backward(
         *arrays, state.channels, state.view, splats.slot_starts, slots

@@ -42,7 +42,7 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     zero pose: ``G_k = W Q_k Bᵀ A_k``, with Q_k the recorded world rotation, B and W the turns from the zero pose's
     and the world's axes to ours, and A_k the least rotation from our bone's direction to theirs. Lengths are scaled by
     the legs; the floor is where the feet come down. Which way a recording faces says nothing, so it is turned by
-    quarters to begin facing the front (+Z).
+    quarters to begin facing the front (+Z). A T-pose for reference before the motion is left out.
 
     Args:
         matched: for our joints the index of theirs; the rest stay at rest.
@@ -57,48 +57,65 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
             "joints of the motion", expected=", ".join(needed), got=f"no {', '.join(missing)}",
             hint="name them in a file given as --joint-map",
         )  # fmt: skip
-    places = {name: number for number, name in enumerate(skeleton.names)}
     source_rest = tree.zero_positions()
     theirs = {name: source_rest[place] for name, place in matched.items()}
-    ours = {name: skeleton.rest_joints[places[name]] for name in matched}
+    ours = {name: skeleton.rest_joints[k] for k, name in enumerate(skeleton.names) if name in matched}
     to_ours = _body_frame(ours) @ _body_frame(theirs).T
     recorded = tree.global_rotations()
     root = matched.get(skeleton.names[0], 0)
     world = _upright(recorded[:, root], to_ours, up)
-    quarters = _quarters_to_front(world @ recorded[0, root] @ to_ours.T)
-    world = axis_angle_to_matrix([0, quarters * np.pi / 2, 0]) @ world
-    aligned = _alignments(skeleton, matched, tree, to_ours)
-
-    frames = len(recorded)
-    turned = np.empty((frames, len(skeleton), 3, 3))
-    rotations = np.tile(np.eye(3), (frames, len(skeleton), 1, 1))
-    for joint, name in enumerate(skeleton.names):
-        parent = int(skeleton.parents[joint])
-        if joint == 0 or name in matched:
-            place = matched.get(name, root)
-            turned[:, joint] = world @ recorded[:, place] @ to_ours.T @ aligned[joint]
-        else:
-            turned[:, joint] = turned[:, parent]
-        above = turned[:, parent] if joint else np.eye(3)
-        rotations[:, joint] = np.swapaxes(above, -1, -2) @ turned[:, joint]
+    turned = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
+    limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
+    first = _reference_frames(_local_rotations(turned, skeleton)[:, limbs])
+    quarters = _quarters_to_front(turned[first, 0])
+    turn = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
+    turned, world = (turn @ turned)[first:], turn @ world
+    rotations = _local_rotations(turned, skeleton)
 
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
     hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
-    hips = tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root])
+    hips = (tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
     pelvis = scale * hips @ world.T - turned[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)
     notes = [*tree.notes]
     if quarters:
         notes.append(f"turned by {quarters * 90:+d}° about the vertical, so that it begins facing the front")
-    first = _reference_frames(rotations[:, [places[name] for name in sorted(_LIMBS & matched.keys())]])
     if first:
         notes.append("the first frame, a T-pose for reference, is left out")
     resting = [name for name in skeleton.names if name not in matched]
     if resting:
         notes.append(f"joints that the motion lacks stay at rest: {', '.join(resting)}")
-    return Retargeted(rotations[first:], translations[first:], tuple(notes))
+    return Retargeted(rotations, translations, tuple(notes))
+
+
+def _world_rotations(
+    tree: MocapTree,
+    recorded: Floats,
+    world: Floats,
+    to_ours: Floats,
+    skeleton: Skeleton,
+    matched: Mapping[str, int],
+) -> Floats:
+    """G [F, J, 3, 3] of our joints, from theirs ``recorded`` [F, ·, 3, 3]."""
+    aligned = _alignments(skeleton, matched, tree, to_ours)
+    turned: Floats = np.empty((len(recorded), len(skeleton), 3, 3))
+    for joint, name in enumerate(skeleton.names):
+        if joint == 0 or name in matched:
+            place = matched.get(name, 0)
+            turned[:, joint] = world @ recorded[:, place] @ to_ours.T @ aligned[joint]
+        else:
+            turned[:, joint] = turned[:, skeleton.parents[joint]]
+    return turned
+
+
+def _local_rotations(turned: Floats, skeleton: Skeleton) -> Floats:
+    """Of each joint in its parent's frame [F, J, 3, 3], from those in the world."""
+    above = turned[:, np.maximum(skeleton.parents, 0)].copy()
+    above[:, 0] = np.eye(3)
+    local: Floats = np.swapaxes(above, -1, -2) @ turned
+    return local
 
 
 def _body_frame(joints: Mapping[str, Floats]) -> Floats:

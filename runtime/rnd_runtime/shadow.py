@@ -24,10 +24,10 @@ Floats32 = NDArray[np.float32]
 # How far a blocker must rise above a point's tangent plane, in disc radii: a disc of radius r beside it on a
 # surface of curvature 1/R rises r²/2R. 0.5 is enough for exact normals; those of a trained avatar disagree by some
 # 10° and speckled its limbs (28.9 dB instead of 29.0 on relit pictures). More loses shadows where limbs touch.
-_CLEARANCE = np.float32(1.0)
+CLEARANCE = np.float32(1.0)
 # ... and no less than this many texels, which is what rounding to the map's grid costs on curved surfaces.
-_CLEARANCE_TEXELS = np.float32(0.35)
-_COSINE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
+CLEARANCE_TEXELS = np.float32(0.35)
+SLOPE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
 _EMPTY = np.float32(-np.inf)
 _CHUNK = 1024  # points turned at a time
 
@@ -171,7 +171,7 @@ def axes_towards(direction):  # type: ignore[no-untyped-def]
 @numba.njit(error_model="numpy")
 def _slopes(normal, i, texel):  # type: ignore[no-untyped-def]
     """Rise of point i's tangent plane towards the light, in metres a texel, along x and y."""
-    scale = -texel / max(normal[i, 2], _COSINE_FLOOR)
+    scale = -texel / max(normal[i, 2], SLOPE_FLOOR)
     return normal[i, 0] * scale, normal[i, 1] * scale
 
 
@@ -196,7 +196,7 @@ def _look_up(depth, position, normal, i, radius, texel):  # type: ignore[no-unty
     """Bilinear share of the four texels around a point in which nothing rises above its plane."""
     x, y, z = position[i, 0], position[i, 1], position[i, 2]
     slope_x, slope_y = _slopes(normal, i, texel)
-    clearance = max(_CLEARANCE * radius, _CLEARANCE_TEXELS * texel) / max(normal[i, 2], _COSINE_FLOOR)
+    clearance = max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
     column, row = int(x), int(y)  # positive, and one texel short of the far edge
     lit = np.float32(0)
     for corner in range(4):

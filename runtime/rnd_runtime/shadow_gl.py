@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .gl_passes import Pass
 from .shading import SHADOW_RESOLUTION
+from .shadow import SLOPE_FLOOR
 
 Floats32 = NDArray[np.float32]
 
@@ -76,7 +77,12 @@ class _Made:
     """Programs and targets for a number of suns."""
 
     def __init__(self, context: moderngl.Context, suns: int) -> None:
-        macros = {"SUNS": suns, "MAP_SIZE": SHADOW_RESOLUTION, "BLOCK": _BLOCK}
+        macros = {
+            "SUNS": suns,
+            "MAP_SIZE": SHADOW_RESOLUTION,
+            "BLOCK": _BLOCK,
+            "SLOPE_FLOOR": float(SLOPE_FLOOR),
+        }
         self.surround = Pass(context, ("sun_bounds.vert",), ("sun_bounds.frag",), macros)
         self.discs = Pass(context, ("shadow_map.glsl", "sun_discs.vert"), ("sun_discs.frag",), macros)
         size = (SHADOW_RESOLUTION, suns * SHADOW_RESOLUTION)

@@ -107,23 +107,17 @@ def bone_transforms(
     skeleton: Skeleton,
     rotations: ArrayLike,
     translation: ArrayLike,
-    canonical_rotations: ArrayLike | None = None,
 ) -> NDArray[np.float32]:
-    """What moves a canonical point with each bone: ``G(pose) · G(canonical)⁻¹`` as [..., J, 3, 4] float32.
+    """What moves a point of the rest pose with each bone: ``G(pose) · G(rest)⁻¹`` as [..., J, 3, 4] float32.
 
     Args:
         skeleton: J joints.
         rotations: [..., J, 3, 3] local rotations of the pose.
         translation: [..., 3] m.
-        canonical_rotations: [J, 3, 3] local rotations of the canonical pose, whose translation is 0;
-            None for the rest pose.
     """
     posed = skeleton.joint_transforms(rotations, translation)
-    turn, places = posed[..., :3, :3], skeleton.rest_joints
-    if canonical_rotations is not None:
-        canonical = skeleton.joint_transforms(canonical_rotations, np.zeros(3))
-        turn, places = turn @ np.swapaxes(canonical[..., :3, :3], -1, -2), canonical[..., :3, 3]
-    shift = posed[..., :3, 3] - (turn @ places[..., None])[..., 0]
+    turn = posed[..., :3, :3]
+    shift = posed[..., :3, 3] - (turn @ skeleton.rest_joints[..., None])[..., 0]
     return np.concatenate([turn, shift[..., None]], -1).astype(np.float32)
 
 

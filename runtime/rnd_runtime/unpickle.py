@@ -83,7 +83,7 @@ def _read(stream: BinaryIO) -> Any:
     if magic[:2] in unpack:
         stream = io.BytesIO(unpack[magic[:2]](stream.read()))
     content = _Machine(stream).load()
-    if content == _TORCH_MAGIC:
+    if isinstance(content, int) and content == _TORCH_MAGIC:
         return _read_old_torch(stream)
     return _understand(content, {})
 

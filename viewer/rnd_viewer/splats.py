@@ -139,7 +139,9 @@ def turned_over(splats: Splats) -> Splats:
 
 
 def _cell_means(cell: NDArray[np.intp], weights: Floats32, values: NDArray[np.floating]) -> Floats:
-    total = np.bincount(cell, weights)
+    total = np.maximum(
+        np.bincount(cell, weights), np.finfo(np.float64).tiny
+    )  # what nobody sees may weigh nothing
     return np.stack([np.bincount(cell, weights * column) / total for column in values.T], axis=1)
 
 

@@ -45,7 +45,7 @@ class Picture:
 
     Attributes:
         srgb: [H, W, 3] uint8.
-        joints: [J, 2] px, and z in metres as third column; what lies behind the camera has z ≤ 0.
+        joints: [J, 3] px, px and z in metres; what lies behind the camera has z ≤ 0.
         seconds: time of each stage.
     """
 

@@ -3,8 +3,6 @@
 uniform mat3 sun_axes[SUNS];  // world → two axes across the sun's direction and the direction itself
 uniform sampler2D bounds;     // a texel a sun: −left, −bottom, right, top m
 
-const float SLOPE_FLOOR = 0.1;  // steeper tangent planes are treated as 84°: their depth tells nothing
-
 struct MapPoint {
     vec3 position;  // x, y texels; z m towards the sun
     float cosine;   // of the normal with the sun's direction

@@ -6,9 +6,6 @@ uniform vec3 sun_directions[SUNS];  // unit, in the light's frame
 uniform vec3 sun_irradiances[SUNS];
 uniform float sun_blurs[SUNS];  // mean square angle
 
-const float CLEARANCE = 1.0;  // in disc radii, and no less than so many texels: shadow.py
-const float CLEARANCE_TEXELS = 0.35;
-
 // Bilinear share of the four texels around the Gaussian in which nothing rises above its tangent plane.
 float reached_by(int sun) {
     MapPoint here = in_map(sun, mean_world, normal_world);
