@@ -51,7 +51,7 @@ def test_another_file_is_refused_before_anything_is_measured(tmp_path, capsys):
     kept = tmp_path / "rows.json"
     kept.write_text('[{"fps": 60}]')
     assert stability_main(["--rows", "P1", "--json", str(kept)]) == 2
-    assert "--json: expected rows of rnd-bench --stability, got another file" in capsys.readouterr().err
+    assert "file of rows: expected rows of rnd-bench --stability, got another file" in capsys.readouterr().err
     assert kept.read_text() == '[{"fps": 60}]'
 
 

@@ -7,6 +7,7 @@ import math
 import shutil
 import struct
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from rnd_viewer.convert_cli import main
 from rnd_viewer.mesh_files import posed_vertices
 from rnd_viewer.player import Player
 from rnd_viewer.splat_files import TRANSFORM
+from rnd_viewer.splats import stored_colours
 from rnd_viewer.visionary import check_clip
 from tiny import ASSETS, body, motion
 
@@ -217,6 +219,26 @@ def test_gltf_splats_show_the_players_picture(played, tmp_path):
     )
     again = to_bytes(linear_to_srgb(picture)).astype(int)
     assert np.abs(again - played.srgb).max() <= ONE_STEP
+
+
+def test_a_probe_made_for_a_z_up_world_lights_as_the_player_has_it(tmp_path):
+    """Half of the colours at least are others than under the same file taken for Y up."""
+    y_up, z_up = (_ply(_splats(tmp_path / up, "--hdr-up", up, "--coding", "linear")) for up in "yz")
+    avatar = Avatar.load(AVATAR, threads=1)
+    walk = load_motion(WALK, avatar.skeleton)
+    gaussians = avatar.pose(walk, FRAME / walk.fps)
+    shader = Shader(load_light(SKY, up="z"), "table+sun")
+    lit = shader.shade(gaussians, _camera().position)
+    stored = 0.5 + 0.28209479177387814 * np.stack([z_up[f"f_dc_{k}"] for k in range(3)], axis=-1)
+    assert np.mean(np.abs(stored - lit).max(axis=1) < 1e-3) > 0.99  # the player shades in the root's frame
+    assert np.mean(np.abs(y_up["f_dc_1"] - z_up["f_dc_1"]) > 0.05) > 0.5
+
+
+def test_colours_of_gaussians_that_nobody_sees_are_numbers():
+    avatar = Avatar.load(AVATAR, threads=1)
+    posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
+    unseen = replace(posed, opacities=np.zeros_like(posed.opacities))
+    assert np.isfinite(stored_colours(unseen, posed.albedo, "srgb", avatar.spacing)).all()
 
 
 def test_albedo_is_the_materials(tmp_path):
@@ -490,7 +512,12 @@ def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):
         ),
         (["splats", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz: not a readable ONNX model"),
         (["mesh", WALK, "--motion", WALK, "--out", "OUT"], "walk.npz"),
-        (["motion", "none.onnx", "--motion", WALK, "--out", "OUT"], "none.onnx: avatar or body not found"),
+        (["motion", "none.onnx", "--motion", WALK, "--out", "a.npz"], "none.onnx: avatar or body not found"),
+        (["motion", AVATAR, "--motion", WALK, "--out", "a.bvh"], "--out: expected a name in .npz, got a.bvh"),
+        (
+            ["splats", AVATAR, "--motion", WALK, "--out", "OUT", "--hdr-up", "z"],
+            "--hdr-up: expected the default, got z (needs --hdr)",
+        ),
     ],
 )
 def test_unusable_input_is_one_line_and_exit_2(words, message, tmp_path, capsys):

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, existing_file, output_folder, read_rows, write_json
+from rnd_runtime.files import atomic_path, earlier_rows, existing_file, output_folder, write_json
 
 
 def _names(folder):
@@ -124,17 +124,19 @@ def test_a_path_that_is_no_utf_8_stands_in_json(tmp_path):
 
 def test_rows_to_add_to_are_what_was_written_or_none_yet(tmp_path):
     path = tmp_path / "rows.json"
-    assert read_rows(path, what="rows", names=("n",)) == []
+    assert earlier_rows(path, what="rows", names=("n",)) == []
     rows = [{"n": 1, "more": [2]}, {"n": 2}]
     write_json(path, rows)
-    assert read_rows(path, what="rows", names=("n",)) == rows
+    assert earlier_rows(path, what="rows", names=("n",)) == rows
 
 
 @pytest.mark.parametrize("content", [b"[{", b"\xff", b'{"n": 1}', b'[{"n": 1}, {"m": 2}]', b"[3]"])
 def test_other_files_are_not_added_to(tmp_path, content):
     path = tmp_path / "rows.json"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"rows\.json: --json: expected rows of a bench, got another file"):
-        read_rows(path, what="rows of a bench", names=("n",))
+    with pytest.raises(
+        InputError, match=r"rows\.json: file of rows: expected rows of a bench, got another file"
+    ):
+        earlier_rows(path, what="rows of a bench", names=("n",))
     with pytest.raises(InputError):
-        read_rows(tmp_path, what="rows of a bench", names=("n",))
+        earlier_rows(tmp_path, what="rows of a bench", names=("n",))

@@ -123,7 +123,7 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     assert strips == ["truth, a", "truth, b", "truth, c"]  # three of four, spread
     for what, value in (("truth", 200), ("render", 100), ("normals", 50), ("albedo", 150), ("error", 90)):
         assert pictures[f"{what}, a"].max() == value
-    assert pictures["truth, a"].shape[:2] == (15 + 15, 6 + 15)  # cropped to the person and a margin
+    assert pictures["truth, a"].shape[:2] == (15 + 16, 6 + 16)  # cropped to the person and a margin
     (clip,) = [attributes["src"] for tag, attributes in page.tags if tag == "video"]
     assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
 

@@ -263,6 +263,21 @@ def test_on_the_port_of_http_browsers_name_no_port():
     assert Access.local("127.0.0.1", 80).refusal("/", {"Host": "evil.example"}) is not None
 
 
+def test_what_fails_before_anything_is_served_ends_it(options):
+    """As a pipe that nobody reads does to the line with the address."""
+    ended = []
+
+    def failing() -> None:
+        with pytest.raises(BrokenPipeError), serve(Scene(options), "127.0.0.1", 0, None):
+            raise BrokenPipeError
+        ended.append(True)
+
+    thread = threading.Thread(target=failing, daemon=True)
+    thread.start()
+    thread.join(timeout=30)
+    assert ended
+
+
 @pytest.mark.skipif(not has_ipv6_loopback(), reason="this machine has no ::1")
 def test_an_ipv6_address_serves(options):
     with serve(Scene(options), "::1", 0, None) as (server, url):
@@ -346,6 +361,16 @@ def test_the_motion_is_edited_as_rnd_play_does(options):
     scene.close()
     with pytest.raises(InputError, match=r"--smooth: expected 0\.01 to 1000, got 0"):
         replace(options, smooth=0)
+
+
+def test_of_a_large_probe_a_smaller_one_is_kept_and_its_light_is_the_files(options, tmp_path):
+    rng = np.random.default_rng(1)
+    write_image(tmp_path / "large.exr", rng.uniform(0.2, 1, (1100, 2200, 3)).astype(np.float32))
+    scene = Scene(replace(options, hdr=(tmp_path / "large.exr",)))
+    shader, light = scene._shader(tmp_path / "large.exr", "table"), load_light(tmp_path / "large.exr")
+    assert shader.light.radiance.shape == (1024, 2048, 3)
+    np.testing.assert_array_equal(shader.sky.diffuse, Shader(light, "table").sky.diffuse)
+    scene.close()
 
 
 def test_options_and_refusals(options, capsys, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, flag
-from rnd_runtime.files import atomic_path, read_rows, write_json
+from rnd_runtime.files import atomic_path, earlier_rows, write_json
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion
 from rnd_trainer.checkpoint import load_checkpoint
@@ -35,7 +35,7 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
     rows = (
         []
         if options.json is None
-        else read_rows(options.json, what="rows of an earlier search", names=("bound",))
+        else earlier_rows(options.json, what="rows of an earlier search", names=("bound",))
     )
     started = perf_counter()
     probe = load_checkpoint(options.checkpoint).probe.numpy()

@@ -60,7 +60,7 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def read_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict[str, Any]]:
+def earlier_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict[str, Any]]:
     """Rows that an earlier run wrote by :func:`write_json`, to add more; none where there is no file yet.
 
     Raises :class:`InputError` where the file is not ``what``: a list of objects that have all of ``names``.
@@ -72,7 +72,7 @@ def read_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict
     except (OSError, ValueError):
         rows = None
     if not are_rows(rows, names):
-        raise InputError("--json", expected=what, got="another file", file=path)
+        raise InputError("file of rows", expected=what, got="another file", file=path)
     return rows
 
 

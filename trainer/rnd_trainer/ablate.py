@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import read_rows, write_json
+from rnd_runtime.files import earlier_rows, write_json
 
 from .checkpoint import load_checkpoint
 from .config import TrainConfig
@@ -231,7 +231,7 @@ def _done_before(place: Path, same: dict[str, Any]) -> list[dict[str, Any]]:
 def _rows(place: Path) -> list[dict[str, Any]]:
     file = place / ROWS
     try:
-        return read_rows(file, what="rows of a study", names=("method", "split", "seed", "psnr"))
+        return earlier_rows(file, what="rows of a study", names=("method", "split", "seed", "psnr"))
     except InputError as error:
         what, expected = "a run done before", error.expected
         raise InputError(what, expected=expected, got=error.got, file=file, hint=ELSEWHERE) from error

@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from rnd_runtime.errors import check_option, flag, parse_options, run_command
-from rnd_runtime.files import read_rows, write_json
+from rnd_runtime.files import earlier_rows, write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
 
@@ -126,7 +126,7 @@ def _grid(options: Grid) -> None:
     )
     draw_chart(rows, list(options.chart))
     console.print(f"{options.json}, {', '.join(map(str, options.chart))}")
-    others = len(read_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)
+    others = len(earlier_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)
     if others:
         console.print(
             f"{options.json} also keeps {others} points of earlier grids, not in the chart (--fresh drops them)"

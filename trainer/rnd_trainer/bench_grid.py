@@ -18,7 +18,7 @@ import numpy as np
 from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option
-from rnd_runtime.files import existing_file, output_folder, read_rows, write_json
+from rnd_runtime.files import earlier_rows, existing_file, output_folder, write_json
 
 from .bench_avatars import Encoders, checkpoint_model, content_key, exported, forget, seeded_checkpoint
 from .bench_frame import Point, measure
@@ -198,7 +198,7 @@ def grid(
     inputs.checked()
     if fresh:
         forget(inputs.work)
-    rows = [] if fresh else read_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
+    rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
     wanted, key = settings(quick, cross, sample), inputs.key()
     here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
     done: list[Row] = []

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, run_command
-from rnd_runtime.files import atomic_path, read_rows, write_json
+from rnd_runtime.files import atomic_path, earlier_rows, write_json
 
 from .eval_cli import need_extra
 
@@ -163,7 +163,7 @@ def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[st
 
 
 def _rows(options: StabilityOptions) -> list[dict[str, Any]]:
-    return read_rows(options.json, what="rows of rnd-bench --stability", names=("id", "what"))
+    return earlier_rows(options.json, what="rows of rnd-bench --stability", names=("id", "what"))
 
 
 def _keep(

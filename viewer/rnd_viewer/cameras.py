@@ -144,7 +144,7 @@ class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
         try:
             return Camera(self.width, self.height, np.array(self.K), np.array(self.world_to_camera))
         except InputError as error:
-            raise InputError(error.what, expected=error.expected, got=error.got, file=file) from error
+            raise error.at(file=file) from error
         except ValueError as error:  # rows of different lengths
             raise InputError("camera matrices", expected="rows of one length", file=file) from error
 

@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, check_option, refuse_changed
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
-from rnd_runtime.light import Light, load_light
+from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
 from .cameras import CameraPath, View, file_path, frame_motion, front_path
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
+from .lights import chosen_light
 from .mesh_files import posed_vertices, write_obj, write_rigged_glb
 from .options import parse_frames, refuse_outside
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
@@ -136,6 +137,7 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
 
 
 def _motion(options: AmassOptions) -> Iterator[str]:
+    check_option(options.out.suffix.lower() == ".npz", "--out", "a name in .npz", options.out)
     file = existing_file(options.skeleton, what="avatar or body")
     skeleton = Body.load(file).skeleton if file.suffix == ".npz" else Avatar.load(file).skeleton
     motion = options.read_motion(options.motion, skeleton)
@@ -153,10 +155,11 @@ def _noted(motion: Motion) -> Iterator[str]:
 
 def _light(options: SplatOptions, avatar: Avatar) -> Light:
     refuse_outside(options, {"exposure": (-30, 30), "hdr_yaw": (-1e6, 1e6)})
-    yaw = math.radians(options.hdr_yaw)
     if options.hdr is None:
-        return Light(avatar.trained_light).scaled(2.0**options.exposure).turned(yaw)
-    return load_light(options.hdr, yaw=yaw, exposure=options.exposure)
+        refuse_changed(options, ["hdr_up"], "needs --hdr")
+    return chosen_light(
+        avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure
+    )
 
 
 def _camera_path(text: str, skeleton: Skeleton, motion: Motion, frames: range) -> CameraPath:

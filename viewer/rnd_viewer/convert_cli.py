@@ -36,6 +36,8 @@ class SplatOptions(MotionOptions):
     """light probe, lat-long EXR or HDR. Default: the light the avatar was captured under"""
     hdr_yaw: float = 0.0
     """turn the light, degrees"""
+    hdr_up: Literal["y", "z"] = "y"
+    """which axis points up in the probe's file"""
     exposure: float = 0.0
     """stops by which the light is made brighter"""
     shade: str = "table+sun"
@@ -56,7 +58,7 @@ class SplatOptions(MotionOptions):
             InputError: naming the first.
         """
         if self.colour == "albedo":
-            lit = ("hdr", "hdr_yaw", "exposure", "shade", "camera", "sh_degree")
+            lit = ("hdr", "hdr_yaw", "hdr_up", "exposure", "shade", "camera", "sh_degree")
             refuse_changed(self, lit, "--colour albedo is the same under every light and from everywhere")
         if self.sh_degree > 0:
             refuse_changed(self, ["camera"], "--sh-degree above 0 looks from all around")

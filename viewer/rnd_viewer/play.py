@@ -16,7 +16,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
-from rnd_runtime.light import Light, load_light
+from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
@@ -35,6 +35,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
+from .lights import chosen_light
 from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
@@ -117,7 +118,9 @@ class _Run:
         with times.stage("load"):
             avatar = Avatar.load(avatar_file, threads=options.threads)
             motion = options.read_motion(motion_file, avatar.skeleton)
-            light = _light(options, avatar)
+            light = chosen_light(
+                avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure
+            )
             shader = Shader(light, mode=options.shade)
             rasterizer = make_rasterizer(options.raster)
         fps = options.fps or motion.fps
@@ -257,14 +260,6 @@ def _inputs(options: PlayOptions) -> list[Path]:
     if options.camera not in OWN_CAMERAS:
         given.append(split_camera(options.camera)[0])
     return [path for path in given if path is not None]
-
-
-def _light(options: PlayOptions, avatar: Avatar) -> Light:
-    """The light named by ``--hdr``, or the one that was learnt with the avatar."""
-    yaw = math.radians(options.hdr_yaw)
-    if options.hdr is None:
-        return Light(avatar.trained_light).scaled(2.0**options.exposure).turned(yaw)
-    return load_light(options.hdr, up=options.hdr_up, yaw=yaw, exposure=options.exposure)
 
 
 def _light_notes(light: Light) -> list[str]:

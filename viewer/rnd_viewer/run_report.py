@@ -27,6 +27,7 @@ from .video import INSTALL
 Bytes = NDArray[np.uint8]
 TILES = ("truth", "render", "normals", "albedo", "error")  # side by side in rnd-eval's strips
 MARGIN = 8  # pixels kept around the person
+DARK = 8  # of 255; what is brighter in any tile is the person
 # Columns of rnd-eval's rows, and what else a row says of the run as a whole.
 METRICS = {
     "split": ("split", "{}"), "frames": ("pictures", "{}"),
@@ -141,10 +142,10 @@ def _shot(strip: Path) -> str:
     if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
         raise InputError("picture of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
     tiles: list[Bytes] = np.split(pixels.astype(np.uint8), len(TILES), axis=1)
-    rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > MARGIN)
+    rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > DARK)
     if len(rows):
         window = tuple(
-            slice(max(int(places.min()) - MARGIN, 0), int(places.max()) + MARGIN)
+            slice(max(int(places.min()) - MARGIN, 0), int(places.max()) + 1 + MARGIN)
             for places in (rows, columns)
         )
         tiles = [np.ascontiguousarray(tile[window]) for tile in tiles]

@@ -19,7 +19,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
 from rnd_runtime.frame import as_seen_from, draw
 from rnd_runtime.gaussians import Gaussians, Raster
-from rnd_runtime.light import Light, load_light
+from rnd_runtime.light import Light, downsize, load_light
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
@@ -37,7 +37,8 @@ Bytes = NDArray[np.uint8]
 
 CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
 ELEVATION, FIELD_OF_VIEW = math.radians(5), math.radians(35)  # rnd-play's own
-SHADERS_KEPT = 12  # tables of 0.6 MB each; building one takes 30–300 ms
+SHADERS_KEPT = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
+LARGEST_SKY = 1024  # rows of a map that is shown behind the avatar and kept: 25 MB
 
 
 class Picture:
@@ -68,6 +69,8 @@ class Scene:
         self.rasterizer = make_rasterizer(options.raster)
         self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
+        self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
+        self._sky = lru_cache(SHADERS_KEPT // 2)(self._smaller_light)
         self._behind: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
 
@@ -214,14 +217,23 @@ class Scene:
         return self._files[state.light - 1] if state.light else None
 
     def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
+        shader = Shader(self._light(name), shade)
+        shader.light = self._sky(name)  # from here on it is only turned
+        return shader
+
+    def _load_light(self, name: str | Path | None) -> Light:
         if name is None:
-            light = Light(self.avatar.trained_light)
-        elif isinstance(name, Path):
-            light = load_light(name)
-        else:
-            assert self.capture
-            light = self.capture.load_light(name)
-        return Shader(light, shade)
+            return Light(self.avatar.trained_light)
+        if isinstance(name, Path):
+            return load_light(name)
+        assert self.capture
+        return self.capture.load_light(name)
+
+    def _smaller_light(self, name: str | Path | None) -> Light:
+        light = self._light(name)
+        if len(light.radiance) <= LARGEST_SKY:
+            return light
+        return replace(light, radiance=downsize(light.radiance, LARGEST_SKY, 2 * LARGEST_SKY))
 
     def _radiance_behind(self, state: ViewState, camera: Camera) -> Floats32:
         """The background; a map's is kept for as long as neither it nor the camera moves."""
@@ -232,7 +244,7 @@ class Scene:
         size = camera.width, camera.height
         key = (name, state.yaw, size, camera.K.tobytes(), camera.world_to_camera.tobytes())
         if self._behind is None or self._behind[0] != key:
-            light = self._shader(name, state.shade).light
+            light = self._sky(name)
             turned = light.turned(light.yaw + state.yaw)
             self._behind = key, background.radiance(camera, turned)
         return self._behind[1] * np.float32(2.0**state.exposure)

@@ -140,11 +140,18 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
         raise InputError(
             "cannot listen", got=f"{error.strerror} on {host}:{port}", hint="--port picks another"
         ) from error
-    with server:
+    try:
         port = server.socket.getsockname()[1]
         access.append(Access(token, None) if token else Access.local(host, port))
         name = f"[{host}]" if ":" in host else host
         yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+    finally:
+        server.socket.close()
+        if (
+            not server.socket_closed.is_set()
+        ):  # nobody has served yet, and shutdown would wait for one who has
+            server.serve_forever()  # returns at once, as its socket is closed
+        server.shutdown()
 
 
 def _static(connection: Any, path: str, access: Access) -> Any:
