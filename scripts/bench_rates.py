@@ -42,8 +42,9 @@ def variants(nodes: int) -> dict[str, Variant]:
 
 def main(checkpoint: Path, out: Path) -> None:
     """Measure and write the rows."""
-    motion = load_motion(ASSETS / "walk.npz", load_checkpoint(checkpoint).skeleton)
-    bench = Workbench(checkpoint, Scene(motion, load_light(ASSETS / "sky.exr"), shade="table"))
+    trained = load_checkpoint(checkpoint)
+    motion = load_motion(ASSETS / "walk.npz", trained.skeleton)
+    bench = Workbench(trained, Scene(motion, load_light(ASSETS / "sky.exr"), shade="table"))
     models = {name: bench.model(Recipe(variant)) for name, variant in variants(bench.config.nodes).items()}
     shots = [*bench.seen, *bench.held_out]
     found = {name: [] for name in models}

@@ -38,7 +38,7 @@ from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
 from rnd_trainer.bench_pass import one_call, three_calls
-from rnd_trainer.bench_raster import body_camera, body_scene
+from rnd_trainer.bench_raster import body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.checkpoint import load_checkpoint
 from tiny import ASSETS
@@ -103,7 +103,7 @@ def test_a_point_is_measured_in_a_process_of_its_own(tiny_avatar) -> None:
 
 def test_one_compiled_function_draws_what_three_kernels_draw() -> None:
     """And what the rasteriser draws: what their times are compared for is the same work."""
-    scene, camera = body_scene(400), body_camera(64)
+    scene, camera = body_scene(400), bench_camera(64)
     arrays = [torch.from_numpy(array) for array in scene]
     truth = raster_cpu.rasterize(*scene, camera, depth=False)
     for draws in (three_calls, one_call):
@@ -172,6 +172,7 @@ def test_a_sample_of_all_combinations_has_each_value_about_as_often_and_grows() 
     assert all(point.window is None for point in many if point.encoder == "static")
     alone = settings(cross=("threads", "shade"), sample=9)
     assert set(alone) == set(settings(cross=("threads", "shade")))
+    assert len(settings(True, cross=("n",), sample=4)) == 5  # the quick grid's usual point is another one
     for count in (0, 10):
         with pytest.raises(InputError, match="--sample: expected 1 to 9 points"):
             settings(cross=("threads", "shade"), sample=count)

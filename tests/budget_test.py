@@ -38,7 +38,7 @@ def _clock(avatar: Avatar) -> float:
 def bench(tiny_checkpoint) -> Workbench:
     moves = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=60, seed=5)
     light = Light(np.ones((32, 64, 3), np.float32))
-    return Workbench(tiny_checkpoint, Scene(moves, light, size=96, shade="table"), _clock)
+    return Workbench(load_checkpoint(tiny_checkpoint), Scene(moves, light, size=96, shade="table"), _clock)
 
 
 def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
@@ -424,5 +424,5 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
 def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint) -> None:
     still = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=2, seed=5).at(0.0)
     light = Light(np.ones((32, 64, 3), np.float32))
-    bench = Workbench(tiny_checkpoint, Scene(still, light, size=48, shade="table"), _clock)
+    bench = Workbench(load_checkpoint(tiny_checkpoint), Scene(still, light, size=48, shade="table"), _clock)
     assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100

@@ -74,7 +74,8 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
 def tiny_avatar(tiny_checkpoint) -> Path:
     """avatar.onnx of ``tiny_checkpoint``."""
     from rnd_export.export import export
+    from rnd_trainer.checkpoint import load_checkpoint
 
     path = tiny_checkpoint.with_suffix(".onnx")
-    export(tiny_checkpoint, path)
+    export(load_checkpoint(tiny_checkpoint), path)
     return path

@@ -65,7 +65,7 @@ def test_neighbours_on_the_body_are_neighbours_in_the_file(tiny_avatar, tiny_che
 
 
 def test_the_same_checkpoint_gives_the_same_bytes(tiny_avatar, tiny_checkpoint, tmp_path) -> None:
-    export(tiny_checkpoint, tmp_path / "again.onnx")
+    export(load_checkpoint(tiny_checkpoint), tmp_path / "again.onnx")
     assert (tmp_path / "again.onnx").read_bytes() == tiny_avatar.read_bytes()
 
 
@@ -84,7 +84,7 @@ def test_the_file_is_plain_onnx(tiny_avatar) -> None:
 def test_nothing_stays_when_the_drift_is_too_large(tiny_checkpoint, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(exports, "MAX_WEIGHT_ERROR", 0.0)
     with pytest.raises(InputError, match="export refused: skinning weights of onnxruntime and torch differ"):
-        export(tiny_checkpoint, tmp_path / "avatar.onnx")
+        export(load_checkpoint(tiny_checkpoint), tmp_path / "avatar.onnx")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -95,7 +95,7 @@ def test_a_static_avatar_exports_too(tiny_checkpoint, tmp_path) -> None:
     model = AvatarModel(model_config, sample_template(body(), 800, 200, seed=1))
     path = tmp_path / "static.ckpt"
     save_checkpoint(path, model, torch.ones(32, 64, 3), checkpoint.skeleton, config, {})
-    drift = export(path, tmp_path / "static.onnx", motion(body()))
+    drift = export(load_checkpoint(path), tmp_path / "static.onnx", motion(body()))
     assert drift.frames == 6 and drift.weights < 1e-6
 
 
@@ -114,19 +114,21 @@ def test_fewer_bits_make_a_smaller_file_that_drifts_little(
     tiny_checkpoint, tiny_avatar, tmp_path, precision
 ) -> None:
     out = tmp_path / "small.onnx"
-    drift = export(tiny_checkpoint, out, motion(body()), Variant(precision=precision))
+    drift = export(load_checkpoint(tiny_checkpoint), out, motion(body()), Variant(precision=precision))
     assert drift.position_m > MAX_POSITION_ERROR_M / 10 and drift.position_p99_m < MAX_P99_M[precision] / 2
     assert out.stat().st_size < 0.8 * tiny_avatar.stat().st_size
     assert Avatar.load(out).metadata.variant.precision == precision
     first = out.read_bytes()
-    export(tiny_checkpoint, out, motion(body()), Variant(precision=precision))
+    export(load_checkpoint(tiny_checkpoint), out, motion(body()), Variant(precision=precision))
     assert out.read_bytes() == first
 
 
 def test_precision_is_refused_where_it_costs_too_much(tiny_checkpoint, tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(MAX_P99_M, "int8", 1e-6)
     with pytest.raises(InputError, match=r"positions \(99 %\) of onnxruntime and torch differ"):
-        export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(precision="int8"))
+        export(
+            load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), Variant(precision="int8")
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -134,9 +136,9 @@ def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
     """With as many nodes as the checkpoint nothing changes; with fewer, the networks say the same at those."""
     checkpoint = load_checkpoint(tiny_checkpoint)
     whole, half = tmp_path / "whole.onnx", tmp_path / "half.onnx"
-    drift = export(tiny_checkpoint, whole, motion(body()), Variant("coarse", nodes=200))
+    drift = export(load_checkpoint(tiny_checkpoint), whole, motion(body()), Variant("coarse", nodes=200))
     assert drift.position_m < MAX_POSITION_ERROR_M / 10
-    export(tiny_checkpoint, half, motion(body()), Variant("coarse"))
+    export(load_checkpoint(tiny_checkpoint), half, motion(body()), Variant("coarse"))
     variant = Avatar.load(half).metadata.variant
     assert (variant.encoder, variant.nodes) == ("coarse", 50)
     codes = bake(checkpoint.model).all_codes
@@ -153,7 +155,7 @@ def test_each_network_may_have_fewer_nodes_of_its_own(
 ) -> None:
     """It says the same at those, what they say lies between them, and the other networks say what they said."""
     checkpoint, fewer = load_checkpoint(tiny_checkpoint), tmp_path / "fewer.onnx"
-    export(tiny_checkpoint, fewer, motion(body()), Variant(**{f"{network}_nodes": 50}))
+    export(load_checkpoint(tiny_checkpoint), fewer, motion(body()), Variant(**{f"{network}_nodes": 50}))
     codes = bake(checkpoint.model).all_codes[:200]
     order = along_curve(codes)  # the file's, of nodes that stand farthest first
     area = checkpoint.config.model.gaussians * float(checkpoint.model.spacing) ** 2
@@ -170,7 +172,7 @@ def test_each_network_may_have_fewer_nodes_of_its_own(
 def test_networks_with_as_many_nodes_are_interpolated_together(tiny_checkpoint, tmp_path) -> None:
     both = tmp_path / "both.onnx"
     export(
-        tiny_checkpoint,
+        load_checkpoint(tiny_checkpoint),
         both,
         motion(body()),
         Variant(offset_nodes=50, visibility_nodes=50, skinning_nodes=100),
@@ -194,7 +196,7 @@ def _output(path, moves: Motion, checkpoint, name: str) -> np.ndarray:
 
 def test_static_is_the_template(tiny_checkpoint, tmp_path) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
-    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant("static"))
+    export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), Variant("static"))
     template = checkpoint.model.log_weights.softmax(-1).numpy()
     weights = _weights(tmp_path / "a.onnx", motion(body()), checkpoint)
     template = template[_rows(checkpoint)]
@@ -207,17 +209,19 @@ def test_a_shorter_window_sees_a_steady_motion_alike(tiny_checkpoint, tmp_path) 
     """Poses on a line in 6D are what the interpolation assumes: a still figure is on one."""
     checkpoint = load_checkpoint(tiny_checkpoint)
     still = dataclasses.replace(motion(body()), rotations=motion(body()).rotations[[3] * 6])
-    drift = export(tiny_checkpoint, tmp_path / "a.onnx", still, Variant(window_poses=2))
+    drift = export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", still, Variant(window_poses=2))
     assert drift.position_m < MAX_POSITION_ERROR_M / 10
     assert Avatar.load(tmp_path / "a.onnx").window_poses == 2
-    moving = export(tiny_checkpoint, tmp_path / "a.onnx", random_motion(checkpoint.skeleton, frames=4, seed=0),
-                    Variant(window_poses=2))  # fmt: skip
+    moves = random_motion(checkpoint.skeleton, frames=4, seed=0)
+    moving = export(checkpoint, tmp_path / "a.onnx", moves, Variant(window_poses=2))
     assert moving.position_m > drift.position_m
     assert np.allclose(line_through(5, 3), [[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]])
 
 
 def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar, tmp_path) -> None:
-    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(visibility_degree=1))
+    export(
+        load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), Variant(visibility_degree=1)
+    )
     less, whole = (
         Avatar.load(p).pose(motion(body()), 0.1).visibility for p in (tmp_path / "a.onnx", tiny_avatar)
     )
@@ -236,13 +240,13 @@ def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar,
 )
 def test_what_no_file_can_be_is_refused(tiny_checkpoint, tmp_path, variant, line) -> None:
     with pytest.raises(InputError, match=line):
-        export(tiny_checkpoint, tmp_path / "a.onnx", variant=variant)
+        export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", variant=variant)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_constants_are_unpacked_when_the_file_is_loaded_not_at_every_frame(tiny_checkpoint, tmp_path) -> None:
     """onnxruntime's own optimised graph: nothing is left of what depends on no input."""
-    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), Variant(precision="f16"))
+    export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), Variant(precision="f16"))
     options = ort.SessionOptions()
     options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
     options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
@@ -255,7 +259,7 @@ def test_constants_are_unpacked_when_the_file_is_loaded_not_at_every_frame(tiny_
     "variant", [Variant(), Variant("static", "int8", visibility_degree=2), Variant("coarse", "f16")]
 )
 def test_the_compiled_posing_says_what_the_graph_says(tiny_checkpoint, tmp_path, variant) -> None:
-    export(tiny_checkpoint, tmp_path / "a.onnx", motion(body()), variant)
+    export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), variant)
     avatar, moves, time = Avatar.load(tmp_path / "a.onnx"), motion(body()), 0.1
     assert {"node_offsets", "rest_limbs", "neighbours"} <= {
         o.name for o in onnx.load(tmp_path / "a.onnx").graph.output
@@ -276,5 +280,5 @@ def test_ablations_are_not_exported(tiny_checkpoint, tmp_path) -> None:
     with pytest.raises(
         InputError, match="an ablation, which is not exported: visibility: expected pose, got paper"
     ):
-        export(tmp_path / "paper.ckpt", tmp_path / "paper.onnx")
+        export(load_checkpoint(tmp_path / "paper.ckpt"), tmp_path / "paper.onnx")
     assert not (tmp_path / "paper.onnx").exists()

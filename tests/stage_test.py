@@ -222,12 +222,17 @@ def test_what_is_there_is_not_filmed_again(filmed: Path, production) -> None:
     )  # the one shot's PNGs and its picture
 
 
-def test_another_recipe_is_refused(tmp_path: Path) -> None:
-    film.keep_recipe(RECIPE, tmp_path)
-    film.keep_recipe(RECIPE, tmp_path)
-    assert json.loads((tmp_path / film.RECIPE_FILE).read_text())["samples"] == 9
+def test_another_recipe_is_refused_and_one_that_cannot_be_filmed_leaves_nothing(tmp_path: Path) -> None:
+    template = Body.load(ASSETS / "body.npz")
+    (tmp_path / "broken.npz").write_bytes(b"no motion")
+    with pytest.raises(InputError, match="broken"):
+        film.prepare(replace(RECIPE, motion=str(tmp_path / "broken.npz")), tmp_path / "out", template)
+    assert not (tmp_path / "out" / film.RECIPE_FILE).exists()
+    film.prepare(RECIPE, tmp_path / "out", template)
+    film.prepare(RECIPE, tmp_path / "out", template)
+    assert json.loads((tmp_path / "out" / film.RECIPE_FILE).read_text())["samples"] == 9
     with pytest.raises(InputError, match="samples"):
-        film.keep_recipe(replace(RECIPE, samples=10), tmp_path)
+        film.prepare(replace(RECIPE, samples=10), tmp_path / "out", template)
 
 
 @pytest.mark.parametrize(

@@ -70,6 +70,21 @@ def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
 
 
+def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    """And is not lit again by a training that goes on from there."""
+    training = Training(tiny_capture, tiny_config)
+    while training.step_index < 6:
+        assert not training.lit
+        training.step()
+    training.save(tmp_path)
+    saved = load_checkpoint(tmp_path / "avatar.ckpt").model.appearance_residual
+    colour, albedo = saved[:, :3], saved[:, 3:6]
+    assert colour.any() and torch.equal(albedo, colour)  # the first stage learns colours alone
+    resumed = Training(tiny_capture, tiny_config)
+    resumed.resume(tmp_path / "training.state")
+    assert training.lit and resumed.lit and resumed.step().terms == training.step().terms
+
+
 def test_a_rehearsal_takes_every_term_and_changes_nothing(
     tiny_capture, tiny_config, one_thread, monkeypatch
 ) -> None:
@@ -247,6 +262,16 @@ def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path)
     assert training.step_index == 1
     assert load_checkpoint(tmp_path / "avatar.ckpt").info["step"] == 1
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_in_the_last_step_leaves_nothing_to_resume(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, steps=2, unseen_fraction=0.0)
+
+    def press(step: object) -> None:
+        if step.index == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    assert not run(Training(tiny_capture, config), tmp_path, on_step=press, on_preview=_nothing)
 
 
 def test_the_log_forgets_steps_that_are_done_again(tiny_capture, tiny_config, tmp_path) -> None:

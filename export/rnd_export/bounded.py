@@ -13,14 +13,16 @@ from rnd_runtime.errors import InputError, flag
 from rnd_runtime.files import atomic_path, earlier_rows, write_json
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion
-from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.checkpoint import Checkpoint
 
 from .budget import Bound, Found, given_up, search
 from .candidates import Scene, Workbench
 from .cli import BOUNDS, Options
 
 
-def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str, float]) -> None:
+def export_bounded(
+    options: Options, checkpoint: Checkpoint, out: Path, motion: Motion, given: dict[str, float]
+) -> None:
     """Write the cheapest file that keeps the bound ``given`` {kind: value}, and say what it gave up.
 
     Raises :class:`InputError` for several bounds, one that is not positive, or one that no file keeps.
@@ -38,10 +40,9 @@ def export_bounded(options: Options, out: Path, motion: Motion, given: dict[str,
         else earlier_rows(options.json, what="rows of an earlier search", names=("bound",))
     )
     started = perf_counter()
-    probe = load_checkpoint(options.checkpoint).probe.numpy()
-    light = Light(probe) if options.hdr is None else load_light(options.hdr)
+    light = Light(checkpoint.probe.numpy()) if options.hdr is None else load_light(options.hdr)
     scene = Scene(motion, light, options.size)
-    bench = Workbench(options.checkpoint, scene)
+    bench = Workbench(checkpoint, scene)
     console, steps = Console(), []
 
     def show(found: Found) -> None:

@@ -21,7 +21,7 @@ from rnd_runtime.images import linear_to_srgb
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.raster_cpu import rasterize
-from rnd_trainer.checkpoint import load_checkpoint
+from rnd_trainer.checkpoint import Checkpoint
 from rnd_trainer.template import node_interpolation
 
 from .bake import BakedAvatar, bake
@@ -82,11 +82,12 @@ class Measured(NamedTuple):
 class Workbench:
     """``seen`` are the shots to search on, ``held_out`` others; ``clock`` gives an avatar's ms per frame."""
 
-    def __init__(self, path: Path, scene: Scene, clock: Callable[[Avatar], float] | None = None) -> None:
-        self.checkpoint, self._path, self._scene = load_checkpoint(path), path, scene
-        refuse_ablations(self.checkpoint, path)
-        self.config = self.checkpoint.config.model
-        self._baked = gaussians_by_place(bake(self.checkpoint.model))
+    def __init__(
+        self, checkpoint: Checkpoint, scene: Scene, clock: Callable[[Avatar], float] | None = None
+    ) -> None:
+        refuse_ablations(checkpoint)
+        self.config, self._checkpoint, self._scene = checkpoint.config.model, checkpoint, scene
+        self._baked = gaussians_by_place(bake(checkpoint.model))
         self._whole = _loaded(self.model(Recipe()))
         times = (np.arange(2 * POSES) + 0.5) / (2 * POSES) * scene.motion.duration
         shots = [Shot(float(t), self._view(float(t), k)) for k, t in enumerate(times)]
@@ -124,7 +125,7 @@ class Workbench:
         return float((self._site_moves(baked)[: baked.rates.skinning] < recipe.dynamic_mm).mean())
 
     def _written(self, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
-        return written(self.checkpoint, self._path, baked, variant)
+        return written(self._checkpoint, baked, variant)
 
     def _renderer(self, avatar: Avatar) -> FrameRenderer:
         return FrameRenderer(avatar, self._scene.light, self.seen[0].camera, shade=self._scene.shade)

@@ -29,7 +29,7 @@ class Options:
     encoder: EncoderKind = "full"
     """networks at every node, at fewer (coarse), or the template's skinning weights (static)"""
     precision: Precision = "f32"
-    """how constants are stored; f16 must keep 99 % of all places within 1 mm, int8 within 3 mm"""
+    """how constants are stored; by itself f16 must keep 99 % of all places within 1 mm, int8 within 3 mm"""
     nodes: int | None = None
     """nodes of --encoder coarse; by default a quarter of the checkpoint's"""
     skinning_nodes: int | None = None
@@ -94,25 +94,24 @@ def _export(options: Options) -> None:
     _refuse_idle(options, bounded=bool(given))
     if options.checkpoint.is_dir():
         options = dataclasses.replace(options, checkpoint=options.checkpoint / "avatar.ckpt")
-    checkpoint = existing_file(options.checkpoint, what="checkpoint")
-    if options.out is None and checkpoint.suffix == ".onnx":
-        raise InputError(
-            "not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=checkpoint
-        )
-    out = options.out or checkpoint.with_suffix(".onnx")
-    check_option(out.resolve() != checkpoint.resolve(), "--out", "another file than the checkpoint", out)
-    skeleton = load_checkpoint(checkpoint).skeleton
+    file = existing_file(options.checkpoint, what="checkpoint")
+    if options.out is None and file.suffix == ".onnx":
+        raise InputError("not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=file)
+    out = options.out or file.with_suffix(".onnx")
+    check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
+    check_option(out.resolve() != file.resolve(), "--out", "another file than the checkpoint", out)
+    checkpoint = load_checkpoint(file)
     if options.motion is not None:
-        motion = load_motion(options.motion, skeleton)
+        motion = load_motion(options.motion, checkpoint.skeleton)
     else:
-        motion = random_motion(skeleton, frames=options.frames, seed=0)
+        motion = random_motion(checkpoint.skeleton, frames=options.frames, seed=0)
     if given:
         from .bounded import export_bounded
 
-        export_bounded(options, out, motion, given)
+        export_bounded(options, checkpoint, out, motion, given)
         return
     variant = Variant(**{name: getattr(options, name) for name in CHOICES})
-    drift = export(options.checkpoint, out, motion, variant)
+    drift = export(checkpoint, out, motion, variant)
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "
         f"weights {drift.weights:.1e}, positions {1e3 * drift.position_m:.4f} mm, "

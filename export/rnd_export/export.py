@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import Skeleton
 from rnd_runtime.window import motion_window
-from rnd_trainer.checkpoint import Checkpoint, load_checkpoint
+from rnd_trainer.checkpoint import Checkpoint
 from rnd_trainer.data import pose_input
 
 from .bake import BakedAvatar, bake
@@ -64,25 +64,28 @@ class Drift:
 
 
 def export(
-    checkpoint_path: Path, out: Path, motion: Motion | None = None, variant: Variant | None = None
+    checkpoint: Checkpoint, out: Path, motion: Motion | None = None, variant: Variant | None = None
 ) -> Drift:
-    """Write ``out`` and return how far it is from torch over ``motion`` (by default 120 random frames).
+    """Write ``out``, a name in .onnx; how far it is from torch over ``motion``, by default 120 random frames.
 
     Raises :class:`InputError`, leaving nothing under ``out``, when the difference exceeds what the variant's
     precision allows. What ``coarse``, ``static`` and the like give up is meant: it is measured, not bounded.
     """
-    checkpoint = load_checkpoint(checkpoint_path)
-    refuse_ablations(checkpoint, checkpoint_path)
+    refuse_ablations(checkpoint)
     variant = variant or Variant()
     variant.check(checkpoint.config.model)
     baked = gaussians_by_place(bake(checkpoint.model))
     baked = reduced(baked, checkpoint.config.model, variant)
-    model = written(checkpoint, checkpoint_path, baked, variant)
+    model = written(checkpoint, baked, variant)
     if motion is None:
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
     with atomic_path(out) as temporary:
         onnx.save_model(model, str(temporary))
         drift = measure_drift(Avatar.load(temporary), checkpoint, motion, baked.rows)
+        if not np.isfinite(dataclasses.astuple(drift)).all():
+            raise InputError(
+                "export refused: places", expected="finite numbers", got="NaN or infinity", file=out
+            )
         for what, got, bound in _bounds(drift, variant):
             if not got <= bound:
                 raise InputError(
@@ -92,7 +95,7 @@ def export(
     return drift
 
 
-def refuse_ablations(checkpoint: Checkpoint, path: Path) -> None:
+def refuse_ablations(checkpoint: Checkpoint) -> None:
     """What the ablations leave out the player would miss: such a checkpoint is for rnd-eval only."""
     config = checkpoint.config
     for field, got, wanted in (
@@ -102,14 +105,14 @@ def refuse_ablations(checkpoint: Checkpoint, path: Path) -> None:
     ):
         if got != wanted and (field, got) != ("light", "capture"):
             raise InputError(
-                f"an ablation, which is not exported: {field}", expected=wanted, got=got, file=path
+                f"an ablation, which is not exported: {field}", expected=wanted, got=got, file=checkpoint.file
             )
 
 
-def written(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
-    """The file of ``baked``, which has been :func:`reduced` to ``variant``; ``path`` is hashed."""
+def written(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
+    """The file of ``baked``, which has been :func:`reduced` to ``variant``."""
     poses = variant.window_poses or checkpoint.config.model.window_poses
-    metadata = _metadata(checkpoint, path, baked, variant)
+    metadata = _metadata(checkpoint, baked, variant)
     return build_model(nodes_by_place(baked), variant.precision, poses, {METADATA_KEY: metadata})
 
 
@@ -162,7 +165,7 @@ def random_motion(skeleton: Skeleton, *, frames: int, seed: int) -> Motion:
     )
 
 
-def _metadata(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: Variant) -> str:
+def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> str:
     skeleton, config = checkpoint.skeleton, checkpoint.config.model
     metadata = AvatarMetadata(
         schema=SCHEMA,
@@ -177,7 +180,7 @@ def _metadata(checkpoint: Checkpoint, path: Path, baked: BakedAvatar, variant: V
         ),
         trained_light=encode_light(checkpoint.probe.numpy()),
         body_license=str(checkpoint.info.get("body_license", "unknown")),
-        checkpoint_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        checkpoint_sha256=checkpoint.sha256,
         conventions=CONVENTIONS,
         generator=f"rnd-avatar {__version__}",
         variant=VariantMetadata(

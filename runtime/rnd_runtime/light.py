@@ -198,6 +198,10 @@ def texel_solid_angles(height: int, width: int) -> Floats:
     return np.broadcast_to(rows[:, None], (height, width)).copy()
 
 
+REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""what of linear R, G and B is luminance (ITU-R BT.709-6, section 3)"""
+
+
 def downsize(radiance: ArrayLike, height: int, width: int) -> Floats32:
     """``radiance`` [H, W, C] as the mean over each of ``height`` × ``width`` texels, weighted by solid angle.
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ._raster_input import floats, mask
 from .brdf import ggx32, roughness_to_alpha
 from .gaussians import Gaussians
-from .light import Light, texel_directions, texel_solid_angles
+from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles
 from .sh import sh_basis
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,6 @@ _ZERO = np.float32(0)
 _ONE_OVER_PI = np.float32(1 / np.pi)
 _HALF_FLOOR = np.float32(1e-8)  # |l + v|² where light and camera are opposite
 _CUT_TEXELS = (128, 256)  # the grid a median cut works on
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,7 @@ class DistantLights:
         """
         height, width = _CUT_TEXELS
         texel_flux = light.resized(height, width).radiance * texel_solid_angles(height, width)[..., None]
-        luminance = texel_flux @ _LUMINANCE
+        luminance = texel_flux @ REC709_LUMINANCE
         total = _summed_area(luminance)
         regions = [(-total[-1, -1], 0, height, 0, width)]  # a heap: the brightest region first
         done: list[tuple[float, int, int, int, int]] = []

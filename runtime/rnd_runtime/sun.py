@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .light import Light, texel_directions, texel_solid_angles
+from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles
 
 Floats = NDArray[np.float64]
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec.709
 _CAP = np.radians(6)  # a peak must fit into this radius: a sun with its glare, a softbox two metres away
 _RING = np.radians(10)  # its background is the median between _CAP and here
 _LARGEST = (512, 1024)  # a third of a degree a texel tells the direction; larger maps only cost memory
@@ -50,7 +49,7 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
     radiance = light.radiance.astype(np.float64)
     height, width = radiance.shape[:2]
     solid_angles = texel_solid_angles(height, width)[:, 0]
-    luminance = radiance @ _LUMINANCE
+    luminance = radiance @ REC709_LUMINANCE
     least = _LEAST_SHARE * float(luminance.sum(1) @ solid_angles)
     directions = texel_directions(height, width)
     suns: list[Sun] = []
@@ -60,12 +59,12 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
         if found is None:
             break
         sun, rows, sky = found
-        if not sun.irradiance @ _LUMINANCE >= max(least, 1e-30):
+        if not sun.irradiance @ REC709_LUMINANCE >= max(least, 1e-30):
             break
         radiance[rows] = sky
-        luminance[rows] = sky @ _LUMINANCE
+        luminance[rows] = sky @ REC709_LUMINANCE
         suns.append(sun)
-    suns.sort(key=lambda sun: -float(sun.irradiance @ _LUMINANCE))
+    suns.sort(key=lambda sun: -float(sun.irradiance @ REC709_LUMINANCE))
     return replace(light, radiance=radiance.astype(np.float32)), tuple(suns)
 
 
@@ -84,7 +83,7 @@ def _peak_around(
         sky = np.where(inside[..., None], np.minimum(radiance[rows], background), radiance[rows])
         sky = sky.astype(np.float32).astype(np.float64)
         flux = np.where(inside[..., None], (radiance[rows] - sky) * solid_angles[rows, None, None], 0)
-        weight = flux @ _LUMINANCE
+        weight = flux @ REC709_LUMINANCE
         mean = np.einsum("hw,hwc->c", weight, directions[rows])
         if not np.linalg.norm(mean) > 0:
             return None

@@ -16,6 +16,7 @@ def subject(tmp_path_factory):
     import torch
 
     from rnd_export.export import export
+    from rnd_trainer.checkpoint import load_checkpoint
     from rnd_trainer.stability.studio import write_studio
     from rnd_trainer.stability.subject import Subject
     from rnd_trainer.stability.trainings import train_small
@@ -28,7 +29,7 @@ def subject(tmp_path_factory):
     checkpoint = train_small(work / "run", capture, STEPS, GAUSSIANS)
     torch.set_num_threads(threads)
     avatar = work / "avatar.onnx"
-    export(checkpoint, avatar)
+    export(load_checkpoint(checkpoint), avatar)
     return Subject(avatar, checkpoint, capture, work, small=True, size=96)
 
 

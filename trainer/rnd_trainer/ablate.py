@@ -35,7 +35,7 @@ from .training_state import STATE_FILE, read_state
 ROWS = "rows.json"
 """of one run, in its folder"""
 MOTION = "motion"
-"""of a row: the file of the poses that were learned from and scored in"""
+"""of a row: the file of the poses that were scored in, and learned from unless the method says otherwise"""
 CAPTURE = "capture_sha256"
 """of a row: the digest of capture.json, which has the pictures of every split"""
 OLDER_LACK = (MOTION, CAPTURE)

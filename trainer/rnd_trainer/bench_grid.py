@@ -114,7 +114,7 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
         if sample is None:
             return distinct
         check_option(0 < sample < len(distinct), "--sample", f"1 to {len(distinct) - 1} points", sample)
-        return [usual, *islice(drawn(names), sample)]
+        return [usual, *islice(drawn(names, usual), sample)]
     if quick:
         factors = {"n": (4_000,), "shade": ("ao", "table"), "encoder": ("coarse", "static"), "threads": (1,),
                    "raster": ("gl-egl",)}  # fmt: skip
@@ -129,15 +129,15 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
     return list(dict.fromkeys(points))
 
 
-def drawn(names: Sequence[str], seed: int = 0) -> Iterator[Setting]:
-    """Combinations of those factors' values at random, none twice and never the usual one.
+def drawn(names: Sequence[str], usual: Setting, seed: int = 0) -> Iterator[Setting]:
+    """Combinations of those factors' values at random, none twice and never the ``usual`` one.
 
     Each factor goes through its values again and again, in another order each time, so that every stretch of points has
     about as many of each; a longer sample begins with a shorter one.
     """
     rng = np.random.default_rng(seed)
     waiting: dict[str, list[Any]] = {name: [] for name in names}
-    seen = {Setting()}
+    seen = {usual}
     while True:
         for name in names:
             if not waiting[name]:
@@ -200,7 +200,11 @@ def grid(
         forget(inputs.work)
     rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
     wanted, key = settings(quick, cross, sample), inputs.key()
-    here = {_key(row): row for row in rows if row["machine"] == machine() and row.get("inputs") == key}
+    here = {
+        _key(row): row
+        for row in rows
+        if row["machine"] == machine() and row.get("inputs") == key and "failed" not in row
+    }
     done: list[Row] = []
     left = sum(_key(asdict(setting)) not in here for setting in wanted)
     for setting in wanted:

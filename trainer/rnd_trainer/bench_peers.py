@@ -26,7 +26,8 @@ from rnd_runtime.projection_gl import GlProjection, Sorting
 from rnd_runtime.surfaces_gl import SurfaceUpload
 
 from .bench_clock import REPEATS, times
-from .bench_raster import Row, Scene, bench_raster, body_camera, body_scene
+from .bench_frame import bench_camera
+from .bench_raster import Row, Scene, bench_raster, body_scene
 from .checkpoint import load_checkpoint
 from .model import AvatarModel
 
@@ -42,7 +43,7 @@ def bench_peers(checkpoint: Path, avatar: Path, n: int, size: int, threads: int)
 
 def depth_order(n: int, size: int, threads: int) -> list[Row]:
     """Projecting and ordering the Gaussians of :func:`body_scene` on every OpenGL backend of this machine."""
-    gaussians, camera, rows = _gaussians(body_scene(n)), body_camera(size), []
+    gaussians, camera, rows = _gaussians(body_scene(n)), bench_camera(size), []
     backends: tuple[Backend, ...] = ("egl", "osmesa")
     for backend in backends:
         try:

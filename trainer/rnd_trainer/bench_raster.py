@@ -30,6 +30,7 @@ from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
 from .bench_clock import summary
+from .bench_frame import bench_camera
 from .bench_pass import one_call, three_calls
 
 Array = NDArray[np.float64]
@@ -112,14 +113,6 @@ def _distance_to_segment(points: Array, a: Array, b: Array) -> Array:
     return np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
 
 
-def body_camera(size: int) -> Camera:
-    """A square view of the person: 20° to the side, 1.75 m filling 70 % of the height."""
-    distance, angle = 3.4, np.radians(20)
-    eye = [distance * np.sin(angle), 0.9, distance * np.cos(angle)]
-    fov = 2 * np.arctan(0.5 * 1.75 / 0.7 / distance)
-    return Camera.look_at(eye, [0, 0.875, 0], width=size, height=size, fov_y=fov)
-
-
 class Result(NamedTuple):
     """Pictures of one call and, after a backward pass, its four gradients."""
 
@@ -137,7 +130,7 @@ def bench_raster(
     against the float64 oracle), grad_rel_l2 (the worst of the four gradients against the float64 reference; None
     for forward), threads, machine, warmup, repeats.
     """
-    return measure(body_scene(n), body_camera(size), repeats=repeats, threads=threads, warmup=warmup)
+    return measure(body_scene(n), bench_camera(size), repeats=repeats, threads=threads, warmup=warmup)
 
 
 def measure(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,13 +30,21 @@ _KEY = "rnd_checkpoint"
 
 @dataclass
 class Checkpoint:
-    """A trained avatar: the model, the probe it was lit by, its skeleton, and where it came from."""
+    """A trained avatar: the model, the probe it was lit by, its skeleton, and where it came from.
+
+    Attributes:
+        probe: [32, 64, 3] linear radiance.
+        info: what the training says of itself, see :meth:`rnd_trainer.train.Training.info`.
+        file, sha256: what it was read from.
+    """
 
     model: AvatarModel
-    probe: Tensor  # [32, 64, 3] linear radiance
+    probe: Tensor
     skeleton: Skeleton
     config: TrainConfig
     info: dict[str, Any]
+    file: Path
+    sha256: str
 
 
 def save_checkpoint(
@@ -78,7 +87,8 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
     if not all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point()):
         raise InputError("checkpoint", expected="finite numbers", got="NaN or infinity", file=path)
-    return Checkpoint(model, probe, skeleton, config, header.get("info", {}))
+    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    return Checkpoint(model, probe, skeleton, config, header.get("info", {}), Path(path), digest)
 
 
 def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:

@@ -52,7 +52,7 @@ class EvalOptions:
     json: Path | None = None
     """write the rows here as JSON"""
     pictures: Path | None = None
-    """folder for strips: truth, render, normals, albedo"""
+    """folder for strips: truth, render, normals, albedo, error"""
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds the LPIPS column"""
     shade: str = "table+sun"
@@ -153,9 +153,12 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
     from .train import REFINED_MOTION
 
     file = path.with_name(REFINED_MOTION).resolve()
-    folder = options.capture if is_folder(options.capture) else options.capture.parent
-    same = checkpoint.info.get("capture") == folder.resolve().name
-    if not (checkpoint.config.refine_poses and file.is_file() and same):
+    capture = options.capture / "capture.json" if is_folder(options.capture) else options.capture
+    if not (checkpoint.config.refine_poses and file.is_file() and capture.is_file()):
+        return None
+    named = checkpoint.info.get("capture") == capture.parent.resolve().name
+    digest = checkpoint.info.get("capture_sha256")  # checkpoints of before have none
+    if not (named if digest is None else digest == hashlib.sha256(capture.read_bytes()).hexdigest()):
         return None
     print(f"rnd-eval: poses of {file}, corrected in training; --motion takes others", file=sys.stderr)  # noqa: T201
     return str(file)

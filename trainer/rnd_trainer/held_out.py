@@ -104,11 +104,15 @@ def picture_names(images: Iterable[str]) -> dict[str, str]:
 def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
     """Size of an exported avatar in MB, and frames a second of the runtime from pose to pixels in memory.
 
-    Under the learned light, seen by the first held-out camera, over ``PLAYED`` consecutive poses; the median.
+    Under the learned light, shaded as it is judged, seen by the first held-out camera, over ``PLAYED`` consecutive
+    poses; the median.
     """
     frame = next(frame for split in HELD_OUT for frame in judge.capture.split(split))
     renderer = FrameRenderer(
-        Avatar.load(avatar), Light(judge.checkpoint.probe.numpy()), judge.capture.cameras[frame.camera]
+        Avatar.load(avatar),
+        Light(judge.checkpoint.probe.numpy()),
+        judge.capture.cameras[frame.camera],
+        shade=judge.mode,
     )
     seconds = []
     for k in range(PLAYED):

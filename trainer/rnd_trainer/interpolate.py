@@ -28,7 +28,6 @@ class NodeInterpolation(nn.Module):
         self.register_buffer("neighbours", neighbours)
         self.register_buffer("weights", weights)
         self._transpose = _transpose(neighbours.numpy(), nodes)
-        self._nodes = nodes
 
     def forward(self, values: Tensor) -> Tensor:
         if values.is_cuda or values.dtype != torch.float32:  # the compiled kernels are for CPU training

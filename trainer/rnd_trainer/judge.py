@@ -33,7 +33,10 @@ def to_gaussians(posed: Posed, pose: PoseInput) -> Gaussians:
 
 @dataclass
 class Rendered:
-    """What the player would show, before any background: premultiplied linear image, camera normals, albedo, alpha."""
+    """What the player would show, before any background; all but ``alpha`` [H, W] is premultiplied by it.
+
+    ``image`` [H, W, 3] linear radiance, ``normals`` [H, W, 3] in the camera's axes, ``albedo`` [H, W, 3] linear.
+    """
 
     image: Tensor
     normals: Tensor

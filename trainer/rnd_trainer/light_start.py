@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rnd_runtime.images import srgb_to_linear
-from rnd_runtime.light import texel_directions, texel_solid_angles
+from rnd_runtime.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
 
 from .data import View
 from .light import PROBE_SHAPE, natural_sky
@@ -77,7 +77,6 @@ OCCLUSION = 0.03
 """metres by which a point may lie behind the first surface and still be the one that is seen"""
 REFLECTANCE = 0.22
 """share of the light that people give back, on average: a photographer's grey card, 18 %, and 4 % at the surface"""
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 @dataclass
@@ -131,8 +130,8 @@ def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseI
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
     radiance[near[np.array(suns, int) - SKY_LOBES]] += strength[SKY_LOBES:]
     exposure = _spread(coarse.mean(0) / wide_angles) * solid_angles
-    level = (seen.colour @ _LUMINANCE).mean() / REFLECTANCE
-    radiance *= level / ((radiance @ _LUMINANCE) @ exposure)
+    level = (seen.colour @ REC709_LUMINANCE).mean() / REFLECTANCE
+    radiance *= level / ((radiance @ REC709_LUMINANCE) @ exposure)
     return FirstLight(
         radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32),
         exposure.reshape(PROBE_SHAPE).astype(np.float32),
@@ -238,7 +237,7 @@ class Quadratic:
 def _by_brightness(seen: Sightings) -> Floats:
     """Weights [n] that are each point's mean luminance: an error of a dark point is a small one."""
     count = np.maximum(np.bincount(seen.who), 1)
-    return (np.bincount(seen.who, seen.colour @ _LUMINANCE) / count)[seen.who]
+    return (np.bincount(seen.who, seen.colour @ REC709_LUMINANCE) / count)[seen.who]
 
 
 def _quadratic(seen: Sightings, transport: NDArray[np.float32], weight: Floats) -> Quadratic:
@@ -267,10 +266,10 @@ def _strengths(seen: Sightings, columns: NDArray[np.float32]) -> Floats:
     """Strengths [Q, 3] of the sky's lobes and the suns that leave the least absolute error of log colours."""
     everything = list(range(columns.shape[1]))
     _, strength = _quadratic(seen, columns, _by_brightness(seen)).fit(everything)
-    colour = np.log(np.maximum(seen.colour @ _LUMINANCE, 1e-4))
+    colour = np.log(np.maximum(seen.colour @ REC709_LUMINANCE, 1e-4))
     count, weight = int(seen.who.max()) + 1, np.ones(len(colour))
     for _ in range(REWEIGHTINGS):
-        light = columns @ (strength @ _LUMINANCE)
+        light = columns @ (strength @ REC709_LUMINANCE)
         light = np.maximum(light / light.mean(), 1e-3)
         total = np.bincount(seen.who, weight * (colour - np.log(light)), count)
         albedo = total / np.maximum(np.bincount(seen.who, weight, count), 1e-12)

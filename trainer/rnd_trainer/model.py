@@ -72,7 +72,11 @@ class Attributes:
 
 @dataclass
 class Posed:
-    """Posed Gaussians, world frame; visibility [N, 16] in the root's frame; the rest feeds the regularisers."""
+    """Posed Gaussians, world frame: means [N, 3] m, covariances [N, 6] m², normals [N, 3] unit.
+
+    visibility [N, 16] in the root's frame; skinning weights [N, J] and the pose's offset [N, 3] m feed the
+    regularisers.
+    """
 
     means: Tensor
     covariances: Tensor

@@ -28,9 +28,9 @@ def frame_scores(
 
     ``psnr, ssim, lpips`` of the sRGB picture on black, in the full frame and (``*_box``) in the mask's bounding
     box: the full frame is nine tenths background, so its figures flatter everybody. ``psnr_n, ssim_n`` of normal
-    pictures (n + 1)/2, ``normal_deg`` the mean angle, both where the truth has normals; ``psnr_albedo`` in the
-    mask, sRGB, after ``scale`` [3]. ``lpips_inner`` has the outline from the truth; ``outline_px`` is the area that
-    coverage is wrong by, per length of outline.
+    pictures (n + 1)/2, ``normal_deg`` the mean angle, both where the truth has normals; ``psnr_albedo`` of sRGB, after
+    ``scale`` [3], where mask and render both cover more than half. ``lpips_inner`` has the outline from the truth;
+    ``outline_px`` is the area that coverage is wrong by, per length of outline.
     """
     target, mask = torch.from_numpy(truth.image_srgb).float(), torch.from_numpy(truth.mask)
     image = to_srgb8(rendered.image)

@@ -92,6 +92,7 @@ class Training:
         self.optimizer = self._optimizer()
         self.step_index = 0
         self.bad_steps = 0
+        self.lit = False  # whether the second stage has begun
         self.seconds = 0.0
 
     # -- one step ------------------------------------------------------------------------------------------
@@ -105,7 +106,7 @@ class Training:
         started = time.perf_counter()
         draws = self.generator.get_state()
         config = self.config
-        period = math.lcm(config.lpips_every, config.consistency_every)
+        period = math.lcm(config.lpips_every, config.consistency_every, config.repulsion_every)
         dearest = (config.steps - 1) // period * period  # all terms are due in it
         stage = 1 if config.light == "none" else 2
         terms = self.objective(self.model, self.views[0], self.poses[0], dearest, stage)
@@ -120,10 +121,8 @@ class Training:
     def step(self) -> Step:
         """Optimise on the next picture. Raises :class:`InputError` after ten non-finite steps in a row."""
         started = time.perf_counter()
+        self._light_up()
         stage = self.stage
-        if stage == 2 and self.step_index == self.stage1_steps:
-            self._start_albedo_from_colour()
-            self._start_light()
         self._set_rates()
         view_index = self._next_view()
         view, pose = self.views[view_index], self.poses[view_index]
@@ -147,8 +146,16 @@ class Training:
             self.step_index, stage, {name: float(value.detach()) for name, value in terms.items()}, not finite
         )
         self.step_index += 1
+        self._light_up()  # now, so that what is saved and shown after the first stage is lit
         self.seconds += time.perf_counter() - started
         return done
+
+    def _light_up(self) -> None:
+        """Begin the second stage, once: albedo from the colours of the first, and a light."""
+        if self.stage == 2 and not self.lit:
+            self._start_albedo_from_colour()
+            self._start_light()
+            self.lit = True
 
     def _picture_terms(self, view: View, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         refinement = self.refinement if self.step_index >= self._refine_from else None
@@ -279,12 +286,11 @@ class Training:
     # -- saving and resuming -------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
-        """Write the resumable state, then the avatar."""
+        """Write the resumable state, then the avatar, then the poses that it was corrected by."""
         tensors = {f"model.{k}": v.cpu().contiguous() for k, v in self.model.state_dict().items()}
         tensors |= {f"probe.{k}": v.cpu().contiguous() for k, v in self.probe.state_dict().items()}
         if self.refinement is not None:
             tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
-            save_motion(folder / REFINED_MOTION, self.motion())
         if self.unseen is not None:
             taught = self.unseen.taught.state_dict()
             tensors |= {f"taught.{k}": v.cpu().contiguous() for k, v in taught.items()}
@@ -297,6 +303,7 @@ class Training:
             "step": self.step_index,
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
+            "lit": self.lit,
             "perceptual_sha256": self._perceptual_sha256(),
             "learned_from_sha256": self._learned_from_sha256,
         }
@@ -309,6 +316,8 @@ class Training:
             self.config,
             self.info(),
         )
+        if self.refinement is not None:
+            save_motion(folder / REFINED_MOTION, self.motion())
 
     def resume(self, path: Path) -> None:
         """Continue from a saved state as if never stopped.
@@ -338,6 +347,8 @@ class Training:
             self.generator.set_state(saved.tensors["generator"])
             self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
             self.bad_steps = int(header["bad_steps"])
+            # before states said so, the second stage began with its first step
+            self.lit = bool(header.get("lit", self.step_index > self.stage1_steps))
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
@@ -374,6 +385,7 @@ class Training:
         """Provenance for the checkpoint."""
         return {
             "capture": self.capture.folder.resolve().name,
+            "capture_sha256": hashlib.sha256(self.capture.file.read_bytes()).hexdigest(),
             "body_license": self.capture.body.license,
             "step": self.step_index,
             "minutes": round(self.seconds / 60, 3),
@@ -389,7 +401,8 @@ def run(
 ) -> bool:
     """Train to the last step after a rehearsal, saving every ``save_every`` steps and at the end.
 
-    Ctrl-C finishes the step in hand, saves, and returns True: resuming continues the very same curve.
+    Ctrl-C finishes the step in hand, saves, and returns True where steps are left: resuming continues the very same
+    curve.
     """
     config = training.config
     if training.step_index < config.steps:
@@ -414,7 +427,7 @@ def run(
             if training.step_index % config.preview_every == 0 or training.step_index == training.total_steps:
                 on_preview()
         training.save(folder)
-        return interrupted()
+        return interrupted() and training.step_index < training.total_steps
 
 
 def _keep_until(path: Path, step: int) -> TextIO:

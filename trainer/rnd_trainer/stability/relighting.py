@@ -10,7 +10,15 @@ import numpy as np
 from rnd_runtime.brdf import F0, LARGEST_ALBEDO, ROUGHNESS_RANGE, specular
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.images import write_image
-from rnd_runtime.light import Light, Up, downsize, load_light, texel_directions, texel_solid_angles
+from rnd_runtime.light import (
+    REC709_LUMINANCE,
+    Light,
+    Up,
+    downsize,
+    load_light,
+    texel_directions,
+    texel_solid_angles,
+)
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.sh import SH_COUNT
 from rnd_runtime.shading import Shader
@@ -324,7 +332,7 @@ def monochrome_probe(subject: Subject) -> Result:
             colour
         )
     light = Light((0.05 + lamps).astype(np.float32))
-    grey = light.radiance @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    grey = light.radiance @ REC709_LUMINANCE.astype(np.float32)
     one = Light(np.repeat(grey[..., None], 3, axis=2)).resized(32, 64)
     truth = subject.picture(subject.rest, shader=Shader(light, "brute", texels=(64, 128)))
     ours = subject.picture(subject.rest, shader=Shader(light.resized(32, 64), "brute"))

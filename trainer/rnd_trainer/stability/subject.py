@@ -19,6 +19,7 @@ from rnd_runtime.images import to_bytes
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion, save_motion
 from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.raster_oracle import symmetric
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import bone_transforms
@@ -159,7 +160,7 @@ class Subject:
         rest, blend = self.rest, self.blend(motion, time)
         linear = blend[:, :, :3]
         means = np.einsum("nrc,nc->nr", linear, rest.means) + blend[:, :, 3]
-        full = rest.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        full = symmetric(rest.covariances)
         moved = (linear @ full @ linear.transpose(0, 2, 1)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
         normals = np.einsum("nrc,nc->nr", linear, rest.normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)

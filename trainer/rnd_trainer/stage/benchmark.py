@@ -20,7 +20,7 @@ from rnd_trainer.ablate import VARIANTS, ablate, summarise
 from rnd_trainer.config import preset, resized
 from rnd_trainer.perceptual import Perceptual
 
-from .film import film, keep_recipe, prepare
+from .film import film, prepare, recipe_for
 from .manifest import finish
 from .plan import BenchmarkOptions, missing, picture_count
 
@@ -37,8 +37,8 @@ def film_subjects(
     done, total = 0, None
     for subject in range(options.subjects):
         place = folder / f"subject{subject}"
-        keep_recipe(options.recipe(subject), place)
         if (place / "capture.json").exists():
+            recipe_for(options.recipe(subject), place)
             continue
         production = prepare(options.recipe(subject), place)
         fresh = [shot for shot in production.shots if missing(place, shot, False)]
@@ -49,13 +49,25 @@ def film_subjects(
             done += 1
             on_picture(done, expected)
 
-        spent = film(production, place, on_picture=count)
-        pictures = picture_count(fresh)
-        cost = {
-            "pictures": pictures, **dataclasses.asdict(spent), "variant": variant, "machine": machine(),
-        }  # fmt: skip
-        write_json(place / COST_FILE, cost)
-        finish(production, place, variant, spent.cpu_seconds / max(pictures, 1))
+        started, started_cpu = time.perf_counter(), time.process_time()
+        try:
+            film(production, place, on_picture=count)
+        finally:  # what an interrupted session filmed is there, and was paid for
+            pictures = picture_count([shot for shot in fresh if not missing(place, shot, False)])
+            spent = {
+                "pictures": pictures,
+                "seconds": time.perf_counter() - started,
+                "cpu_seconds": time.process_time() - started_cpu,
+            }
+            cost = _added(place / COST_FILE, spent) | {"variant": variant, "machine": machine()}
+            write_json(place / COST_FILE, cost)
+        finish(production, place, variant, cost["cpu_seconds"] / max(cost["pictures"], 1))
+
+
+def _added(file: Path, spent: dict[str, float]) -> dict[str, Any]:
+    """``spent`` with what earlier sessions left in ``file``."""
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    return {name: value + before.get(name, 0) for name, value in spent.items()}
 
 
 def run_benchmark(

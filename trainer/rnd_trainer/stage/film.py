@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from .dressing import Dressed, Wearer
 from .estimates import estimated_mask, estimated_normals
 from .lights import WHITE, StageLight, module_directions, stage_lights
 from .plan import Recipe, Shot
-from .render import Set, Truth
+from .render import MASK_FLOOR, Set, Truth
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
     for what, file in (("motion", recipe.motion), ("character", recipe.character)):
         if file is not None:
             existing_file(Path(file), what=what)
-    keep_recipe(recipe, folder)
+    mine = recipe_for(recipe, folder)
     dressed, title = _cast(recipe, template)
     motion = dance(dressed.body.skeleton)
     if recipe.motion is not None:
@@ -80,6 +81,7 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
     frames = plans.instants(recipe, motion.frame_count)
     if len(frames) < 5:
         raise InputError("motion", expected="at least 5 frames", got=motion.frame_count, file=motion.source)
+    write_json(folder / RECIPE_FILE, mine)  # now that it can be filmed
     names = [light.name for light in lights]
     shots = plans.plan(recipe, frames, list(ring_cameras(recipe.cameras, recipe.size)), names)
     return Production(recipe, dressed, title, motion, frames, lights, shots)
@@ -143,7 +145,7 @@ def _shoot(production: Production, stage: Set, shot: Shot, folder: Path) -> None
 
 
 def _write_truth(folder: Path, shot: Shot, truth: Truth, recipe: Recipe) -> None:
-    place, covered = shot.place, (truth.coverage >= 0.05)[..., None]
+    place, covered = shot.place, (truth.coverage >= MASK_FLOOR)[..., None]
     write_image(folder / f"masks/{place}.png", to_bytes(truth.coverage))
     write_image(folder / f"normals_gt/{place}.png", to_bytes(0.5 * (truth.normals + 1) * covered))
     write_image(folder / f"albedo/{place}.png", to_bytes(linear_to_srgb(np.clip(truth.albedo, 0, 1))))
@@ -157,8 +159,11 @@ def _write_truth(folder: Path, shot: Shot, truth: Truth, recipe: Recipe) -> None
         write_image(folder / f"masks_estimated/{place}.png", to_bytes(mask))
 
 
-def keep_recipe(recipe: Recipe, folder: Path) -> None:
-    """Write the recipe, or hold it against the one that is there."""
+def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
+    """The recipe as JSON has it.
+
+    Raises :class:`InputError` where ``folder`` holds another one's pictures.
+    """
     file = output_folder(folder) / RECIPE_FILE
     mine = json.loads(json.dumps(asdict(recipe)))
     if file.exists():
@@ -174,8 +179,7 @@ def keep_recipe(recipe: Recipe, folder: Path) -> None:
                 file=file,
                 hint="or another OUT",
             )
-        return
-    write_json(file, mine)
+    return mine
 
 
 def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:
