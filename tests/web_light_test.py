@@ -128,11 +128,34 @@ def test_files_cut_anywhere_are_refused(tmp_path, order):
         assert "refused" in _page(tmp_path / "cut.exr"), length
 
 
-def _hdr(path: Path) -> bytes:
+def _hdr(path: Path, radiance: np.ndarray = RADIANCE) -> bytes:
     target = oiio.ImageOutput.create(str(path))
     assert target.open(str(path), oiio.ImageSpec(2 * HEIGHT, HEIGHT, 3, "float"))
-    assert target.write_image(RADIANCE.astype(np.float32)) and target.close()
+    assert target.write_image(radiance.astype(np.float32)) and target.close()
     return path.read_bytes()
+
+
+def test_radiance_files_cut_anywhere_are_refused(tmp_path):
+    radiance, file = RADIANCE.copy(), tmp_path / "cut.hdr"
+    radiance[-1, ::2] = 0.1  # exponents that differ: the last line ends with a literal, not with a run
+    whole = _hdr(tmp_path / "sky.hdr", radiance)
+    for length in (*range(0, 200, 7), 3000, len(whole) - 30, len(whole) - 1):
+        file.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            load_light(file)
+        assert "refused" in _page(file), length
+    assert _page(file)["refused"] == "the .hdr file is cut short"
+
+
+@pytest.mark.parametrize("kind", ["run", "bytes"])
+def test_radiance_files_whose_lines_are_overrun_are_refused(tmp_path, kind):
+    whole, file = _hdr(tmp_path / "sky.hdr"), tmp_path / "long.hdr"
+    first = whole.index(b"\n", whole.index(b"\n\n") + 2) + 1 + 4  # of the codes of the first line
+    longer = {"run": b"\xff\x80", "bytes": b"\x80" + bytes(128)}[kind]
+    file.write_bytes(whole[:first] + 3 * longer + whole[first:])
+    with pytest.raises(InputError):
+        load_light(file)
+    assert _page(file)["refused"] == "the .hdr file: expected runs that end with their line, got a longer one"
 
 
 def test_radiance_files_with_the_line_ends_of_windows(tmp_path):

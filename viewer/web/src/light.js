@@ -48,21 +48,24 @@ function readHdr(bytes) {
 /** One scanline into `row`, plane by plane; where the next one starts. */
 function readScanline(bytes, at, width, row) {
   const coded = bytes[at] === 2 && bytes[at + 1] === 2 && bytes[at + 2] * 256 + bytes[at + 3] === width;
+  const need = (count) => { if (at + count > bytes.length) throw new Error("the .hdr file is cut short"); };
   if (!coded) {
-    if (at + 4 * width > bytes.length) throw new Error("the .hdr file is cut short");
+    need(4 * width);
     for (let x = 0; x < width; x++) for (let c = 0; c < 4; c++) row[c * width + x] = bytes[at + 4 * x + c];
     return at + 4 * width;
   }
   at += 4;
   for (let filled = 0; filled < 4 * width;) {
-    if (at + 1 >= bytes.length) throw new Error("the .hdr file is cut short");
-    const length = bytes[at++];
-    if (length > 128) row.fill(bytes[at++], filled, filled += length - 128);
+    need(2);
+    const code = bytes[at++], run = code > 128, length = run ? code - 128 : code;
+    if (filled + length > 4 * width)
+      throw refusal("the .hdr file", { expected: "runs that end with their line", got: "a longer one" });
+    if (run) row.fill(bytes[at++], filled, filled + length);
     else {
-      row.set(bytes.subarray(at, at + length), filled);
-      at += length;
-      filled += length;
+      need(length);
+      row.set(bytes.subarray(at, at += length), filled);
     }
+    filled += length;
   }
   return at;
 }
