@@ -19,6 +19,7 @@ import numpy as np
 import onnx
 import OpenImageIO as oiio
 import pytest
+from onnx import numpy_helper
 from PIL import Image
 
 from browser import CHROMIUM, PATIENCE, Page, chromium
@@ -97,6 +98,7 @@ def site(tmp_path_factory) -> Path:
     _write_avatar(folder / "stranger.onnx", _rename)
     _write_avatar(folder / "later.onnx", lambda about: about.update(hair=1))
     _write_avatar(folder / "joined.onnx", lambda about: about["skeleton"].pop("parents"))
+    _write_broken_avatar(folder / "holes.onnx")
     broken_trans = first.translations.copy()
     broken_trans[7, 1] = np.nan
     np.savez(folder / "nan.npz", poses=np.zeros((31, 72)), trans=broken_trans)
@@ -112,6 +114,23 @@ def _write_avatar(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     about = json.loads(entry.value)
     change(about)
     entry.value = json.dumps(about)
+    onnx.save(model, path)
+
+
+def _write_broken_avatar(path: Path) -> None:
+    """The embedded avatar, a sixth of its Gaussians of no use: each has one number that is not finite, or no extent."""
+    model = onnx.load(ASSETS / "avatar.onnx")
+    arrays = {entry.name: numpy_helper.to_array(entry).copy() for entry in model.graph.initializer}
+    arrays["rest/rest_points"][0::36, 1] = np.nan
+    arrays["rest/rest_points"][6::36] = np.inf
+    arrays["rest/rest_factors"][12::36, 4] = np.nan
+    arrays["rest/rest_factors"][18::36] = 0
+    for floor in (arrays["pose_gaussians/floor"], arrays["rest/posing_limits"][1:2]):
+        floor[:] = 0  # which would be an extent
+    arrays["rest/opacities"][24::36] = np.inf
+    arrays["rest/albedo"][30::36, 2] = np.nan
+    for entry in model.graph.initializer:
+        entry.CopyFrom(numpy_helper.from_array(arrays[entry.name], entry.name))
     onnx.save(model, path)
 
 
@@ -311,6 +330,26 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         _assert_agreed(loaded, got, scene)
         seen.add(got.tobytes())
     assert len(seen) == len(states)
+    scene.close()
+
+
+def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receive_shadows(fresh, site):
+    _drop(fresh, "holes.onnx", "walk.npz", "sky.exr")
+    avatar, sky = site / "holes.onnx", site / "sky.exr"
+    scene = Scene(ViewOptions(avatar, site / "walk.npz", (sky,), size=SIZE, raster="cpu"))
+    straight = {"time": 0.4, "light": 1, "shade": "table+sun", "output": "light", "gaussians": None}
+    straight |= {"width": SIZE, "height": SIZE}
+    states: list[dict[str, Any]] = [
+        {},  # of one albedo: the suns' shadows alone
+        {"yaw": 2.0, "azimuth": 0.8},
+        {"gaussians": 5000},
+        {"shade": "lights:16", "output": "lit"},
+        {"output": "albedo"},
+    ]
+    for changes in states:
+        got = _picture(fresh, **(straight | changes))
+        assert got.any()
+        _assert_agreed(fresh, got, scene)
     scene.close()
 
 

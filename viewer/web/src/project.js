@@ -10,6 +10,7 @@ const RADIX = 11, DIGITS = 1 << RADIX;
 /**
  * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
  * front to back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
+ * A Gaussian with a number that is not finite, or of no extent, is not drawn: NaN fails every guard.
  */
 export function project({ means, covariances, opacities }, count, features, camera, grown) {
   const { rotation: r, translation: t, focal, width, height } = camera;
@@ -21,7 +22,8 @@ export function project({ means, covariances, opacities }, count, features, came
     const mx = means[3 * i], my = means[3 * i + 1], mz = means[3 * i + 2], opacity = opacities[i];
     const x = r[0] * mx + r[1] * my + r[2] * mz + t[0], y = r[3] * mx + r[4] * my + r[5] * mz + t[1];
     const z = r[6] * mx + r[7] * my + r[8] * mz + t[2];
-    if (!(z >= NEAR && z < Infinity && opacity >= 1 / 255)) continue;
+    const trace = covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5];
+    if (!(z >= NEAR && z < Infinity && opacity >= 1 / 255 && opacity < Infinity && trace > 0 && trace < Infinity)) continue;
     const slopeX = Math.min(Math.max(x / z, -limitX), limitX), slopeY = Math.min(Math.max(y / z, -limitY), limitY);
     const scale = focal / z;
     const a0 = scale * (r[0] - slopeX * r[6]), a1 = scale * (r[1] - slopeX * r[7]), a2 = scale * (r[2] - slopeX * r[8]);
@@ -40,6 +42,7 @@ export function project({ means, covariances, opacities }, count, features, came
     const top = Math.max(centerY - reachY, 0), bottom = Math.min(centerY + reachY, height - 1);
     if (!(left < width && top < height && right >= 0 && bottom >= 0)) continue;
     if (Math.floor(left) > Math.floor(right) || Math.floor(top) > Math.floor(bottom)) continue;
+    if (!Number.isFinite(features[3 * i] + features[3 * i + 1] + features[3 * i + 2])) continue;
     boxes.set([left / TILE, top / TILE, right / TILE, bottom / TILE], 4 * i);  // whole tiles: what is stored is cut off
     const column = Math.floor(centerX - 0.5), row = Math.floor(centerY - 0.5);
     records.set([column, row, centerX - 0.5 - column, centerY - 0.5 - row, shear, HALF_LOG2_E / pyy, HALF_LOG2_E / conditional,

@@ -23,20 +23,25 @@ function discRadii({ covariances, opacities }, count, grown) {
     ? DISC_SIGMAS * Math.sqrt(sum3(variance(6 * i), variance(6 * i + 3), variance(6 * i + 5)) / 2) : 0);
 }
 
+/** Visibility [count]; a Gaussian with a number that is not finite neither casts nor receives. */
 function sunVisibility(direction, { means, normals }, count, radii) {
   const frame = frameOf(direction), position = new Float32Array(3 * count), normal = new Float32Array(3 * count);
   const visibility = new Float32Array(count), lower = [Infinity, Infinity], upper = [-Infinity, -Infinity];
-  for (let i = 0; i < count; i++)
+  for (let i = 0; i < count; i++) {
+    const mx = means[3 * i], my = means[3 * i + 1], mz = means[3 * i + 2];
+    const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];
+    if (!Number.isFinite(mx + my + mz + nx + ny + nz + radii[i])) continue;  // its normal stays 0, which faces no light
     for (let axis = 0; axis < 3; axis++) {
       const [fx, fy, fz] = frame[axis], k = 3 * i + axis;
-      position[k] = sum3(f(fx * means[3 * i]), f(fy * means[3 * i + 1]), f(fz * means[3 * i + 2]));
-      normal[k] = sum3(f(fx * normals[3 * i]), f(fy * normals[3 * i + 1]), f(fz * normals[3 * i + 2]));
+      position[k] = sum3(f(fx * mx), f(fy * my), f(fz * mz));
+      normal[k] = sum3(f(fx * nx), f(fy * ny), f(fz * nz));
       if (axis < 2) {
         lower[axis] = Math.min(lower[axis], position[k]);
         upper[axis] = Math.max(upper[axis], position[k]);
       }
     }
-  const spans = [f(upper[0] - lower[0]), f(upper[1] - lower[1])], extent = Math.max(...spans);
+  }
+  const spans = [0, 1].map((axis) => f(Math.max(upper[axis] - lower[axis], 0))), extent = Math.max(...spans);
   const texel = f((extent > 0 ? extent : 1) / (RESOLUTION - 3));  // centres at integers, one empty row all around
   const [width, height] = spans.map((span) => Math.floor(f(span / texel)) + 3);
   const map = { depth: new Float32Array(width * height).fill(-Infinity), width, height, texel };
