@@ -473,6 +473,22 @@ def test_a_motion_that_does_not_fit_keeps_the_avatar_out_until_another_comes(fre
     assert _picture(fresh, width=SIZE, height=SIZE).any()
 
 
+def test_the_slider_keeps_its_share_of_another_avatars_gaussians(fresh, site, tiny_avatar):
+    (site / "tiny.onnx").symlink_to(tiny_avatar)
+    _drop(fresh, "avatar.onnx", "walk.npz")
+    fresh.run("""
+        const slider = document.getElementById("gaussians");
+        slider.value = 20;
+        slider.dispatchEvent(new Event("input"));
+    """)
+    for name in ("tiny.onnx", "avatar.onnx"):
+        assert _drop(fresh, name) == ""
+        assert fresh.run("rnd.state.gaussians") == fresh.run("rnd.scene().gaussians") / 5
+    fresh.run("slider.value = 100; slider.dispatchEvent(new Event('input'))")
+    assert _drop(fresh, "tiny.onnx") == ""
+    assert fresh.run("rnd.state.gaussians") is None
+
+
 def test_a_refused_drop_changes_nothing(fresh):
     _drop(fresh, "avatar.onnx", "walk.npz")
     scene = fresh.run("rnd.scene()")

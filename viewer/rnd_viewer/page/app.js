@@ -152,10 +152,17 @@ function setScene(description) {
   freeClip();
   state.time = Math.min(state.time, scene.motion.duration);
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
+  setGaussians();
   if (first) Object.assign(state, { width: scene.size, height: scene.size });
   if (moved) home();
   $("notes").textContent = scene.notes.join(" · ");
   redraw();
+}
+
+/** As many as the slider's share of this avatar's. */
+function setGaussians() {
+  const percent = Number($("gaussians").value);
+  state.gaussians = percent < 100 ? Math.max(Math.round(scene.gaussians * percent / 100), 1) : null;
 }
 
 async function setTruth() {
@@ -228,9 +235,7 @@ function bind() {
   slider("yaw", (degrees) => { state.yaw = wrapped(degrees * RADIANS); });
   slider("exposure", (stops) => { state.exposure = stops; });
   slider("size", (pixels) => { state.width = state.height = pixels; });
-  slider("gaussians", (percent) => {
-    state.gaussians = percent < 100 ? Math.max(Math.round(scene.gaussians * percent / 100), 1) : null;
-  });
+  slider("gaussians", setGaussians);
   slider("time", (seconds) => { state.time = seconds; play(false); });
   for (const name of ["shade", "background"])
     $(name).addEventListener("change", () => { state[name] = $(name).value; redraw(); });
