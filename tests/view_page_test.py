@@ -201,6 +201,19 @@ def test_screenshot_and_clip_are_downloads(page, tmp_path):
     assert files[".mp4"].stat().st_size > 10_000
 
 
+def test_a_clip_has_no_more_frames_than_screens_show(page):
+    page.run("""
+        rnd.scene().motion.fps = 120;
+        window.asked = [];
+        const { send } = WebSocket.prototype;
+        WebSocket.prototype.send = function (text) { asked.push(JSON.parse(text)); send.call(this, text); };
+        document.getElementById("clip").click();
+    """)
+    page.wait("!document.getElementById('clip').disabled")
+    assert page.run("asked.filter(({ ask }) => ask === 'clip').map(({ fps }) => fps)") == [60]
+    page.run("WebSocket.prototype.send = send; rnd.scene().motion.fps = 30")
+
+
 def test_with_a_token_and_in_jpeg(page, scene):
     exact = _picture(page, f"width: {SIZE}, height: {SIZE}, time: 0.5").astype(int)
     back = page.run("location.href")

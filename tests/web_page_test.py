@@ -14,6 +14,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import av
 import msgspec
 import numpy as np
 import onnx
@@ -71,6 +72,10 @@ def site(tmp_path_factory) -> Path:
     walk = load_motion(ASSETS / "walk.npz", avatar.skeleton)
     first = replace(walk, rotations=walk.rotations[:31], translations=walk.translations[:31])
     save_motion(folder / "walk.npz", first)
+    fast = replace(walk, rotations=walk.rotations[:61], translations=walk.translations[:61], fps=120.0)
+    save_motion(folder / "fast.npz", fast)
+    slow = replace(walk, rotations=walk.rotations[:21], translations=walk.translations[:21], fps=10.0)
+    save_motion(folder / "slow.npz", slow)
     rng = np.random.default_rng(3)
     # AMASS' SMPL-H: Z up, joints by number, fingers beside
     poses = np.zeros((8, 52, 3))
@@ -383,15 +388,44 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
     _drop(loaded, "walk.npz")
 
 
-def test_the_clip_is_a_download(loaded, tmp_path):
-    loaded.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    loaded.run("Object.assign(rnd.state, {width: 128, height: 128}); document.getElementById('clip').click()")
-    loaded.wait("!document.getElementById('clip').disabled")
+def _clip(page: Page, folder: Path, size: int) -> Path:
+    """The clip of ``size``² pixels that the page offers as a download to ``folder``."""
+    page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
+    page.run(f"Object.assign(rnd.state, {{ width: {size}, height: {size} }})")
+    page.run("document.getElementById('clip').click()")
+    page.wait("!document.getElementById('clip').disabled")
     until = time.monotonic() + PATIENCE
-    while not (files := [file for file in tmp_path.iterdir() if file.stem == "clip"]):
-        assert time.monotonic() < until, loaded.run("document.getElementById('message').textContent")
+    while not (files := [file for file in folder.iterdir() if file.stem == "clip"]):
+        assert time.monotonic() < until, page.run("document.getElementById('message').textContent")
         time.sleep(0.05)
-    assert files[0].suffix in (".webm", ".mp4") and files[0].stat().st_size > 5_000
+    return files[0]
+
+
+def test_the_clip_is_a_download(loaded, tmp_path):
+    file = _clip(loaded, tmp_path, 128)
+    assert file.suffix in (".webm", ".mp4") and file.stat().st_size > 5_000
+
+
+def test_a_clip_lasts_as_long_as_its_motion_though_timers_are_late(fresh, tmp_path):
+    _drop(fresh, "avatar.onnx", "slow.npz")
+    fresh.run("const timer = setTimeout; window.setTimeout = (done, ms) => timer(done, Math.max(ms, 0) + 50)")
+    with av.open(str(_clip(fresh, tmp_path, 64))) as clip:
+        times = [frame.time for frame in clip.decode(video=0)]
+    assert times[-1] - times[0] == pytest.approx(2, abs=0.4)  # 3 if the lateness of 21 frames adds up
+
+
+def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_held(fresh, tmp_path):
+    _drop(fresh, "avatar.onnx", "fast.npz")
+    fresh.run("""
+        const message = document.getElementById("message"), { close } = ImageBitmap.prototype;
+        let closed = 0;
+        ImageBitmap.prototype.close = function () { closed += 1; close.call(this); };
+        window.said = [];
+        new MutationObserver(() => said.push([message.textContent, closed])).observe(message, { childList: true });
+    """)
+    _clip(fresh, tmp_path, 64)
+    progress = [(text, closed) for text, closed in fresh.run("said") if text.endswith(" of 16")]
+    assert progress == [(f"making a clip: {done} of 16", done) for done in range(1, 17)]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import { connect } from "./engine.js";
 import { orbit, wrapped } from "./orbit.js";
 
 const IN_FLIGHT = 2;  // one picture is drawn while the next is made
+const MOST_CLIP_FPS = 60;  // what most screens show; motions have 120
 const RADIANS = Math.PI / 180;
 const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
 const $ = (id) => document.getElementById(id);
@@ -215,7 +216,7 @@ function clip() {
   freeClip();
   say("making a clip …");
   const turn = $("turntable").checked ? 2 * Math.PI : 0;
-  const fps = Math.min(Math.max(scene.motion.fps, 1), 240);
+  const fps = Math.min(Math.max(scene.motion.fps, 1), MOST_CLIP_FPS);
   engine.clip({ ...state }, fps, turn, scene.motion.duration);
 }
 

@@ -1,6 +1,8 @@
 // The pictures come from a worker of this page: nothing is asked of any server once the files are here.
 
 const MOST_CLIP_FRAMES = 900;
+const MOST_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
+const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder; it halves the chroma as well
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
@@ -35,7 +37,8 @@ export async function connect(on) {
     taken.set(clipNumber, { done, failed });
     render(clipNumber, state);
   });
-  const clip = (state, fps, turn, duration) => record(picture, state, { fps, turn, duration }, on).catch((error) => on.error(error.message));
+  const clip = (state, fps, turn, duration) =>
+    record(picture, state, { fps: Math.min(fps, MOST_CLIP_FPS), turn, duration }, on).catch((error) => on.error(error.message));
 
   const named = addressed();
   if (named.length) fetchFiles(named).then(load).catch((error) => on.refused(error.message));
@@ -74,24 +77,28 @@ async function record(picture, state, { fps, turn, duration }, on) {
   if (!type) throw new Error("this browser cannot record a clip");
   const count = Math.floor(duration * fps + 1e-6) + 1;
   if (count > MOST_CLIP_FRAMES) throw new Error(`a clip has at most ${MOST_CLIP_FRAMES} frames`);
-  const frames = [];
+  const canvas = document.createElement("canvas"), context = canvas.getContext("2d");
+  Object.assign(canvas, { width: state.width, height: state.height });
+  const show = (image) => {
+    context.drawImage(image, 0, 0);
+    image.close();
+  };
+  const frames = [];  // coded: 900 of 1024² pixels would be 3.8 GB
   for (let k = 0; k < count; k++) {
-    frames.push((await picture({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
+    show((await picture({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
+    frames.push(await new Promise((done) => { canvas.toBlob(done, "image/jpeg", FRAME_QUALITY); }));
     on.progress(k + 1, count);
   }
-  const canvas = document.createElement("canvas");
-  Object.assign(canvas, { width: frames[0].width, height: frames[0].height });
-  const context = canvas.getContext("2d");
-  context.drawImage(frames[0], 0, 0);
+  show(await createImageBitmap(frames[0]));
   const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: type, videoBitsPerSecond: 12e6 });
   const parts = [];
   recorder.ondataavailable = ({ data }) => parts.push(data);
   const stopped = new Promise((done) => { recorder.onstop = done; });
   recorder.start();
-  for (const frame of frames) {
-    context.drawImage(frame, 0, 0);
-    frame.close();
-    await new Promise((done) => { setTimeout(done, 1000 / fps); });
+  const started = performance.now();
+  for (let k = 0; k < count; k++) {
+    show(await createImageBitmap(frames[k]));
+    await new Promise((done) => { setTimeout(done, started + 1000 * (k + 1) / fps - performance.now()); });
   }
   recorder.stop();
   await stopped;
