@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import rnd_viewer.view_server
 from browser import CHROMIUM, Page, chromium
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.capture import load_capture
@@ -29,6 +30,11 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 ASSETS = Path(__file__).parent.parent / "assets"
 SIZE = 192
 FRAME = 20
+MESSAGE = "document.getElementById('message').textContent"
+OUTCOME = """Promise.race([
+    rnd.picture(false).then(() => "drawn", (error) => error.message),
+    new Promise((done) => setTimeout(() => done("nothing"), 30000)),
+])"""
 
 
 @pytest.fixture(scope="module")
@@ -185,6 +191,28 @@ def test_ground_truth_stands_beside(page):
     _set(page, "size", str(SIZE))
 
 
+def test_ground_truth_that_the_browser_cannot_decode_is_said_and_leaves_its_pane_blank(
+    page, scene, tmp_path, monkeypatch
+):
+    Image.new("RGB", (8, 8), "white").save(tmp_path / "truth.tiff")
+    page.run("document.getElementById('truth-on').click()")
+    index = page.run("rnd.state.truth")
+    page.wait(f"document.getElementById('truth').dataset.index === '{index}'")
+    assert _pixels(page, "truth").any()
+    with monkeypatch.context() as patch:
+        patch.setattr(scene, "truth_file", lambda index: tmp_path / "truth.tiff")
+        _set(page, "truth-index", str(index + 1))
+        page.wait("document.getElementById('message').classList.contains('wrong')")
+    label = page.run(f"rnd.scene().truths[{index + 1}].label")
+    assert page.run(MESSAGE) == f"{label}: this browser cannot decode the picture"
+    assert not _pixels(page, "truth").any()
+    _set(page, "truth-index", str(index))
+    page.wait(f"document.getElementById('truth').dataset.index === '{index}'")
+    assert _pixels(page, "truth").any() and page.run(MESSAGE) == ""
+    page.run("document.getElementById('truth-on').click()")
+    _set(page, "size", str(SIZE))
+
+
 def test_screenshot_and_clip_are_downloads(page, tmp_path):
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     shown = _picture(page)
@@ -228,3 +256,36 @@ def test_with_a_token_and_in_jpeg(page, scene):
         page.wait("!location.search && window.rnd && rnd.scene()")
     page.open(back)
     page.wait("window.rnd && rnd.scene()")
+
+
+def test_what_is_asked_of_a_viewer_that_is_gone_fails_at_once(page, scene):
+    back = page.run("location.href")
+    page.run("""
+        const { send: sendOn } = WebSocket.prototype;
+        WebSocket.prototype.send = function (text) { window.socket = this; sendOn.call(this, text); };
+        rnd.picture().then(() => new Promise((done) => {
+            socket.addEventListener("close", done);
+            socket.close();
+        })).then(() => 1);
+    """)
+    gone = "rnd-view does not answer; is it still running?"
+    assert page.run(OUTCOME) == gone
+    page.run("document.getElementById('clip').click()")
+    assert page.run(MESSAGE) == gone and not page.run("document.getElementById('clip').disabled")
+    page.open(back)
+    page.wait("!window.socket && window.rnd && rnd.scene()")
+
+
+def test_a_picture_that_the_browser_cannot_decode_is_said(page, scene, monkeypatch):
+    back = page.run("location.href")
+    with _serving(scene) as url:
+        page.open(f"{url}?encoding=jpeg")
+        page.wait("location.search && window.rnd && rnd.scene()")
+        assert page.run(OUTCOME) == "drawn"
+        monkeypatch.setattr(rnd_viewer.view_server, "_jpeg", lambda srgb: b"torn")
+        wrong = "this browser cannot decode a picture that rnd-view sent"
+        assert page.run(OUTCOME) == wrong == page.run(MESSAGE)
+        monkeypatch.undo()
+        assert page.run(OUTCOME) == "drawn"
+        page.open(back)
+        page.wait("!location.search && window.rnd && rnd.scene()")

@@ -171,6 +171,7 @@ async function setTruth() {
   state.truth = on ? index : null;
   $("truth-pane").hidden = !on;
   $("light").disabled = on;  // the picture's own shines
+  say("");  // what was said of another picture
   if (on) {
     play(false);
     engine.truth(index);
@@ -180,11 +181,12 @@ async function setTruth() {
 
 function showTruth(index, bitmap) {
   if (index !== state.truth) return;  // another was asked for since
-  const canvas = $("truth");
+  const canvas = $("truth"), { label, width, height } = scene.truths[index];
   canvas.dataset.index = index;
-  canvas.width = bitmap.width;
-  canvas.height = bitmap.height;
-  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  canvas.width = bitmap?.width ?? width;  // and it is blank
+  canvas.height = bitmap?.height ?? height;
+  if (bitmap) canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  else say(`${label}: this browser cannot decode the picture`, true);
 }
 
 function download(blob, name) {

@@ -4,8 +4,9 @@ const WITH_BODY = ["picture", "clip", "truth"];
 const UNREACHABLE = "rnd-view does not answer; is it still running?";
 
 /**
- * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap),
- * progress(done, of), clip(blob, name), error(text, ends): of a picture or of a clip, which ends with it unless told otherwise.
+ * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap or
+ * null where the browser cannot decode it), progress(done, of), clip(blob, name), error(text, ends): of a picture or of a
+ * clip, which ends with it unless told otherwise. None of them is called before what asks for it has returned.
  */
 export async function connect(on) {
   const address = new URL("socket", location.href);
@@ -25,7 +26,10 @@ export async function connect(on) {
   // Raw pixels are exact, and no slower while no wire is in between.
   const local = ["127.0.0.1", "localhost", "[::1]"].includes(location.hostname);
   const encoding = new URLSearchParams(location.search).get("encoding") ?? (local ? "raw" : "jpeg");
-  const send = (request) => { if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(request)); };
+  const send = (request) => {
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(request));
+    else queueMicrotask(() => on.error(UNREACHABLE));
+  };
   return {
     render: (number, state, exact) => send({ ask: "render", number, state: { ...state, encoding: exact ? "raw" : encoding } }),
     clip: (state, fps, turn) => send({ ask: "clip", state, fps, turn }),
@@ -38,12 +42,15 @@ async function receive(header, body, on) {
   else if (header.kind === "error") on.error(header.message);
   else if (header.kind === "progress") on.progress(header.done, header.of);
   else if (header.kind === "clip") on.clip(new Blob([body], { type: "video/mp4" }), "clip.mp4");
-  else if (header.kind === "truth") on.truth(header.index, await createImageBitmap(new Blob([body])));
-  else if (header.encoding === "raw") {
-    const pixels = new Uint8ClampedArray(body);
-    on.picture({ ...header, image: new ImageData(pixels, header.width, header.height) });
-  } else {
-    const image = await createImageBitmap(new Blob([body], { type: "image/jpeg" }));
-    on.picture({ ...header, image });
+  else if (header.kind === "truth") on.truth(header.index, await createImageBitmap(new Blob([body])).catch(() => null));
+  else {
+    const image = await pixels(header, body).catch(() => null);
+    if (image) on.picture({ ...header, image });
+    else on.error("this browser cannot decode a picture that rnd-view sent", false);
   }
+}
+
+async function pixels({ encoding, width, height }, body) {
+  if (encoding === "raw") return new ImageData(new Uint8ClampedArray(body), width, height);
+  return createImageBitmap(new Blob([body], { type: "image/jpeg" }));
 }
