@@ -24,6 +24,7 @@ from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import ImportOptions
+from rnd_trainer.importing.pictures import listed
 from rnd_trainer.importing.pose_files import read_poses
 from rnd_trainer.importing.recording import Poses, easymocap_poses, read_as, smpl_poses
 from rnd_trainer.silhouette import overlap, posed_vertices
@@ -214,6 +215,32 @@ def test_easymocaps_files_put_the_person_where_it_saw_it(tmp_path) -> None:
     assert_allclose(other.root(np.zeros(3)), [[0, 0, 9]])
 
 
+def test_romps_files_are_sorted_by_number(tmp_path) -> None:
+    """By name, frame_10 would come before frame_9."""
+    folder, world = write_romp(tmp_path), layouts.camera_world()
+    numbers = [1, 9, 10, 11]
+    for number, file in zip(numbers, sorted(folder.iterdir())):
+        file.rename(folder / f"frame_{number}.npz")
+    poses = read_poses(folder).poses
+    assert poses.frames.tolist() == numbers
+    assert_allclose(poses.root(world.rest), world.places, atol=PLACE)
+    np.savez(folder / "again_9.npz", **np.load(folder / "frame_9.npz", allow_pickle=True))
+    with pytest.raises(InputError, match="romp: body poses: expected frames that ascend, got 9 after 9"):
+        read_poses(folder)
+
+
+def test_romps_results_of_a_video_may_lie_beside_those_of_its_frames(tmp_path) -> None:
+    """As ROMP leaves them; by themselves their pictures' names count by number, too."""
+    folder, world = write_romp(tmp_path), layouts.camera_world()
+    rows = [np.load(file, allow_pickle=True)["results"].item() for file in sorted(folder.iterdir())]
+    results = np.array({f"{k + 8}.jpg": row for k, row in enumerate(rows)}, dtype=object)
+    np.savez(folder / "video_results.npz", results=results)
+    for path in (folder, folder / "video_results.npz"):
+        poses = read_poses(path).poses
+        assert poses.frames.tolist() == list(range(FRAMES))
+        assert_allclose(poses.root(world.rest), world.places, atol=PLACE)
+
+
 def test_a_track_is_chosen_by_number(tmp_path) -> None:
     path = write_wham(tmp_path)
     assert len(read_poses(path, person=0).poses.frames) == 1
@@ -292,6 +319,19 @@ def test_members_of_other_counts_than_the_poses_are_refused(tmp_path, name) -> N
     with pytest.raises(InputError) as caught:
         read_poses(tmp_path / "p.npz")
     assert str(caught.value).startswith(f"{tmp_path / 'p.npz'}: {said}")
+
+
+@pytest.mark.parametrize(("frames", "said"), [([0, 2, 1], "1 after 2"), ([0, 1, 1], "1 after 1")])
+def test_poses_in_no_order_are_refused(frames, said) -> None:
+    with pytest.raises(InputError, match=f"body poses: expected frames that ascend, got {said}"):
+        smpl_poses(frames, np.zeros((3, 72)), np.zeros((3, 3)))
+
+
+def test_pictures_are_listed_by_the_numbers_in_their_names(tmp_path) -> None:
+    names = ["00009.png", "00010.png", "a.png", "a1.png", "a2b7.png", "a2b10.png", "a10.png", "b.png"]
+    for name in names:
+        (tmp_path / name).touch()
+    assert [file.name for file in listed(tmp_path)] == names
 
 
 def test_poses_ask_where_the_root_is_once_and_check_it() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ Bytes = NDArray[np.uint8]
 PICTURES = (".jpg", ".jpeg", ".png")
 _LABELS = 32
 """a mask of fewer different values, none above 127, holds labels (0/1, body parts), not coverage"""
+_DIGITS = 20
+"""more than a number in a file's name has"""
 
 
 def read_rgb(path: Path) -> Bytes:
@@ -75,11 +78,17 @@ def sized(path: Path) -> tuple[int, int]:
 
 
 def listed(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> list[Path]:
-    """The files of ``folder`` with one of ``suffixes``, by name; at least one."""
-    found = sorted(p for p in folder.glob("*") if p.suffix.lower() in suffixes) if folder.is_dir() else []
+    """The files of ``folder`` with one of ``suffixes``, in :func:`natural` order; at least one."""
+    files = [p for p in folder.glob("*") if p.suffix.lower() in suffixes] if folder.is_dir() else []
+    found = sorted(files, key=lambda file: natural(file.name))
     if not found:
         raise InputError("pictures", expected=f"{' or '.join(suffixes)} files", got="none", file=folder)
     return found
+
+
+def natural(name: str) -> tuple[str, str]:
+    """A key that sorts by the numbers in names: frame2 before frame10. Zero-padded ones keep their order."""
+    return re.sub("[0-9]+", lambda digits: digits[0].zfill(_DIGITS), name), name
 
 
 def beside(path: Path, *folders: Path) -> Path | None:

@@ -25,7 +25,7 @@ from rnd_runtime.video_fits import (
     with_root,
 )
 
-from .pictures import listed
+from .pictures import listed, natural
 from .recording import Floats, Poses, easymocap_poses, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
@@ -82,7 +82,10 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
         if files[0].suffix == ".json":
             return _fitted("EasyMocap", read_easymocap_folder(path, person))
         _refuse_number(person, "ROMP")
-        return _romp(files)
+        try:
+            return _romp(files)
+        except InputError as error:
+            raise error.at(file=path) from error
     if path.suffix.lower() == ".npz":
         with Npz(path, what="body poses") as archive:
             names = archive.names
@@ -157,12 +160,15 @@ def _gvhmr(content: dict[str, Any]) -> FoundPoses:
 
 def _romp(files: Sequence[Path]) -> FoundPoses:
     rows: list[tuple[int, dict[str, Any]]] = []
-    for number, file in enumerate(files):
+    film: list[tuple[int, dict[str, Any]]] = []
+    for place, file in enumerate(files):
         content = _romp_content(file)
         if "smpl_thetas" in content:
-            rows.append((trailing_number(file.stem, number), content))
+            rows.append((trailing_number(file.stem, place), content))
         else:  # a video's results: picture name → result
-            rows += [(k, content[name]) for k, name in enumerate(sorted(content)) if content[name]]
+            names = sorted(content, key=lambda name: natural(str(name)))
+            film += [(k, content[name]) for k, name in enumerate(names) if content[name]]
+    rows = sorted(rows, key=lambda row: row[0]) or film  # of a video, ROMP writes both, in one folder
     kept = [(k, row) for k, row in rows if len(np.atleast_2d(row["smpl_thetas"]))]
     if not kept:
         raise InputError(

@@ -68,7 +68,7 @@ class Poses:
     """Body poses in the source's world.
 
     Attributes:
-        frames: [F] ascending, the moments they belong to.
+        frames: [F] strictly ascending, the moments they belong to.
         rotations: [F, J, 3, 3] local, the root first.
         root: gives the root's places [F, 3] m for a rest place [3] m: where conventions differ. Called once to
             check them.
@@ -91,6 +91,10 @@ class Poses:
         count = len(self.frames)
         if count == 0:
             raise InputError("body poses", expected="at least one frame", got="none")
+        late = np.flatnonzero(np.diff(self.frames) <= 0)
+        if len(late):
+            before, after = self.frames[late[0] : late[0] + 2].tolist()
+            raise InputError("body poses", expected="frames that ascend", got=f"{after} after {before}")
         if self.rotations.shape != (count, len(self.joint_names), 3, 3):
             raise InputError(
                 "body poses", expected=f"{count} × {len(self.joint_names)} rotations", got=list(self.rotations.shape)
