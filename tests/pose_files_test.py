@@ -241,6 +241,14 @@ def test_romps_results_of_a_video_may_lie_beside_those_of_its_frames(tmp_path) -
         assert_allclose(poses.root(world.rest), world.places, atol=PLACE)
 
 
+def test_a_frame_in_which_romp_saw_nobody_is_left_out(tmp_path) -> None:
+    folder = write_romp(tmp_path)
+    np.savez(folder / f"{1:08d}.npz", results=None)
+    assert read_poses(folder).poses.frames.tolist() == [0, 2, 3]
+    with pytest.raises(InputError, match="smpl_thetas of at least one frame, got none"):
+        read_poses(folder / f"{1:08d}.npz")
+
+
 def test_a_track_is_chosen_by_number(tmp_path) -> None:
     path = write_wham(tmp_path)
     assert len(read_poses(path, person=0).poses.frames) == 1

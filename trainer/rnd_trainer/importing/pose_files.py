@@ -187,12 +187,14 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
 
 
 def _romp_content(file: Path) -> dict[str, Any]:
-    """ROMP saves a dict as one array of Python objects, or its members."""
+    """ROMP saves a dict as one array of Python objects, or its members; of a frame in which it saw nobody, None."""
     with Npz(file, what="ROMP results") as archive:
         if "results" not in archive.names:
             return {key: archive.numbers(key) for key in ("smpl_thetas", "cam_trans", "smpl_betas")}
     with zipfile.ZipFile(file) as members, tempfile.TemporaryDirectory() as folder:
         content = read_pickle(members.extract("results.npy", folder), what="ROMP results")
+    if content is None:
+        return {}
     if not isinstance(content, dict):
         raise InputError("ROMP results", expected="a dict", got=type(content).__name__, file=file)
     return content
