@@ -372,7 +372,8 @@ def _film(folder: Path, camera: Camera) -> Path:
 
 
 def _options(folder: Path, **options: object) -> ImportOptions:
-    return ImportOptions(**({"body": str(layouts.body_file(folder)), "poses": write_romp(folder)} | options))
+    options = options if "poses" in options else {"poses": write_romp(folder)} | options
+    return ImportOptions(**({"body": str(layouts.body_file(folder))} | options))
 
 
 FAR = 52.0  # m: what PHALP's long lens needs to see as much of the person as the others
@@ -430,6 +431,116 @@ def test_a_plain_video_becomes_a_capture(tmp_path, program) -> None:
         assert (images.normal * view.normals).sum(-1)[facing].min() > 0.999
     report = check_capture(tmp_path / "out")
     assert not report.wrong, report.findings
+
+
+PAIRED = {
+    # number of each picture → pose of the scene, number of each pose file → pose of the scene, pictures kept, noted
+    "ffmpeg's, both from 1": ({1: 0, 2: 1, 3: 2, 4: 3}, {1: 0, 2: 1, 3: 2, 4: 3}, 4, ""),
+    "pictures taken out": ({1: 0, 2: 1, 4: 3}, {1: 0, 2: 1, 3: 2, 4: 3}, 3, ""),
+    "nobody seen in some": ({8: 0, 9: 1, 10: 2, 11: 3}, {9: 1, 11: 3}, 2, ""),
+    "each lacks one": ({1: 0, 2: 1, 4: 3}, {2: 1, 3: 2, 4: 3}, 2, ""),
+    "poses before the pictures": ({12: 2, 13: 3}, {10: 0, 11: 1, 12: 2, 13: 3}, 2, ""),
+    "poses from 0": ({1: 0, 2: 1, 3: 2, 4: 3}, {0: 0, 1: 1, 2: 2, 3: 3}, 4, "from 0, frames from 1"),
+    "poses from 0, one missing": ({1: 0, 2: 1, 3: 2, 4: 3}, {0: 0, 2: 2}, 2, "from 0, frames from 1"),
+    "pictures from 0": ({0: 0, 1: 1, 2: 2, 3: 3}, {1: 0, 2: 1, 4: 3}, 3, "from 1, frames from 0"),
+    "a part, poses from 0": ({51: 0, 52: 1, 53: 2, 54: 3}, {0: 0, 1: 1, 2: 2, 3: 3}, 4, "from 0, frames from 51"),
+}  # fmt: skip
+
+
+def _pictures(folder: Path, camera: Camera, names: dict[str, int]) -> Path:
+    """frames/ and masks/ of the scene's poses, by name."""
+    for name, k in names.items():
+        view = view_of(camera, k)
+        image = np.where(view.mask[..., None], to_bytes(0.2 + 0.35 * (view.normals + 1)), 90)
+        write_image(folder / "frames" / f"{name}.png", image.astype(np.uint8))
+        write_image(folder / "masks" / f"{name}.png", (255 * view.mask).astype(np.uint8))
+    return folder / "frames"
+
+
+def _fits(folder: Path, numbers: dict[int, int]) -> Path:
+    """ROMP's files of the scene's poses, by number."""
+    written = write_romp(folder)
+    (folder / "fits").mkdir()
+    for number, k in numbers.items():
+        (folder / "fits" / f"{number:05d}.npz").hardlink_to(written / f"{k:08d}.npz")
+    return folder / "fits"
+
+
+def _assert_together(folder: Path, camera: Camera, pose_of: dict[int, int]) -> None:
+    """The capture in ``folder`` shows and poses the scene's poses, by the numbers in its pictures' names."""
+    capture = load_capture(folder)
+    for frame in capture.frames:
+        k = pose_of[int(Path(frame.image).stem.split("_")[1])]
+        assert ((capture.load_frame(frame).mask > 0.5) == view_of(camera, k).mask).all()
+        posed = posed_vertices(
+            capture.body, capture.motion.rotations[frame.frame], capture.motion.translations[frame.frame]
+        )
+        truth = posed_vertices(shaped_body(), motion().rotations[k], motion().translations[k])
+        local, expected = (
+            v @ c.world_to_camera[:3, :3].T + c.world_to_camera[:3, 3]
+            for v, c in ((posed, capture.cameras["0"]), (truth, camera))
+        )
+        assert_allclose(local, expected, atol=PLACE)
+
+
+@pytest.mark.parametrize("name", PAIRED)
+def test_numbered_pictures_and_poses_belong_together_by_number(tmp_path, name) -> None:
+    pictures, poses, kept, noted = PAIRED[name]
+    camera = layouts.video_camera(FOCALS["romp"])
+    source = _pictures(tmp_path, camera, {f"f{number}": k for number, k in pictures.items()})
+    options = _options(tmp_path, poses=_fits(tmp_path, poses), masks=tmp_path / "masks")
+    scene = import_source(source, tmp_path / "out", options)
+    notes = [note for note in scene.notes if "taken for the same" in note]
+    assert len(notes) == bool(noted) and noted in "".join(notes)
+    assert len(load_capture(tmp_path / "out").frames) == kept
+    _assert_together(tmp_path / "out", camera, pictures)
+
+
+WHOLE = {k: k for k in range(FRAMES)}
+
+
+@pytest.mark.parametrize("write", [write_wham, write_romp_video])
+def test_poses_in_one_file_belong_to_the_pictures_in_their_order(tmp_path, write) -> None:
+    """Whatever the pictures are numbered from."""
+    camera = layouts.video_camera(FOCALS[write.__name__.split("_")[1]])
+    source = _pictures(tmp_path, camera, {f"{k + 1:05d}": k for k in range(FRAMES)})
+    options = _options(tmp_path, poses=write(tmp_path), masks=tmp_path / "masks")
+    import_source(source, tmp_path / "out", options)
+    assert len(load_capture(tmp_path / "out").frames) == FRAMES
+    _assert_together(tmp_path / "out", camera, WHOLE)
+
+
+@pytest.mark.parametrize("start", [0, 1])
+@pytest.mark.parametrize("film", [True, False])
+def test_numbered_poses_of_frames_without_numbers_belong_to_them_in_their_order(
+    tmp_path, film, start
+) -> None:
+    """Where the last number tells that the first is 1, by that."""
+    camera = layouts.video_camera(FOCALS["romp"])
+    source = _pictures(tmp_path, camera, {f"f{k}{'' if film else 'x'}": k for k in range(FRAMES)})
+    poses = _fits(tmp_path, {k + start: k for k in range(FRAMES)})
+    options = _options(tmp_path, poses=poses, masks=tmp_path / "masks")
+    scene = import_source(_film(tmp_path, camera) if film else source, tmp_path / "out", options)
+    assert any("from 1, frames from 0" in note for note in scene.notes) == bool(start)
+    assert len(load_capture(tmp_path / "out").frames) == FRAMES
+    _assert_together(tmp_path / "out", camera, WHOLE)
+
+
+def test_poses_of_other_frames_are_refused(tmp_path) -> None:
+    source = _pictures(tmp_path, layouts.video_camera(FOCALS["romp"]), {"f1": 0, "f2": 1, "f3": 2})
+    options = _options(tmp_path, poses=_fits(tmp_path, {7: 0, 8: 1}))
+    with pytest.raises(InputError, match=r"frames: body poses: expected some of frames 1 … 3, got 7 … 8"):
+        import_source(source, tmp_path / "out", options)
+
+
+@pytest.mark.parametrize("write", [write_romp, write_easymocap_folder])
+def test_files_are_numbered_where_each_has_a_number(tmp_path, write) -> None:
+    folder = write(tmp_path)
+    assert read_poses(folder).numbered
+    for name, file in zip("abcd", sorted(folder.iterdir())):
+        file.rename(folder / f"{name}{file.suffix}")
+    found = read_poses(folder)
+    assert not found.numbered and found.poses.frames.tolist() == list(range(FRAMES))
 
 
 def test_rough_masks_are_made_where_there_are_none(tmp_path) -> None:

@@ -23,7 +23,7 @@ class Film:
     Attributes:
         width, height: pixels, after the file's rotation.
         fps: frames per second, on average.
-        count: frames, as its packets say without being decoded.
+        count: frames, as its packets say without being decoded; ``numbers`` counts them from 0.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -42,6 +42,7 @@ class Film:
             self.height, self.width = first.shape[:2]
         with self._open() as container:
             self.count = sum(1 for packet in container.demux(video=0) if packet.pts is not None)
+        self.numbers = range(self.count)
         self._kept: dict[int, Bytes] = {}
         self._frames: Iterator[Bytes] | None = None
         self._next = 0

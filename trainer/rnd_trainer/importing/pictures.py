@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,18 @@ def listed(folder: Path, suffixes: tuple[str, ...] = PICTURES) -> list[Path]:
 def natural(name: str) -> tuple[str, str]:
     """A key that sorts by the numbers in names: frame2 before frame10. Zero-padded ones keep their order."""
     return re.sub("[0-9]+", lambda digits: digits[0].zfill(_DIGITS), name), name
+
+
+def last_number(name: str) -> int | None:
+    """The number that ``name`` ends in."""
+    digits = name[len(name.rstrip("0123456789")) :]
+    return int(digits) if digits else None
+
+
+def numbers_of(files: Sequence[Path]) -> list[int] | None:
+    """The number that each file's name ends in; None unless each has one of its own."""
+    numbers = [number for file in files if (number := last_number(file.stem)) is not None]
+    return numbers if len(set(numbers)) == len(files) else None
 
 
 def beside(path: Path, *folders: Path) -> Path | None:

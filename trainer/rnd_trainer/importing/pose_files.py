@@ -17,6 +17,7 @@ from rnd_runtime.unpickle import read_pickle
 from rnd_runtime.video_fits import (
     PHALP_FOCAL,
     VideoFits,
+    easymocap_files,
     is_phalp,
     one_of,
     read_easymocap_folder,
@@ -25,7 +26,7 @@ from rnd_runtime.video_fits import (
     with_root,
 )
 
-from .pictures import listed, natural
+from .pictures import listed, natural, numbers_of
 from .recording import Floats, Poses, easymocap_poses, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
@@ -44,6 +45,7 @@ class FoundPoses:
         focal: what the program assumed, as a function of width and height; None where it says nothing.
         fps: where the file has it.
         notes: what had to be assumed.
+        numbered: a file a frame, and the frames are the numbers in their names; else they count from 0.
     """
 
     kind: str
@@ -52,6 +54,7 @@ class FoundPoses:
     focal: Focal | None = None
     fps: float | None = None
     notes: tuple[str, ...] = ()
+    numbered: bool = False
 
 
 def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
@@ -80,7 +83,8 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     if path.is_dir():
         files = listed(path, (".json", ".npz"))
         if files[0].suffix == ".json":
-            return _fitted("EasyMocap", read_easymocap_folder(path, person))
+            numbered = numbers_of(easymocap_files(path)) is not None
+            return replace(_fitted("EasyMocap", read_easymocap_folder(path, person)), numbered=numbered)
         _refuse_number(person, "ROMP")
         try:
             return _romp(files)
@@ -161,10 +165,12 @@ def _gvhmr(content: dict[str, Any]) -> FoundPoses:
 def _romp(files: Sequence[Path]) -> FoundPoses:
     rows: list[tuple[int, dict[str, Any]]] = []
     film: list[tuple[int, dict[str, Any]]] = []
+    singles = []
     for place, file in enumerate(files):
         content = _romp_content(file)
         if "smpl_thetas" in content:
             rows.append((trailing_number(file.stem, place), content))
+            singles.append(file)
         else:  # a video's results: picture name → result
             names = sorted(content, key=lambda name: natural(str(name)))
             film += [(k, content[name]) for k, name in enumerate(names) if content[name]]
@@ -182,8 +188,9 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
     several = any(len(np.atleast_2d(row["smpl_thetas"])) > 1 for _, row in kept)
     notes = ("ROMP saw several people in a frame: its first is taken",) if several else ()
     return FoundPoses(
-        "ROMP", poses, focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)), notes=notes
-    )
+        "ROMP", poses, focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)), notes=notes,
+        numbered=bool(singles) and numbers_of(singles) is not None,
+    )  # fmt: skip
 
 
 def _romp_content(file: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rnd_trainer.silhouette import View, draw, posed_vertices
 from .masks import make_masks
 from .networks import ImageNetwork
 from .normals import Normals, find_axes, normal_map, normal_network, read_normals, smoothed, to_opencv
-from .pictures import Bytes, listed, read_mask
+from .pictures import Bytes, last_number, listed, read_mask
 from .recording import Recording, Shot
 from .write import Scene
 
@@ -52,19 +52,14 @@ def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...]) -> Path:
     named = {file.stem: file for file in files}
     if shot.name in named:
         return named[shot.name]
-    numbered = {k if (n := _last_number(file.stem)) is None else n: file for k, file in enumerate(files)}
-    number = _last_number(shot.name)
+    numbered = {k if (n := last_number(file.stem)) is None else n: file for k, file in enumerate(files)}
+    number = last_number(shot.name)
     number = shot.frame if number is None else number
     if number not in numbered:
         raise InputError(
             "file", expected=f"one numbered {number}", got=f"{files[0].name} … {files[-1].name}", file=inner
         )
     return numbered[number]
-
-
-def _last_number(name: str) -> int | None:
-    digits = name[len(name.rstrip("0123456789")) :]
-    return int(digits) if digits else None
 
 
 class _Lazy(Sequence[Any]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,9 +18,9 @@ from rnd_trainer.silhouette import posed_vertices, silhouette
 from .body_models import BodyModel
 from .frames import Film
 from .options import ALL, Choice
-from .pictures import PICTURES, Bytes, camera_of, listed, read_rgb, sized
+from .pictures import PICTURES, Bytes, camera_of, listed, numbers_of, read_rgb, sized
 from .pose_files import FoundPoses
-from .recording import Floats, Lens, Recording, Shot
+from .recording import Floats, Lens, Poses, Recording, Shot
 from .select import select_frames, sharpness
 from .write import TRAIN_SHARE, Scene, placed
 
@@ -41,12 +42,18 @@ def detect(source: Path) -> str | None:
 
 
 class _Folder:
-    """A folder of frames with a :class:`Film`'s face."""
+    """A folder of frames with a :class:`Film`'s face.
 
-    def __init__(self, path: Path, fps: float) -> None:
-        self.pictures = listed(path)
-        self.path, self.fps, self.count = path, fps, len(self.pictures)
-        self.width, self.height = sized(self.pictures[0])
+    Its ``numbers`` count the pictures from 0; where ``numbered``, they are those in their names, if all have one.
+    """
+
+    def __init__(self, path: Path, fps: float, numbered: bool) -> None:
+        files = listed(path)
+        named = numbers_of(files) if numbered else None
+        self.pictures = dict(sorted(zip(named or range(len(files)), files)))
+        self.numbers = list(self.pictures)
+        self.path, self.fps, self.count = path, fps, len(files)
+        self.width, self.height = sized(self.pictures[self.numbers[0]])
 
     def name(self, number: int) -> str:
         return self.pictures[number].stem
@@ -78,19 +85,18 @@ def read(
     The lens is ``intrinsics`` (fx, fy, cx, cy in pixels), else the pose file's, else what its program assumed. Poses
     fit the pictures through the lens they were estimated with; another one is noted. The first 4/5 of those frames give
     ``count`` training pictures, the last 1/5 a quarter of that as novel poses.
+
+    A frame is known by its number in the video or the folder's order, from 0; where each pose has a numbered file and
+    each picture a number, by those.
     """
-    film = Film(source) if source.is_file() else _Folder(source, FPS)
+    film = Film(source) if source.is_file() else _Folder(source, FPS, found.numbered)
     rate = fps or (film.fps if source.is_file() else found.fps or FPS)
     K, notes = _lens(found, film.width, film.height, intrinsics)
     lens = Lens(camera_of(K, np.eye(3), np.zeros(3), (film.width, film.height), corner=0), tuple(distortion))
-    poses = found.poses
-    if poses.frames[0] >= film.count:
-        raise InputError(
-            "body poses", expected=f"frames below {film.count}", got=int(poses.frames[0]), file=source
-        )
+    poses, counted = _paired(found, film)
     recording = Recording(
-        f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes)
-    )
+        f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes, *counted)
+    )  # fmt: skip
     chosen = _choose(film, placed(recording, model), recording, count, choice)
     stills = _stills(film, [frame for frame, _ in chosen])
     shots = [
@@ -99,6 +105,33 @@ def read(
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
     return Recording(recording.kind, recording.lenses, shots, poses, rate, (*recording.notes, kept))
+
+
+def _paired(found: FoundPoses, film: Film | _Folder) -> tuple[Poses, tuple[str, ...]]:
+    """The poses by the numbers of ``film``'s frames, and what was assumed.
+
+    Numbers mean the same in both where all of one's are among the other's. Else one may have been counted from 0 and
+    the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
+    poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
+
+    Raises:
+        InputError: no frame has a pose.
+    """
+    poses, numbers = found.poses, film.numbers
+    ours, theirs = set(numbers), set(poses.frames.tolist())
+    begin, first, last = numbers[0], int(poses.frames[0]), int(poses.frames[-1])
+    if found.numbered and not (ours <= theirs or theirs <= ours):
+        extent = last - first + 1
+        as_many = extent == film.count and min(begin, first) <= 1
+        from_zero = extent <= film.count and (first, begin) == (0, 1)
+        if numbers[-1] - begin + 1 == film.count and (as_many or from_zero):
+            note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
+            return replace(poses, frames=poses.frames + (begin - first)), (note,)
+    if not ours & theirs:
+        raise InputError(
+            "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=film.path
+        )  # fmt: skip
+    return poses, ()
 
 
 def _lens(
@@ -129,10 +162,11 @@ def _choose(
 ) -> list[tuple[int, Split]]:
     """(frame, split) of the frames to keep, ascending."""
     first = int(recording.poses.frames[0])
-    frames = min(scene.motion.frame_count, film.count - first)
-    given = {int(frame) - first for frame in recording.poses.frames if choice.keeps(int(frame))}
-    start = max(0, choice.start - first)
-    stop = frames if choice.stop is None else min(frames, choice.stop - first)
+    last = min(first + scene.motion.frame_count, film.numbers[-1] + 1)
+    posed = set(film.numbers).intersection(recording.poses.frames.tolist())
+    given = {frame - first for frame in posed if choice.keeps(frame)}
+    start = max(first, film.numbers[0], choice.start) - first
+    stop = min(last, last if choice.stop is None else choice.stop) - first
     camera = scene.cameras[CAMERA]
     factor = min(1.0, _SMALL / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
