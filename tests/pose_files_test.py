@@ -533,6 +533,19 @@ def test_poses_of_other_frames_are_refused(tmp_path) -> None:
         import_source(source, tmp_path / "out", options)
 
 
+def test_numbers_that_count_no_frames_are_refused(tmp_path) -> None:
+    """Times, to the microsecond."""
+    times = {1767225600000000: 0, 1767225600033333: 1, 1767225600066666: 2, 1767229200000000: 3}
+    source = _pictures(
+        tmp_path, layouts.video_camera(FOCALS["romp"]), {str(time): k for time, k in times.items()}
+    )
+    options = _options(tmp_path, poses=_fits(tmp_path, times))
+    with pytest.raises(
+        InputError, match="frames of the poses: expected at most 100000 left out, got 3599999997 "
+    ):
+        import_source(source, tmp_path / "out", options)
+
+
 @pytest.mark.parametrize("write", [write_romp, write_easymocap_folder])
 def test_files_are_numbered_where_each_has_a_number(tmp_path, write) -> None:
     folder = write(tmp_path)

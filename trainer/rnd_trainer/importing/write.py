@@ -33,6 +33,8 @@ SNAP = np.cos(np.radians(30))
 """a person who stands within 30° of an axis on average stands along it; farther off the world was never levelled"""
 TRAIN_SHARE = 0.8
 """of the training camera's frames: the paper's split"""
+MOST_FILLED = 100_000
+"""poses between given ones, an hour of a video; numbers farther apart, such as times, count no frames"""
 _TO_LINEAR = srgb_to_linear(np.arange(256) / 255)
 
 
@@ -245,6 +247,12 @@ def _filled(
     notes: list[str],
 ) -> Motion:
     """A pose for every frame from the first to the last, slerped where the source has none."""
+    missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
+    if missing > MOST_FILLED:
+        raise InputError(
+            "frames of the poses", expected=f"at most {MOST_FILLED} left out",
+            got=f"{missing} between {frames[0]} and {frames[-1]}",
+        )  # fmt: skip
     wanted = np.arange(frames[0], frames[-1] + 1)
     after = np.minimum(np.searchsorted(frames, wanted, side="right"), len(frames) - 1)
     before = np.maximum(np.searchsorted(frames, wanted, side="right") - 1, 0)
@@ -252,6 +260,6 @@ def _filled(
     t = ((wanted - frames[before]) / span)[:, None]
     turned = slerp_matrices(rotations[before], rotations[after], t)
     moved = (1 - t) * translations[before] + t * translations[after]
-    if len(wanted) > len(frames):
-        notes.append(f"{len(wanted) - len(frames)} of {len(wanted)} poses lie between given ones")
+    if missing:
+        notes.append(f"{missing} of {len(wanted)} poses lie between given ones")
     return Motion(turned, moved, fps, body.skeleton.names)
