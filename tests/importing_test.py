@@ -17,6 +17,7 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
 from rnd_trainer.checking.check import check_capture
+from rnd_trainer.importing import nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import Choice, ImportOptions
 from rnd_trainer.silhouette import overlap, posed_vertices
@@ -272,6 +273,39 @@ def test_a_training_camera_without_pictures_in_range_is_refused(tmp_path) -> Non
     assert refusal(choice=Choice(train_camera="2", stop=2)) == (
         "--train-camera: expected one with pictures in range: 1 or 3, got 2"
     )
+
+
+# nerfstudio's frames without a time
+
+UNTIMED = {
+    # where each picture was taken from, its frame
+    "one that moves": ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 4, 5]),
+    "one that comes to rest": ([0, 1, 2, 3, 4, 4], [0, 1, 2, 3, 4, 5]),
+    "one that comes back": ([0, 1, 2, 0, 1, 3], [0, 1, 2, 3, 4, 5]),
+    "one that stands": ([0, 0, 0, 0], [0, 1, 2, 3]),
+    "two that stand": ([0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2]),
+    "two in turn": ([0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2]),
+}
+
+
+@pytest.mark.parametrize("name", UNTIMED)
+@pytest.mark.parametrize("null", [True, False])
+def test_nerfstudios_frames_without_times_are_counted(tmp_path, name, null) -> None:
+    places, frames = UNTIMED[name]
+    layouts.write_nerfstudio(tmp_path)
+    record = json.loads((tmp_path / "transforms.json").read_text())
+    entry = record["frames"][0]
+    del entry["time_index"]
+    record["frames"] = []
+    for place in places:
+        pose = np.array(entry["transform_matrix"])
+        pose[0, 3] += place
+        more = {"time_index": None} if null else {}
+        record["frames"].append(entry | more | {"transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps(record))
+    shots = nerfstudio.read(tmp_path).shots
+    assert [shot.camera for shot in shots] == [f"{place:04d}" for place in places]
+    assert [shot.frame for shot in shots] == frames
 
 
 def _one_camera(tmp_path: Path, name: str) -> tuple[Path, str]:

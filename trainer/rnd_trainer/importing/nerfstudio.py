@@ -34,9 +34,10 @@ def detect(source: Path) -> str | None:
 def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> Recording:
     """Read cameras (OpenGL's camera-to-world, pixel centres at +0.5) and pictures.
 
-    Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given, else
-    the n-th picture of each camera. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a file
-    called poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
+    Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given. Else
+    cameras with equally many pictures, several each, saw every moment: the n-th picture of each is frame n. Any others
+    are one that moves, a frame a picture. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a
+    file called poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
     """
     file = source / "transforms.json" if source.is_dir() else source
     record = read_json(file)
@@ -59,14 +60,14 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
         lens, key = _lens({**record, **entry}, picture, file)
         name = names.setdefault(key, f"{len(names):04d}")
         lenses.setdefault(name, lens)
-        number = next(
-            (int(entry[k]) for k in ("time_index", "frame") if entry.get(k) is not None), seen.get(name, 0)
-        )
+        time = _time(entry)
+        number = seen.get(name, 0) if time is None else time
         seen[name] = number + 1
         mask = entry.get("mask_path")
         read_it = partial(read_mask, file.parent / mask) if mask else _alpha(picture)
         shots.append(Shot(name, number, partial(read_rgb, picture), read_it, name=picture.stem))
-    if len(names) == len(shots) > 1 and not any("time_index" in e or "frame" in e for e in entries):
+    untimed = all(_time(entry) is None for entry in entries)
+    if untimed and not (len(set(seen.values())) == 1 and len(shots) > len(names)):
         shots = [replace(shot, frame=k) for k, shot in enumerate(shots)]  # one camera that moves
     pose_file = poses or next((file.parent / name for name in _POSES if (file.parent / name).is_file()), None)
     if pose_file is None:
@@ -75,6 +76,10 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
         )
     found = read_poses(pose_file, person=person)
     return Recording("nerfstudio transforms.json", lenses, shots, found.poses, found.fps or FPS, found.notes)
+
+
+def _time(entry: dict[str, Any]) -> int | None:
+    return next((int(entry[key]) for key in ("time_index", "frame") if entry.get(key) is not None), None)
 
 
 def _picture(folder: Path, name: Any, file: Path) -> Path:
