@@ -248,6 +248,44 @@ def test_what_a_source_lacks_is_named(tmp_path, name) -> None:
         import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
 
 
+OTHERS = {
+    "transforms.json": ("3", "null", '"frames"', '["frames"]', "{}"),
+    "frame_000000.json": (
+        "3", "[]", "{}", '{"skeleton_0": null}', '{"skeleton_0": "smpl_data"}', '{"skeleton_0": ["smpl_data"]}',
+    ),
+    "cameras.json": ("3", '["intrinsic"]', "null"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "content"), [(name, text) for name in OTHERS for text in OTHERS[name]])
+def test_a_file_that_is_only_called_like_a_layouts_is_none(tmp_path, name, content) -> None:
+    (tmp_path / name).write_text(content)
+    np.savez(tmp_path / "poses.npz", poses=np.zeros(3))
+    with pytest.raises(InputError, match="source: expected a known layout"):
+        find_layout(tmp_path)
+    (tmp_path / "0.png").touch()
+    assert find_layout(tmp_path) == ("video", "a folder of frames")
+
+
+@pytest.mark.parametrize("content", ["{", "[" * 100_000])
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_damaged_file_of_a_layout_is_named(tmp_path, name, content) -> None:
+    (tmp_path / name).write_text(content)
+    np.savez(tmp_path / "poses.npz", poses=np.zeros(3))
+    with pytest.raises(InputError, match=f"{name}: cannot be read: expected JSON"):
+        find_layout(tmp_path)
+
+
+def test_records_of_another_kind_than_the_first_are_named(tmp_path) -> None:
+    source, refusal = _arah(tmp_path)
+    (source / "cam_params.json").write_text('["1", "2"]')
+    assert refusal() == f"{source / 'cam_params.json'}: cameras: expected a dict by name, got list"
+    layouts.write_rana(rana := tmp_path / "rana")
+    (rana / "frame_000002.json").write_text("[]")
+    with pytest.raises(InputError, match=r"frame_000002\.json: frame 2: smpl_data"):
+        import_source(rana, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
+
+
 @pytest.mark.parametrize("inner", ["models/shape.npz", "1/cover.jpg"])
 def test_an_arah_file_without_a_number_is_named(tmp_path, inner) -> None:
     source, refusal = _arah(tmp_path)

@@ -44,6 +44,9 @@ def read(source: Path) -> Recording:
             betas = archive.numbers("betas") if "betas" in archive.names else betas
         frames.append(_number(file))
     record = read_json(source / "cam_params.json")
+    if not isinstance(record, dict):
+        got = type(record).__name__
+        raise InputError("cameras", expected="a dict by name", got=got, file=source / "cam_params.json")
     lenses, shots = {}, []
     for name in record.get("all_cam_names", []):
         folder = source / str(name)

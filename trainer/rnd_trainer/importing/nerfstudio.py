@@ -28,7 +28,8 @@ def detect(source: Path) -> str | None:
     file = source / "transforms.json" if source.is_dir() else source
     if file.name != "transforms.json" or not file.is_file():
         return None
-    return "transforms.json" if "frames" in read_json(file) else None
+    record = read_json(file)
+    return "transforms.json" if isinstance(record, dict) and "frames" in record else None
 
 
 def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> Recording:

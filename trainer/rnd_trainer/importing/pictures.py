@@ -118,7 +118,7 @@ def read_json(path: Path) -> Any:
     """A JSON file's content."""
     try:
         return json.loads(existing_file(path, what="file").read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError("cannot be read", expected="JSON", got=str(error), file=path) from error
 
 

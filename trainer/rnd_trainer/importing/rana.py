@@ -22,7 +22,9 @@ _HANDS_FROM = 57  # of body_pose: RANA's hands are not SMPL's, IntrinsicAvatar z
 def detect(source: Path) -> str | None:
     """ "frame_000000.json" with "skeleton_0.smpl_data" beside the pictures."""
     first = next(iter(sorted(source.glob("frame_*.json"))), None)
-    if first is None or "smpl_data" not in read_json(first).get("skeleton_0", {}):
+    record = None if first is None else read_json(first)
+    skeleton = record.get("skeleton_0") if isinstance(record, dict) else None
+    if not isinstance(skeleton, dict) or "smpl_data" not in skeleton:
         return None
     return "frame_*.png with frame_*.json of smpl_data"
 
@@ -49,7 +51,7 @@ def read(source: Path) -> Recording:
             lens = lens or Lens(
                 camera_of(_K(record, data, sized(picture)), np.eye(3), np.zeros(3), sized(picture), corner=0)
             )
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise InputError("smpl_data", expected="pose, global_orient, global_trans, scale, betas", got=str(error),
                              file=file, frame=frame) from error  # fmt: skip
         frames.append(frame)
