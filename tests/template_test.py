@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -69,3 +71,14 @@ def test_skinning_by_identity_changes_nothing(template) -> None:
 def test_too_many_nodes_are_refused() -> None:
     with pytest.raises(InputError, match="nodes: expected 16 to 100"):
         sample_template(body(), 100, 200, seed=0)
+
+
+@pytest.mark.parametrize("what", ["faces", "area"])
+def test_a_body_without_a_surface_is_refused(what) -> None:
+    """No faces, or each of them a point."""
+    flat = body()
+    faces = flat.faces[:0] if what == "faces" else flat.faces[:, :1].repeat(3, 1)
+    with pytest.raises(
+        InputError, match=rf"faces of the body: expected a surface, got {len(faces)} faces, 0 m²"
+    ):
+        sample_template(replace(flat, faces=faces), 100, 20, seed=0)

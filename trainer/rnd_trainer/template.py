@@ -66,6 +66,9 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
     """Spread ``count`` points evenly over the surface of ``body``.
 
     Farthest point sampling (Eldar et al. 1997) of uniform candidates, so that any prefix covers the body too.
+
+    Raises:
+        InputError: too few or too many ``nodes``, or the body has no surface.
     """
     if not 16 <= nodes <= count:
         raise InputError("nodes", expected=f"16 to {count} (the number of Gaussians)", got=nodes)
@@ -73,8 +76,11 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
     triangles = vertices[body.faces]
     crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     areas = 0.5 * np.linalg.norm(crosses, axis=1)
+    area = float(areas.sum())
+    if not 0 < area < np.inf:
+        raise InputError("faces of the body", expected="a surface", got=f"{len(areas)} faces, {area:.3g} m²")
     rng = np.random.default_rng(seed)
-    face = rng.choice(len(areas), size=OVERSAMPLING * count, p=areas / areas.sum())
+    face = rng.choice(len(areas), size=OVERSAMPLING * count, p=areas / area)
     u, v = rng.random((2, len(face)))
     flip = u + v > 1
     u[flip], v[flip] = 1 - u[flip], 1 - v[flip]
@@ -97,14 +103,14 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
     normals = interpolate(_vertex_normals(vertices, body.faces, crosses))[chosen]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
-    neighbours, neighbour_weights = node_interpolation(codes, codes[:nodes], float(areas.sum()))
+    neighbours, neighbour_weights = node_interpolation(codes, codes[:nodes], area)
     weights = weights / weights.sum(axis=1, keepdims=True)
     return Template(
         points=points,
         normals=normals,
         codes=codes,
         weights=weights,
-        spacing=float(np.sqrt(areas.sum() / count)),
+        spacing=float(np.sqrt(area / count)),
         neighbours=neighbours,
         neighbour_weights=neighbour_weights,
         limbs=twist_frames(points, weights, body.skeleton),
