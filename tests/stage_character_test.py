@@ -130,25 +130,36 @@ def test_bent_arms_are_straightened(body: Body, tmp_path: Path) -> None:
     assert abs(wrist[1] - shoulder[1]) < 1e-6
 
 
-def test_the_project_layout_is_read_with_its_textures(body: Body, tmp_path: Path) -> None:
+def write_character(path: Path, body: Body, names: tuple[str, ...] = ("jeans", "skin")) -> None:
+    """The body in the project's own layout: grey, jeans up to 1.5 m."""
     grey = np.full((4, 4, 4), round(255 * float(linear_to_srgb(0.2))), np.uint8)
     grey[..., 3] = 255
-    write_image(tmp_path / "cloth.png", grey)
+    write_image(path.with_name("cloth.png"), grey)
     save_npz(
-        tmp_path / "person.npz",
+        path,
         {
             "vertices": body.vertices, "faces": body.faces, "uv": np.zeros((1, 2)), "face_uv": 0 * body.faces,
             "material": (body.vertices[body.faces[:, 0], 1] > 1.5).astype(np.uint8),
-            "material_names": np.array(["jeans", "skin"]), "textures": np.array(["cloth.png", "cloth.png"]),
+            "material_names": np.array(names), "textures": np.array(["cloth.png", "cloth.png"]),
             "weights": body.skinning_weights, "joint_names": np.array(SMPL_NAMES),
             "parents": np.array(SMPL_PARENTS), "joints": body.skeleton.rest_joints,
         },
     )  # fmt: skip
+
+
+def test_the_project_layout_is_read_with_its_textures(body: Body, tmp_path: Path) -> None:
+    write_character(tmp_path / "person.npz", body)
     dressed = characters.load_character(tmp_path / "person.npz")
     np.testing.assert_allclose(dressed.colour, 0.2, atol=0.005)
     cloth = dressed.drape.radius > 0
     assert 0.5 < cloth.mean() < 0.95 and dressed.vertices[cloth, 1].max() < 1.6
     assert set(np.round(dressed.roughness, 2)) == {0.45, 0.8}
+
+
+def test_a_material_without_a_name_is_refused(body: Body, tmp_path: Path) -> None:
+    write_character(tmp_path / "person.npz", body, ("jeans",))
+    with pytest.raises(InputError, match=r"person\.npz: material: expected indices below 1, got 1"):
+        characters.load_character(tmp_path / "person.npz")
 
 
 def test_skin_under_clothes_is_tucked_in(body: Body) -> None:

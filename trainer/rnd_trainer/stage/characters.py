@@ -224,7 +224,7 @@ def _read_npz(path: Path) -> Character:
     for what, index, limit in (
         ("faces", faces, len(vertices)),
         ("face_uv", face_uv, len(uv)),
-        ("material", material, len(textures)),
+        ("material", material, min(len(materials), len(textures))),
     ):
         if len(index) and not 0 <= index.min() <= index.max() < limit:
             raise InputError(what, expected=f"indices below {limit}", got=int(index.max()), file=path)
