@@ -22,6 +22,7 @@ from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.checking.check import check_capture
+from rnd_trainer.importing import nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pictures import listed
@@ -544,6 +545,28 @@ def test_numbers_that_count_no_frames_are_refused(tmp_path) -> None:
         InputError, match="frames of the poses: expected at most 100000 left out, got 3599999997 "
     ):
         import_source(source, tmp_path / "out", options)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "frames", "kept"),
+    [([1, 2, 3, 4], [1, 2, 3, 4], [2, 1, 4, 3]), ([0, 1, 2, 3], [1, 2, 3, 4], [2, 1, 4, 3]),
+     (None, [0, 1, 2, 3], [0, 1, 2, 3])],
+)  # fmt: skip
+@pytest.mark.parametrize("moves", [0, 1])
+def test_pictures_of_one_camera_belong_to_numbered_poses(tmp_path, moves, numbers, frames, kept) -> None:
+    """Of transforms.json, whatever their order; to poses of one file, in the order they come."""
+    layouts.write_nerfstudio(tmp_path)
+    record = json.loads((tmp_path / "transforms.json").read_text())
+    for k, entry in zip((2, 1, 4, 3), record["frames"]):
+        entry |= {"time_index": None, "file_path": f"f{k}.png"}
+        entry["transform_matrix"][0][3] += moves * k
+    del record["frames"][FRAMES:]
+    (tmp_path / "transforms.json").write_text(json.dumps(record))
+    poses = None if numbers is None else _fits(tmp_path, dict(zip(numbers, range(FRAMES))))
+    recording = nerfstudio.read(tmp_path, poses=poses)
+    assert [shot.frame for shot in recording.shots] == kept
+    assert recording.poses.frames.tolist() == frames
+    assert any("taken for the same" in note for note in recording.notes) == (numbers == [0, 1, 2, 3])
 
 
 @pytest.mark.parametrize("write", [write_romp, write_easymocap_folder])

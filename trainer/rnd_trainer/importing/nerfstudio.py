@@ -12,8 +12,8 @@ import numpy as np
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_header
 
-from .pictures import camera_of, read_json, read_mask, read_rgb, sized
-from .pose_files import read_poses
+from .pictures import camera_of, numbers_of, read_json, read_mask, read_rgb, sized
+from .pose_files import paired, read_poses
 from .recording import Lens, Recording, Shot
 
 FPS = 30.0
@@ -36,9 +36,10 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     """Read cameras (OpenGL's camera-to-world, pixel centres at +0.5) and pictures.
 
     Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given. Else
-    cameras with equally many pictures, several each, saw every moment: the n-th picture of each is frame n. Any others
-    are one that moves, a frame a picture. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a
-    file called poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
+    several cameras with equally many pictures, more than one, saw every moment: the n-th picture of each is frame n.
+    Any others are one that may move, a frame a picture, by the numbers in their names where the poses' files are
+    numbered, else as they come. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a file called
+    poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
     """
     file = source / "transforms.json" if source.is_dir() else source
     record = read_json(file)
@@ -52,7 +53,7 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     lenses: dict[str, Lens] = {}
     names: dict[bytes, str] = {}
     seen: dict[str, int] = {}
-    shots = []
+    shots, pictures = [], []
     entries = record["frames"]
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError("frames", expected="a list of at least one frame", got=repr(entries)[:60], file=file)
@@ -66,17 +67,22 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
         seen[name] = number + 1
         mask = entry.get("mask_path")
         read_it = partial(read_mask, file.parent / mask) if mask else _alpha(picture)
+        pictures.append(picture)
         shots.append(Shot(name, number, partial(read_rgb, picture), read_it, name=picture.stem))
-    untimed = all(_time(entry) is None for entry in entries)
-    if untimed and not (len(set(seen.values())) == 1 and len(shots) > len(names)):
-        shots = [replace(shot, frame=k) for k, shot in enumerate(shots)]  # one camera that moves
     pose_file = poses or next((file.parent / name for name in _POSES if (file.parent / name).is_file()), None)
     if pose_file is None:
         raise InputError(
             "body poses", expected="--poses FILE, as transforms.json has none", got="none", file=file
         )
     found = read_poses(pose_file, person=person)
-    return Recording("nerfstudio transforms.json", lenses, shots, found.poses, found.fps or FPS, found.notes)
+    body_poses, notes = found.poses, found.notes
+    several = 1 < len(names) < len(shots) and len(set(seen.values())) == 1
+    if not several and all(_time(entry) is None for entry in entries):  # one camera, that may move
+        numbers = (numbers_of(pictures) if found.numbered else None) or range(len(shots))
+        shots = [replace(shot, frame=number) for shot, number in zip(shots, numbers)]
+        body_poses, counted = paired(found, sorted(numbers), file)
+        notes += counted
+    return Recording("nerfstudio transforms.json", lenses, shots, body_poses, found.fps or FPS, notes)
 
 
 def _time(entry: dict[str, Any]) -> int | None:

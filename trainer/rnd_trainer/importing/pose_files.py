@@ -123,6 +123,33 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     )
 
 
+def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
+    """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
+
+    Numbers mean the same in both where all of one's are among the other's. Else one may have been counted from 0 and
+    the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
+    poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
+
+    Raises:
+        InputError: no frame has a pose.
+    """
+    poses = found.poses
+    ours, theirs = set(numbers), set(poses.frames.tolist())
+    begin, first, last = numbers[0], int(poses.frames[0]), int(poses.frames[-1])
+    if found.numbered and not (ours <= theirs or theirs <= ours):
+        extent = last - first + 1
+        as_many = extent == len(numbers) and min(begin, first) <= 1
+        from_zero = extent <= len(numbers) and (first, begin) == (0, 1)
+        if numbers[-1] - begin + 1 == len(numbers) and (as_many or from_zero):
+            note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
+            return replace(poses, frames=poses.frames + (begin - first)), (note,)
+    if not ours & theirs:
+        raise InputError(
+            "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
+        )  # fmt: skip
+    return poses, ()
+
+
 def _refuse_number(person: int | None, of: str) -> None:
     """Refuse ``--person`` where a file has one person, or several without numbers."""
     if person is not None:

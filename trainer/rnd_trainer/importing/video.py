@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,8 +18,8 @@ from .body_models import BodyModel
 from .frames import Film
 from .options import ALL, Choice
 from .pictures import PICTURES, Bytes, camera_of, listed, numbers_of, read_rgb, sized
-from .pose_files import FoundPoses
-from .recording import Floats, Lens, Poses, Recording, Shot
+from .pose_files import FoundPoses, paired
+from .recording import Floats, Lens, Recording, Shot
 from .select import select_frames, sharpness
 from .write import TRAIN_SHARE, Scene, placed
 
@@ -93,7 +92,7 @@ def read(
     rate = fps or (film.fps if source.is_file() else found.fps or FPS)
     K, notes = _lens(found, film.width, film.height, intrinsics)
     lens = Lens(camera_of(K, np.eye(3), np.zeros(3), (film.width, film.height), corner=0), tuple(distortion))
-    poses, counted = _paired(found, film)
+    poses, counted = paired(found, film.numbers, film.path)
     recording = Recording(
         f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes, *counted)
     )  # fmt: skip
@@ -105,33 +104,6 @@ def read(
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
     return Recording(recording.kind, recording.lenses, shots, poses, rate, (*recording.notes, kept))
-
-
-def _paired(found: FoundPoses, film: Film | _Folder) -> tuple[Poses, tuple[str, ...]]:
-    """The poses by the numbers of ``film``'s frames, and what was assumed.
-
-    Numbers mean the same in both where all of one's are among the other's. Else one may have been counted from 0 and
-    the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
-    poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
-
-    Raises:
-        InputError: no frame has a pose.
-    """
-    poses, numbers = found.poses, film.numbers
-    ours, theirs = set(numbers), set(poses.frames.tolist())
-    begin, first, last = numbers[0], int(poses.frames[0]), int(poses.frames[-1])
-    if found.numbered and not (ours <= theirs or theirs <= ours):
-        extent = last - first + 1
-        as_many = extent == film.count and min(begin, first) <= 1
-        from_zero = extent <= film.count and (first, begin) == (0, 1)
-        if numbers[-1] - begin + 1 == film.count and (as_many or from_zero):
-            note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
-            return replace(poses, frames=poses.frames + (begin - first)), (note,)
-    if not ours & theirs:
-        raise InputError(
-            "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=film.path
-        )  # fmt: skip
-    return poses, ()
 
 
 def _lens(
