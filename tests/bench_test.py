@@ -37,7 +37,7 @@ from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
-from rnd_trainer.bench_pass import one_call, three_calls
+from rnd_trainer.bench_pass import one_call, showing, three_calls
 from rnd_trainer.bench_raster import body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.checkpoint import load_checkpoint
@@ -110,6 +110,16 @@ def test_one_compiled_function_draws_what_three_kernels_draw() -> None:
         image, alpha, _ = draws(*arrays, camera)
         np.testing.assert_array_equal(image.numpy(), truth.image)
         np.testing.assert_array_equal(alpha.numpy(), truth.alpha)
+
+
+def test_those_that_show_nearly_make_the_picture_alone() -> None:
+    scene, camera = body_scene(2000), bench_camera(64)
+    kept = showing(*scene, camera)
+    assert 0.5 < kept.mean() < 0.9  # a body hides its own back
+    whole = raster_cpu.rasterize(*scene, camera, depth=False)
+    alone = raster_cpu.rasterize(*(array[kept] for array in scene), camera, depth=False)
+    assert 0 < np.mean((alone.image - whole.image) ** 2) < 1e-6
+    assert np.abs(alone.image - whole.image).max() < 0.1
 
 
 @pytest.mark.parametrize("raster", ["gl-egl", "gl-osmesa"])

@@ -98,8 +98,8 @@ def _export(options: Options) -> None:
     if options.out is None and file.suffix == ".onnx":
         raise InputError("not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=file)
     out = options.out or file.with_suffix(".onnx")
-    check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
     check_option(out.resolve() != file.resolve(), "--out", "another file than the checkpoint", out)
+    check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
     checkpoint = load_checkpoint(file)
     if options.motion is not None:
         motion = load_motion(options.motion, checkpoint.skeleton)

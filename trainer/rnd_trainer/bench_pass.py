@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from numba import get_num_threads, njit
 from torch import Tensor
@@ -12,6 +13,10 @@ from rnd_runtime._raster_blend import blend
 from rnd_runtime._raster_project import project, view_of
 from rnd_runtime._raster_tiles import Splats, sort_into_tiles
 from rnd_runtime.camera import Camera
+from rnd_runtime.raster_cpu import backward, forward
+
+HIDDEN = 0.01
+"""of one pixel; of trained Gaussians 3 % add nothing at all, 28 % less than this"""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -40,6 +45,17 @@ def one_call(*arguments: Any) -> tuple[Tensor, Tensor, None]:
     """The same three kernels within one compiled function."""
     arrays, camera = _arrays(arguments)
     return _pictures(_splat(*arrays, view_of(camera), get_num_threads()))
+
+
+def showing(means: Any, covariances: Any, opacities: Any, features: Any, camera: Camera) -> Any:
+    """[N] the Gaussians that add more than HIDDEN to the picture: those that others hide do not.
+
+    Arguments of :func:`rnd_runtime.raster_cpu.rasterize`. What a Gaussian adds is what the picture's sum gains by its
+    feature.
+    """
+    raster, state = forward(means, covariances, opacities, features, camera, depth=False)
+    weights = backward(state, np.ones_like(raster.image), np.zeros_like(raster.alpha))[3]
+    return weights[:, 0] > HIDDEN
 
 
 def _arrays(arguments: tuple[Any, ...]) -> tuple[list[Any], Camera]:

@@ -31,7 +31,7 @@ from rnd_trainer import raster, raster_reference
 
 from .bench_clock import summary
 from .bench_frame import bench_camera
-from .bench_pass import one_call, three_calls
+from .bench_pass import one_call, showing, three_calls
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]
@@ -150,7 +150,14 @@ def measure(
             ("torch tiles", raster_reference.rasterize, 1, max(3, repeats // 10)),
         ]
         cases = [(*kernel, wanted) for wanted in (None, incoming) for kernel in kernels]
-        alone = [("numba, three calls", three_calls), ("numba, one call", one_call), *_gl_rasterizers()]
+        kept = showing(*scene, camera)
+        shown = [torch.from_numpy(array[kept]) for array in scene]
+        alone = [
+            ("numba, three calls", three_calls),
+            ("numba, one call", one_call),
+            ("numba, three calls, none hidden", lambda *_: three_calls(*shown, camera)),
+            *_gl_rasterizers(),
+        ]
         cases += [(name, draws, warmup, repeats, None) for name, draws in alone]
         times: list[list[float]] = [[] for _ in cases]
         results: list[Result] = [Result(torch.empty(0), torch.empty(0))] * len(cases)
