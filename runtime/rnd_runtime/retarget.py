@@ -65,18 +65,21 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     root = matched.get(skeleton.names[0], 0)
     world = _upright(recorded[:, root], to_ours, up)
     turned = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
-    limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
-    first = _reference_frames(_local_rotations(turned, skeleton)[:, limbs])
-    quarters = _quarters_to_front(turned[first, 0])
-    turn = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
-    turned, world = (turn @ turned)[first:], turn @ world
     rotations = _local_rotations(turned, skeleton)
+    limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
+    first = _reference_frames(rotations[:, limbs])
+    quarters = _quarters_to_front(turned[first, 0])
+    turn = axis_angle_to_matrix(
+        [0, quarters * np.pi / 2, 0]
+    )  # of the root: in their parents' frames others stay
+    rotations, world = rotations[first:], turn @ world
+    rotations[:, 0] = turn @ rotations[:, 0]
 
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
     hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
     hips = (tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
-    pelvis = scale * hips @ world.T - turned[:, 0] @ hips_ours
+    pelvis = scale * hips @ world.T - rotations[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)
     notes = [*tree.notes]

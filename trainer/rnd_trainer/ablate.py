@@ -11,7 +11,6 @@ import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import earlier_rows, write_json
+from rnd_runtime.files import earlier_rows, sha256_of, write_json
 
 from .checkpoint import load_checkpoint
 from .config import TrainConfig
@@ -148,7 +147,7 @@ def ablate(
 
     Raises :class:`InputError`, before anything is trained, where a run done or begun before is not of this study.
     """
-    told = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256(capture.file.read_bytes()).hexdigest()}
+    told = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256_of(capture.file)}
 
     def same(config: TrainConfig) -> dict[str, Any]:
         """What rows of a run with ``config`` say of themselves."""

@@ -109,7 +109,7 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
     if cross or sample is not None:
         names = tuple(cross or FACTORS)
         combinations = product(*(FACTORS[name] for name in names))
-        points = [usual, *(_of(names, values) for values in combinations)]
+        points = [usual, *(_of(usual, names, values) for values in combinations)]
         distinct = list(dict.fromkeys(points))
         if sample is None:
             return distinct
@@ -142,14 +142,14 @@ def drawn(names: Sequence[str], usual: Setting, seed: int = 0) -> Iterator[Setti
         for name in names:
             if not waiting[name]:
                 waiting[name] = [FACTORS[name][k] for k in rng.permutation(len(FACTORS[name]))]
-        point = _of(names, [waiting[name].pop() for name in names])
+        point = _of(usual, names, [waiting[name].pop() for name in names])
         if point not in seen:
             seen.add(point)
             yield point
 
 
-def _of(names: Sequence[str], values: Sequence[Any]) -> Setting:
-    point = Setting(**dict(zip(names, values)))
+def _of(usual: Setting, names: Sequence[str], values: Sequence[Any]) -> Setting:
+    point = replace(usual, **dict(zip(names, values)))
     return replace(point, window=None) if point.encoder == "static" else point  # which looks at no window
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, existing_file
+from rnd_runtime.files import atomic_path, existing_file, sha256_of
 from rnd_runtime.skeleton import Skeleton
 
 from .config import TrainConfig, from_dict, to_dict
@@ -87,8 +86,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
     if not all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point()):
         raise InputError("checkpoint", expected="finite numbers", got="NaN or infinity", file=path)
-    digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    return Checkpoint(model, probe, skeleton, config, header.get("info", {}), Path(path), digest)
+    return Checkpoint(model, probe, skeleton, config, header.get("info", {}), Path(path), sha256_of(path))
 
 
 def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import importlib.util
 import sys
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
-from rnd_runtime.files import is_folder, write_json
+from rnd_runtime.files import is_folder, sha256_of, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -131,7 +130,7 @@ def evaluate_run(options: EvalOptions) -> None:
         mode=options.shade,
         pictures=options.pictures,
         perceptual=load_lpips(options.perceptual_weights),
-        avatar=exported if _is_of(exported, path) else None,
+        avatar=exported if _is_of(exported, checkpoint) else None,
     )
     names = [name for name in COLUMNS if any(name in row for row in rows)]
     table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=str(path))
@@ -158,13 +157,13 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
         return None
     named = checkpoint.info.get("capture") == capture.parent.resolve().name
     digest = checkpoint.info.get("capture_sha256")  # checkpoints of before have none
-    if not (named if digest is None else digest == hashlib.sha256(capture.read_bytes()).hexdigest()):
+    if not (named if digest is None else digest == sha256_of(capture)):
         return None
     print(f"rnd-eval: poses of {file}, corrected in training; --motion takes others", file=sys.stderr)  # noqa: T201
     return str(file)
 
 
-def _is_of(exported: Path, checkpoint: Path) -> bool:
+def _is_of(exported: Path, checkpoint: Checkpoint) -> bool:
     """Whether ``exported`` is there and was made from ``checkpoint`` as it is now; says where only the first holds."""
     from rnd_runtime.avatar_file import read_metadata
     from rnd_runtime.onnx_parts import OnnxFile
@@ -175,7 +174,7 @@ def _is_of(exported: Path, checkpoint: Path) -> bool:
         source = read_metadata(OnnxFile(exported.read_bytes())).checkpoint_sha256
     except InputError as error:
         raise error.at(file=exported) from error
-    if source == hashlib.sha256(checkpoint.read_bytes()).hexdigest():
+    if source == checkpoint.sha256:
         return True
     print(f"{exported}: of another checkpoint: its size and speed are left out", file=sys.stderr)  # noqa: T201
     return False

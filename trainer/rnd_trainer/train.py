@@ -24,7 +24,7 @@ from torch import Tensor
 
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import atomic_path, sha256_of
 from rnd_runtime.light import texel_directions
 from rnd_runtime.motion import Motion, save_motion
 
@@ -385,7 +385,7 @@ class Training:
         """Provenance for the checkpoint."""
         return {
             "capture": self.capture.folder.resolve().name,
-            "capture_sha256": hashlib.sha256(self.capture.file.read_bytes()).hexdigest(),
+            "capture_sha256": sha256_of(self.capture.file),
             "body_license": self.capture.body.license,
             "step": self.step_index,
             "minutes": round(self.seconds / 60, 3),

@@ -139,9 +139,8 @@ def turned_over(splats: Splats) -> Splats:
 
 
 def _cell_means(cell: NDArray[np.intp], weights: Floats32, values: NDArray[np.floating]) -> Floats:
-    total = np.maximum(
-        np.bincount(cell, weights), np.finfo(np.float64).tiny
-    )  # what nobody sees may weigh nothing
+    nothing = np.finfo(np.float64).tiny  # what a cell that nobody sees may weigh
+    total = np.maximum(np.bincount(cell, weights), nothing)
     return np.stack([np.bincount(cell, weights * column) / total for column in values.T], axis=1)
 
 

@@ -147,10 +147,9 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
         yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
     finally:
         server.socket.close()
-        if (
-            not server.socket_closed.is_set()
-        ):  # nobody has served yet, and shutdown would wait for one who has
-            server.serve_forever()  # returns at once, as its socket is closed
+        # Where nobody has served yet, shutdown would wait for ever; with its socket closed serving ends at once.
+        if not server.socket_closed.is_set():
+            server.serve_forever()
         server.shutdown()
 
 

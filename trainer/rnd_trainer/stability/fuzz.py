@@ -7,7 +7,6 @@ whatever is executed, and every file opened for writing outside FOLDER. Hypothes
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -27,6 +26,7 @@ import numpy as np
 import rnd_runtime
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import write_json
+from rnd_trainer.bench_avatars import content_key
 
 from .commands import environment
 from .figures import Figure, at_most, holds
@@ -376,12 +376,9 @@ def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], obj
 
 
 def _readers_key() -> str:
-    """Twelve hexadecimal digits for the code that reads: what another one did says nothing of this one."""
-    digest = hashlib.sha256()
-    for package in (Path(rnd_runtime.__file__).parent, Path(__file__).parents[1]):
-        for file in sorted(package.rglob("*.py")):
-            digest.update(file.read_bytes())
-    return digest.hexdigest()[:12]
+    """Of the code that reads: what another one did says nothing of this one."""
+    packages = Path(rnd_runtime.__file__).parent, Path(__file__).parents[1]
+    return content_key(*(file for package in packages for file in sorted(package.rglob("*.py"))))
 
 
 def _batch(folder: Path, name: str, seed: int, size: int) -> dict[str, Any]:
