@@ -16,7 +16,7 @@ import rnd_trainer.ablate
 import rnd_trainer.held_out
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import write_json
+from rnd_runtime.files import sha256_of, write_json
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
 from rnd_runtime.shading import Shader
@@ -439,16 +439,16 @@ def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
 ) -> None:
     checkpoint, exported = tmp_path / "avatar.ckpt", tmp_path / "avatar.onnx"
     checkpoint.write_bytes(tiny_checkpoint.read_bytes())
-    assert not _is_of(exported, checkpoint)
+    assert not _is_of(exported, sha256_of(checkpoint))
     exported.write_bytes(tiny_avatar.read_bytes())
-    assert _is_of(exported, checkpoint) and not capsys.readouterr().err
+    assert _is_of(exported, sha256_of(checkpoint)) and not capsys.readouterr().err
     checkpoint.write_bytes(tiny_checkpoint.read_bytes() + b"later")
-    assert not _is_of(exported, checkpoint)
+    assert not _is_of(exported, sha256_of(checkpoint))
     said = capsys.readouterr().err
     assert said == f"{exported}: of another checkpoint: its size and speed are left out\n"
     exported.write_bytes(b"cut")
     with pytest.raises(InputError, match=r"avatar\.onnx: not a readable ONNX model"):
-        _is_of(exported, checkpoint)
+        _is_of(exported, sha256_of(checkpoint))
 
 
 def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar, tiny_capture) -> None:

@@ -130,7 +130,7 @@ def evaluate_run(options: EvalOptions) -> None:
         mode=options.shade,
         pictures=options.pictures,
         perceptual=load_lpips(options.perceptual_weights),
-        avatar=exported if _is_of(exported, checkpoint) else None,
+        avatar=exported if _is_of(exported, checkpoint.sha256) else None,
     )
     names = [name for name in COLUMNS if any(name in row for row in rows)]
     table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=str(path))
@@ -163,8 +163,8 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
     return str(file)
 
 
-def _is_of(exported: Path, checkpoint: Checkpoint) -> bool:
-    """Whether ``exported`` is there and was made from ``checkpoint`` as it is now; says where only the first holds."""
+def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
+    """Whether ``exported`` is there and was made of that checkpoint; says where only the first holds."""
     from rnd_runtime.avatar_file import read_metadata
     from rnd_runtime.onnx_parts import OnnxFile
 
@@ -174,7 +174,7 @@ def _is_of(exported: Path, checkpoint: Checkpoint) -> bool:
         source = read_metadata(OnnxFile(exported.read_bytes())).checkpoint_sha256
     except InputError as error:
         raise error.at(file=exported) from error
-    if source == checkpoint.sha256:
+    if source == checkpoint_sha256:
         return True
     print(f"{exported}: of another checkpoint: its size and speed are left out", file=sys.stderr)  # noqa: T201
     return False
