@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -309,6 +310,19 @@ def test_each_network_gets_as_few_nodes_as_it_can_do_with() -> None:
     assert found.plan.offset_nodes == found.plan.visibility_nodes == 2 and found.plan.skinning_nodes == 0
     assert found.plan.nodes == 0 and found.measured.psnr > 65
     assert given_up(bench, found.plan)[0] == "offsets at 1875 of 7500 nodes"
+
+
+@pytest.mark.parametrize(("formula", "most_ms"), [(_Formula, 9.5), (_OwnRates, 12.0)])
+def test_what_a_bound_does_not_need_is_taken_back(formula, most_ms) -> None:
+    """What the search ends with has no step that could be taken back: each would break the bound or gain nothing."""
+    bench, steps = formula(), []
+    found = search(bench, Bound("ms", most_ms), steps.append)
+    assert steps[-2].measured.psnr < steps[-1].measured.psnr and steps[-1].plan == found.plan
+    for name in LADDERS:
+        if rung := getattr(found.plan, name):
+            less = replace(found.plan, **{name: rung - 1}).recipe(bench.config)
+            measured = bench.measure(less, "held out")
+            assert measured.ms > most_ms or measured.psnr <= found.measured.psnr, name
 
 
 class _NodesFirst(_OwnRates):

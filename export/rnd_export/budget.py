@@ -1,9 +1,9 @@
 """No more than a scene needs: the cheapest file of an avatar that keeps a bound, found on this machine.
 
 The search starts from the whole avatar and takes, one after another, the step that saves most for what it costs in the
-picture. Pictures are compared with those of the whole avatar under the same player, light and poses, the worst one
-counts. What is found must keep the bound in shots that the search has not seen; a file that does not is given up for
-the one before it.
+picture. Steps that a bound of time or size turns out not to need are then taken back, the dearest in the picture first.
+Pictures are compared with those of the whole avatar under the same player, light and poses, the worst one counts. What
+is found must keep the bound in shots that the search has not seen; a file that does not is given up for the one before.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
         if bound.kind != "psnr" and bound.held(now.measured):
             now = path[-1] = _tested(bench, now)
             if _kept(bound, now):
-                return now
+                return _relaxed(bench, bound, now, on_step)
         step = _best_step(bench, bound, now, worths)
         if step is None and bound.kind == "ms":  # each for itself may save too little to be told from noise
             step, worths = _mildest_step(bench, now), dict.fromkeys(LADDERS, np.inf)
@@ -139,6 +139,25 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
         expected=f"{bound.value:g}",
         got=f"{getattr(path[-1].measured, bound.kind):.3g} at the end of all steps",
     )
+
+
+def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Found], None]) -> Found:
+    """``found`` with steps taken back for as long as ``bound`` holds: of each round's, what the picture gains most by.
+
+    What saved most for its cost at first may be dear beside what was found later, and the last step may save too much.
+    """
+    while True:
+        plans = [_next(bench, found.plan, name, -1) for name in LADDERS]
+        made = [_made(bench, plan) for plan in plans if plan is not None]
+        gains = (f for f in made if bound.held(f.measured) and f.measured.psnr > found.measured.psnr)
+        for candidate in sorted(gains, key=_square):
+            tested = _tested(bench, candidate)
+            if _kept(bound, tested):
+                found = tested
+                on_step(found)
+                break
+        else:
+            return found
 
 
 def _tested(bench: Workbench, found: Found) -> Found:
@@ -164,7 +183,7 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
             return None
         if name in made:
             return made[name]
-        plan = _further(bench, now.plan, name)
+        plan = _next(bench, now.plan, name, 1)
         if plan is None:
             worths[name] = 0
             continue
@@ -179,16 +198,17 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
 
 def _mildest_step(bench: Workbench, now: Found) -> Found | None:
     """Of the steps further down, the one that costs least in the picture."""
-    plans = [_further(bench, now.plan, name) for name in LADDERS]
+    plans = [_next(bench, now.plan, name, 1) for name in LADDERS]
     return min((_made(bench, plan) for plan in plans if plan is not None), key=_square, default=None)
 
 
-def _further(bench: Workbench, plan: Plan, name: str) -> Plan | None:
-    """The next rung of ``name`` that makes another file; None at the end of the ladder."""
-    for rung in range(getattr(plan, name) + 1, len(LADDERS[name]) + 1):
-        further = replace(plan, **{name: rung})
-        if further.recipe(bench.config) != plan.recipe(bench.config):
-            return further
+def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan | None:
+    """The next rung of ``name`` down the ladder, or up for −1, that makes another file; None at its end."""
+    last = len(LADDERS[name]) if way > 0 else 0
+    for rung in range(getattr(plan, name) + way, last + way, way):
+        other = replace(plan, **{name: rung})
+        if other.recipe(bench.config) != plan.recipe(bench.config):
+            return other
     return None
 
 
