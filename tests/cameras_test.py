@@ -12,10 +12,10 @@ from play_fakes import fake_motion, fake_skeleton
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_viewer.cameras import View, file_path, frame_motion, front_path, orbit_path
+from rnd_viewer.cameras import CameraOptions, file_path, frame_motion, front_path, orbit_path
 
 ONE = range(1)
-VIEW = View(width=320, height=200, fov_y=0.6, elevation=0.1)
+VIEW = CameraOptions(width=320, height=200, fov_y=0.6, elevation=0.1)
 
 
 def _sphere_margins(framing, camera: Camera) -> np.ndarray:
@@ -34,7 +34,9 @@ def _turned(yaw: float):
     return replace(motion, rotations=rotations)
 
 
-@pytest.mark.parametrize("view", [VIEW, View(200, 320, 1.2, -0.4), View(256, 256, 0.3, 1.0)])
+@pytest.mark.parametrize(
+    "view", [VIEW, CameraOptions(200, 320, 1.2, -0.4), CameraOptions(256, 256, 0.3, 1.0)]
+)
 def test_front_camera_shows_the_whole_motion_and_no_more(view):
     framing = frame_motion(fake_skeleton(), fake_motion())
     margins = _sphere_margins(framing, front_path(framing, view)(0, 0.0))
@@ -51,7 +53,7 @@ def test_orbit_shows_the_whole_motion_from_everywhere():
 @pytest.mark.parametrize("yaw", [0.0, 1.3, np.pi])
 def test_front_camera_looks_the_body_in_the_face(yaw):
     framing = frame_motion(fake_skeleton(), _turned(yaw))
-    camera = front_path(framing, View(64, 64, 0.6, 0.0))(0, 0.0)
+    camera = front_path(framing, CameraOptions(64, 64, 0.6, 0.0))(0, 0.0)
     to_camera = (camera.position - framing.centre) / np.linalg.norm(camera.position - framing.centre)
     np.testing.assert_allclose(to_camera, [np.sin(yaw), 0, np.cos(yaw)], atol=1e-9)
 

@@ -26,7 +26,7 @@ from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.npz import save_npz
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
-from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.convert_cli import main
 from rnd_viewer.mesh_files import posed_vertices
 from rnd_viewer.player import Player
@@ -110,7 +110,7 @@ def _drawn_ply(path: Path, half_turn: bool) -> np.ndarray:
 def _camera():
     skeleton = Avatar.load(AVATAR, threads=1).skeleton
     framing = frame_motion(skeleton, load_motion(WALK, skeleton))
-    return front_path(framing, View(SIDE, SIDE, math.radians(35), math.radians(5)))(0, 0.0)
+    return front_path(framing, CameraOptions(SIDE, SIDE, math.radians(35), math.radians(5)))(0, 0.0)
 
 
 @pytest.fixture(scope="module")

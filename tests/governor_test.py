@@ -11,12 +11,12 @@ from play_fakes import FakeAvatar, fake_motion
 from rnd_runtime.light import Light
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
-from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.governor import FULL, LADDER, Governor, Quality, enlarged
 from rnd_viewer.player import Player
 
 MOTION = fake_motion()
-CAMERA = front_path(frame_motion(FakeAvatar().skeleton, MOTION), View(96, 80, 0.6, 0.1))(0, 0.0)
+CAMERA = front_path(frame_motion(FakeAvatar().skeleton, MOTION), CameraOptions(96, 80, 0.6, 0.1))(0, 0.0)
 
 
 def test_one_slow_frame_gives_nothing_up_and_steady_ones_do_step_by_step():

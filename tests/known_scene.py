@@ -13,7 +13,7 @@ from rnd_runtime.capture import Capture, Frame, load_capture, save_capture
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_trainer.silhouette import View, draw, posed_vertices
+from rnd_trainer.silhouette import DrawnMesh, draw, posed_vertices
 from tiny import body as embedded_body
 
 WIDTH, HEIGHT, FRAMES, FPS = 48, 64, 4, 30.0
@@ -132,7 +132,7 @@ def see(camera: str, frame: int, k1: float = 0.0) -> Truth:
     return Truth(np.where(view.mask[..., None], colours, GREY).astype(np.uint8), view.mask, view.normals)
 
 
-def view_of(camera: Camera, frame: int, k1: float = 0.0) -> View:
+def view_of(camera: Camera, frame: int, k1: float = 0.0) -> DrawnMesh:
     vertices = posed_vertices(shaped_body(), motion().rotations[frame], motion().translations[frame])
     return draw(vertices, shaped_body().faces, camera, k1)
 

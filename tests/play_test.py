@@ -18,7 +18,7 @@ from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.sh import sh_basis, sphere_quadrature
 from rnd_viewer.aov import CHANNELS, ambient_visibility, parse_aovs
 from rnd_viewer.background import Background
-from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.options import parse_frames, parse_size
 from rnd_viewer.player import Frame, Player
 from rnd_viewer.run_folder import claim
@@ -46,7 +46,9 @@ def _player(radiance: float = 0.18, light: Light | None = None, **options) -> Pl
 
 
 def _camera(width: int = 96, height: int = 80) -> Camera:
-    return front_path(frame_motion(FakeAvatar().skeleton, MOTION), View(width, height, 0.6, 0.1))(0, 0.0)
+    return front_path(frame_motion(FakeAvatar().skeleton, MOTION), CameraOptions(width, height, 0.6, 0.1))(
+        0, 0.0
+    )
 
 
 def test_grey_card_is_118():

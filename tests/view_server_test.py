@@ -35,7 +35,7 @@ from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_viewer.background import Background
-from rnd_viewer.cameras import View, frame_motion, front_path
+from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.player import Player
 from rnd_viewer.view_cli import main
 from rnd_viewer.view_options import ViewOptions
@@ -131,7 +131,7 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     motion = load_motion(options.motion, avatar.skeleton)
     light = load_light(options.hdr[0], yaw=changes.pop("yaw", 0.0), exposure=changes.pop("exposure", 0.0))
     shader = Shader(light, changes.pop("shade", "table+sun"))
-    view = View(SIZE, SIZE, np.radians(35), np.radians(5))
+    view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
     return Player(avatar, light, shader, make_rasterizer("cpu"), **changes).render(motion, time, camera).srgb
 

@@ -26,7 +26,7 @@ LOG2_ALPHA_MIN = -math.log2(255.0)
 CHUNK = 1024  # Gaussians projected at a time
 
 
-class View(NamedTuple):
+class Pinhole(NamedTuple):
     """A camera as numbers for a kernel: pixels, and limits of x/z and y/z where the Jacobian is taken."""
 
     width: int
@@ -43,12 +43,12 @@ class View(NamedTuple):
     high_y: float
 
 
-def view_of(camera: Camera) -> View:
+def pinhole(camera: Camera) -> Pinhole:
     """The numbers of ``camera``."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     margin_x = FIELD_OF_VIEW_MARGIN * 0.5 * camera.width / fx
     margin_y = FIELD_OF_VIEW_MARGIN * 0.5 * camera.height / fy
-    return View(
+    return Pinhole(
         camera.width,
         camera.height,
         np.ascontiguousarray(camera.world_to_camera[:3, :3]),
@@ -65,7 +65,7 @@ def view_of(camera: Camera) -> View:
 
 
 @njit(inline="always")
-def _camera_point(view: View, means: Any, i: int) -> Any:
+def _camera_point(view: Pinhole, means: Any, i: int) -> Any:
     x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     r, t = view.rotation, view.translation
     return (
@@ -76,14 +76,14 @@ def _camera_point(view: View, means: Any, i: int) -> Any:
 
 
 @njit(inline="always")
-def _clamped_slopes(view: View, x: float, y: float, z: float) -> Any:
+def _clamped_slopes(view: Pinhole, x: float, y: float, z: float) -> Any:
     slope_x = min(max(x / z, view.low_x), view.high_x)
     slope_y = min(max(y / z, view.low_y), view.high_y)
     return slope_x, slope_y
 
 
 @njit(inline="always")
-def _projection_rows(view: View, slope_x: float, slope_y: float, z: float) -> Any:
+def _projection_rows(view: Pinhole, slope_x: float, slope_y: float, z: float) -> Any:
     """Rows of M = J·W [2, 3]: how pixels move with world metres."""
     r = view.rotation
     a, b = view.fx / z, view.fy / z

@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 from numba import njit
 
-from ._raster_project import view_of
+from ._raster_project import pinhole
 from ._raster_tiles import _front_to_back
 from .camera import Camera
 from .errors import InputError
@@ -67,7 +67,7 @@ class GlProjection:
         """All of ``surfaces`` that can be seen, but those whose n·v is below ``cull``."""
         count = surfaces.gaussians
         (places, shapes, drawn), target = self._targets.reserve(count)
-        view = view_of(camera)
+        view = pinhole(camera)
         self._pass.bind(
             surfaces.textures(),
             count=count,

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._raster_blend import blend, blend_backward
 from ._raster_input import check_shape, checked, floats
-from ._raster_project import View, project, project_backward, view_of
+from ._raster_project import Pinhole, pinhole, project, project_backward
 from ._raster_tiles import Splats, sort_into_tiles
 from .camera import Camera
 from .gaussians import Floats32, Raster
@@ -31,7 +31,7 @@ class State:
     means: Floats32
     covariances: Floats32
     opacities: Floats32
-    view: View
+    view: Pinhole
     splats: Splats
     image: Floats32  # [H, W, K] features, then depth
     coverage: Floats32  # [H, W]
@@ -54,7 +54,7 @@ class Projected:
         means, covariances, opacities, nothing = checked(means, covariances, opacities, nothing)
         self._arrays = means, covariances, opacities, camera
         self._centers, self._shapes, self._boxes, _, self._depths, self._slot_starts = project(
-            means, covariances, opacities, nothing, view_of(camera), False
+            means, covariances, opacities, nothing, pinhole(camera), False
         )
         self.drawn: NDArray[np.bool_] = np.diff(self._slot_starts) > 0
 
@@ -115,7 +115,7 @@ def forward(
     """
     means, covariances, opacities, features = checked(means, covariances, opacities, features)
     started = perf_counter()
-    view = view_of(camera)
+    view = pinhole(camera)
     centers, shapes, boxes, attributes, depths, slot_starts = project(
         means, covariances, opacities, features, view, depth
     )

@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ._raster_input import checked
-from ._raster_project import View, _project_range, view_of
+from ._raster_project import Pinhole, _project_range, pinhole
 from ._raster_tiles import _front_to_back
 from .camera import Camera
 from .errors import InputError
@@ -86,7 +86,7 @@ class GlRasterizer:
         self.check_limits(len(means), camera)
         channels = features.shape[1]
         started = perf_counter()
-        splats = sorted_ellipses(means, covariances, opacities, features, view_of(camera))
+        splats = sorted_ellipses(means, covariances, opacities, features, pinhole(camera))
         seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
         pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
@@ -233,7 +233,7 @@ class Ellipses(NamedTuple):
 
 
 def sorted_ellipses(
-    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, view: View
+    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, view: Pinhole
 ) -> Ellipses:
     return Ellipses(*_project_and_sort(means, covariances, opacities, features, view))
 

@@ -50,7 +50,7 @@ TIMED = 20
 
 
 @dataclass(frozen=True)
-class Variant:
+class StudyRow:
     """One row of the table: what is switched, beside which row it is to be read, and on which split it should show.
 
     ``model`` and ``train`` are the fields of the configuration that differ from ours; ``noisy`` trains on the
@@ -66,60 +66,60 @@ class Variant:
     length: float = 1.0
 
 
-def _window(d: int) -> Variant:
+def _window(d: int) -> StudyRow:
     model = {"window_poses": d, "window_seconds": (d - 1) * POSE_SECONDS}
-    return Variant(f"d = {d}", f"a window of {d} poses instead of 10", "ours", model)
+    return StudyRow(f"d = {d}", f"a window of {d} poses instead of 10", "ours", model)
 
 
 _NO_GC = {"weight_consistency": 0.0}
 VARIANTS = (
-    Variant("ours", "everything", None),
-    Variant(
+    StudyRow("ours", "everything", None),
+    StudyRow(
         "LBS, plain colour",
         "template skinning and colours that no light changes: the core of 3DGS-Avatar and GauHuman",
         "ours",
         {"dynamic_skinning": False},
         {"light": "none", **_NO_GC},
     ),
-    Variant(
+    StudyRow(
         "static skinning", "the template's weights, no L_gc", "ours", {"dynamic_skinning": False}, _NO_GC
     ),
-    Variant("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
-    Variant("+ unseen poses", "the third stage: edge lengths", "ours", {}, {"unseen_fraction": 0.3}),
-    Variant("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
+    StudyRow("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
+    StudyRow("+ unseen poses", "the third stage: edge lengths", "ours", {}, {"unseen_fraction": 0.3}),
+    StudyRow("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
     *(_window(d) for d in (2, 5, 20, 30)),
-    Variant("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),
-    Variant("light from white", "no search for sky and suns", "ours", {}, {"light_search": False}),
-    Variant("paper's visibility", "of the direction to the camera", "ours", {"visibility": "paper"}),
-    Variant("no visibility", "no shadows", "ours", {"visibility": "none"}),
-    Variant("mesh normals", "the template's normals for shading", "ours", {"learned_normals": False}),
+    StudyRow("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),
+    StudyRow("light from white", "no search for sky and suns", "ours", {}, {"light_search": False}),
+    StudyRow("paper's visibility", "of the direction to the camera", "ours", {"visibility": "paper"}),
+    StudyRow("no visibility", "no shadows", "ours", {"visibility": "none"}),
+    StudyRow("mesh normals", "the template's normals for shading", "ours", {"learned_normals": False}),
 )
 
 
-def _gaussians(count: int) -> Variant:
+def _gaussians(count: int) -> StudyRow:
     model = {"gaussians": count, "nodes": count // 4}
-    return Variant(f"N = {count}", f"{count} Gaussians", "ours", model)
+    return StudyRow(f"N = {count}", f"{count} Gaussians", "ours", model)
 
 
 CAUSES = (
-    Variant("ours", "everything learned, exact poses", None),
-    Variant("true light", "the capture's own light map", "ours", {}, {"light": "capture"}),
-    Variant("true normals", "exact normals instead of estimated ones", "ours", {}, {"normals": "true"}),
-    Variant("noisy poses", "the capture's noisy poses", "ours", {}, {}, noisy=True),
-    Variant("noisy poses, refined", "and corrected", "noisy poses", {}, {"refine_poses": True}, noisy=True),
+    StudyRow("ours", "everything learned, exact poses", None),
+    StudyRow("true light", "the capture's own light map", "ours", {}, {"light": "capture"}),
+    StudyRow("true normals", "exact normals instead of estimated ones", "ours", {}, {"normals": "true"}),
+    StudyRow("noisy poses", "the capture's noisy poses", "ours", {}, {}, noisy=True),
+    StudyRow("noisy poses, refined", "and corrected", "noisy poses", {}, {"refine_poses": True}, noisy=True),
     *(_gaussians(count) for count in (7_500, 15_000, 60_000, 120_000)),
 )
 LENGTHS = (
-    Variant("ours", "the steps of the preset", None),
+    StudyRow("ours", "the steps of the preset", None),
     *(
-        Variant(name, f"{name} times the steps", "ours", length=length)
+        StudyRow(name, f"{name} times the steps", "ours", length=length)
         for name, length in (("1/8", 1 / 8), ("1/4", 1 / 4), ("1/2", 1 / 2), ("5", 5.0))
     ),
 )
 STUDIES = {"ablations": VARIANTS, "causes": CAUSES, "lengths": LENGTHS}
 
 
-def chosen(variants: Sequence[Variant], names: Sequence[str]) -> tuple[Variant, ...]:
+def chosen(variants: Sequence[StudyRow], names: Sequence[str]) -> tuple[StudyRow, ...]:
     """Those of ``names``, in the study's order; all where none is named. Raises :class:`InputError` for others."""
     known = [variant.name for variant in variants]
     unknown = [name for name in names if name not in known]
@@ -132,7 +132,7 @@ def ablate(
     capture: Capture,
     base: TrainConfig,
     folder: Path,
-    variants: Sequence[Variant],
+    variants: Sequence[StudyRow],
     *,
     seeds: Sequence[int],
     perceptual: Perceptual | None,
@@ -159,7 +159,7 @@ def ablate(
         }  # fmt: skip
 
     rows: list[dict[str, Any]] = []
-    jobs: list[tuple[Variant, int, TrainConfig, list[dict[str, Any]]]] = []
+    jobs: list[tuple[StudyRow, int, TrainConfig, list[dict[str, Any]]]] = []
     for seed in seeds:
         for variant in variants:
             config = _config(base, variant, seed)
@@ -191,7 +191,7 @@ def ablate(
     return rows
 
 
-def check_needs(variants: Iterable[Variant], capture: Capture) -> None:
+def check_needs(variants: Iterable[StudyRow], capture: Capture) -> None:
     """Raise :class:`InputError` where ``capture`` lacks what one of ``variants`` learns from."""
     for variant in variants:
         if variant.noisy:
@@ -202,7 +202,7 @@ def check_needs(variants: Iterable[Variant], capture: Capture) -> None:
             check_true_normals(capture, capture.split("train"), f"variant {variant.name!r}")
 
 
-def _config(base: TrainConfig, variant: Variant, seed: int) -> TrainConfig:
+def _config(base: TrainConfig, variant: StudyRow, seed: int) -> TrainConfig:
     model = dataclasses.replace(base.model, **variant.model)
     steps = round(base.steps * variant.length)
     changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
@@ -237,7 +237,7 @@ def _rows(place: Path) -> list[dict[str, Any]]:
 
 
 def time_encoders(
-    rows: list[dict[str, Any]], folder: Path, variants: Sequence[Variant], seed: int
+    rows: list[dict[str, Any]], folder: Path, variants: Sequence[StudyRow], seed: int
 ) -> list[dict[str, Any]]:
     """``rows`` with every variant's :func:`encoder_cost` measured now, one after the other, on its avatar of ``seed``.
 
@@ -251,7 +251,7 @@ def time_encoders(
 
 
 def summarise(
-    rows: Sequence[dict[str, Any]], variants: Sequence[Variant], figure: str = "psnr"
+    rows: Sequence[dict[str, Any]], variants: Sequence[StudyRow], figure: str = "psnr"
 ) -> list[dict[str, Any]]:
     """One row for each variant: mean and spread (standard deviation) over seeds of ``figure`` on every split.
 
@@ -353,7 +353,7 @@ def _spread(values: list[float]) -> float | None:
     return statistics.stdev(values) if len(values) > 1 else None
 
 
-def _place(folder: Path, variant: Variant, seed: int) -> Path:
+def _place(folder: Path, variant: StudyRow, seed: int) -> Path:
     return folder / f"{_slug(variant.name)}-{seed}"
 
 

@@ -10,7 +10,7 @@ from numba import get_num_threads, njit
 from torch import Tensor
 
 from rnd_runtime._raster_blend import blend
-from rnd_runtime._raster_project import project, view_of
+from rnd_runtime._raster_project import pinhole, project
 from rnd_runtime._raster_tiles import Splats, sort_into_tiles
 from rnd_runtime.camera import Camera
 from rnd_runtime.raster_cpu import backward, forward
@@ -34,7 +34,7 @@ def _splat(means, covariances, opacities, features, view, threads):
 def three_calls(*arguments: Any) -> tuple[Tensor, Tensor, None]:
     """As a player draws: each kernel called from Python. Arguments of :func:`rnd_trainer.raster.rasterize`."""
     arrays, camera = _arrays(arguments)
-    view, threads = view_of(camera), get_num_threads()
+    view, threads = pinhole(camera), get_num_threads()
     centers, shapes, boxes, attributes, depths, starts = project(*arrays, view, False)
     pairs = sort_into_tiles(boxes, depths, starts, (camera.width, camera.height), threads, False)
     splats = Splats(centers, shapes, attributes, starts, *pairs)
@@ -44,7 +44,7 @@ def three_calls(*arguments: Any) -> tuple[Tensor, Tensor, None]:
 def one_call(*arguments: Any) -> tuple[Tensor, Tensor, None]:
     """The same three kernels within one compiled function."""
     arrays, camera = _arrays(arguments)
-    return _pictures(_splat(*arrays, view_of(camera), get_num_threads()))
+    return _pictures(_splat(*arrays, pinhole(camera), get_num_threads()))
 
 
 def showing(means: Any, covariances: Any, opacities: Any, features: Any, camera: Camera) -> Any:

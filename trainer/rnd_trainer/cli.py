@@ -19,6 +19,7 @@ from rnd_runtime.files import output_folder, write_json
 from .eval_cli import EvalOptions, evaluate_run, need_extra
 
 if TYPE_CHECKING:
+    from .config import TrainConfig
     from .train import Training
 
 PREVIEWS = 3
@@ -83,17 +84,55 @@ def _train(options: TrainOptions) -> None:
     need_extra()
     from rnd_runtime.capture import load_capture
 
-    from .config import check_sizes, preset, resized, to_dict
+    from .config import to_dict
     from .live_view import live_view
     from .perceptual import load_lpips
-    from .train import Training, run
+    from .train import Training
     from .training_state import STATE_FILE
 
+    config, device = _config(options), _device(options.device)
+    capture = load_capture(options.capture, motion_file=options.motion)
+    folder = options.out
+    state = folder / STATE_FILE
+    if state.exists() and not options.resume:
+        raise InputError(
+            "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
+        )
+    perceptual = load_lpips(options.perceptual_weights)
+    with _memory_runs_out():
+        training = Training(capture, config, perceptual, device)
+    if options.resume:
+        training.resume(state)
+    write_json(output_folder(folder) / "config.json", to_dict(config))
+    if perceptual is None:
+        _say("no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss")
+    for frame in training.bad_masks:
+        _say(f"frame {frame}: mask empty or full, skipped")
+    _say(f"{folder}: {training.total_steps} steps in all")
+    with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
+        if page:
+            _say(page)
+        with _memory_runs_out():
+            interrupted = _run_with_progress(training, folder)
+    print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
+    if interrupted:
+        _say(f"stopped; continue with --resume --out {folder}")
+        raise KeyboardInterrupt
+    _score_after_training(training, folder, options)
+
+
+def _say(what: str) -> None:
+    print(f"rnd-train: {what}", file=sys.stderr)  # noqa: T201
+
+
+def _config(options: TrainOptions) -> TrainConfig:
+    """The preset with what ``options`` change; raises :class:`InputError` for what no training can do."""
+    from .config import check_sizes, preset, resized
+
     config = resized(preset(options.preset), options.gaussians, options.steps)
-    model = dataclasses.replace(config.model, visibility=options.visibility)
     config = dataclasses.replace(
         config,
-        model=model,
+        model=dataclasses.replace(config.model, visibility=options.visibility),
         seed=options.seed,
         light=options.light,
         normals=options.normals,
@@ -111,39 +150,7 @@ def _train(options: TrainOptions) -> None:
         refuse_changed(options, ["visibility"], "--light none has plain colours, which no shadow falls on")
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
-    device = _device(options.device)
-
-    capture = load_capture(options.capture, motion_file=options.motion)
-    folder = options.out
-    state = folder / STATE_FILE
-    if state.exists() and not options.resume:
-        raise InputError(
-            "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
-        )
-    perceptual = load_lpips(options.perceptual_weights)
-    with _memory_runs_out():
-        training = Training(capture, config, perceptual, device)
-    if options.resume:
-        training.resume(state)
-    write_json(output_folder(folder) / "config.json", to_dict(config))
-    if perceptual is None:
-        print(  # noqa: T201
-            "rnd-train: no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss",
-            file=sys.stderr,
-        )
-    for frame in training.bad_masks:
-        print(f"rnd-train: frame {frame}: mask empty or full, skipped", file=sys.stderr)  # noqa: T201
-    print(f"rnd-train: {folder}: {training.total_steps} steps in all", file=sys.stderr)  # noqa: T201
-    with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
-        if page:
-            print(f"rnd-train: {page}", file=sys.stderr)  # noqa: T201
-        with _memory_runs_out():
-            interrupted = _run_with_progress(training, folder, run)
-    print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
-    if interrupted:
-        print(f"rnd-train: stopped; continue with --resume --out {folder}", file=sys.stderr)  # noqa: T201
-        raise KeyboardInterrupt
-    _score_after_training(training, folder, options)
+    return config
 
 
 @contextmanager
@@ -176,7 +183,7 @@ def _device(name: str) -> str:
     return name
 
 
-def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
+def _run_with_progress(training: Training, folder: Path) -> bool:
     """Train with a progress bar; True when Ctrl-C ended it."""
     from rich.console import Console
     from rich.progress import (
@@ -189,6 +196,7 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
     )
 
     from .preview import save_preview
+    from .train import run
 
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
     shown = [(training.views[k], training.poses[k]) for k in dict.fromkeys(chosen)]
@@ -216,7 +224,7 @@ def _run_with_progress(training: Training, folder: Path, run: Any) -> bool:
             light = training.light() if lit else None
             save_preview(folder / "previews" / name, training.model, light, shown)
 
-        return bool(run(training, folder, on_step=on_step, on_preview=on_preview))
+        return run(training, folder, on_step=on_step, on_preview=on_preview)
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:

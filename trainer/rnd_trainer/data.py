@@ -35,7 +35,7 @@ _TO_LINEAR = torch.as_tensor(srgb_to_linear(np.arange(256) / 255), dtype=torch.f
 
 
 @dataclass
-class View:
+class TrainingView:
     """One training picture: a crop, kept in 8 bits until it is used.
 
     image [h, w, 3] sRGB premultiplied on black, mask [h, w], normal [h, w, 3] as (n + 1)/2, or black where the
@@ -67,7 +67,7 @@ class View:
 
 def load_views(
     capture: Capture, split: str, scale: float = 1.0, true_normals: bool = False
-) -> tuple[list[View], list[int]]:
+) -> tuple[list[TrainingView], list[int]]:
     """The usable views of a split, and the motion frames whose masks were empty or full.
 
     ``true_normals`` takes the capture's exact normals instead of the estimated ones (an oracle, for studies).
@@ -128,7 +128,7 @@ def usable(mask: NDArray[np.floating[Any]]) -> bool:
     return low < float(mask.mean()) < high
 
 
-def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> View:
+def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> TrainingView:
     if scale != 1.0:
         image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
     rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
@@ -142,7 +142,7 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Vi
         unknown = _covered(coverage) & ~normal[rows, columns].any(-1)
         normal = np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8)
         normal[unknown] = 0  # which is nobody's normal
-    return View(frame, crop, np.round(image[rows, columns] * 255).astype(np.uint8), coverage, normal)
+    return TrainingView(frame, crop, np.round(image[rows, columns] * 255).astype(np.uint8), coverage, normal)
 
 
 def _covered(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:

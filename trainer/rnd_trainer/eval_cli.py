@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
+from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
 from rnd_runtime.files import is_folder, sha256_of, write_json
 
 if TYPE_CHECKING:
@@ -35,7 +34,6 @@ COLUMNS = {
 """what the terminal's table shows of a row: heading and format"""
 OF_ONE_RUN = ("pictures", "method")
 OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds")
-MOST_SEEDS = 100
 WIDTH = 140
 """characters of the widest table"""
 
@@ -86,12 +84,14 @@ def main() -> None:
     """Entry point of ``rnd-eval``."""
 
     def command() -> None:
+        from .study_cli import run_study
+
         options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
         if options.ablate:
             refuse_changed(options, OF_ONE_RUN, "a study scores and names its rows itself")
         else:
             refuse_changed(options, OF_STUDIES, "needs --ablate")
-        (ablate_run if options.ablate else evaluate_run)(options)
+        (run_study if options.ablate else evaluate_run)(options)
 
     sys.exit(run_command("rnd-eval", command))
 
@@ -180,80 +180,8 @@ def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
     return False
 
 
-def ablate_run(options: EvalOptions) -> None:
-    """Train the ablations into the folder ``options.run``; print their table and write rows and summary as JSON."""
-    need_extra()
-    from rich.console import Console
-    from rich.progress import Progress
-    from rich.table import Table
-
-    from rnd_runtime.capture import load_capture
-    from rnd_runtime.shading import check_mode
-
-    from .ablate import STUDIES, ablate, check_needs, chosen, summarise, time_encoders
-    from .charts import check_chart, draw_lengths
-    from .config import check_sizes, preset, resized
-    from .perceptual import load_lpips
-
-    variants = chosen(STUDIES[options.study], options.variants)
-    config = resized(preset(options.preset), options.gaussians, options.steps)
-    config = dataclasses.replace(config, image_scale=options.image_scale)
-    if options.chart is not None:
-        check_chart(options.chart)
-        check_option(options.study == "lengths", "--chart", "--study lengths beside it", options.study)
-    check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
-    check_option(options.seeds <= MOST_SEEDS, "--seeds", f"at most {MOST_SEEDS}", options.seeds)
-    check_mode(options.shade)
-    check_sizes(config)
-    capture = load_capture(options.capture, motion_file=options.motion)
-    check_needs(variants, capture)
-    perceptual = load_lpips(options.perceptual_weights)
-    console = Console(stderr=True)
-    if perceptual is None:
-        console.print("rnd-eval: no --perceptual-weights: no LPIPS, and L_gc is off in every row")
-    with Progress(console=console, speed_estimate_period=600) as progress:
-        task = progress.add_task("", total=None)
-
-        def on_run(name: str, seed: int, done: float, total: int) -> None:
-            progress.update(task, description=f"{name}, seed {seed}", completed=done, total=total)
-
-        seeds = range(options.seeds)
-        rows = ablate(
-            capture,
-            config,
-            options.run,
-            variants,
-            seeds=seeds,
-            perceptual=perceptual,
-            mode=options.shade,
-            on_run=on_run,
-        )
-    rows = time_encoders(rows, options.run, variants, seeds[0])
-    summary = summarise(rows, variants)
-    splits = [key for key, cell in summary[0].items() if isinstance(cell, dict)]
-    table = Table("method", *splits, "read beside", "GFLOP", "ms", title=f"{options.study}, PSNR")
-    for line in summary:
-        cells = [_with_gain(line[split]) if split in line else "" for split in splits]
-        cost = (f"{line['encoder_gflop']:.3f}", f"{line['encoder_ms']:.1f}")
-        table.add_row(line["method"], *cells, line["beside"] or "", *cost)
-    wide_console().print(table)
-    if options.json is not None:
-        write_json(options.json, {"summary": summary, "rows": rows})
-    if options.chart is not None:
-        draw_lengths(rows, [options.chart])
-
-
 def wide_console() -> Console:
     """Where a terminal is too narrow, lines go on in the next: figures cut to two digits tell nothing."""
     from rich.console import Console
 
     return Console(width=max(Console().width, WIDTH), soft_wrap=True)
-
-
-def _with_gain(cell: dict[str, Any]) -> str:
-    """Mean ± spread, and the difference to the row it is read beside; in brackets where the seeds differ by more."""
-    text = f"{cell['mean']:.2f}" + ("" if cell["spread"] is None else f" ± {cell['spread']:.2f}")
-    if "gain" not in cell:
-        return text
-    gain = f"{cell['gain']:+.2f}"
-    return f"{text}  {f'({gain})' if cell['shows'] is False else gain}"

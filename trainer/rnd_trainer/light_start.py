@@ -31,7 +31,7 @@ from scipy.optimize import nnls
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
 
-from .data import View
+from .data import TrainingView
 from .light import PROBE_SHAPE, natural_sky
 from .model import AvatarModel, PoseInput
 from .shading import traced_visibility
@@ -101,7 +101,9 @@ class Sightings:
     spacing: float
 
 
-def start_light(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> FirstLight | None:
+def start_light(
+    model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]
+) -> FirstLight | None:
     """The light that best explains the pictures; None where too little is seen, or always the same.
 
     Its scale is such that what is seen gives back :data:`REFLECTANCE` of what arrives.
@@ -147,7 +149,7 @@ def rehearse() -> None:
     _quadratic(seen, transport, _by_brightness(seen)).fit(range(SKY_LOBES))
 
 
-def _sight(model: AvatarModel, views: Sequence[View], poses: Sequence[PoseInput]) -> Sightings:
+def _sight(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Sightings:
     """Colours of the first nodes wherever they are seen well: inside the mask, in front, not clipped."""
     nodes = min(POINTS, model.config.nodes)
     spacing = float(model.spacing) * math.sqrt(len(model.points) / nodes)

@@ -13,7 +13,7 @@ from rnd_runtime.images import srgb_to_linear
 
 from .config import TrainConfig
 from .consistency import POINTS, consistency_loss, covisible, project, virtual_camera
-from .data import View
+from .data import TrainingView
 from .light import LightProbe, Texels, all_texels, draw_texels
 from .losses import (
     geometry_prior,
@@ -61,7 +61,7 @@ class Objective:
         return self.probe.radiance() if self.fixed_light is None else self.fixed_light
 
     def __call__(
-        self, model: AvatarModel, view: View, pose: PoseInput, step: int, stage: int
+        self, model: AvatarModel, view: TrainingView, pose: PoseInput, step: int, stage: int
     ) -> dict[str, Tensor]:
         """Weighted loss terms of one picture by name; their sum is minimised."""
         config = self.config

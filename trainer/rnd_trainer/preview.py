@@ -12,7 +12,7 @@ from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.light import Light
 from rnd_runtime.shading import Shader
 
-from .data import View
+from .data import TrainingView
 from .judge import Rendered, render_runtime
 from .model import AvatarModel, PoseInput
 
@@ -40,7 +40,7 @@ def strip(rendered: Rendered, target_srgb: np.ndarray) -> np.ndarray:
 
 
 def save_preview(
-    path: Path, model: AvatarModel, probe: torch.Tensor | None, views: list[tuple[View, PoseInput]]
+    path: Path, model: AvatarModel, probe: torch.Tensor | None, views: list[tuple[TrainingView, PoseInput]]
 ) -> None:
     """A picture with one row for each view: what the player would show of the training so far.
 

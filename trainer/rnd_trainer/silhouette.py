@@ -20,7 +20,7 @@ NEAR = 0.05
 """metres: triangles with a corner nearer than this (or behind the camera) are left out"""
 
 
-class View(NamedTuple):
+class DrawnMesh(NamedTuple):
     """A mesh drawn into a camera's pixels.
 
     Attributes:
@@ -38,7 +38,7 @@ def posed_vertices(body: Body, rotations: Floats, translation: Floats) -> Floats
     return skin(body.vertices, body.skinning_weights.astype(np.float64), bones)
 
 
-def draw(vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float = 0.0) -> View:
+def draw(vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float = 0.0) -> DrawnMesh:
     """The mesh ``vertices`` [V, 3] (world, m), ``faces`` [F, 3] through ``camera``.
 
     ``distortion`` is a radial coefficient k1 in normalised coordinates (x (1 + k1 r²)): for asking whether
@@ -54,7 +54,7 @@ def draw(vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion:
     )  # meshes wound the other way too
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = cross[nearest[mask]]
-    return View(mask, normals)
+    return DrawnMesh(mask, normals)
 
 
 def silhouette(

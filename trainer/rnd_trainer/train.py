@@ -31,7 +31,7 @@ from rnd_runtime.motion import Motion, save_motion
 from . import light_start
 from .checkpoint import save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
-from .data import View, load_views, pose_input, training_light
+from .data import TrainingView, load_views, pose_input, training_light
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
@@ -157,7 +157,7 @@ class Training:
             self._start_light()
             self.lit = True
 
-    def _picture_terms(self, view: View, pose: PoseInput, stage: int) -> dict[str, Tensor]:
+    def _picture_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         refinement = self.refinement if self.step_index >= self._refine_from else None
         if refinement is not None:
             pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
@@ -267,7 +267,7 @@ class Training:
         groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in parts]
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
-    def _pose(self, view: View, motion: Motion | None = None) -> PoseInput:
+    def _pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
         motion = self.capture.motion if motion is None else motion
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)

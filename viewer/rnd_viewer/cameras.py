@@ -56,7 +56,7 @@ class Framing:
 
 
 @dataclass(frozen=True)
-class View:
+class CameraOptions:
     """The options of an automatic camera.
 
     Attributes:
@@ -87,14 +87,14 @@ def frame_motion(skeleton: Skeleton, motion: Motion) -> Framing:
     return Framing(joints, (joints.min(axis=0) + joints.max(axis=0)) / 2, PADDING * height, facing)
 
 
-def front_path(framing: Framing, view: View) -> CameraPath:
+def front_path(framing: Framing, view: CameraOptions) -> CameraPath:
     """A standing camera that looks the body in the face as it is in the first frame."""
     distance = view.distance or _fitting_distance(framing, view, np.array([framing.facing]))
     camera = _camera_around(framing.centre, view, framing.facing, distance)
     return lambda frame, time_s: camera
 
 
-def orbit_path(framing: Framing, view: View, seconds: float) -> CameraPath:
+def orbit_path(framing: Framing, view: CameraOptions, seconds: float) -> CameraPath:
     """A camera that starts in front and circles once in ``seconds``, towards the body's left."""
     azimuths = np.linspace(0, 2 * np.pi, ORBIT_SAMPLES, endpoint=False)
     distance = view.distance or _fitting_distance(framing, view, azimuths)
@@ -103,7 +103,7 @@ def orbit_path(framing: Framing, view: View, seconds: float) -> CameraPath:
     )
 
 
-def _camera_around(centre: Floats, view: View, azimuth: float, distance: float) -> Camera:
+def _camera_around(centre: Floats, view: CameraOptions, azimuth: float, distance: float) -> Camera:
     horizontal = np.cos(view.elevation)
     direction = np.array([horizontal * np.sin(azimuth), np.sin(view.elevation), horizontal * np.cos(azimuth)])
     return Camera.look_at(
@@ -111,7 +111,7 @@ def _camera_around(centre: Floats, view: View, azimuth: float, distance: float) 
     )
 
 
-def _fitting_distance(framing: Framing, view: View, azimuths: Floats) -> float:
+def _fitting_distance(framing: Framing, view: CameraOptions, azimuths: Floats) -> float:
     """The smallest distance in metres at which every padded joint lies in the image at all ``azimuths``.
 
     A sphere of radius r at (x, y, z) from the centre, in camera axes, is inside the plane with half-angle a

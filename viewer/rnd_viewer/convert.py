@@ -21,7 +21,7 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
-from .cameras import CameraPath, View, file_path, frame_motion, front_path
+from .cameras import CameraOptions, CameraPath, file_path, frame_motion, front_path
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
 from .lights import chosen_light
 from .mesh_files import posed_vertices, write_obj, write_rigged_glb
@@ -34,7 +34,7 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog", "visionary"), ("glb", "obj")
 # The front camera of rnd-play; only where it stands matters here.
-FRONT = View(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
+FRONT = CameraOptions(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
 
 
 def convert(options: Options) -> Iterator[str]:

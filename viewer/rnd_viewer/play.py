@@ -25,9 +25,9 @@ from rnd_runtime.threads import set_threads
 from .aov import parse_aovs
 from .background import Background
 from .cameras import (
+    CameraOptions,
     CameraPath,
     Framing,
-    View,
     file_path,
     frame_motion,
     front_path,
@@ -279,7 +279,7 @@ def _camera_path(
     if options.camera not in OWN_CAMERAS:
         return file_path(options.camera, size, frames)
     width, height = size or (DEFAULT_SIZE, None)
-    view = View(
+    view = CameraOptions(
         width, height or width, math.radians(options.fov), math.radians(options.elevation), options.distance
     )
     if options.camera == "orbit":

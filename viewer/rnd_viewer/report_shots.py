@@ -18,7 +18,7 @@ from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
 from .aov import aov_picture
-from .cameras import View, frame_motion, front_path, orbit_path
+from .cameras import CameraOptions, frame_motion, front_path, orbit_path
 from .player import Player
 from .video import clip_writer
 
@@ -40,7 +40,7 @@ class Shots:
             if read_motion is None
             else read_motion(skeleton)
         )
-        view = View(SIDE, SIDE, math.radians(35), math.radians(5))
+        view = CameraOptions(SIDE, SIDE, math.radians(35), math.radians(5))
         framing = frame_motion(skeleton, self.motion)
         self._orbit = orbit_path(framing, view, SECONDS)
         self._front = front_path(framing, view)

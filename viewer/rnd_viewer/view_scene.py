@@ -28,7 +28,7 @@ from rnd_runtime.tone import tone_map
 
 from .aov import aov_picture, aov_values, splat_features
 from .background import Background
-from .cameras import View, frame_motion, front_path
+from .cameras import CameraOptions, frame_motion, front_path
 from .view_options import ViewOptions
 from .view_state import ViewState
 
@@ -77,7 +77,7 @@ class Scene:
     def description(self) -> dict[str, Any]:
         """What a page needs to know before it asks for pictures."""
         framing = frame_motion(self.avatar.skeleton, self.motion)
-        view = View(self.size, self.size, FIELD_OF_VIEW, ELEVATION)
+        view = CameraOptions(self.size, self.size, FIELD_OF_VIEW, ELEVATION)
         home = front_path(framing, view)(0, 0.0)
         return {
             "avatar": self.name,

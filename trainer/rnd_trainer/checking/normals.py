@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_trainer.silhouette import View
+from rnd_trainer.silhouette import DrawnMesh
 
 Floats = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ def best_reading(products: Floats) -> tuple[Floats, float]:
     return best, float((best * products).sum())
 
 
-def pixels(normals: NDArray[np.float32], view: View) -> tuple[Floats, Floats]:
+def pixels(normals: NDArray[np.float32], view: DrawnMesh) -> tuple[Floats, Floats]:
     """Pairs of normals [n, 3] where the map ``normals`` [H, W, 3] and the template's ``view`` [h, w] both have one."""
     height, width = view.mask.shape
     rows = ((np.arange(height) + 0.5) * normals.shape[0] / height).astype(int)

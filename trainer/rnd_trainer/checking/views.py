@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame
-from rnd_trainer.silhouette import View, draw, overlap, posed_vertices, silhouette
+from rnd_trainer.silhouette import DrawnMesh, draw, overlap, posed_vertices, silhouette
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ class Sight:
     turn: Floats
     joint: Floats
 
-    def view(self) -> View:
+    def view(self) -> DrawnMesh:
         """The template as the camera sees it."""
         return draw(self.vertices, self.faces, self.camera)
 

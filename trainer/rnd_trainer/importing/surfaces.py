@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError
 from rnd_trainer.checking.normals import parse_axes
-from rnd_trainer.silhouette import View, draw, posed_vertices
+from rnd_trainer.silhouette import DrawnMesh, draw, posed_vertices
 
 from .masks import make_masks
 from .networks import ImageNetwork
@@ -75,7 +75,7 @@ class _Lazy(Sequence[Any]):
         return self.compute(self.entries[index])
 
 
-def _template(shot: Shot, scene: Scene, recording: Recording) -> View:
+def _template(shot: Shot, scene: Scene, recording: Recording) -> DrawnMesh:
     k = shot.frame - int(recording.poses.frames[0])
     vertices = posed_vertices(scene.body, scene.motion.rotations[k], scene.motion.translations[k])
     return draw(vertices, scene.body.faces, scene.cameras[shot.camera])
