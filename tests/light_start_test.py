@@ -107,3 +107,14 @@ def test_too_few_sightings_give_none(monkeypatch) -> None:
     few = Sightings(ball.who[:20], ball.colour[:20], ball.picture[:20], ball.posed, 0.1)
     monkeypatch.setattr(light_start, "_sight", lambda *_: few)
     assert start_light(None, [], []) is None  # type: ignore[arg-type]
+
+
+def test_what_is_seen_once_or_twice_invents_no_sun(monkeypatch) -> None:
+    """Three pictures from three sides: each point is in one or two of them, and its albedo could explain any sun."""
+    ball = _turning_ball(np.array([0.7, 0.5, 0.51]), 6.0)
+    few = np.isin(ball.picture, (0, 8, 16))
+    seen = Sightings(
+        ball.who[few], ball.colour[few], ball.picture[few] // 8, ball.posed[::8], ball.spacing
+    )  # fmt: skip
+    monkeypatch.setattr(light_start, "_sight", lambda *_: seen)
+    assert start_light(None, [], []) is None  # type: ignore[arg-type]

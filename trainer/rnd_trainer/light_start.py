@@ -73,6 +73,9 @@ FRAMES = 40
 """pictures that are looked at, spread evenly over the capture"""
 FACING = 0.3
 """cosine between normal and view below which a point's colour is not trusted"""
+LEAST_SIGHTINGS = 4
+"""of a point before it has a say in where suns are: a sun that shines only on what is seen once or twice, its albedo
+unknown, contradicts nothing, and the search would give it all the light"""
 OCCLUSION = 0.03
 """metres by which a point may lie behind the first surface and still be the one that is seen"""
 REFLECTANCE = 0.22
@@ -113,20 +116,24 @@ def start_light(
         views, poses: of the training pictures, in the same order.
     """
     seen = _sight(model, views, poses)
-    if len(seen.who) < 10 * SKY_LOBES:
+    if len(seen.who) == 0:
         return None
+    often = np.bincount(seen.who)[seen.who] >= LEAST_SIGHTINGS
+    if np.count_nonzero(often) < 10 * SKY_LOBES:
+        return None
+    weight = _by_brightness(seen) * often
     directions, solid_angles = _grid(PROBE_SHAPE)
     wide, wide_angles = _grid(SEARCH_SHAPE)
     coarse = _transport(seen, wide, wide_angles)
     sky = coarse @ _lobes(wide).astype(np.float32)
-    everything = _quadratic(seen, np.concatenate([sky, coarse], axis=1), _by_brightness(seen))
+    everything = _quadratic(seen, np.concatenate([sky, coarse], axis=1), weight)
     if everything.says_nothing():
         return None
     found = _search(everything)
     near = _texels_near(directions, wide[np.array(found, int) - SKY_LOBES])
     fine = _transport(seen, directions[near], solid_angles[near])
     columns = np.concatenate([sky, fine], axis=1)
-    suns = _search(_quadratic(seen, columns, _by_brightness(seen)))
+    suns = _search(_quadratic(seen, columns, weight))
     strength = _strengths(seen, columns[:, [*range(SKY_LOBES), *suns]])
     radiance = _lobes(directions) @ strength[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
