@@ -22,8 +22,10 @@ from rnd_export.places import moving_sites
 from rnd_export.stopwatch import Stopwatch
 from rnd_export.variant import OWN_NODES, Variant, reduced, static_where
 from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import read_metadata
 from rnd_runtime.errors import InputError
 from rnd_runtime.light import Light
+from rnd_runtime.onnx_parts import OnnxFile
 from rnd_runtime.raster_cpu import rasterize
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.config import ModelConfig
@@ -440,3 +442,10 @@ def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint)
     light = Light(np.ones((32, 64, 3), np.float32))
     bench = Workbench(load_checkpoint(tiny_checkpoint), Scene(still, light, size=48, shade="table"), _clock)
     assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100
+
+
+def test_fewer_gaussians_stand_farther_apart(bench) -> None:
+    for count, apart in ((None, 1.0), (200, 2.0)):
+        metadata = read_metadata(OnnxFile(bench.model(Recipe(gaussians=count)).SerializeToString()))
+        whole = float(bench._checkpoint.model.spacing)
+        assert metadata.spacing_m == pytest.approx(apart * whole, rel=1e-6)

@@ -148,3 +148,10 @@ def test_playing_refuses_bad_files(tiny_avatar, tmp_path) -> None:
     cut.write_bytes(tiny_avatar.read_bytes()[:5000])
     assert "cut.onnx" in line(avatar=cut)
     assert not list(tmp_path.rglob("*.png"))
+
+
+def test_an_avatar_is_not_overwritten_where_its_state_is_gone(played, tiny_capture, tmp_path) -> None:
+    shutil.copy(played / "run" / "avatar.ckpt", tmp_path)
+    line = _refused("rnd-train", tiny_capture.folder, "--out", tmp_path)
+    assert "holds a training already" in line and "--resume" not in line
+    assert [file.name for file in tmp_path.iterdir()] == ["avatar.ckpt"]

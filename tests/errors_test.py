@@ -196,3 +196,12 @@ def test_a_name_that_the_file_system_takes_is_written_and_a_longer_one_is_one_li
     error = capsys.readouterr().err
     assert error.endswith("File name too long\n") and error.count("\n") == 1
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_streams_that_are_closed_end_nothing(closed):
+    words = "from rnd_runtime.errors import run_command; raise SystemExit(run_command('rnd-x', lambda: print('done')))"
+    done = subprocess.run(
+        f'"{sys.executable}" -c "{words}" {closed}', shell=True, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import onnx
@@ -227,6 +228,13 @@ def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar,
     )
     assert np.abs(less[:, :4] - whole[:, :4]).max() < 1e-5
     assert (less[:, 4:] == 0).all() and np.abs(whole[:, 4:]).max() > 0.01
+
+
+def test_a_body_of_alike_weights_is_exported(tiny_checkpoint, tmp_path) -> None:
+    """As of one joint: the template's logarithms are all the smallest."""
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    checkpoint.model.log_weights.fill_(-math.log(checkpoint.model.log_weights.shape[1]))
+    assert export(checkpoint, tmp_path / "a.onnx", motion(body(), 2)).position_m < 1e-4
 
 
 @pytest.mark.parametrize(

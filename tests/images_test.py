@@ -1,5 +1,6 @@
 """The one transfer function, the one rounding, and files that keep every byte."""
 
+import os
 import struct
 import subprocess
 import sys
@@ -212,24 +213,36 @@ def test_writing_elsewhere_is_refused_and_leaves_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
+def test_names_that_are_not_text_are_one_line(tmp_path):
+    folder = tmp_path / os.fsdecode(b"\xff")
+    folder.mkdir()
+    with pytest.raises(InputError, match="name of an image: expected UTF-8"):
+        write_image(folder / "a.png", np.ones((2, 2, 3), np.uint8))
+    (folder / "a.exr").write_bytes(b"")
+    with pytest.raises(InputError, match="name of an image: expected UTF-8"):
+        read_image(folder / "a.exr")
+    assert [file.name for file in folder.iterdir()] == ["a.exr"]
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits file sizes with ulimit")
-def test_full_disk_leaves_no_half_picture(tmp_path):
+@pytest.mark.parametrize(("name", "kind"), [("a.exr", "float32"), ("a.png", "uint8")])
+def test_full_disk_leaves_no_half_picture(tmp_path, name, kind):
     """A write that fails (here: a limit on the size of files) is an InputError and keeps the old picture."""
-    write_image(tmp_path / "a.exr", np.ones((2, 2, 3), np.float32))
-    before = (tmp_path / "a.exr").read_bytes()
+    write_image(tmp_path / name, np.ones((2, 2, 3), kind))
+    before = (tmp_path / name).read_bytes()
     code = (
         "import resource, signal, sys, numpy as np\n"
         "from rnd_runtime.images import write_image\n"
         "from rnd_runtime.errors import InputError\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "pixels = np.random.default_rng(0).random((256, 256, 3)).astype(np.float32)\n"
+        "pixels = (255 * np.random.default_rng(0).random((256, 256, 3))).astype(sys.argv[2])\n"
         "try:\n    write_image(sys.argv[1], pixels)\n"
         "except InputError as error:\n    print(error)\n"
     )
     result = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / "a.exr")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, str(tmp_path / name), kind], capture_output=True, text=True, check=True
     )
     assert "cannot be written" in result.stdout, result
-    assert (tmp_path / "a.exr").read_bytes() == before
-    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+    assert (tmp_path / name).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [name]

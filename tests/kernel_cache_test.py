@@ -73,3 +73,11 @@ def test_few_states_of_the_sources_are_kept_and_a_folder_of_the_users_is_his(clo
     inner.write_text(INNER.format(factor=1, added=9))
     assert _run(clone, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "10"
     assert (tmp_path / "mine").is_dir() and len(list((clone / ".cache/kernels").iterdir())) == 4
+
+
+def test_an_editors_lock_is_no_source(clone):
+    """Emacs marks a buffer that is not saved by a link to nowhere beside the file."""
+    inner = clone / "runtime/rnd_runtime/inner.py"
+    inner.write_text(INNER.format(factor=2, added=1))
+    inner.with_name(".#inner.py").symlink_to("me@here.1234")
+    assert _run(clone) == "4" and (clone / ".cache/kernels").is_dir()

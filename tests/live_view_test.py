@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rnd_runtime.files import atomic_path
 from rnd_runtime.images import read_image, write_image
 from rnd_trainer import cli
 from rnd_trainer.live_view import POINTS, Metrics, live_view, state
@@ -73,7 +74,11 @@ def test_metrics_are_read_on_and_torn_lines_wait(tmp_path):
         assert [row["step"] for row in metrics.read()] == [0]
         stream.write('ge": 1, "seconds": 0.5}\n')
     assert [row["step"] for row in metrics.read()] == [0, 1]
-    metrics.path.write_text("")  # --resume kept nothing
+    with atomic_path(metrics.path) as kept:  # --resume cut it, and it has grown past where it was
+        kept.write_text("".join(json.dumps(_row(k)) + "\n" for k in range(9)) + "{half\n")
+    assert [row["step"] for row in metrics.read()] == list(range(9))
+    with atomic_path(metrics.path) as kept:  # it kept nothing
+        kept.write_text("")
     assert metrics.read() == []
 
 
@@ -115,7 +120,7 @@ def test_view_is_an_option_of_rnd_train(tiny_capture, tmp_path, monkeypatch, cap
     """The page is up while steps are made, and gone afterwards; the steps themselves are tested elsewhere."""
     answers = []
 
-    def steps(training, folder, run) -> bool:
+    def steps(training, folder) -> bool:
         page = capsys.readouterr().err.split()[-1]
         answers.append((page, _get(page)[0]))
         return False

@@ -22,7 +22,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.checkpoint import load_checkpoint, read_tensors, write_tensors
 from rnd_trainer.config import from_dict
-from rnd_trainer.eval_cli import EvalOptions
+from rnd_trainer.eval_cli import EvalOptions, evaluate_run
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
@@ -375,3 +375,37 @@ def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(
     assert leaving.value.code == 2
     assert said[-1].startswith("rnd-train: --device: expected enough memory, got a GPU that is full (fewer")
     assert load_checkpoint(out / "avatar.ckpt").info["step"] == 2
+
+
+def test_a_training_that_was_stopped_early_says_so(tiny_capture, tiny_config, tmp_path, capsys) -> None:
+    training = Training(tiny_capture, tiny_config)
+    training.step()
+    training.save(tmp_path)
+    note = load_checkpoint(tmp_path / "avatar.ckpt").note()
+    assert note is not None and "stopped at step 1 of 14, before light and albedo were learned" in note
+    evaluate_run(EvalOptions(tmp_path, tiny_capture.folder))
+    assert note in capsys.readouterr().err
+
+
+def test_a_finished_training_has_nothing_to_say(tiny_run) -> None:
+    assert load_checkpoint(tiny_run / "avatar.ckpt").note() is None
+
+
+def test_plain_colours_learn_no_visibility(tiny_capture, tiny_config) -> None:
+    plain = Training(tiny_capture, dataclasses.replace(tiny_config, light="none"))
+    assert "visibility" not in plain.step().terms
+    assert "visibility" in Training(tiny_capture, tiny_config).step().terms
+
+
+def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, monkeypatch) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, refine_poses=True))
+    assert training.refinement is not None
+    with torch.no_grad():
+        for raw in training.refinement.raw:
+            raw += 0.3
+    training.step_index, given = tiny_config.steps, []
+    monkeypatch.setattr(training, "_unseen", lambda: lambda model, pose, step: given.append(pose) or {})
+    training._unseen_terms(training.views[0], training.poses[0])
+    expected = training.refinement.bones(training.views[0].frame.frame)
+    assert torch.equal(given[0].bones, expected) and not given[0].bones.requires_grad
+    assert not torch.equal(expected, training.poses[0].bones)

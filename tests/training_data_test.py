@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from msgspec.structs import replace
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb
+from rnd_trainer.config import TrainConfig
 from rnd_trainer.data import CROP_MARGIN, load_views
+from rnd_trainer.train import Training
 
 
 def test_a_crop_is_the_picture_and_its_camera_agrees(tiny_capture) -> None:
@@ -90,3 +93,11 @@ def test_true_normals_that_are_not_there_are_refused(tiny_capture) -> None:
 def test_a_split_that_is_not_there_is_refused(tiny_capture) -> None:
     with pytest.raises(InputError, match="split 'relight': expected at least one frame, got none"):
         load_views(tiny_capture, "relight")
+
+
+def test_a_light_that_changes_is_not_learned(tiny_capture) -> None:
+    lights = itertools.cycle(["noon", "evening"])
+    frames = tuple(replace(frame, light=next(lights)) for frame in tiny_capture.frames)
+    two = dataclasses.replace(tiny_capture, frames=frames)
+    with pytest.raises(InputError, match="expected one light in the train split, got evening, noon"):
+        Training(two, TrainConfig())

@@ -101,6 +101,8 @@ def _export(options: Options) -> None:
     check_option(out.resolve() != file.resolve(), "--out", "another file than the checkpoint", out)
     check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
     checkpoint = load_checkpoint(file)
+    if note := checkpoint.note():
+        print(f"rnd-export: {note}", file=sys.stderr)  # noqa: T201
     if options.motion is not None:
         motion = load_motion(options.motion, checkpoint.skeleton)
     else:

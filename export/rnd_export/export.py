@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -170,7 +171,7 @@ def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> s
     metadata = AvatarMetadata(
         schema=SCHEMA,
         gaussians=len(baked.points),
-        spacing_m=float(checkpoint.model.spacing),
+        spacing_m=float(checkpoint.model.spacing) * math.sqrt(config.gaussians / len(baked.points)),
         window_poses=variant.window_poses or config.window_poses,
         window_seconds=config.window_seconds,
         skeleton=SkeletonMetadata(

@@ -90,6 +90,8 @@ class RestConstants:
             logs = np.log(weights)
             flat = (logs - logs.min(axis=1, keepdims=True)).reshape(-1)
             entries = np.flatnonzero(flat > SMALLEST_LOG)
+            if len(entries) == 0:  # one joint, or all alike
+                return graph.reshape(graph.filled("zeros", (flat.size,), 0.0), weights.shape, "log_template")
             steps = np.diff(entries, prepend=0)
             places = graph.packed("steps", steps)
             places = graph.op("CumSum", places, graph.constant("step_axis", np.int64(0)), name="places")

@@ -22,11 +22,11 @@ def keep_kernels_by_source() -> None:
     root = Path(__file__).parents[2]
     if "NUMBA_CACHE_DIR" in os.environ or not (root / "pyproject.toml").is_file():
         return
-    digest = hashlib.sha256()
-    for file in _sources(root):
-        digest.update(file.name.encode() + file.read_bytes())
-    folder = root / ".cache" / "kernels" / digest.hexdigest()[:16]
     try:
+        digest = hashlib.sha256()
+        for file in _sources(root):
+            digest.update(file.name.encode() + file.read_bytes())
+        folder = root / ".cache" / "kernels" / digest.hexdigest()[:16]
         if not folder.is_dir():
             folder.mkdir(parents=True)
             for old in sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_KEPT]:
@@ -39,7 +39,7 @@ def keep_kernels_by_source() -> None:
 def _sources(root: Path) -> Iterator[Path]:
     """All that kernels may be made of: this package, whose constants they hold, and whatever else compiles some."""
     own = Path(__file__).parent
-    yield from sorted(own.glob("*.py"))
-    for file in sorted((root / "trainer").rglob("*.py")):
+    yield from sorted(own.glob("[!.]*.py"))  # a name with a dot is an editor's
+    for file in sorted((root / "trainer").rglob("[!.]*.py")):
         if b"njit" in file.read_bytes():
             yield file

@@ -92,8 +92,12 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
 
     2 for an :class:`InputError` and for a file that the machine withholds (one line on stderr), 130 for Ctrl-C and for
     SIGTERM, which is the same to us, 141 in silence where nobody reads the output to its end
-    (``rnd-play --help | head``), otherwise what ``main`` returns. A terminal that cannot show a letter shows a ?.
+    (``rnd-play --help | head``), otherwise what ``main`` returns. A terminal that cannot show a letter shows a ?. What
+    is said to a stream that was closed is lost.
     """
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:  # closed by who started us
+            setattr(sys, stream, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
     try:

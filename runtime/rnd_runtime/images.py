@@ -21,6 +21,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 # A file that claims more pixels than deflate (1032 : 1) could hide in it is damaged; reading it would fill the memory.
 _MOST_COMPRESSED = 2000
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 
 
@@ -110,11 +111,23 @@ def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str,
     else:
         spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are divided by alpha
     with atomic_path(path) as temporary:
-        target: Any = oiio.ImageOutput.create(str(temporary))
-        written = target.open(str(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
+        target: Any = oiio.ImageOutput.create(_text(temporary))
+        written = target.open(_text(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
         reason = target.geterror()
         if not (target.close() and written):
             raise InputError("image cannot be written", got=_reason(reason or target.geterror()), file=path)
+        if suffix == ".png" and not temporary.read_bytes().endswith(
+            _PNG_END
+        ):  # of a full disk its writer is silent
+            raise InputError("image cannot be written", got="half a file: the disk may be full", file=path)
+
+
+def _text(path: str | Path) -> str:
+    """``path`` as OpenImageIO takes names; raises :class:`InputError` where it is not UTF-8."""
+    try:
+        return str(path).encode().decode()
+    except UnicodeEncodeError as error:
+        raise InputError("name of an image", expected="UTF-8", got="other bytes", file=path) from error
 
 
 def _floats(values: ArrayLike) -> Floats:
@@ -129,7 +142,7 @@ def _opened(path: str | Path) -> Iterator[Any]:
     settings.attribute("oiio:UnassociatedAlpha", 1)
     source = None
     try:
-        source = oiio.ImageInput.open(str(path), settings)
+        source = oiio.ImageInput.open(_text(path), settings)
         if source is None:
             reason = _reason(oiio.geterror())
             raise InputError("image cannot be read", got=_other_format(Path(path)) or reason, file=path)

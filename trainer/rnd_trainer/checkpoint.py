@@ -45,6 +45,20 @@ class Checkpoint:
     file: Path
     sha256: str
 
+    def learned_from(self, capture: Path) -> bool:
+        """Whether this is the capture.json that the avatar was trained on."""
+        digest = self.info.get("capture_sha256")
+        if digest is None:  # checkpoints of before have none
+            return bool(self.info.get("capture") == capture.parent.resolve().name)
+        return bool(digest == sha256_of(capture))
+
+    def note(self) -> str | None:
+        """What a user should know of an avatar whose training was stopped before there was a light; else None."""
+        if self.config.light == "none" or self.info.get("lit", True):
+            return None
+        stopped = f"step {self.info.get('step')} of {self.info.get('steps_planned')}"
+        return f"{self.file}: stopped at {stopped}, before light and albedo were learned; rnd-train --resume goes on"
+
 
 def save_checkpoint(
     path: Path,

@@ -94,10 +94,11 @@ def _train(options: TrainOptions) -> None:
     capture = load_capture(options.capture, motion_file=options.motion)
     folder = options.out
     state = folder / STATE_FILE
-    if state.exists() and not options.resume:
-        raise InputError(
-            "holds a training already", file=folder, hint="--resume continues it; or choose another --out"
+    if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
+        hint = (
+            "choose another --out" if not state.exists() else "--resume continues it; or choose another --out"
         )
+        raise InputError("holds a training already", file=folder, hint=hint)
     perceptual = load_lpips(options.perceptual_weights)
     with _memory_runs_out():
         training = Training(capture, config, perceptual, device)

@@ -72,8 +72,8 @@ def consistency_loss(
     """
     matches = torch.arange(len(first_pixels), device=first_pixels.device)
     losses = []
-    features = zip(perceptual.features(first_srgb), perceptual.features(second_srgb), perceptual.grids)
-    for a, b, grid in list(features)[:LAYERS]:
+    shallow = dataclasses.replace(perceptual, layers=min(LAYERS, perceptual.layers))
+    for a, b, grid in zip(shallow.features(first_srgb), shallow.features(second_srgb), shallow.grids):
         unit_a, unit_b = _look_up(a, first_pixels, grid), _look_up(b, second_pixels, grid)
         losses.append(functional.cross_entropy(unit_a @ unit_b.T / TEMPERATURE, matches))
     return torch.stack(losses).mean()

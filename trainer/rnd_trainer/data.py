@@ -114,12 +114,20 @@ def training_light(capture: Capture, what: str = "--light capture") -> tuple[str
 
     Raises :class:`InputError` where there are several, or the capture does not have it.
     """
+    name = training_light_name(capture, what)
+    return name, capture.load_light(name)
+
+
+def training_light_name(capture: Capture, what: str) -> str:
+    """The name of the one light that all training pictures were taken under, "unknown" where it has none.
+
+    Raises :class:`InputError` where there are several.
+    """
     names = {frame.light or "unknown" for frame in capture.split("train")}
     if len(names) != 1:
         got = ", ".join(sorted(names))
         raise InputError(what, expected="one light in the train split", got=got, file=capture.folder)
-    name = names.pop()
-    return name, capture.load_light(name)
+    return names.pop()
 
 
 def usable(mask: NDArray[np.floating[Any]]) -> bool:

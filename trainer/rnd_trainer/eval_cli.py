@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
-from rnd_runtime.files import is_folder, sha256_of, write_json
+from rnd_runtime.files import is_folder, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -119,6 +119,8 @@ def evaluate_run(options: EvalOptions) -> None:
 
     path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
+    if note := checkpoint.note():
+        print(f"rnd-eval: {note}", file=sys.stderr)  # noqa: T201
     capture = load_capture(
         options.capture, motion_file=options.motion or _corrected(path, checkpoint, options)
     )
@@ -155,9 +157,7 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
     capture = options.capture / "capture.json" if is_folder(options.capture) else options.capture
     if not (checkpoint.config.refine_poses and file.is_file() and capture.is_file()):
         return None
-    named = checkpoint.info.get("capture") == capture.parent.resolve().name
-    digest = checkpoint.info.get("capture_sha256")  # checkpoints of before have none
-    if not (named if digest is None else digest == sha256_of(capture)):
+    if not checkpoint.learned_from(capture):
         return None
     print(f"rnd-eval: poses of {file}, corrected in training; --motion takes others", file=sys.stderr)  # noqa: T201
     return str(file)

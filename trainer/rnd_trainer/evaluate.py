@@ -43,7 +43,8 @@ class SplitScore:
 class Judge:
     """Renders a trained avatar for the frames of a capture, each under its light.
 
-    Unknown lights come from the capture, the training light from the learned probe: both are what a player has.
+    The light that the avatar was trained under is the learned probe, others come from the capture: both are what a
+    player has.
 
     Args:
         mode: shading of the runtime.
@@ -55,7 +56,8 @@ class Judge:
     ) -> None:
         self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
         self.motion = capture.motion if motion is None else motion
-        self._trained = {frame.light for frame in capture.split("train")}
+        own = checkpoint.info.get("capture") == capture.folder.resolve().name  # edited since or not
+        self._trained = {frame.light for frame in capture.split("train")} if own else set()
         self._shaders: dict[str | None, Shader | None] = {}
 
     def render(self, frame: Frame, albedo_scale: Tensor | None = None, index: int | None = None) -> Rendered:

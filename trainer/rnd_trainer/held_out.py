@@ -125,7 +125,8 @@ def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
 def _provenance(checkpoint: Any) -> dict[str, Any]:
     info, config = checkpoint.info, checkpoint.config
     return {
-        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps, "seed": config.seed,
+        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps,
+        "step": info.get("step"), "seed": config.seed,
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
         "train_perceptual": info.get("perceptual"), "refine_poses": config.refine_poses,
         "machine": machine(),

@@ -7,6 +7,7 @@ of it. It answers to 127.0.0.1 alone, and only when asked by that name, so that 
 from __future__ import annotations
 
 import json
+import os
 import re
 import threading
 from collections.abc import Iterator
@@ -31,23 +32,35 @@ class Metrics:
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows = path, list[dict[str, Any]]()
-        self._offset = 0
+        self._offset, self._file = 0, 0
         self._lock = threading.Lock()
 
     def read(self) -> list[dict[str, Any]]:
-        """All rows so far; a line still being written waits for the next call, a file cut by --resume starts anew."""
+        """All rows so far; a line still being written waits for the next call, a file cut by --resume starts anew.
+
+        Damaged rows are left out, as --resume leaves them out.
+        """
         with self._lock:
             if not self.path.exists():
                 return []
-            if self.path.stat().st_size < self._offset:
-                self.rows, self._offset = [], 0
             with self.path.open("rb") as stream:
+                file = os.fstat(stream.fileno()).st_ino
+                if file != self._file:
+                    self.rows, self._offset, self._file = [], 0, file
                 stream.seek(self._offset)
                 content = stream.read()
             whole = content[: content.rfind(b"\n") + 1]
-            self.rows += [json.loads(line) for line in whole.splitlines() if line]
+            self.rows += [row for line in whole.splitlines() if (row := _row(line)) is not None]
             self._offset += len(whole)
             return list(self.rows)
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) and "step" in row else None
 
 
 def state(rows: list[dict[str, Any]], total: int, previews: list[str]) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class Objective:
             terms["repulsion"] = (
                 config.repulsion_every * config.weight_repulsion * self._crowding(model, posed)
             )
-        if config.model.visibility == "pose":
+        if config.model.visibility == "pose" and config.light != "none":  # which is never shaded
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)
         if stage == 2 and self.fixed_light is None:
@@ -120,9 +120,9 @@ class Objective:
     def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
         """L1 with a structural term; LPIPS where there is a network and the picture is large enough for it."""
         config = self.config
-        scales = 1 if self.perceptual is not None else config.dssim_scales
-        terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
         seen = self._network_for(target_srgb)
+        scales = 1 if seen is not None else config.dssim_scales
+        terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
         if seen is not None and _due(step, config.weight_lpips, config.lpips_every):
             distance = seen(image_srgb.clamp(max=1), target_srgb)
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance

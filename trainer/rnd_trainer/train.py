@@ -31,7 +31,7 @@ from rnd_runtime.motion import Motion, save_motion
 from . import light_start
 from .checkpoint import save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
-from .data import TrainingView, load_views, pose_input, training_light
+from .data import TrainingView, load_views, pose_input, training_light, training_light_name
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
@@ -74,6 +74,8 @@ class Training:
         perceptual: Perceptual | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
+        if config.light == "learn":
+            training_light_name(capture, "learning a light")
         self.capture, self.config = capture, config
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -100,8 +102,8 @@ class Training:
     def rehearse(self) -> None:
         """Take the dearest kind of step, one of the last with a picture, for nothing: nothing changes by it.
 
-        Kernels are compiled, and what memory a step or the light's search can need is asked for, now and not when
-        hours have gone by. What compilers leave behind is cleared away.
+        Kernels are compiled, and what memory a step or the light's search commonly needs is asked for, now and not
+        when hours have gone by. What compilers leave behind is cleared away.
         """
         started = time.perf_counter()
         draws = self.generator.get_state()
@@ -127,7 +129,7 @@ class Training:
         view_index = self._next_view()
         view, pose = self.views[view_index], self.poses[view_index]
         pose = noisy(pose, self.config.pose_noise, self.generator)
-        terms = self._picture_terms(view, pose, stage) if stage < 3 else self._unseen_terms(pose)
+        terms = self._picture_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
         total = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(total))
@@ -166,9 +168,11 @@ class Training:
             terms["poses"] = self.config.weight_poses * refinement.prior(view.frame.frame)
         return terms
 
-    def _unseen_terms(self, pose: PoseInput) -> dict[str, Tensor]:
+    def _unseen_terms(self, view: TrainingView, pose: PoseInput) -> dict[str, Tensor]:
         if self.unseen is None:
             self.unseen = self._unseen()
+        if self.refinement is not None:  # where the pictures put the skin
+            pose = dataclasses.replace(pose, bones=self.refinement.bones(view.frame.frame).detach())
         return self.unseen(self.model, pose, self.step_index)
 
     # -- schedule ------------------------------------------------------------------------------------------
@@ -388,6 +392,8 @@ class Training:
             "capture_sha256": sha256_of(self.capture.file),
             "body_license": self.capture.body.license,
             "step": self.step_index,
+            "steps_planned": self.total_steps,
+            "lit": self.lit,
             "minutes": round(self.seconds / 60, 3),
             "pictures": len(self.views),
             "spacing_m": float(self.model.spacing),
