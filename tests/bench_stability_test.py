@@ -30,6 +30,8 @@ from rnd_trainer.stability.figures import (
 from rnd_trainer.stability.rows import ROWS
 from rnd_trainer.stability.subject import Subject
 
+MEASURED_ON = {"gaussians": 600, "machine": "this one"}
+
 
 def test_every_row_of_the_list_is_there_once():
     ids = [row.id for row in ROWS]
@@ -47,6 +49,11 @@ def test_unknown_rows_are_refused(capsys):
     assert "--rows: expected some of P1,P2" in capsys.readouterr().err
 
 
+def test_a_size_that_no_picture_has_is_refused(capsys):
+    assert stability_main(["--rows", "none", "--size", "0"]) == 2
+    assert "--size: expected 16 to 4096, got 0" in capsys.readouterr().err
+
+
 def test_another_file_is_refused_before_anything_is_measured(tmp_path, capsys):
     kept = tmp_path / "rows.json"
     kept.write_text('[{"fps": 60}]')
@@ -58,15 +65,18 @@ def test_another_file_is_refused_before_anything_is_measured(tmp_path, capsys):
 def test_the_table_keeps_other_rows_and_replaces_its_own(tmp_path):
     options = StabilityOptions(json=tmp_path / "table.json")
     picture = np.full((4, 6, 3), 9, np.uint8)
-    _keep(options, "L1", "suns", (below("energy", 0.2, 1, "%", baseline=("bilinear", 39.0)),), None)
+    _keep(
+        options, MEASURED_ON, "L1", "suns", (below("energy", 0.2, 1, "%", baseline=("bilinear", 39.0)),), None
+    )
     for measured in (1.0, 5.0):
         result = Result((above("edges", measured, 3, "×"), stated("length", 2.0, "m")), (picture, picture))
-        _keep(options, "P1", "poses", result.figures, result)
+        _keep(options, MEASURED_ON, "P1", "poses", result.figures, result)
     rows = json.loads(options.json.read_text())
     assert [(row["id"], row["measured"], row["verdict"]) for row in rows] == [
         ("P1", 5.0, "pass"), ("P1", 2.0, "reported"), ("L1", 0.2, "pass"),
     ]  # fmt: skip
     assert rows[2]["baseline"] == 39.0 and rows[2]["line"] == "< 1"
+    assert all(MEASURED_ON.items() <= row.items() for row in rows)
     assert "| L1 | suns | energy | 0.2 % | < 1 | ✓ | bilinear: 39 % |" in (tmp_path / "table.md").read_text()
     assert (tmp_path / "table" / "P1.png").exists()
 
@@ -85,8 +95,8 @@ def test_a_figure_that_is_missing_is_said_so_and_stops_no_later_row(tmp_path):
         stated("lost", nan, "dB"),
         stated("length", 2.0, "m"),
     )
-    _keep(options, "L11", "scale", figures, None)
-    _keep(options, "P1", "poses", (stated("length", 2.0, "m"),), None)
+    _keep(options, MEASURED_ON, "L11", "scale", figures, None)
+    _keep(options, MEASURED_ON, "P1", "poses", (stated("length", 2.0, "m"),), None)
     rows = json.loads(options.json.read_text())
     assert [(row["measured"], row["verdict"]) for row in rows] == [
         (2.0, "reported"), (None, "not measured"), (None, "fail"), (None, "fail"), (2.0, "reported"),

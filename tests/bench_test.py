@@ -172,6 +172,11 @@ def test_factors_that_are_crossed_come_in_all_combinations() -> None:
         settings(cross=("n", "colour"))
 
 
+def test_a_factor_is_crossed_once() -> None:
+    with pytest.raises(InputError, match="--cross: expected each factor once, got n,n"):
+        settings(cross=("n", "n"), sample=3)
+
+
 def test_a_sample_of_all_combinations_has_each_value_about_as_often_and_grows() -> None:
     few, many = settings(sample=60), settings(sample=180)
     assert many[: len(few)] == few and few[0] == Setting() and len(set(many)) == len(many) == 181
@@ -300,9 +305,9 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
         return subprocess.CompletedProcess(line, 0)
 
     monkeypatch.setattr(bench_avatars.subprocess, "run", pretend)
-    assert "export.py" in {file.name for file in bench_avatars._exporter()}
+    assert "export.py" in {file.name for file in bench_avatars.sources("rnd_export")}
     checkpoint, code = tmp_path / "avatar.ckpt", tmp_path / "export.py"
-    monkeypatch.setattr(bench_avatars, "_exporter", lambda: [code])
+    monkeypatch.setattr(bench_avatars, "sources", lambda package: [code])
     checkpoint.write_bytes(b"one")
     code.write_bytes(b"old")
     assert exported(checkpoint, Encoders(), tmp_path) == exported(checkpoint, Encoders(), tmp_path)
@@ -329,6 +334,9 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
     for folder in ("a", "b", "a"):
         reference(tiny_avatar, tmp_path / folder / "walk.npz", SKY, 8, tmp_path)
     assert lit == [tmp_path / "a" / "walk.npz", tmp_path / "b" / "walk.npz"]
+    monkeypatch.setattr(bench_reference, "sources", lambda package: [code])
+    reference(tiny_avatar, tmp_path / "a" / "walk.npz", SKY, 8, tmp_path)
+    assert len(lit) == 3  # by another formula
 
 
 def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:

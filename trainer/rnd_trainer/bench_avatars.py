@@ -50,7 +50,7 @@ class Encoders:
             nodes = checkpoint_model(checkpoint)["nodes"]
             words[1] = "full"
             words += ["--skinning-nodes", str(nodes // 4), "--offset-nodes", str(nodes // 8)]
-        return words + (["--window-poses", str(self.window)] if self.window else [])
+        return words + (["--window-poses", str(self.window)] if self.window is not None else [])
 
 
 def content_key(*parts: Path | str) -> str:
@@ -71,7 +71,7 @@ def forget(folder: Path) -> None:
 
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
     """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless this exporter has made it."""
-    key = content_key(checkpoint, *_exporter())
+    key = content_key(checkpoint, *sources("rnd_export"))
     words = encoders.words(checkpoint)
     name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
     out = folder / f"{name}.onnx"
@@ -102,9 +102,9 @@ def checkpoint_model(checkpoint: Path) -> dict[str, Any]:
     return model
 
 
-def _exporter() -> list[Path]:
-    """The source files of ``rnd_export``, found without importing it; none where it is not installed."""
-    found = importlib.util.find_spec("rnd_export")
+def sources(package: str) -> list[Path]:
+    """The source files of ``package``, found without importing it; none where it is not installed."""
+    found = importlib.util.find_spec(package)
     folders = () if found is None else found.submodule_search_locations or ()
     return sorted(file for folder in folders for file in Path(folder).glob("*.py"))
 

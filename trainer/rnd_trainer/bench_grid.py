@@ -106,6 +106,7 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
     factors = FACTORS
     for name in cross:
         check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
+    check_option(len(set(cross)) == len(cross), "--cross", "each factor once", ",".join(cross))
     if cross or sample is not None:
         names = tuple(cross or FACTORS)
         combinations = product(*(FACTORS[name] for name in names))

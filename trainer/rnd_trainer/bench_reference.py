@@ -27,7 +27,7 @@ from rnd_runtime.shading_reference import shade_reference
 from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 
-from .bench_avatars import content_key
+from .bench_avatars import content_key, sources
 from .bench_frame import COMPARED, STEP_S, TURN, Drawn, bench_camera
 
 MOST_DB = 120.0  # of two equal pictures
@@ -42,8 +42,11 @@ class Reference(NamedTuple):
 
 
 def reference(avatar_file: Path, motion_file: Path, hdr: Path, size: int, folder: Path) -> Reference:
-    """The reference of a whole avatar; what is slow about it is kept in ``folder``, by what the files hold."""
-    stem = f"reference_{content_key(avatar_file, motion_file, hdr)}"
+    """The reference of a whole avatar; what is slow about it is kept in ``folder``, by what the files hold.
+
+    And by the sources of the runtime: another formula is another reference.
+    """
+    stem = f"reference_{content_key(avatar_file, motion_file, hdr, *sources('rnd_runtime'))}"
     lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, motion_file, hdr))
 
     def drawn() -> dict[str, Any]:

@@ -6,6 +6,7 @@ Rows that were measured before stay in the file until they are measured again, s
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, run_command
-from rnd_runtime.files import atomic_path, earlier_rows, write_json
+from rnd_runtime.doctor import machine
+from rnd_runtime.errors import InputError, check_option, parse_options, run_command
+from rnd_runtime.files import atomic_path, earlier_rows, sha256_of, write_json
 
 from .eval_cli import need_extra
 
@@ -77,20 +79,22 @@ def _stability(options: StabilityOptions) -> None:
     wanted = known if options.rows == "all" else [] if options.rows == "none" else options.rows.split(",")
     if unknown := set(wanted) - set(known):
         raise InputError("--rows", expected=f"some of {','.join(known)}", got=",".join(sorted(unknown)))
+    check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
     _rows(options)  # before hours go by, not after the first row
     console = Console()
     with tempfile.TemporaryDirectory() as temporary:
         work = options.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
         subject = _subject(options, work)
+        measured_on = _measured_on(subject)
         for row in (*ROWS, TIMES):
             if row.id in wanted:
                 with console.status(f"{row.id} {row.failure}"):
                     result = row.measure(subject)
-                _keep(options, row.id, row.failure, result.figures, result)
+                _keep(options, measured_on, row.id, row.failure, result.figures, result)
                 _show(console, row.id, result.figures)
         for name, failure, figures in _long_runs(options, subject):
-            _keep(options, name, failure, figures, None)
+            _keep(options, measured_on, name, failure, figures, None)
             _show(console, name, figures)
 
 
@@ -117,6 +121,13 @@ def _subject(options: StabilityOptions, work: Path) -> Subject:
     return Subject(
         avatar.resolve(), checkpoint.resolve(), capture, work.resolve(), small=False, size=options.size
     )
+
+
+def _measured_on(subject: Subject) -> dict[str, Any]:
+    return {
+        "gaussians": subject.avatar.gaussians, "size": subject.size, "checkpoint_sha256": sha256_of(subject.checkpoint),
+        "threads": os.cpu_count(), "machine": machine(),
+    }  # fmt: skip
 
 
 def _fuzz(options: StabilityOptions, subject: Subject) -> Sequence[Figure]:
@@ -167,7 +178,12 @@ def _rows(options: StabilityOptions) -> list[dict[str, Any]]:
 
 
 def _keep(
-    options: StabilityOptions, name: str, failure: str, figures: Sequence[Figure], result: Result | None
+    options: StabilityOptions,
+    measured_on: dict[str, Any],
+    name: str,
+    failure: str,
+    figures: Sequence[Figure],
+    result: Result | None,
 ) -> None:
     """Replace the row's figures in the JSON, write the table again, and the pictures."""
     from rnd_runtime.images import write_image
@@ -177,7 +193,7 @@ def _keep(
         {
             "id": name, "failure": failure, "what": figure.what, "measured": figure.measured, "unit": figure.unit,
             "line": figure.line, "verdict": _verdict(figure), "baseline": figure.baseline,
-            "baseline_name": figure.baseline_name,
+            "baseline_name": figure.baseline_name, **measured_on,
         }
         for figure in figures
     ]  # fmt: skip

@@ -112,11 +112,13 @@ def evaluate_run(options: EvalOptions) -> None:
     from rich.table import Table
 
     from rnd_runtime.capture import load_capture
+    from rnd_runtime.shading import check_mode
 
     from .checkpoint import load_checkpoint
     from .held_out import score
     from .perceptual import load_lpips
 
+    check_mode(options.shade)
     path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
     if note := checkpoint.note():

@@ -8,9 +8,11 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numba
 from torch import Tensor
 
 from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture
 from rnd_runtime.capture_format import Split
 from rnd_runtime.doctor import machine
@@ -64,6 +66,7 @@ def score(
         "lpips_weights": None if perceptual is None else perceptual.backbone,
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
         **({} if avatar is None else playback(avatar, judge)),
+        "size": sorted({(camera.width, camera.height) for camera in _seen_by(capture)}),
         **_provenance(checkpoint),
     }
     names = picture_names([frame.image for split, _ in jobs for frame in capture.split(split)])
@@ -85,7 +88,13 @@ def score(
         )
         if folder is not None:
             contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
-        rows.append({"split": name, "method": method, "frames": result.frames, **result.scores, **whole})
+        exact = all(frame.normal_gt is not None for frame in capture.split(split))
+        rows.append(
+            {
+                "split": name, "method": method, "frames": result.frames, **result.scores,
+                "normals": "exact" if exact else "estimated", **whole,
+            }
+        )  # fmt: skip
     return rows
 
 
@@ -122,6 +131,11 @@ def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
     return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}
 
 
+def _seen_by(capture: Capture) -> list[Camera]:
+    """Cameras of the held-out pictures."""
+    return [capture.cameras[frame.camera] for split in HELD_OUT for frame in capture.split(split)]
+
+
 def _provenance(checkpoint: Any) -> dict[str, Any]:
     info, config = checkpoint.info, checkpoint.config
     return {
@@ -129,5 +143,5 @@ def _provenance(checkpoint: Any) -> dict[str, Any]:
         "step": info.get("step"), "seed": config.seed,
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
         "train_perceptual": info.get("perceptual"), "refine_poses": config.refine_poses,
-        "machine": machine(),
+        "threads": numba.get_num_threads(), "machine": machine(),
     }  # fmt: skip
