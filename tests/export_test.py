@@ -30,6 +30,7 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 from rnd_trainer.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
+from rnd_trainer.data import pose_input
 from rnd_trainer.model import AvatarModel
 from rnd_trainer.template import along_curve, node_interpolation, sample_template
 from tiny import body, motion
@@ -228,6 +229,19 @@ def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar,
     )
     assert np.abs(less[:, :4] - whole[:, :4]).max() < 1e-5
     assert (less[:, 4:] == 0).all() and np.abs(whole[:, 4:]).max() > 0.01
+
+
+def test_of_a_long_motion_some_frames_are_compared_the_last_one_too(
+    tiny_checkpoint, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("rnd_export.export.MOST_FRAMES", 4)
+    checkpoint, seen = load_checkpoint(tiny_checkpoint), []
+    original = checkpoint.model.forward
+    monkeypatch.setattr(checkpoint.model, "forward", lambda pose: seen.append(pose) or original(pose))
+    moves = motion(body(), 31)
+    drift = export(checkpoint, tmp_path / "a.onnx", moves)
+    last = pose_input(moves, checkpoint.skeleton, 30 / moves.fps, checkpoint.config.model)
+    assert drift.frames == 4 == len(seen) and torch.equal(seen[-1].bones, last.bones)
 
 
 def test_a_body_of_alike_weights_is_exported(tiny_checkpoint, tmp_path) -> None:

@@ -75,7 +75,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
             "--device: expected cpu, cuda or cuda:NUMBER, got mps",
         ),
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
-        ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected at least 2, got 1"),
+        ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected 2 to 1000, got 1"),
         (f"rnd-export {BODY} --out {BODY}", "--out: expected another file than the checkpoint, got"),
         (f"rnd-export {BODY} --out a.json", "--out: expected a name in .onnx, got a.json"),
         ("rnd-export .", "avatar.ckpt: checkpoint not found"),

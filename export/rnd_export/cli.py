@@ -23,9 +23,9 @@ class Options:
     out: Path | None = None
     """where to write; by default avatar.onnx beside the checkpoint"""
     motion: Path | None = None
-    """check against torch on this motion instead of random frames"""
+    """check against torch on this motion instead of random frames, on 1000 of its frames at most"""
     frames: int = 120
-    """random frames of that check"""
+    """random frames of that check, up to 1000"""
     encoder: EncoderKind = "full"
     """networks at every node, at fewer (coarse), or the template's skinning weights (static)"""
     precision: Precision = "f32"
@@ -77,7 +77,7 @@ def main() -> None:
 
 def _export(options: Options) -> None:
     try:
-        from .export import export, random_motion
+        from .export import MOST_FRAMES, export, random_motion
         from .variant import Variant
     except ModuleNotFoundError as error:
         raise InputError(
@@ -88,7 +88,7 @@ def _export(options: Options) -> None:
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
 
-    check_option(options.frames >= 2, "--frames", "at least 2", options.frames)
+    check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     _refuse_idle(options, bounded=bool(given))
