@@ -324,6 +324,7 @@ UNTIMED = {
     "two that stand": ([0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2]),
     "two in turn": ([0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2]),
 }
+"""pictures listed backwards, as nerfstudio lists them in any order"""
 
 
 @pytest.mark.parametrize("name", UNTIMED)
@@ -335,11 +336,13 @@ def test_nerfstudios_frames_without_times_are_counted(tmp_path, name, null) -> N
     entry = record["frames"][0]
     del entry["time_index"]
     record["frames"] = []
-    for place in places:
+    for k, place in reversed(list(enumerate(places))):
         pose = np.array(entry["transform_matrix"])
         pose[0, 3] += place
         more = {"time_index": None} if null else {}
-        record["frames"].append(entry | more | {"transform_matrix": pose.tolist()})
+        (tmp_path / f"images/{8 + k}.png").hardlink_to(tmp_path / "images/0_0.png")
+        named = {"file_path": f"images/{8 + k}.png", "transform_matrix": pose.tolist()}
+        record["frames"].append(entry | more | named)
     (tmp_path / "transforms.json").write_text(json.dumps(record))
     shots = nerfstudio.read(tmp_path).shots
     assert [shot.camera for shot in shots] == [f"{place:04d}" for place in places]
