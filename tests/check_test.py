@@ -178,6 +178,11 @@ def test_pictures_of_another_time_are_named(tmp_path) -> None:
     assert "2 times the rate of the pictures" in _wrong(tmp_path)["timing"]
 
 
+def test_pictures_one_frame_late_are_named(folder) -> None:
+    _move(folder, lambda turns, places, rest: (turns[[0, 0, 1, 2]], places[[0, 0, 1, 2]]))
+    assert "the motion looks 1 frame late: picture k shows motion frame k+1" in _wrong(folder)["timing"]
+
+
 def test_a_frame_rate_that_no_body_reaches_is_named(folder) -> None:
     capture = load_capture(folder)
     save_capture(dataclasses.replace(capture, motion=dataclasses.replace(capture.motion, fps=3000.0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +20,12 @@ def _grey() -> list[np.ndarray]:
     return [np.full((HEIGHT, WIDTH, 3), STEP * k, np.uint8) for k in range(FRAMES)]
 
 
-def _write(path: Path, images: list[np.ndarray], **codec: object) -> Path:
-    """Lossless but for its 4:2:0; ``codec``: attributes of its stream's."""
+def _write(path: Path, images: list[np.ndarray]) -> Path:
+    """Lossless but for its 4:2:0."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=25, options={"qp": "0", "preset": "ultrafast"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
-        for name, value in codec.items():
-            setattr(stream.codec_context, name, value)
         for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
@@ -51,3 +50,40 @@ def test_frames_that_a_cut_hides_are_not_counted(tmp_path) -> None:
     assert film.count == FRAMES - 3 and list(film.numbers) == list(range(FRAMES - 3))
     for number in (0, 1, 6, 2):
         assert np.abs(film.frame(number).astype(int) - STEP * (number + 3)).max() <= CODED
+
+
+def test_a_phones_video_stands_upright(tmp_path) -> None:
+    """Its container says to turn it by 90° clockwise: x' = h − y, y' = x."""
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    image[:8, :8] = 240  # at the upper left of what is stored
+    path = _write(tmp_path / "phone.mp4", [image] * 2)
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 4 + 40
+    one = 1 << 16
+    assert struct.unpack_from(">5i", content, matrix) == (one, 0, 0, 0, one)
+    struct.pack_into(">9i", content, matrix, 0, one, 0, -one, 0, 0, HEIGHT * one, 0, 1 << 30)
+    path.write_bytes(content)
+    film = Film(path)
+    assert (film.width, film.height) == (HEIGHT, WIDTH)
+    shown = film.frame(1)
+    assert shown.shape == (WIDTH, HEIGHT, 3) and shown[:8, -8:].min() > 200
+    assert shown[:8, :-10].max() < 40 and shown[10:].max() < 40
+
+
+@pytest.mark.parametrize(("height", "matrix"), [(720, "itu709"), (480, "itu601")])
+def test_colours_without_a_name_are_those_of_the_size(tmp_path, height, matrix) -> None:
+    """BT.709 from 720 lines on, BT.601 below."""
+    colours = np.zeros((height, 64, 3), np.uint8) + np.uint8([200, 60, 90])
+    frame = av.VideoFrame.from_ndarray(colours, format="rgb24").reformat(
+        format="yuv420p", dst_colorspace=matrix
+    )
+    path = tmp_path / "hd.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25, options={"qp": "0", "preset": "ultrafast"})
+        stream.height, stream.width, stream.pix_fmt = height, 64, "yuv420p"
+        planes = av.VideoFrame.from_ndarray(frame.to_ndarray(), format="yuv420p")
+        container.mux(stream.encode(planes))
+        container.mux(stream.encode(None))
+    with av.open(str(path)) as container:
+        assert int(next(container.decode(video=0)).colorspace) == 2  # not named
+    assert np.abs(Film(path).frame(0).astype(int) - colours).max() <= CODED

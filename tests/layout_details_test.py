@@ -41,12 +41,12 @@ def test_other_cameras_hold_out_every_so_many_of_the_frames_that_there_are() -> 
     """Counted, not by their numbers, which may be even all of them; after the border they are of novel poses."""
     numbers = list(range(0, 40, 2))
     shots = [Shot(name, number, _nothing) for name in cameras() for number in numbers]
-    kept = chosen_shots(_recording(list(range(40)), shots), Choice(held_out_every=3))
+    kept = chosen_shots(_recording(list(range(40)), shots), Choice(held_out_every=4))
     split = {(shot.camera, shot.frame): shot.split for shot in kept}
     assert [split["0", number] for number in numbers] == ["train"] * 16 + ["novel_pose"] * 4
     others = {number: split["1", number] for number in numbers if ("1", number) in split}
-    assert list(others) == numbers[::3]
-    assert others == {number: "novel_view" if number <= 30 else "novel_pose" for number in numbers[::3]}
+    assert list(others) == numbers[::4]
+    assert others == {number: "novel_view" if number <= 30 else "novel_pose" for number in numbers[::4]}
 
 
 def test_half_a_pixel_on_black_is_half_its_light(tmp_path) -> None:
