@@ -142,6 +142,16 @@ def test_posing_agrees_with_the_published_formulas(
     assert_allclose(shaped.skeleton.rest_joints, arrays["J_regressor"] @ shaped.vertices, atol=1e-9)
 
 
+@pytest.mark.parametrize(("columns", "shapes"), [(10, 10), (16, 16), (20, 10), (400, 300)])
+def test_smplx_columns_of_expressions_are_no_shape(tmp_path, columns, shapes) -> None:
+    """v1.0 holds ten of either, v1.1 300 and 100."""
+    arrays = _family(55)
+    arrays["shapedirs"] = RNG.normal(size=(len(arrays["v_template"]), 3, columns))
+    np.savez(tmp_path / "m.npz", **arrays)
+    model = load_body_model(tmp_path / "m.npz")
+    assert (model.shape_dirs == arrays["shapedirs"][..., :shapes]).all()
+
+
 def test_our_own_body_has_one_shape(tmp_path) -> None:
     coarse_body().save(tmp_path / "body.npz")
     model = load_body_model(tmp_path / "body.npz")

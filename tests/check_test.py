@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_image, write_image
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_trainer.checking import hypotheses
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.checking.normals import judge, parse_axes
 from rnd_trainer.checking.overlay import CAPTION, TILE
@@ -176,6 +178,23 @@ def test_pictures_of_another_time_are_named(tmp_path) -> None:
     motion = Motion(fine.rotations, fine.translations, capture.fps, capture.motion.joint_names)
     save_capture(dataclasses.replace(capture, motion=motion))
     assert "2 times the rate of the pictures" in _wrong(tmp_path)["timing"]
+
+
+def test_pictures_one_frame_late_are_named(folder) -> None:
+    _move(folder, lambda turns, places, rest: (turns[[0, 0, 1, 2]], places[[0, 0, 1, 2]]))
+    assert "the motion looks 1 frame late: picture k shows motion frame k+1" in _wrong(folder)["timing"]
+
+
+@pytest.mark.parametrize(("gain", "named"), [(0.03, True), (0.015, False)])
+def test_another_timing_must_win_two_hundredths(monkeypatch, gain, named) -> None:
+    """A frame costs a walker at 30 per second three."""
+    sights = [SimpleNamespace(frame=SimpleNamespace(frame=k)) for k in range(8)]
+    monkeypatch.setattr(hypotheses, "posed", lambda capture, seen, k: k - seen.frame.frame)
+    monkeypatch.setattr(
+        hypotheses, "mean_overlap", lambda seen: 0.9 + gain * all(shift == 1 for shift in seen)
+    )
+    verdict = hypotheses.explain_timing(SimpleNamespace(motion=SimpleNamespace(frame_count=8)), sights)
+    assert (verdict is not None and "1 frame late" in verdict.sentence) is named
 
 
 def test_a_frame_rate_that_no_body_reaches_is_named(folder) -> None:

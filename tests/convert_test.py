@@ -17,14 +17,17 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
+from rnd_runtime.motion_files import SMPLH_NAMES
 from rnd_runtime.npz import save_npz
 from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.convert_cli import main
@@ -420,6 +423,21 @@ def test_amass_brings_the_motion_back(tmp_path):
         == 0
     )
     assert (tmp_path / "w.npz").read_bytes() == (tmp_path / "v.npz").read_bytes()
+
+
+def test_a_hand_turns_all_its_fingers(tmp_path):
+    skeleton = Body.load(ASSETS / "body.npz").skeleton
+    still = load_motion(WALK, skeleton)
+    rotations = still.rotations.copy()
+    turns = {"left": np.array([0.1, 0.2, 0.3]), "right": np.array([-0.3, 0, 0.2])}
+    for side, turn in turns.items():
+        rotations[:, skeleton.names.index(f"{side}_hand")] = axis_angle_to_matrix(turn)
+    assert not write_amass(tmp_path / "a.npz", replace(still, rotations=rotations), skeleton)
+    with np.load(tmp_path / "a.npz") as archive:
+        poses = archive["poses"].reshape(-1, 52, 3)
+    for joint, name in enumerate(SMPLH_NAMES[22:], 22):
+        expected = turns[name.split("_")[0]] if name.endswith("1") else np.zeros(3)
+        np.testing.assert_allclose(poses[:, joint], np.tile(expected, (len(poses), 1)), atol=1e-9)
 
 
 def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):

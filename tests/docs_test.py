@@ -143,10 +143,28 @@ def test_tables_are_those_of_the_files():
         assert script["filled"](text, ASSETS / "bench", pictures) == text, "run: python scripts/doc_tables.py"
 
 
-def test_links_lead_somewhere():
+def _anchors(page: Path) -> set[str]:
+    """What GitHub calls the headings of ``page``."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = [
+        re.sub(r"\]\([^)]*\)", "]", line) for line in re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)
+    ]
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        if target.startswith("https://"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), (page.name, target)
+        assert not anchor or anchor in _anchors(file), (page.name, target, sorted(_anchors(file)))
+
+
+def test_sources_that_are_named_are_there():
     for page in PAGES:
-        for target in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
-            assert target.startswith("https://") or (page.parent / target).is_file(), (page.name, target)
         for name in re.findall(r"`(?:\w+/)?(\w+\.py)`", page.read_text(encoding="utf-8")):
             assert list(ROOT.glob(f"*/rnd_*/**/{name}")), (page.name, name)
 

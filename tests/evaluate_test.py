@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,17 +16,19 @@ import torch
 from msgspec import structs
 
 import rnd_trainer.ablate
+import rnd_trainer.evaluate
 import rnd_trainer.held_out
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import sha256_of, write_json
-from rnd_runtime.images import srgb_to_linear
+from rnd_runtime.images import linear_to_srgb, srgb_to_linear
 from rnd_runtime.light import Light
 from rnd_runtime.shading import Shader
 from rnd_trainer.ablate import (
     CAUSES,
     LENGTHS,
     VARIANTS,
+    StudyRow,
     ablate,
     check_needs,
     chosen,
@@ -36,12 +41,12 @@ from rnd_trainer.checkpoint import load_checkpoint, write_tensors
 from rnd_trainer.config import ModelConfig, to_dict
 from rnd_trainer.data import pose_input
 from rnd_trainer.eval_cli import EvalOptions, _is_of, evaluate_run
-from rnd_trainer.evaluate import Judge, evaluate, flicker
-from rnd_trainer.held_out import picture_names, score
+from rnd_trainer.evaluate import Judge, albedo_scale, evaluate, flicker
+from rnd_trainer.held_out import picture_names, playback, score
 from rnd_trainer.judge import Rendered, render_runtime
 from rnd_trainer.metrics import psnr, ssim_map
 from rnd_trainer.model import AvatarModel
-from rnd_trainer.scores import EDGE, frame_scores, normal_picture, outline_length, silhouette, to_srgb8
+from rnd_trainer.scores import frame_scores, normal_picture, outline_length, silhouette, to_srgb8
 from rnd_trainer.template import sample_template
 from rnd_trainer.train import Training
 from rnd_trainer.training_state import STATE_FILE, STATE_SCHEMA
@@ -68,6 +73,19 @@ def test_a_perfect_rendering_is_perfect_in_every_figure(tiny_capture) -> None:
     assert scores["psnr_n"] > 120  # normals are scaled to unit length once more
     assert scores["ssim"] == pytest.approx(1) and scores["ssim_n"] == pytest.approx(1)
     assert scores["normal_deg"] == pytest.approx(0, abs=0.1) and scores["outline_px"] == 0
+
+
+def test_an_albedo_is_compared_after_its_scale(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    perfect = dataclasses.replace(truth, albedo_srgb=truth.image_srgb)
+    scale = torch.tensor([2.0, 1.5, 4.0])
+    half = dataclasses.replace(_perfect(truth), albedo=_perfect(truth).image / scale)
+    assert (
+        frame_scores(half, perfect, scale=scale)["psnr_albedo"]
+        > 60
+        > 20
+        > frame_scores(half, perfect)["psnr_albedo"]
+    )
 
 
 def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
@@ -196,8 +214,8 @@ def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
     mask[12:28, 28] = 0.4  # less than half: still outside
     band = silhouette(mask)[..., 0]
     outside, inside = torch.zeros(40, 40), torch.zeros(40, 40)
-    outside[12 - EDGE : 28 + EDGE, 12 - EDGE : 28 + EDGE] = 1
-    inside[12 + EDGE : 28 - EDGE, 12 + EDGE : 28 - EDGE] = 1
+    outside[8:32, 8:32] = 1  # four pixels on either side
+    inside[16:24, 16:24] = 1
     assert torch.equal(band, (outside - inside) > 0)
 
 
@@ -241,6 +259,11 @@ def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp
         refined,
         tiny_capture.motion.source,
     ]
+    other = tmp_path / "other" / tiny_capture.folder.name  # another capture of the same name
+    shutil.copytree(tiny_capture.folder, other)
+    (other / "capture.json").write_bytes(tiny_capture.file.read_bytes() + b"\n")
+    evaluate_run(EvalOptions(run, other))
+    assert Path(str(scored[-1].motion.source)) == other / "motion.npz"
     (run / "refined_motion.npz").unlink()
     evaluate_run(EvalOptions(run, tiny_capture.folder))
     assert str(scored[-1].motion.source) == str(tiny_capture.motion.source)
@@ -265,6 +288,104 @@ def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_
     shaken = flicker(Judge(checkpoint, tiny_capture, motion=jumping), "train")
     assert shaken is not None and shaken > 1
     assert flicker(Judge(checkpoint, tiny_capture), "relight") is None
+
+
+def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:
+    """A judge of grey pictures of these sRGB ``values`` by motion frame."""
+
+    def render(frame: object, index: int) -> Rendered:
+        grey = torch.full((*mask.shape, 3), float(srgb_to_linear(np.array(values[index]))))
+        return Rendered(grey, grey, grey, torch.from_numpy(mask))
+
+    capture = SimpleNamespace(split=lambda name: [SimpleNamespace(camera="0", frame=0)])
+    return SimpleNamespace(capture=capture, motion=SimpleNamespace(frame_count=len(values)), render=render)
+
+
+def test_flicker_is_what_does_not_change_evenly() -> None:
+    """Half the second difference: nothing at constant speed, the whole of a step to and fro."""
+    mask = np.ones((4, 5), np.float32)
+    assert flicker(_shown([k * 10 / 255 for k in range(8)], mask)) == pytest.approx(0, abs=1e-3)
+    assert flicker(_shown([k % 2 * 10 / 255 for k in range(8)], mask)) == pytest.approx(10, abs=1e-3)
+
+
+def test_the_training_light_is_the_learned_one_and_others_the_captures(
+    tiny_run, tiny_capture, monkeypatch
+) -> None:
+    frames = tuple(
+        structs.replace(frame, light="noon" if frame.split == "train" else "dusk")
+        for frame in tiny_capture.frames
+    )
+    capture = dataclasses.replace(tiny_capture, frames=frames)
+    monkeypatch.setattr(Capture, "load_light", lambda self, name: f"the true {name}")
+    monkeypatch.setattr(rnd_trainer.evaluate, "Shader", lambda light, mode: light)
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    judge = Judge(checkpoint, capture)
+    assert judge._shader("dusk") == "the true dusk"
+    for name in ("noon", None):
+        assert np.array_equal(judge._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
+
+
+def test_the_albedos_scale_is_fitted_to_training_frames() -> None:
+    """By least squares, wherever both cover; lights that are held out say nothing about it."""
+    rng = np.random.default_rng(0)
+    ours, factor = rng.uniform(0.1, 0.3, (6, 7, 3)).astype(np.float32), np.array([1.5, 2.0, 0.5])
+    splits = {"train": 1.0, "relight": 3.0}
+    whole = np.ones((6, 7), np.float32)
+    capture = SimpleNamespace(
+        split=lambda name: [SimpleNamespace(albedo="a.png", split=name)],
+        load_frame=lambda frame: SimpleNamespace(
+            albedo_srgb=linear_to_srgb(splits[frame.split] * factor * ours), mask=whole
+        ),
+    )
+    albedo = torch.from_numpy(ours)
+    rendered = Rendered(albedo, albedo, albedo, torch.from_numpy(whole))
+    scale = albedo_scale(SimpleNamespace(capture=capture, render=lambda frame: rendered))
+    np.testing.assert_allclose(scale.numpy(), factor, rtol=1e-4)
+
+
+def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, tmp_path, monkeypatch) -> None:
+    seconds = iter([0.5] * 5 + [0.01] * 30 + [0.001] * 5)
+
+    class Renderer:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        def render(self, *_: object) -> SimpleNamespace:
+            whole = next(seconds)
+            return SimpleNamespace(stage_seconds={"pose": whole / 4, "splat": 3 * whole / 4})
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(rnd_trainer.held_out, "FrameRenderer", Renderer)
+    monkeypatch.setattr(rnd_trainer.held_out.Avatar, "load", lambda path: None)
+    (tmp_path / "avatar.onnx").write_bytes(bytes(3_000_000))
+    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    assert playback(tmp_path / "avatar.onnx", judge) == {"file_mb": 3.0, "fps": pytest.approx(100)}
+
+
+@pytest.mark.parametrize(
+    ("differences", "shows"),
+    [((2.0, 2.2), True), ((-2.0, -2.2), True), ((-0.1, 0.3), False), ((0.1, -0.3), False), ((2.0,), None)],
+)
+def test_a_loss_shows_as_a_gain_does(differences, shows) -> None:
+    variants = (StudyRow("ours", "", None), StudyRow("less", "", "ours"))
+    common = {"split": "novel_view", "encoder_gflop": 1.0, "encoder_ms": 1.0}
+    rows = [
+        common | {"method": name, "seed": seed, "psnr": 30 + (difference if name == "less" else 0)}
+        for seed, difference in enumerate(differences)
+        for name in ("ours", "less")
+    ]
+    assert summarise(rows, variants)[1]["novel_view"]["shows"] is shows
+
+
+def test_windows_of_the_study_are_as_dense_as_ours() -> None:
+    ours = ModelConfig()
+    step = ours.window_seconds / (ours.window_poses - 1)
+    windows = [row.model for row in VARIANTS if row.name.startswith("d = ")]
+    assert [model["window_poses"] for model in windows] == [2, 5, 20, 30]
+    for model in windows:
+        assert model["window_seconds"] == pytest.approx((model["window_poses"] - 1) * step)
 
 
 def test_ablations_are_trained_once_and_compared_seed_by_seed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_trainer.importing.importer import import_source
 from rnd_trainer.importing.options import Choice, ImportOptions
+from rnd_trainer.importing.pictures import read_mask
 
 CAMERA = layouts.video_camera(77.0)
 BENT = (1e-4, 0.0, 0.0, 0.0)  # a lens whose distortion moves nothing by a pixel
@@ -53,6 +55,60 @@ def test_masks_are_found_by_the_names_of_the_frames(tmp_path, frame_name, mask_n
     for frame in capture.frames:
         mask = capture.load_frame(frame).mask
         assert np.array_equal(mask > 0.5, view_of(CAMERA, frame.frame).mask), frame.frame
+
+
+@pytest.mark.parametrize("names", ["{:05d}", "mask_{:d}"])
+@pytest.mark.parametrize("first", [0, 1])
+def test_masks_of_frames_without_numbers_may_be_counted_from_one(tmp_path, names, first) -> None:
+    """Where there are as many as frames: a video's, or pictures that are called otherwise."""
+    _write(tmp_path, "frame{:d}x", names)
+    for k in reversed(range(FRAMES)):
+        (tmp_path / "masks" / f"{names.format(k)}.png").rename(
+            tmp_path / "masks" / f"{names.format(k + first)}.png"
+        )
+    capture = _imported(tmp_path)
+    for frame in capture.frames:
+        assert np.array_equal(capture.load_frame(frame).mask > 0.5, view_of(CAMERA, frame.frame).mask)
+    notes = json.loads((tmp_path / "out" / "capture.json").read_text())["import"]["notes"]
+    assert ("masks are numbered from 1, frames from 0: taken for the same" in notes) == bool(first)
+
+
+def test_masks_from_one_that_are_fewer_than_the_frames_are_those_of_their_numbers(tmp_path) -> None:
+    _write(tmp_path, "frame{:d}x")
+    (tmp_path / "masks" / "00000.png").unlink()
+    with pytest.raises(InputError, match=r"file: expected one numbered 0, got 00001\.png … 00003\.png"):
+        _imported(tmp_path)
+
+
+_FILLED = np.pad(np.ones((3, 2), np.uint8), 1)
+STORED = {
+    # what a mask's file holds: the person is 3 × 2 pixels inside a border of one
+    "0/1.png": _FILLED, "0/255.png": 255 * _FILLED, "0/1, 16 bit.png": _FILLED.astype(np.uint16),
+    "ids, 16 bit.png": 3 * _FILLED.astype(np.uint16), "0/255, 16 bit.png": 255 * _FILLED.astype(np.uint16),
+    "0/65535.png": 65535 * _FILLED.astype(np.uint16), "0/1, 16 bit.npy": _FILLED.astype(np.uint16),
+    "bool.npy": _FILLED.astype(bool), "SAM 2's.npy": _FILLED.astype(bool)[None], "floats.npy": _FILLED[None] * 1.0,
+    "last axis.npy": _FILLED[..., None],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_a_mask_is_read_whatever_it_is_stored_as(tmp_path, name) -> None:
+    path = tmp_path / name.replace("/", " or ")
+    np.save(path, STORED[name]) if path.suffix == ".npy" else write_image(path, STORED[name])
+    assert np.array_equal(read_mask(path), 255 * _FILLED)
+
+
+def test_sixteen_bits_of_coverage_stay_soft(tmp_path) -> None:
+    soft = np.linspace(0, 65535, 64).reshape(8, 8).astype(np.uint16)
+    write_image(tmp_path / "m.png", soft)
+    assert np.abs(read_mask(tmp_path / "m.png") - soft / 257).max() <= 1
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 3, 4, 5)])
+def test_an_array_that_is_no_mask_is_refused(tmp_path, shape) -> None:
+    np.save(tmp_path / "m.npy", np.zeros(shape))
+    with pytest.raises(InputError, match=r"m\.npy: mask: expected \[H, W\], got"):
+        read_mask(tmp_path / "m.npy")
 
 
 @pytest.mark.parametrize(

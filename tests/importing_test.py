@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import layouts
-from known_scene import FRAMES, HEIGHT, WIDTH, cameras, motion, see, shaped_body
+from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, cameras, motion, see, shaped_body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
@@ -163,6 +164,25 @@ def test_a_layout_can_be_named_and_not_another(tmp_path, name) -> None:
     other = "arah" if layout != "arah" else "zju"
     with pytest.raises(InputError, match=f"layout: expected {other}"):
         find_layout(tmp_path, other)
+
+
+def test_a_layout_and_a_root_may_both_be_said(tmp_path) -> None:
+    """EasyMocap's Rh and Th under SMPL's names, in a folder that could be frames of a video as well."""
+    source = tmp_path / "source"
+    source.mkdir()
+    layouts.write_nerfstudio(source)
+    world = layouts.World(layouts.Z_UP, (0.3, -0.2, 0.1))
+    angles = np.concatenate([world.Rh, world.thetas[:, 3:]], 1)
+    np.savez(source / "poses.npz", poses=angles, trans=world.Th, betas=BETAS, fps=30)
+    (source / "0.png").write_bytes((source / "images" / "0_0.png").read_bytes())
+    options = ImportOptions(
+        body=str(layouts.body_file(tmp_path)), layout="nerfstudio,easymocap", choice=EVERYTHING
+    )
+    import_source(source, tmp_path / "out", options)
+    assert_the_scene(load_capture(tmp_path / "out"), _either, bent=True, fps=30)
+    for said in ("nerfstudio,", "nerfstudio,zju", "smpl,easymocap", ",smpl"):
+        with pytest.raises(InputError, match="--as: expected a layout, a comma and smpl or easymocap"):
+            import_source(source, tmp_path / "more", replace(options, layout=said))
 
 
 # InstantAvatar's own split of PeopleSnapshot: first and last frame and the step, as its configurations have them
@@ -324,6 +344,7 @@ UNTIMED = {
     "two that stand": ([0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 1, 2]),
     "two in turn": ([0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2]),
 }
+"""pictures listed backwards, as nerfstudio lists them in any order"""
 
 
 @pytest.mark.parametrize("name", UNTIMED)
@@ -335,11 +356,13 @@ def test_nerfstudios_frames_without_times_are_counted(tmp_path, name, null) -> N
     entry = record["frames"][0]
     del entry["time_index"]
     record["frames"] = []
-    for place in places:
+    for k, place in reversed(list(enumerate(places))):
         pose = np.array(entry["transform_matrix"])
         pose[0, 3] += place
         more = {"time_index": None} if null else {}
-        record["frames"].append(entry | more | {"transform_matrix": pose.tolist()})
+        (tmp_path / f"images/{8 + k}.png").hardlink_to(tmp_path / "images/0_0.png")
+        named = {"file_path": f"images/{8 + k}.png", "transform_matrix": pose.tolist()}
+        record["frames"].append(entry | more | named)
     (tmp_path / "transforms.json").write_text(json.dumps(record))
     shots = nerfstudio.read(tmp_path).shots
     assert [shot.camera for shot in shots] == [f"{place:04d}" for place in places]

@@ -134,11 +134,11 @@ def test_a_frame_whose_template_is_out_of_view_has_an_empty_mask(video):
 
 
 def _red_network(
-    path: Path, *, channels_first=True, size: int | str = 64, two=False, logits=False, rank=4
+    path: Path, *, channels_first=True, size: int | str = 64, two=False, logits=False, rank=4, gain=1.0
 ) -> Path:
     """A network that finds what is more red than green."""
     weights = np.float32([[8, -8, 0]]) if not two else np.float32([[0, 0, 0], [8, -8, 0]])
-    count = len(weights)
+    weights, count = gain * weights, len(weights)
     shape = [1, 3, size, size] if channels_first else [1, size, size, 3]
     nodes = [helper.make_node("Conv", ["x", "w"], ["c"])]
     if not channels_first:
@@ -181,7 +181,7 @@ def _red_on_green(columns: slice) -> tuple[np.ndarray, np.ndarray]:
     "layout",
     [
         {}, {"channels_first": False}, {"size": "side"}, {"two": True}, {"two": True, "logits": True},
-        {"logits": True}, {"rank": 3}, {"channels_first": False, "rank": 3},
+        {"logits": True}, {"logits": True, "gain": 0.05}, {"rank": 3}, {"channels_first": False, "rank": 3},
     ],
 )  # fmt: skip
 def test_networks_of_every_layout(tmp_path, layout):

@@ -52,6 +52,15 @@ def test_smoothing_stills_jitter():
     assert still.translations[60:-60].std() < path.std() / 3
 
 
+def test_smoothing_prefers_no_direction_of_time():
+    rng = np.random.default_rng(1)
+    motion = _motion(rng.normal(size=90), rng.normal(size=(90, 3)))
+    back = replace(motion, rotations=motion.rotations[::-1], translations=motion.translations[::-1])
+    once, again = smoothed(motion, 1.0), smoothed(back, 1.0)
+    assert_allclose(again.rotations[::-1], once.rotations, atol=1e-9)
+    assert_allclose(again.translations[::-1], once.translations, atol=ROUND_OFF)
+
+
 def test_smoothing_leaves_fast_movement_and_its_timing():
     """A wave of 1 Hz through ±60° reaches 6.6 rad/s: it keeps its height within 5 % and does not lag."""
     t = np.arange(300) / FPS

@@ -290,6 +290,17 @@ def test_numbers_that_leave_out_hours_are_refused(tmp_path, write):
         load_motion(write(tmp_path, [*range(FRAMES - 1), 99_999_999]), SKELETON)
 
 
+@pytest.mark.parametrize(("first", "said"), [([0, 0], "0 after 0"), ([0, 1, 1, 5], "1 after 1")])
+def test_pictures_of_the_same_time_are_refused(tmp_path, first, said):
+    path = _phalp(tmp_path)
+    content = pickle.loads(path.read_bytes())
+    for time, moment in zip([*first, *range(9, 9 + FRAMES)], content.values()):
+        moment["time"] = time
+    path.write_bytes(pickle.dumps(content))
+    with pytest.raises(InputError, match=f"frame numbers: expected some that ascend, got {said}"):
+        load_motion(path, SKELETON)
+
+
 def test_a_folder_that_is_no_motion_is_refused_in_one_line(tmp_path):
     def refusal(text=None) -> str:
         if text is not None:

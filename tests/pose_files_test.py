@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.checking.check import check_capture
-from rnd_trainer.importing import nerfstudio
+from rnd_trainer.importing import easymocap, nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pictures import listed
@@ -168,15 +169,15 @@ def write_romp_video(folder: Path) -> Path:
     return folder / "video_results.npz"
 
 
-def write_easymocap_folder(folder: Path) -> Path:
+def write_easymocap_folder(folder: Path, numbers: Sequence[int] = range(FRAMES)) -> Path:
     """A file a frame, with somebody else before ours in the first; a camera at the origin of its world."""
     world, path = layouts.camera_world(), folder / "smpl"
     path.mkdir()
-    for k in range(FRAMES):
+    for k, number in enumerate(numbers):
         ours = {"id": 3, "Rh": [world.Rh[k].tolist()], "Th": [world.Th[k].tolist()],
                 "poses": [[0.0] * 3 + world.thetas[k, 3:].tolist()], "shapes": [BETAS.tolist()]}  # fmt: skip
         people = [ours | {"id": 1, "Th": [[0, 0, 9]]}, ours] if k == 0 else [ours]
-        (path / f"{k:06d}.json").write_text(json.dumps({"annots": people} if k % 2 else people))
+        (path / f"{number:06d}.json").write_text(json.dumps({"annots": people} if k % 2 else people))
     return path
 
 
@@ -276,6 +277,50 @@ def test_an_npz_is_read_by_its_keys_or_as_told(tmp_path) -> None:
     assert_allclose(told.root(rest), world.places, atol=1e-9)
     assert_allclose(told.rotations[:, 0], world.roots, atol=1e-9)
     assert np.abs(read_poses(tmp_path / "em.npz").poses.root(rest) - world.places).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("more", "family"),
+    [({}, "SMPL"), ({"jaw_pose": np.zeros((FRAMES, 3))}, "SMPL-X"), ({"expression": np.zeros((FRAMES, 10))}, "SMPL-X"),
+     ({"left_hand_pose": np.zeros((FRAMES, 12))}, "SMPL-X"), ({"surface_model_type": "smplx"}, "SMPL-X"),
+     ({"surface_model_type": "smplh", "expression": np.zeros(10)}, "SMPL")],
+)  # fmt: skip
+def test_members_tell_smplx(tmp_path, more, family) -> None:
+    thetas = layouts.camera_world().thetas
+    np.savez(tmp_path / "p.npz", global_orient=thetas[:, :3], body_pose=thetas[:, 3:66], betas=BETAS, **more)
+    poses = read_poses(tmp_path / "p.npz").poses
+    assert poses.family == family and len(poses.joint_names) == 22
+
+
+@pytest.mark.parametrize(
+    ("gender", "betas", "said"),
+    [("female", True, "female"), (b"male", True, "male"), ("neutral", True, ""), (None, True, ""),
+     ("female", False, "")],
+)  # fmt: skip
+def test_a_shape_of_another_body_is_noted(tmp_path, gender, betas, said) -> None:
+    world = layouts.camera_world()
+    shape = {"betas": BETAS} if betas else {}
+    np.savez(tmp_path / "p.npz", poses=world.thetas, trans=world.trans, gender=gender, **shape)
+    notes = read_poses(tmp_path / "p.npz").notes
+    assert notes == ((f"the shape is meant for the {said} body model: give that as --body",) if said else ())
+
+
+def test_a_track_that_phalp_lost_is_left_out_there(tmp_path) -> None:
+    """It repeats the last sight, ``tracked_time`` frames old; a person seen once is no longer than one seen twice."""
+    joblib, path = pytest.importorskip("joblib"), write_phalp(tmp_path)
+    content = joblib.load(path)
+    moments = list(content.values())
+    for moment in moments:
+        moment["tracked_time"] = [0] * len(moment["tid"])
+    moments[2]["tracked_time"] = [1]
+    joblib.dump(content, path)
+    assert read_poses(path).poses.frames.tolist() == [0, 1, 3]
+    for moment in moments[:2]:
+        moment["tracked_time"][-1] = 5
+    joblib.dump(content, path)
+    assert read_poses(path).poses.frames.tolist() == [1, 3] and "number 2 taken" in " ".join(
+        read_poses(path).notes
+    )
 
 
 def test_files_that_are_no_poses_are_refused_by_name(tmp_path) -> None:
@@ -527,6 +572,22 @@ def test_numbered_poses_of_frames_without_numbers_belong_to_them_in_their_order(
     _assert_together(tmp_path / "out", camera, WHOLE)
 
 
+@pytest.mark.parametrize(
+    ("count", "fps", "noted"),
+    [(FRAMES, 25, ""), (FRAMES, 25.1, ""), (8, 50, "poses end with frame 7, pictures with frame 3"),
+     (8, 50, "poses have 50 frames per second, pictures 25"), (3, 25, "poses end with frame 2, pictures with frame 3")],
+)  # fmt: skip
+def test_poses_of_another_rate_or_count_than_the_pictures_are_noted(tmp_path, count, fps, noted) -> None:
+    camera, world = layouts.video_camera(77.0), layouts.camera_world()
+    rows = np.arange(count) % FRAMES
+    np.savez(tmp_path / "p.npz", poses=world.thetas[rows], trans=world.trans[rows], betas=BETAS, fps=fps)
+    K = (77.0, 77.0, WIDTH / 2, HEIGHT / 2)
+    options = _options(tmp_path, poses=tmp_path / "p.npz", intrinsics=K)
+    notes = import_source(_film(tmp_path, camera), tmp_path / "out", options).notes
+    found = [note for note in notes if "poses end" in note or "per second" in note]
+    assert noted in " ".join(found) and bool(found) == bool(noted)
+
+
 def test_poses_of_other_frames_are_refused(tmp_path) -> None:
     source = _pictures(tmp_path, layouts.video_camera(FOCALS["romp"]), {"f1": 0, "f2": 1, "f3": 2})
     options = _options(tmp_path, poses=_fits(tmp_path, {7: 0, 8: 1}))
@@ -548,13 +609,12 @@ def test_numbers_that_count_no_frames_are_refused(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("numbers", "frames", "kept"),
-    [([1, 2, 3, 4], [1, 2, 3, 4], [2, 1, 4, 3]), ([0, 1, 2, 3], [1, 2, 3, 4], [2, 1, 4, 3]),
-     (None, [0, 1, 2, 3], [0, 1, 2, 3])],
-)  # fmt: skip
+    ("numbers", "frames"),
+    [([1, 2, 3, 4], [1, 2, 3, 4]), ([0, 1, 2, 3], [1, 2, 3, 4]), (None, [0, 1, 2, 3])],
+)
 @pytest.mark.parametrize("moves", [0, 1])
-def test_pictures_of_one_camera_belong_to_numbered_poses(tmp_path, moves, numbers, frames, kept) -> None:
-    """Of transforms.json, whatever their order; to poses of one file, in the order they come."""
+def test_pictures_of_one_camera_belong_to_poses_by_name(tmp_path, moves, numbers, frames) -> None:
+    """Of transforms.json, whatever their order there: to poses in numbered files and in one."""
     layouts.write_nerfstudio(tmp_path)
     record = json.loads((tmp_path / "transforms.json").read_text())
     for k, entry in zip((2, 1, 4, 3), record["frames"]):
@@ -562,11 +622,96 @@ def test_pictures_of_one_camera_belong_to_numbered_poses(tmp_path, moves, number
         entry["transform_matrix"][0][3] += moves * k
     del record["frames"][FRAMES:]
     (tmp_path / "transforms.json").write_text(json.dumps(record))
-    poses = None if numbers is None else _fits(tmp_path, dict(zip(numbers, range(FRAMES))))
+    poses = None if numbers is None else write_easymocap_folder(tmp_path, numbers)
     recording = nerfstudio.read(tmp_path, poses=poses)
-    assert [shot.frame for shot in recording.shots] == kept
+    assert {shot.name: shot.frame for shot in recording.shots} == dict(zip(("f1", "f2", "f3", "f4"), frames))
     assert recording.poses.frames.tolist() == frames
     assert any("taken for the same" in note for note in recording.notes) == (numbers == [0, 1, 2, 3])
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_poses_before_a_camera_are_turned_with_it_where_it_is_the_only_one(tmp_path, program) -> None:
+    """A camera that moves has a world of another size than the poses."""
+    (tmp_path / "source").mkdir()
+    layouts.write_nerfstudio(tmp_path / "source")
+    file = tmp_path / "source" / "transforms.json"
+    record = json.loads(file.read_text())
+    poses = PROGRAMS[program](tmp_path)
+    with pytest.raises(
+        InputError, match=r"transforms\.json: body poses: expected some in the cameras' world, got .*2"
+    ):
+        nerfstudio.read(tmp_path / "source", poses=poses)
+    file.write_text(json.dumps(record | {"frames": record["frames"][:FRAMES]}))
+    theirs = nerfstudio.read(tmp_path / "source", poses=poses).poses
+    world = layouts.World(layouts.Z_UP, (0.3, -0.2, 0.1))
+    rest = SMPLX_REST_ROOT if program == "gvhmr" else world.rest
+    assert_allclose(theirs.root(rest), world.places, atol=PLACE)
+    assert_allclose(theirs.rotations[:, 0], world.roots, atol=PLACE)
+
+
+def test_poses_before_one_of_easymocaps_cameras_are_refused(tmp_path) -> None:
+    (tmp_path / "source").mkdir()
+    layouts.write_easymocap(tmp_path / "source")
+    with pytest.raises(InputError, match="expected some in the cameras' world, got ROMP's"):
+        easymocap.read(tmp_path / "source", poses=write_romp(tmp_path))
+
+
+def test_rows_of_easyvolcaps_motion_belong_to_the_pictures_in_their_order(tmp_path) -> None:
+    """Whatever number those begin with; its JSON files have numbers of their own."""
+    layouts.write_easymocap(tmp_path, volcap=True)
+    for part in ("images", "masks"):
+        for file in sorted(tmp_path.glob(f"{part}/*/*"), reverse=True):
+            file.rename(file.with_stem(f"{int(file.stem) + 1:06d}"))
+    recording = easymocap.read(tmp_path)
+    assert {(shot.name, shot.frame) for shot in recording.shots} == {
+        (f"{k + 1:06d}", k) for k in range(FRAMES)
+    }
+    assert recording.poses.frames.tolist() == list(range(FRAMES)) and not recording.notes
+    numbered = easymocap.read(tmp_path, poses=write_easymocap_folder(tmp_path, [1, 2, 3, 4]))
+    assert {shot.frame for shot in numbered.shots} == {1, 2, 3, 4} == set(numbered.poses.frames.tolist())
+
+
+@pytest.mark.parametrize("name", ["intri.yml", "extri.yml"])
+@pytest.mark.parametrize(
+    "text", ["", "hello", "%YAML:1.0\n---\nnames: [1, \n", "%YAML:1.0\n---\nnames: 3\nK_01: 1\nT_01: 1\n",
+             "%YAML:1.0\n---\nnames: [\"01\"]\n" + "".join(
+                 f"{key}_01: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [1, 2]\n" for key in "KT")],
+)  # fmt: skip
+def test_a_damaged_calibration_is_one_line(tmp_path, name, text) -> None:
+    (tmp_path / "source").mkdir()
+    layouts.write_easymocap(tmp_path / "source")
+    (tmp_path / "source" / name).write_text(text)
+    with pytest.raises(InputError, match=r"source.*: (calibration|names).*: expected"):
+        import_source(
+            tmp_path / "source", tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path)))
+        )
+
+
+LENSES = {
+    "camera_model": ["OPENCV_FISHEYE", "FISHEYE624", "VR180_L", "ORTHOPHOTO", "EQUIRECTANGULAR"],
+    "is_fisheye": [True], "k4": [0.1],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "value"), [(key, value) for key in LENSES for value in LENSES[key]])
+@pytest.mark.parametrize("of_all", [True, False])
+def test_lenses_that_are_no_pinholes_are_refused(tmp_path, of_all, key, value) -> None:
+    layouts.write_nerfstudio(tmp_path)
+    record = json.loads((tmp_path / "transforms.json").read_text())
+    (record if of_all else record["frames"][-1])[key] = value
+    (tmp_path / "transforms.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=rf"transforms\.json: {key}: expected .*, got {value}"):
+        nerfstudio.read(tmp_path)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", None])
+def test_pinholes_are_read(tmp_path, model) -> None:
+    """instant-ngp says that they are no fisheyes."""
+    layouts.write_nerfstudio(tmp_path)
+    record = json.loads((tmp_path / "transforms.json").read_text())
+    more = {"camera_model": model, "is_fisheye": False, "k4": 0}
+    (tmp_path / "transforms.json").write_text(json.dumps(record | more))
+    assert nerfstudio.read(tmp_path).shots
 
 
 @pytest.mark.parametrize("write", [write_romp, write_easymocap_folder])

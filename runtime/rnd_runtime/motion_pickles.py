@@ -166,6 +166,10 @@ def _without_gaps(
     frames: NDArray[np.int64], turns: Floats, places: Floats, path: str | Path
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
     """Axis-angles ``turns`` [F, 3J] and ``places`` [F, 3] of ascending ``frames`` at every frame between the ends."""
+    late = np.flatnonzero(np.diff(frames) <= 0)
+    if len(late):
+        got = "{1} after {0}".format(*frames[late[0] : late[0] + 2])
+        raise InputError("frame numbers", expected="some that ascend", got=got, file=path)
     missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
     if missing == 0:
         return turns, places, ()

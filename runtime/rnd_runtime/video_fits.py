@@ -94,17 +94,17 @@ def is_phalp(content: Mapping[Any, Any]) -> bool:
 def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None) -> VideoFits:
     """Read what :func:`is_phalp` recognises: rotation matrices, and places before a lens of :data:`PHALP_FOCAL`.
 
-    ``person`` is a track number; the one with most frames when None. Frames are those of the picture list.
+    ``person`` is a track number; the one with most frames when None. Frames are those of the picture list. A track
+    that was not seen in a picture (its last sight repeated, ``tracked_time`` frames old) is left out there.
     """
     moments = sorted(content.values(), key=lambda moment: int(moment.get("time", 0)))
-    seen = [int(track) for moment in moments for track in moment["tid"][: len(moment["smpl"])]]
-    chosen, others = one_of(seen, person, path)
+    tracks = [_phalp_tracks(moment) for moment in moments]
+    chosen, others = one_of([track for seen in tracks for track in seen], person, path)
     frames, angles, translations, betas = [], [], [], []
-    for number, moment in enumerate(moments):
-        tracks = [int(track) for track in moment["tid"][: len(moment["smpl"])]]
-        if chosen not in tracks:
+    for number, (moment, seen) in enumerate(zip(moments, tracks)):
+        if chosen not in seen:
             continue
-        place = tracks.index(chosen)
+        place = seen[chosen]
         smpl = moment["smpl"][place]
         parts = [
             np.asarray(smpl[key], np.float64).reshape(-1, 3, 3) for key in ("global_orient", "body_pose")
@@ -116,6 +116,13 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
     return VideoFits(
         chosen, others, np.array(frames, np.int64), np.stack(angles), np.stack(translations), np.stack(betas)
     )
+
+
+def _phalp_tracks(moment: Mapping[str, Any]) -> dict[int, int]:
+    """The place in ``moment`` of every track that was seen there."""
+    tracks = moment["tid"][: len(moment["smpl"])]
+    ages = moment.get("tracked_time", [0] * len(tracks))
+    return {int(track): place for place, (track, age) in enumerate(zip(tracks, ages)) if age == 0}
 
 
 def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tuple[int, ...]]:

@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 SMPL_LICENSE = "the licence of the body model it was made from; SMPL's forbids passing its shape on"
 _FAMILIES = {24: ("SMPL", SMPL_NAMES), 52: ("SMPL-H", SMPLH_NAMES), 55: ("SMPL-X", SMPLX_NAMES)}
 _MEMBERS = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
+_SMPLX_SHAPES = {20: 10, 400: 300}
+"""of the columns of SMPL-X's shapedirs (v1.0, v1.1), the first are shape; the rest are expressions"""
 _NO_PARENT = 2**32 - 1  # SMPL's files hold the root's parent, −1, as an unsigned integer
 
 
@@ -167,4 +169,6 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
     skeleton = Skeleton(names, parents.astype(np.int32), arrays["J_regressor"] @ vertices)
     weights = arrays["weights"].astype(np.float32)
     body = Body(vertices, arrays["f"].astype(np.int32), weights, skeleton, SMPL_LICENSE)
-    return BodyModel(family, body, arrays["shapedirs"], arrays["J_regressor"], arrays.get("posedirs"))
+    columns = arrays["shapedirs"].shape[2]
+    shapes_only = arrays["shapedirs"][..., : _SMPLX_SHAPES.get(columns, columns) if joints == 55 else columns]
+    return BodyModel(family, body, shapes_only, arrays["J_regressor"], arrays.get("posedirs"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from rnd_runtime.errors import InputError
 
 from .pictures import beside, camera_of, listed, read_mask, read_rgb, sized
-from .pose_files import read_poses
+from .pose_files import before_cameras, paired, read_poses
 from .recording import Floats, Lens, Recording, Shot
 
 FPS = 30.0
@@ -38,16 +39,15 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     """Read OpenCV's calibration (pixel centres at whole numbers, metres), pictures and the fits of one person.
 
     ``poses``: any file of :func:`pose_files.read_poses`; looked for where EasyMocap (a folder of one JSON file a frame)
-    and EasyVolcap (motion.npz) write it when not given.
+    and EasyVolcap (motion.npz) write it when not given. Poses in numbered files belong to the pictures of those
+    numbers, those in one file to the pictures in their order.
     """
     fits = poses or next((source / name for name in _FITS if _is_fit(source / name)), None)
     if fits is None:
         raise InputError("SMPL fits", expected=" or ".join(_FITS) + ", or --poses", got="none", file=source)
     found = read_poses(fits, person=person)
     names = _names(source / "intri.yml")
-    intrinsics, extrinsics = (
-        cv2.FileStorage(str(source / f"{k}tri.yml"), cv2.FILE_STORAGE_READ) for k in ("in", "ex")
-    )
+    intrinsics, extrinsics = (_opened(source / f"{k}tri.yml") for k in ("in", "ex"))
     lenses, shots = {}, []
     for name in names:
         folder = source / "images" / name
@@ -58,24 +58,28 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
             _matrix(storage, key, source)
             for storage, key in ((intrinsics, f"K_{name}"), (extrinsics, f"T_{name}"))
         )
-        R = extrinsics.getNode(f"Rot_{name}").mat()
+        R = _found(extrinsics, f"Rot_{name}", source)
         if R is None:
             R = cv2.Rodrigues(_matrix(extrinsics, f"R_{name}", source))[0]
         bent = next(
-            (m for k in ("dist", "D") if (m := intrinsics.getNode(f"{k}_{name}").mat()) is not None),
+            (m for k in ("dist", "D") if (m := _found(intrinsics, f"{k}_{name}", source)) is not None),
             np.zeros(0),
         )
-        size = sized(pictures[0])
-        lenses[name] = Lens(
-            camera_of(K, R, T, size), tuple(np.asarray(bent, np.float64).reshape(-1).tolist())
-        )
+        lenses[name] = Lens(camera_of(K, R, T, sized(pictures[0])), tuple(bent.reshape(-1).tolist()))
         for picture in pictures:
             mask = beside(picture, *(source / part / name for part in _MASKS))
             read_it = None if mask is None else partial(read_mask, mask)
-            shots.append(Shot(name, _number(picture), partial(read_rgb, picture), read_it))
+            shots.append(Shot(name, _number(picture), partial(read_rgb, picture), read_it, name=picture.stem))
     if not shots:
         raise InputError("pictures", expected=f"images/{names[0]}/*.jpg", got="none", file=source)
-    return Recording("EasyMocap", lenses, shots, found.poses, found.fps or FPS, found.notes)
+    found = replace(found, poses=before_cameras(found, list(lenses.values()), source))
+    numbers = sorted({shot.frame for shot in shots})
+    if not found.numbered:
+        place = {number: k for k, number in enumerate(numbers)}
+        shots = [replace(shot, frame=place[shot.frame]) for shot in shots]
+        numbers = list(place.values())
+    body_poses, counted = paired(found, numbers, source)
+    return Recording("EasyMocap", lenses, shots, body_poses, found.fps or FPS, (*found.notes, *counted))
 
 
 def _is_fit(path: Path) -> bool:
@@ -90,21 +94,35 @@ def _number(picture: Path) -> int:
 
 
 def _names(file: Path) -> list[str]:
-    try:
-        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-        node = storage.getNode("names")
-        names = [node.at(k).string() for k in range(node.size())]
-    except cv2.error as error:
-        raise InputError(
-            "calibration cannot be read", expected="OpenCV's YAML", got=str(error), file=file
-        ) from error
+    storage = _opened(file)
+    node = storage.getNode("names")
+    names = [node.at(k).string() for k in range(node.size())] if node.isSeq() else []
     if not names:
         raise InputError("names", expected="the cameras' names", got="none", file=file)
     return names
 
 
+def _opened(file: Path) -> cv2.FileStorage:
+    try:
+        return cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError) as error:
+        raise InputError(
+            "calibration cannot be read", expected="OpenCV's YAML", got="another text", file=file
+        ) from error
+
+
 def _matrix(storage: cv2.FileStorage, key: str, source: Path) -> Floats:
-    matrix = storage.getNode(key).mat()
+    matrix = _found(storage, key, source)
     if matrix is None:
         raise InputError("calibration", expected=key, got="none", file=source)
-    return np.asarray(matrix, np.float64)
+    return matrix
+
+
+def _found(storage: cv2.FileStorage, key: str, source: Path) -> Floats | None:
+    try:
+        matrix = storage.getNode(key).mat()
+    except cv2.error as error:
+        raise InputError(
+            "calibration", expected=f"{key}, a matrix", got="a damaged one", file=source
+        ) from error
+    return None if matrix is None else np.asarray(matrix, np.float64)

@@ -23,7 +23,8 @@ class Film:
     Attributes:
         width, height: pixels, after the file's rotation.
         fps: frames per second, on average.
-        count: frames, as its packets say without being decoded; ``numbers`` counts them from 0.
+        count: frames, all decoded once for it: packets may hold frames that a cut (an edit list) leaves out;
+            ``numbers`` counts them from 0.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -36,15 +37,15 @@ class Film:
         with container:
             stream = container.streams.video[0]
             self.fps = float(stream.average_rate or 30)
-            first = next(self._decode(container), None)
+            frames = self._decode(container)
+            first = next(frames, None)
             if first is None:
                 raise InputError("video", expected="at least one frame", got="none", file=self.path)
-            self.height, self.width = first.shape[:2]
-        with self._open() as container:
-            self.count = sum(1 for packet in container.demux(video=0) if packet.pts is not None)
+            self.height, self.width = _upright(first).shape[:2]
+            self.count = 1 + sum(1 for _ in frames)
         self.numbers = range(self.count)
         self._kept: dict[int, Bytes] = {}
-        self._frames: Iterator[Bytes] | None = None
+        self._frames: Iterator[Any] | None = None
         self._next = 0
 
     def frame(self, number: int) -> Bytes:
@@ -53,8 +54,9 @@ class Film:
             return self._kept[number]
         if self._frames is None or number < self._next:
             self._frames, self._next = self._decode(self._open()), 0
-        for pixels in self._frames:
+        for decoded in self._frames:
             place, self._next = self._next, self._next + 1
+            pixels = _upright(decoded)
             self._kept[place] = pixels
             self._kept.pop(place - _KEPT, None)
             if place == number:
@@ -77,18 +79,21 @@ class Film:
             raise InputError("video", expected="a video stream", got="none", file=self.path)
         return container
 
-    def _decode(self, container: Any) -> Iterator[Bytes]:
+    def _decode(self, container: Any) -> Iterator[Any]:
         import av
 
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         try:
-            for frame in container.decode(stream):
-                pixels = _rgb(frame)
-                turns = round(-getattr(frame, "rotation", 0) / 90) % 4
-                yield np.ascontiguousarray(np.rot90(pixels, -turns)) if turns else pixels
+            yield from container.decode(stream)
         except av.error.FFmpegError as error:
             raise InputError("video cannot be decoded", got=str(error), file=self.path) from error
+
+
+def _upright(frame: Any) -> Bytes:
+    pixels = _rgb(frame)
+    turns = round(-getattr(frame, "rotation", 0) / 90) % 4
+    return np.ascontiguousarray(np.rot90(pixels, -turns)) if turns else pixels
 
 
 def _rgb(frame: Any) -> Bytes:

@@ -77,6 +77,14 @@ def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
     )  # fmt: skip
 
 
+def _said(name: str | None) -> tuple[str | None, RootConvention | None]:
+    """(layout, root convention) of ``--as``: one of them, or both with a comma between."""
+    layout, comma, root = (name or "").partition(",")
+    if comma and (layout not in LAYOUTS or root not in _CONVENTIONS):
+        raise InputError("--as", expected="a layout, a comma and smpl or easymocap", got=name)
+    return layout or None, _CONVENTIONS.get(root or layout)
+
+
 def _detect(layout: str, source: Path) -> str | None:
     found: str | None = (
         LAYOUTS[layout].detect(source) if source.is_dir() or layout in ("video", "nerfstudio") else None
@@ -106,7 +114,8 @@ def import_source(
         InputError: with the file and, where there is one, the frame.
     """
     _check_numbers(options)
-    layout, found = find_layout(source, options.layout)
+    name, convention = _said(options.layout)
+    layout, found = find_layout(source, name)
     on_found(f"{layout}: {found}")
     _refuse_full(out, source)
     if options.body is None:
@@ -120,7 +129,6 @@ def import_source(
     except (LookupError, TypeError, ValueError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(f"{layout} cannot be read", expected=_needs(layout), got=got, file=source) from error
-    convention = _CONVENTIONS.get(options.layout or "")
     if convention is not None:
         recording = replace(recording, poses=read_as(recording.poses, convention))
     on_found(_contents(recording))

@@ -12,14 +12,14 @@ import numpy as np
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_header
 
-from .pictures import camera_of, numbers_of, read_json, read_mask, read_rgb, sized
-from .pose_files import paired, read_poses
+from .pictures import camera_of, natural, numbers_of, read_json, read_mask, read_rgb, sized
+from .pose_files import before_cameras, paired, read_poses
 from .recording import Lens, Recording, Shot
 
 FPS = 30.0
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _BENT = ("k1", "k2", "p1", "p2", "k3")
-_FISHEYE = ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "FISHEYE")
+_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _POSES = ("poses.npz", "smpl.npz", "motion.npz", "smpl_params.npz")
 
 
@@ -36,20 +36,14 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     """Read cameras (OpenGL's camera-to-world, pixel centres at +0.5) and pictures.
 
     Pictures that share a lens and a place share a camera. Frame numbers are ``time_index``/``frame`` where given. Else
-    several cameras with equally many pictures, more than one, saw every moment: the n-th picture of each is frame n.
-    Any others are one that may move, a frame a picture, by the numbers in their names where the poses' files are
-    numbered, else as they come. ``poses`` may be any file of :func:`pose_files.read_poses`; without it a file called
-    poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked for beside transforms.json.
+    several cameras with equally many pictures, more than one, saw every moment: the n-th picture of each, by name, is
+    frame n. Any others are one that may move, a frame a picture, by the numbers in their names where the poses' files
+    are numbered, else in their names' order: nerfstudio lists pictures in any. ``poses`` may be any file of
+    :func:`pose_files.read_poses`; without it a file called poses.npz, smpl.npz, motion.npz or smpl_params.npz is looked
+    for beside transforms.json.
     """
     file = source / "transforms.json" if source.is_dir() else source
     record = read_json(file)
-    if record.get("camera_model") in _FISHEYE:
-        raise InputError(
-            "camera_model",
-            expected="a pinhole with OpenCV's distortion",
-            got=record["camera_model"],
-            file=file,
-        )
     lenses: dict[str, Lens] = {}
     names: dict[bytes, str] = {}
     seen: dict[str, int] = {}
@@ -57,6 +51,9 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
     entries = record["frames"]
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError("frames", expected="a list of at least one frame", got=repr(entries)[:60], file=file)
+    timed = any(_time(entry) is not None for entry in entries)
+    if not timed:
+        entries = sorted(entries, key=lambda entry: natural(str(entry.get("file_path"))))
     for entry in entries:
         picture = _picture(file.parent, entry.get("file_path"), file)
         lens, key = _lens({**record, **entry}, picture, file)
@@ -75,12 +72,14 @@ def read(source: Path, *, poses: Path | None = None, person: int | None = None) 
             "body poses", expected="--poses FILE, as transforms.json has none", got="none", file=file
         )
     found = read_poses(pose_file, person=person)
+    found = replace(found, poses=before_cameras(found, list(lenses.values()), file))
     body_poses, notes = found.poses, found.notes
     several = 1 < len(names) < len(shots) and len(set(seen.values())) == 1
-    if not several and all(_time(entry) is None for entry in entries):  # one camera, that may move
+    if not several and not timed:  # one camera, that may move
         numbers = (numbers_of(pictures) if found.numbered else None) or range(len(shots))
         shots = [replace(shot, frame=number) for shot, number in zip(shots, numbers)]
-        body_poses, counted = paired(found, sorted(numbers), file)
+    if not timed:
+        body_poses, counted = paired(found, sorted({shot.frame for shot in shots}), file)
         notes += counted
     return Recording("nerfstudio transforms.json", lenses, shots, body_poses, found.fps or FPS, notes)
 
@@ -96,7 +95,18 @@ def _picture(folder: Path, name: Any, file: Path) -> Path:
     return path if path.suffix else path.with_suffix(".png")  # instant-ngp's synthetic scenes leave it out
 
 
+def _refuse_fisheye(entry: dict[str, Any], file: Path) -> None:
+    model = entry.get("camera_model") or "OPENCV"
+    if model not in _MODELS:
+        raise InputError("camera_model", expected=" or ".join(_MODELS), got=model, file=file)
+    for name in ("is_fisheye", "k4"):
+        if entry.get(name):
+            expected = "a pinhole with OpenCV's k1 k2 p1 p2 k3"
+            raise InputError(name, expected=expected, got=entry[name], file=file)
+
+
 def _lens(entry: dict[str, Any], picture: Path, file: Path) -> tuple[Lens, bytes]:
+    _refuse_fisheye(entry, file)
     try:
         width, height = (int(entry["w"]), int(entry["h"])) if "w" in entry else sized(picture)
         fx = (

@@ -44,7 +44,8 @@ class ImportOptions:
     body: str | None = None
     """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny"""
     layout: Annotated[str | None, tyro.conf.arg(name="as")] = None
-    """what SOURCE is, where it is not found out rightly; smpl or easymocap: how the root of the poses is meant"""
+    """what SOURCE is, where it is not found out rightly; smpl or easymocap: how the root of the poses is meant;
+    both as nerfstudio,smpl"""
     poses: Path | None = None
     """body poses from WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap or an SMPL .npz"""
     person: int | None = None

@@ -41,20 +41,23 @@ def read_mask(path: Path) -> Bytes:
     """A mask [H, W] as coverage 0…255, from what people store.
 
     Alpha where there is one; 0/255 and soft greys as they are; 0/1, body-part labels and coloured palettes: all
-    that is not zero is the person. ``.npy`` holds [H, W] of the same.
+    that is not zero is the person. ``.npy`` holds [H, W] of the same, or [1, H, W], as SAM 2 gives it.
     """
     if path.suffix == ".npy":
         try:
             pixels = np.load(existing_file(path, what="mask"), allow_pickle=False)
         except (ValueError, OSError, EOFError) as error:
             raise InputError("mask cannot be read", expected="an array of numbers", file=path) from error
+        pixels = pixels[0] if pixels.ndim == 3 and len(pixels) == 1 else pixels
+        if pixels.ndim not in (2, 3):
+            raise InputError("mask", expected="[H, W]", got=list(pixels.shape), file=path)
         pixels = pixels.reshape(*pixels.shape[:2], -1)
     else:
         pixels = read_image(path)
     if pixels.dtype.kind not in "bui" and pixels.size and pixels.max() <= 1:
         pixels = np.round(255 * np.clip(pixels, 0, 1))  # floats are coverage
     elif pixels.dtype == np.uint16:
-        pixels = np.round(pixels / 257)
+        pixels = np.ceil(pixels / 257)  # up: a label of 1 stays one
     return as_coverage(pixels)
 
 

@@ -27,7 +27,7 @@ from rnd_runtime.video_fits import (
 )
 
 from .pictures import listed, natural, numbers_of
-from .recording import Floats, Poses, easymocap_poses, smpl_poses, threes
+from .recording import Floats, Lens, Poses, easymocap_poses, moved, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
 
@@ -46,6 +46,7 @@ class FoundPoses:
         fps: where the file has it.
         notes: what had to be assumed.
         numbered: a file a frame, and the frames are the numbers in their names; else they count from 0.
+        in_camera: the poses are in the axes of the camera that saw them, whatever its place in the world.
     """
 
     kind: str
@@ -55,6 +56,7 @@ class FoundPoses:
     fps: float | None = None
     notes: tuple[str, ...] = ()
     numbered: bool = False
+    in_camera: bool = False
 
 
 def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
@@ -110,7 +112,7 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
             if is_phalp(content):
                 found = _fitted("4D-Humans / PHALP", read_phalp(content, path, person))
                 notes = ("frames are those of PHALP's picture list", *found.notes)
-                return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes)
+                return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes, in_camera=True)
         except InputError as error:
             raise error.at(file=path) from error
         except (KeyError, TypeError, ValueError, IndexError) as error:
@@ -130,6 +132,8 @@ def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Pos
     the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
     poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
 
+    Poses without numbers belong to the frames from the first on; that there are more or fewer is noted.
+
     Raises:
         InputError: no frame has a pose.
     """
@@ -147,7 +151,25 @@ def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Pos
         raise InputError(
             "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
         )  # fmt: skip
+    if not found.numbered and last != numbers[-1]:
+        return poses, (
+            f"poses end with frame {last}, pictures with frame {numbers[-1]}: both begin with frame 0",
+        )
     return poses, ()
+
+
+def before_cameras(found: FoundPoses, lenses: Sequence[Lens], source: Path) -> Poses:
+    """The poses in the world of ``lenses``: those in a camera's axes are turned with it, where there is one.
+
+    Raises:
+        InputError: they are in a camera's axes and there are several, or it moves: their sizes need not agree.
+    """
+    if not found.in_camera:
+        return found.poses
+    if len(lenses) > 1:
+        got = f"{found.kind}'s, in the camera's, of {len(lenses)} cameras or places of one"
+        raise InputError("body poses", expected="some in the cameras' world", got=got, file=source)
+    return moved(found.poses, np.linalg.inv(lenses[0].camera.world_to_camera).astype(np.float64))
 
 
 def _refuse_number(person: int | None, of: str) -> None:
@@ -175,7 +197,7 @@ def _wham(content: dict[Any, Any], person: int | None, path: Path) -> FoundPoses
     pose, trans, betas = (np.asarray(entry[key], np.float64)[order] for key in ("pose", "trans", "betas"))
     poses = smpl_poses(frames[order], pose, trans, betas)
     notes = _several(chosen, others)
-    return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=notes)
+    return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=notes, in_camera=True)
 
 
 def _gvhmr(content: dict[str, Any]) -> FoundPoses:
@@ -186,7 +208,7 @@ def _gvhmr(content: dict[str, Any]) -> FoundPoses:
     angles = np.concatenate([root.reshape(-1, 3), body.reshape(len(body), -1)[:, :63]], 1)
     K = np.asarray(content["K_fullimg"], np.float64).reshape(-1, 3, 3)[0] if "K_fullimg" in content else None
     poses = smpl_poses(range(len(angles)), angles, trans.reshape(-1, 3), entry["betas"], family="SMPL-X")
-    return FoundPoses("GVHMR", poses, K=K)
+    return FoundPoses("GVHMR", poses, K=K, in_camera=True)
 
 
 def _romp(files: Sequence[Path]) -> FoundPoses:
@@ -216,7 +238,7 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
     notes = ("ROMP saw several people in a frame: its first is taken",) if several else ()
     return FoundPoses(
         "ROMP", poses, focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)), notes=notes,
-        numbered=bool(singles) and numbers_of(singles) is not None,
+        numbered=bool(singles) and numbers_of(singles) is not None, in_camera=True,
     )  # fmt: skip
 
 
@@ -251,21 +273,46 @@ def _npz(path: Path) -> FoundPoses:
         poses = with_root(poses)
         betas_name = archive.first_of("shapes", "betas")
         betas = None if betas_name is None else archive.numbers(betas_name)
+        notes = () if betas is None else _gender(archive)
+        smplx = _is_smplx(archive) or poses.shape[1] == 165
         rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
         fps = None if rate is None else float(archive.numbers(rate).reshape(-1)[0])
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
         Rh, trans = (
             np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift)
         )
-    notes = () if shift is not None else ("no trans in the file: the root stays at its rest place",)
+    if shift is None:
+        notes += ("no trans in the file: the root stays at its rest place",)
     frames = range(len(poses))
-    family = "SMPL-X" if poses.shape[1] == 165 else "SMPL"
+    family = "SMPL-X" if smplx else "SMPL"
     place = shift or "trans"
     if turn is not None:
         found = easymocap_poses(frames, poses, Rh, trans, betas, family=family, members=(turn, place))
         return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
     found = smpl_poses(frames, poses, trans, betas, family=family, member=place)
     return FoundPoses("SMPL", found, fps=fps, notes=notes)
+
+
+def _is_smplx(archive: Npz) -> bool:
+    """Whether members say so that no file of SMPL's has; AMASS names the model."""
+    if model := _word(archive, "surface_model_type"):
+        return model.startswith("smplx")
+    return archive.first_of("jaw_pose", "expression", "left_hand_pose") is not None
+
+
+def _gender(archive: Npz) -> tuple[str, ...]:
+    gender = _word(archive, "gender")
+    if gender in ("", "neutral"):
+        return ()
+    return (f"the shape is meant for the {gender} body model: give that as --body",)
+
+
+def _word(archive: Npz, name: str) -> str:
+    """A member's text; empty where it has none, or stores it as a Python object."""
+    try:
+        return archive.strings(name)[0]
+    except (InputError, IndexError):
+        return ""
 
 
 def _several(chosen: int, others: tuple[int, ...]) -> tuple[str, ...]:

@@ -118,6 +118,7 @@ class Recording:
         fps: pictures' frames per second.
         notes: what was assumed, one sentence each.
         up: the world's axis that points up ("y", "-y", "z", …) where the layout says so; None to ask the poses.
+        film_length: the frames of a film that ``shots`` are some of, by numbers from 0; 0 for any other source.
     """
 
     kind: str
@@ -127,6 +128,7 @@ class Recording:
     fps: float = 30.0
     notes: tuple[str, ...] = field(default=())
     up: str | None = None
+    film_length: int = 0
 
 
 def straightened(recording: Recording) -> Recording:
@@ -220,6 +222,14 @@ def read_as(poses: Poses, convention: RootConvention) -> Poses:
         return offsets + (turn @ rest if convention == "easymocap" else rest)
 
     return replace(poses, root=root, convention=convention)
+
+
+def moved(poses: Poses, motion: Floats) -> Poses:
+    """``poses`` in another world: ``motion`` [4, 4] rigidly brings theirs there."""
+    turn, shift = motion[:3, :3], motion[:3, 3]
+    rotations = poses.rotations.copy()
+    rotations[:, 0] = turn @ rotations[:, 0]
+    return replace(poses, rotations=rotations, root=lambda rest: poses.root(rest) @ turn.T + shift)
 
 
 def threes(name: str, values: ArrayLike, count: int) -> Floats:

@@ -29,37 +29,47 @@ Turn = Callable[[Normals], Normals]
 
 def attached(recording: Recording, masks: Path | None, normals: Path | None) -> Recording:
     """``recording`` with masks and normals from the folders that the user names, by the picture's name or number."""
+    length, notes = recording.film_length, set()
+
+    def file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...]) -> Path:
+        file, counted = _file_of(folder, shot, suffixes, length)
+        if counted:
+            notes.add(f"{folder.name} are numbered from 1, frames from 0: taken for the same")
+        return file
 
     def replaced(shot: Shot) -> Shot:
         if masks is not None:
-            shot = replace(shot, mask=partial(read_mask, _file_of(masks, shot, (".png", ".npy", ".jpg"))))
+            shot = replace(shot, mask=partial(read_mask, file_of(masks, shot, (".png", ".npy", ".jpg"))))
         if normals is not None:
-            file = _file_of(normals, shot, (".npy", ".png", ".exr"))
+            file = file_of(normals, shot, (".npy", ".png", ".exr"))
             shot = replace(shot, normals=partial(read_normals, file))
         return shot
 
-    return replace(recording, shots=[replaced(shot) for shot in recording.shots])
+    shots = [replaced(shot) for shot in recording.shots]
+    return replace(recording, shots=shots, notes=(*recording.notes, *sorted(notes)))
 
 
-def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...]) -> Path:
-    """The file of ``shot`` in the camera's folder, where there is one.
+def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...], length: int) -> tuple[Path, bool]:
+    """The file of ``shot`` in the camera's folder, where there is one, and whether frames are counted from 1 there.
 
     It is called like the picture, or has the number at its end that the picture has there; of a picture without
-    either, such as a video's, the number of its frame.
+    either, such as a video's, the number of its frame. Where a film of ``length`` frames has as many files, from 1 on,
+    its first frame is 1.
     """
     inner = folder / shot.camera if (folder / shot.camera).is_dir() else folder
     files = listed(inner, suffixes)
     named = {file.stem: file for file in files}
     if shot.name in named:
-        return named[shot.name]
+        return named[shot.name], False
     numbered = {k if (n := last_number(file.stem)) is None else n: file for k, file in enumerate(files)}
     number = last_number(shot.name)
-    number = shot.frame if number is None else number
+    from_one = number is None and sorted(numbered) == list(range(1, length + 1))
+    number = shot.frame + from_one if number is None else number
     if number not in numbered:
         raise InputError(
             "file", expected=f"one numbered {number}", got=f"{files[0].name} … {files[-1].name}", file=inner
         )
-    return numbered[number]
+    return numbered[number], from_one
 
 
 class _Lazy(Sequence[Any]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -92,6 +93,8 @@ def read(
     rate = fps or (film.fps if source.is_file() else found.fps or FPS)
     K, notes = _lens(found, film.width, film.height, intrinsics)
     lens = Lens(camera_of(K, np.eye(3), np.zeros(3), (film.width, film.height), corner=0), tuple(distortion))
+    if found.fps is not None and abs(found.fps - rate) > 0.01 * rate:
+        notes += (f"poses have {found.fps:g} frames per second, pictures {rate:g}: paired frame by frame",)
     poses, counted = paired(found, film.numbers, film.path)
     recording = Recording(
         f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes, *counted)
@@ -103,7 +106,8 @@ def read(
         for k, (frame, split) in enumerate(chosen)
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
-    return Recording(recording.kind, recording.lenses, shots, poses, rate, (*recording.notes, kept))
+    length = film.count if film.numbers[0] == 0 else 0
+    return replace(recording, shots=shots, notes=(*recording.notes, kept), film_length=length)
 
 
 def _lens(
