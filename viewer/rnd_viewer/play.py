@@ -50,7 +50,9 @@ OWN_TO_A_PROCESS = (
     "threads",
     "format",
     "pipeline",
+    "raster",
 )  # options that do not tell one run from another
+FILES = ("avatar", "motion", "hdr", "joint_map")  # a run goes by what they are, however their paths are spelt
 DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 
@@ -88,6 +90,7 @@ class _Run:
         notes: what the inputs' readers found, and what the run itself has to say.
         qualities: of every frame that was drawn, in turn.
         in_view: whether anything of the avatar was seen yet.
+        removed: files that another run had left in the folder.
     """
 
     options: PlayOptions
@@ -105,6 +108,7 @@ class _Run:
     governor: Governor | None
     qualities: list[Quality] = field(default_factory=list)
     in_view: bool = False
+    removed: int = 0
 
     @classmethod
     def of(cls, options: PlayOptions) -> _Run:
@@ -160,7 +164,7 @@ class _Run:
 
             def put(number: int, drawn: tuple[Frame, Camera]) -> None:
                 if number == self.frames.start:  # not before: what fails at once leaves the folder as it was
-                    claim(self.out, _common(self.options), _inputs(self.options))
+                    self.removed = claim(self.out, _common(self.options), _inputs(self.options))
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
             for _ in with_progress(
@@ -199,6 +203,8 @@ class _Run:
 
     def afterthoughts(self) -> Iterator[str]:
         """What can be said of the frames only once they are there."""
+        if self.removed:
+            yield f"{self.removed} files that another run had left in {self.out} were removed"
         if lowered := sum(quality != FULL for quality in self.qualities):
             share = f"{lowered} of {len(self.frames)} frames"
             yield f"{share} at less than full quality, for {self.options.fps_floor:g} frames/s"
@@ -227,8 +233,10 @@ class _Run:
 
 
 def _common(options: PlayOptions) -> dict[str, object]:
-    """The settings that all processes of one run share."""
-    return {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
+    """The settings that all processes of one run share, beside its :func:`_inputs`."""
+    camera = options.camera if options.camera in OWN_CAMERAS else split_camera(options.camera)[1]
+    settings = _settings(options) | {"camera": camera}
+    return {key: value for key, value in settings.items() if key not in (*OWN_TO_A_PROCESS, *FILES)}
 
 
 def _settings(options: PlayOptions) -> dict[str, object]:
