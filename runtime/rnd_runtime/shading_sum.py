@@ -91,17 +91,21 @@ class DistantLights:
             directions @ np.asarray(gaussians.root_rotation, np.float64)
         )  # rows times R: root's frame
         radiance = np.zeros((len(gaussians.means), 3), np.float32)
+        means, normals, albedo = (floats(a) for a in (gaussians.means, gaussians.normals, gaussians.albedo))
+        visibility, seen = floats(gaussians.visibility), mask(seen, len(radiance))
         _sum_lights(
-            floats(gaussians.means),
-            floats(gaussians.normals),
-            floats(gaussians.albedo),
+            means,
+            normals,
+            albedo,
             floats(roughness_to_alpha(gaussians.roughness)),
-            floats(gaussians.visibility),
+            visibility,
             np.array(camera_position, np.float32),
             *(np.array(a.T, np.float32, order="C") for a in (directions, basis, self.flux)),
-            mask(seen, len(radiance)),
+            seen,
             radiance,
         )
+        surfaces = (means, normals, albedo, floats(gaussians.roughness), visibility)
+        _leave_out_broken(*surfaces, seen, radiance)
         return radiance
 
 
@@ -180,3 +184,14 @@ def _sum_lights(  # type: ignore[no-untyped-def]
         radiance[i, 0] = max(albedo[i, 0] * _ONE_OVER_PI * diffuse_r + specular_r, _ZERO)
         radiance[i, 1] = max(albedo[i, 1] * _ONE_OVER_PI * diffuse_g + specular_g, _ZERO)
         radiance[i, 2] = max(albedo[i, 2] * _ONE_OVER_PI * diffuse_b + specular_b, _ZERO)
+
+
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _leave_out_broken(means, normals, albedo, roughness, visibility, seen, radiance):  # type: ignore[no-untyped-def]
+    """NaN for Gaussians that have a number that is not finite; the sum's arithmetic (``fastmath``) may lose that."""
+    for i in numba.prange(len(means)):
+        if seen[i]:
+            sum_of_all = means[i].sum() + normals[i].sum() + albedo[i].sum() + roughness[i]
+            sum_of_all += visibility[i].sum()
+            if not np.isfinite(sum_of_all):
+                radiance[i] = np.nan
