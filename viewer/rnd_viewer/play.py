@@ -16,7 +16,6 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
-from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
@@ -35,7 +34,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
-from .lights import chosen_light
+from .lights import chosen_light, light_notes
 from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
@@ -53,7 +52,6 @@ OWN_TO_A_PROCESS = (
     "raster",
 )  # options that do not tell one run from another
 FILES = ("avatar", "motion", "hdr", "joint_map")  # a run goes by what they are, however their paths are spelt
-DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 
 def play(options: PlayOptions) -> int:
@@ -143,7 +141,7 @@ class _Run:
             count=count,
             framing=framing,
             camera_at=_camera_path(options, size, framing, frames),
-            notes=[*motion.notes, *_light_notes(light)],
+            notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light)],
             governor=Governor(options.fps_floor) if options.fps_floor else None,
         )
 
@@ -268,17 +266,6 @@ def _inputs(options: PlayOptions) -> list[Path]:
     if options.camera not in OWN_CAMERAS:
         given.append(split_camera(options.camera)[0])
     return [path for path in given if path is not None]
-
-
-def _light_notes(light: Light) -> list[str]:
-    notes = []
-    if light.repaired:
-        notes.append(
-            f"{light.repaired} texels of the light were NaN, infinite or negative and were filled in"
-        )
-    if light.maximum < DIM:
-        notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
-    return notes
 
 
 def _camera_path(
