@@ -172,7 +172,7 @@ def _colour_notes(chromaticities: tuple[float, ...] | None) -> tuple[str, ...]:
         f"({x:.4g}, {y:.4g})" for x, y in zip(chromaticities[::2], chromaticities[1::2])
     )
     stated = f"red {red}, green {green}, blue {blue} and white {white}"
-    return (f"the light's file states {stated}; its numbers are taken as Rec.709, so its colours are off",)
+    return (f"the light is taken as Rec.709, but its file states {stated}",)
 
 
 def repair(radiance: Floats32) -> tuple[Floats32, int]:
