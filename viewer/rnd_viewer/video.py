@@ -52,13 +52,13 @@ WEBP_MOST_FPS = 1000  # its frames begin at whole milliseconds
 INSTALL = "pip install 'rnd-avatar[video]'"
 
 
-def load_pyav() -> ModuleType:
-    """Import PyAV or say which extra brings it."""
+def load_pyav(otherwise: str = "") -> ModuleType:
+    """Import PyAV, or say which extra brings it and what could be done ``otherwise``."""
     try:
         import av
     except ImportError as error:
         raise InputError(
-            "mp4 and webp need PyAV, which is not installed", hint=f"{INSTALL}, or --format png"
+            "mp4 and webp need PyAV, which is not installed", hint=INSTALL + otherwise
         ) from error
     return av
 
