@@ -21,7 +21,7 @@ from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
-from rnd_runtime.images import linear_to_srgb, to_bytes
+from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.motion_files import SMPLH_NAMES
@@ -34,8 +34,8 @@ from rnd_viewer.convert_cli import main
 from rnd_viewer.mesh_files import posed_vertices
 from rnd_viewer.player import Player
 from rnd_viewer.splat_files import TRANSFORM
-from rnd_viewer.splats import stored_colours
-from rnd_viewer.visionary import check_clip
+from rnd_viewer.splats import fixed_colour, make_splats, stored_colours
+from rnd_viewer.visionary import check_clip, write_visionary
 from tiny import ASSETS, body, motion
 
 AVATAR, WALK, SKY = ASSETS / "avatar.onnx", ASSETS / "walk.npz", ASSETS / "sky.exr"
@@ -244,6 +244,30 @@ def test_colours_of_gaussians_that_nobody_sees_are_numbers():
     assert np.isfinite(stored_colours(unseen, posed.albedo, "srgb", avatar.spacing)).all()
 
 
+def test_gaussians_that_are_not_finite_are_left_out_and_counted(tmp_path, monkeypatch, capsys):
+    posed = Avatar.posed
+
+    def broken(avatar, encoded):
+        gaussians = posed(avatar, encoded)
+        covariances, visibility = gaussians.covariances.copy(), gaussians.visibility.copy()
+        covariances[5, 2], visibility[9, 3] = np.nan, np.inf
+        return replace(gaussians, covariances=covariances, visibility=visibility)
+
+    monkeypatch.setattr(Avatar, "posed", broken)
+    ply = _ply(_splats(tmp_path))
+    assert len(ply["x"]) == Avatar.load(AVATAR, threads=1).gaussians - 2
+    assert all(np.isfinite(column).all() for column in ply.values())
+    assert "note: Gaussians with numbers that are not finite were left out, 2 of" in capsys.readouterr().out
+
+
+def test_what_is_wrong_with_a_light_is_told(tmp_path, capsys):
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    _splats(tmp_path, light=("--hdr", str(tmp_path / "nan.exr")))
+    assert "note: 1 texels of the light were NaN, infinite or negative" in capsys.readouterr().out
+
+
 def test_albedo_is_the_materials(tmp_path):
     ply = _ply(_splats(tmp_path, "--colour", "albedo", "--coding", "linear", light=()))
     albedo = Avatar.load(AVATAR, threads=1).pose(load_motion(WALK, body().skeleton), 0.0).albedo
@@ -295,6 +319,15 @@ def test_a_clip_that_no_webgpu_buffer_holds_is_refused():
         InputError, match="--frames: expected at most 111 of this avatar for visionary, got 112"
     ):
         check_clip(112, 30_000)
+
+
+def test_a_clip_of_ever_other_numbers_of_gaussians_is_refused(tmp_path):
+    avatar = Avatar.load(AVATAR, threads=1)
+    posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
+    parts = [posed.only(np.arange(count)) for count in (7, 9)]
+    clip = [make_splats(part, fixed_colour(part.albedo)) for part in parts]
+    with pytest.raises(InputError, match="as many finite Gaussians in every frame, got 7 to 9"):
+        write_visionary(tmp_path / "clip.onnx", clip, 30.0)
 
 
 @pytest.mark.skipif(shutil.which(TRANSFORM) is None, reason="splat-transform is not installed")
@@ -454,6 +487,12 @@ def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
     line = ["motion", str(tmp_path / "robot.npz"), "--motion", str(tmp_path / "nod.npz")]
     assert main([*line, "--out", str(tmp_path / "out.npz")]) == 0
     assert "left out: antenna" in capsys.readouterr().out
+
+
+def test_a_body_is_known_by_its_suffix_in_capitals_too(tmp_path):
+    shutil.copy(ASSETS / "body.npz", tmp_path / "BODY.NPZ")
+    line = ["motion", str(tmp_path / "BODY.NPZ"), "--motion", str(WALK), "--out", str(tmp_path / "out.npz")]
+    assert main(line) == 0
 
 
 def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):

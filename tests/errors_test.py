@@ -28,6 +28,7 @@ from rnd_runtime.files import write_json
         ),
         (InputError("poses", frame=0, hint="are these degrees?"), "frame 0: poses (are these degrees?)"),
         (InputError("poses", got="two\n  lines\t"), "poses: got two lines"),
+        (InputError("not found", file="two  spaces.npz"), "two  spaces.npz: not found"),
     ],
 )
 def test_message(error, line):
@@ -158,18 +159,19 @@ from rnd_runtime.files import atomic_path
 def main():
     with atomic_path(sys.argv[1]) as file:
         file.write_text("half")
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), getattr(signal, sys.argv[2]))
         time.sleep(30)
 
 sys.exit(run_command("rnd-x", main))
 """
 
 
+@pytest.mark.parametrize("ending", ["SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("ignored", [False, True])
-def test_a_program_that_is_ended_takes_its_half_files_away(tmp_path, ignored):
-    """SIGTERM, also where a shell that put the command into the background has switched Ctrl-C off."""
+def test_a_program_that_is_ended_takes_its_half_files_away(tmp_path, ignored, ending):
+    """SIGTERM and SIGHUP, also where a shell that put the command into the background has switched Ctrl-C off."""
     ignore = (lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)) if ignored else None
-    command = [sys.executable, "-c", _COMMAND, str(tmp_path / "a.txt")]
+    command = [sys.executable, "-c", _COMMAND, str(tmp_path / "a.txt"), ending]
     done = subprocess.run(command, capture_output=True, text=True, timeout=25, preexec_fn=ignore)
     assert (done.returncode, done.stderr) == (130, "rnd-x: interrupted\n")
     assert not list(tmp_path.iterdir())

@@ -131,11 +131,24 @@ def test_culling_is_the_cpus(avatar, motion, sky, rasterizer):
 
 
 _ARRAYS = ("means", "covariances", "opacities", "normals", "albedo", "roughness", "visibility")
-_BROKEN = (*((name, np.nan) for name in _ARRAYS), ("albedo", np.inf), ("covariances", np.inf))
+_BROKEN = (
+    *((name, np.nan) for name in _ARRAYS),
+    *((name, np.inf) for name in ("albedo", "covariances", "roughness", "visibility")),
+)
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_broken_gaussians_leave_no_trace(sky, rasterizer, mode):
+    _assert_no_trace_of_broken_ones(sky, rasterizer, mode)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_broken_gaussians_leave_no_trace_on_the_cpu(sky, mode):
+    with make_rasterizer("cpu") as cpu:
+        _assert_no_trace_of_broken_ones(sky, cpu, mode)
+
+
+def _assert_no_trace_of_broken_ones(sky, rasterizer, mode):
     gaussians, shader = ball(300), Shader(sky, mode)
     camera = Camera.look_at([0.5, 0.4, 4.0], [0, 0, 0], width=64, height=64, fov_y=0.6)
     broken = {name: np.array(getattr(gaussians, name)) for name in _ARRAYS}

@@ -188,6 +188,20 @@ def test_broken_files_say_why_in_one_line(tmp_path):
         assert message.endswith(said.get(name, ""))
 
 
+def test_even_pixels_in_dwab_are_sound_and_more_than_memory_holds_is_not(tmp_path):
+    """DWAB has no bound such as deflate's; here 7200 : 1."""
+    pixels = np.full((1024, 2048, 3), 0.5, np.float32)
+    _save(tmp_path / "even.exr", pixels, "half", compression="dwab")
+    assert_allclose(read_image(tmp_path / "even.exr"), pixels, atol=0.01)
+    data = bytearray((tmp_path / "even.exr").read_bytes())
+    for name in (b"dataWindow", b"displayWindow"):
+        at = data.index(name + b"\0box2i\0") + len(name) + 7 + 4
+        data[at + 8 : at + 16] = np.array([19999, 19999], "<i4").tobytes()
+    (tmp_path / "vast.exr").write_bytes(data + bytes(1_000_000))
+    with pytest.raises(InputError, match="expected 2400000000 bytes of pixels"):
+        read_header(tmp_path / "vast.exr")
+
+
 def test_missing_file_and_folder(tmp_path):
     for path in (tmp_path / "none.png", tmp_path):
         with pytest.raises(InputError, match="image not found"):

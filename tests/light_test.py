@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from numpy.testing import assert_allclose
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
 from rnd_runtime.light import (
+    REC709,
     Light,
     downsize,
     load_light,
@@ -288,6 +290,29 @@ def test_channels_are_found_by_name(tmp_path):
     pixels = np.random.default_rng(0).random((4, 8, 5)).astype(np.float32)
     write_image(tmp_path / "a.exr", pixels, channel_names=("A", "probe.B", "probe.G", "probe.R", "Z"))
     assert (load_light(tmp_path / "a.exr").radiance == pixels[..., [3, 2, 1]]).all()
+
+
+def test_one_of_several_layers_is_not_chosen_in_silence(tmp_path):
+    names = [f"{layer}.{colour}" for layer in "ab" for colour in "RGB"]
+    pixels = np.random.default_rng(0).random((4, 8, 6)).astype(np.float32)
+    write_image(tmp_path / "a.exr", pixels, channel_names=tuple(names))
+    with pytest.raises(InputError, match=r"R, G and B of one layer, got a\.R, a\.G"):
+        load_light(tmp_path / "a.exr")
+    write_image(tmp_path / "b.exr", pixels, channel_names=(*names[:3], "R", "G", "B"))
+    assert (load_light(tmp_path / "b.exr").radiance == pixels[..., 3:]).all()  # of no layer
+
+
+def test_other_primaries_than_rec709s_are_noted(tmp_path):
+    pixels = np.ones((4, 8, 3), np.float32)
+    ap0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+    for name, values in (("same", (*REC709[:6], 0.31271, 0.32902)), ("ap0", ap0)):
+        spec = oiio.ImageSpec(8, 4, 3, "float")
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), values)
+        file = oiio.ImageOutput.create(str(tmp_path / f"{name}.exr"))
+        assert file.open(str(tmp_path / f"{name}.exr"), spec) and file.write_image(pixels) and file.close()
+    assert load_light(tmp_path / "same.exr").notes == ()
+    (note,) = load_light(tmp_path / "ap0.exr").turned(1.0).notes
+    assert "red (0.7347, 0.2653)" in note and note.startswith("the light is taken as Rec.709")
 
 
 def _write_rgbe(path: Path, bytes_rgbe: np.ndarray) -> None:

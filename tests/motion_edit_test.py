@@ -113,8 +113,18 @@ def test_a_loop_stays_one_at_another_rate_and_speed():
 
 def test_a_loop_that_no_whole_number_of_frames_goes_round_is_open():
     """48 frames at 60 per second are 20.8 at 26: the one after the 21st would come too late."""
-    after = resampled(looped(_motion(0.8 * np.sin(np.arange(72) / 7))), 26.0)
+    loop = looped(_motion(0.8 * np.sin(np.arange(72) / 7)))
+    after = resampled(loop, 26.0)
     assert after.frame_count == 21 and not after.closed
+    assert loop.loop_notes(30.0) == () == after.loop_notes(7.0)
+    (note,) = loop.loop_notes(26.0)
+    assert (
+        note.startswith("the loop of 0.8 s is no whole number of frames at 26") and "26.25 go round" in note
+    )
+
+
+def test_a_loop_of_few_frames_a_second_has_a_seam_of_one():
+    assert looped(replace(_motion(np.linspace(0, 1, 10)), fps=0.5)).frame_count == 9
 
 
 def test_in_place_keeps_heights_and_turns():

@@ -762,6 +762,16 @@ def test_acclaim_bones_keep_their_lengths(tmp_path):
         skeleton.write_text(words)
         with pytest.raises(InputError, match=r"02\.asf: skeleton: .* not finite: " + number):
             load_motion(file, SKELETON)
+    for words, replaced, reason in (
+        ("direction 0 1 0", "direction 0 1", "2 numbers of three: 0 1"),
+        ("    root link1", "    nobody link1", "link1 that no line of the hierarchy joins to the root"),
+    ):
+        assert words in before
+        skeleton.write_text(
+            before.replace(words, replaced).replace(" name lfemur", " name nobody\n  name lfemur")
+        )
+        with pytest.raises(InputError, match=r"02\.asf: skeleton: .*" + reason):
+            load_motion(file, SKELETON)
 
 
 def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):
@@ -786,6 +796,9 @@ def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):
     file.write_text(text)
     skeleton.rename(tmp_path / "other.asf")
     assert load_motion(file, SKELETON).frame_count == FRAMES  # the only one there
+    (tmp_path / "02.ASF").write_text(":root\n")
+    assert motion_inputs(file.with_suffix(".AMC"))[1] == tmp_path / "02.ASF"
+    (tmp_path / "02.ASF").unlink()
     (tmp_path / "third.asf").write_text(":root\n")
     with pytest.raises(InputError, match=r"02_01\.asf"):
         load_motion(file, SKELETON)

@@ -343,6 +343,10 @@ POSES = _flat(_axis_angles(24))
         ({"poses_all": POSES, "Rh_all": TRANS}, ["Th is missing"]),
         ({"poses_all": POSES, "Rh_all": TRANS[:2], "Th_all": TRANS}, ["Rh_all", "5×3", "2×3"]),
         ({"poses": POSES, "trans": TRANS, "mocap_framerate": 0.0}, ["mocap_framerate", "per second"]),
+        (
+            {"poses": POSES, "trans": TRANS, "mocap_framerate": 1e-5},
+            ["per second, 0.001 to 10000, got [1e-05]"],
+        ),
         ({"poses": POSES, "trans": TRANS, "mocap_framerate": np.nan}, ["mocap_framerate", "finite"]),
         ({"poses": POSES, "trans": TRANS, "fps": [30.0, 30.0]}, ["fps"]),
         ({"poses": POSES, "trans": TRANS, "fps": "30"}, ["fps", "numbers"]),

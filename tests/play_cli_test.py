@@ -173,6 +173,27 @@ def test_parts_share_a_folder_inside_the_motions(files, tmp_path, capsys):
     assert "--out: expected another folder than the motion's" in capsys.readouterr().err
 
 
+def test_parts_that_spell_a_path_or_choose_a_rasterizer_their_own_way_are_of_one_run(
+    files, tmp_path, monkeypatch, capsys
+):
+    camera = {"width": 48, "height": 48, "K": [[50, 0, 24], [0, 50, 24], [0, 0, 1]]}
+    camera["world_to_camera"] = [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4], [0, 0, 0, 1]]
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": {"a": camera}}))
+    monkeypatch.chdir(tmp_path)
+    for part, folder, raster in (("0:2", Path(), "cpu"), ("2:6", tmp_path, "auto")):
+        named = {
+            "motion": folder / "walk.npz",
+            "hdr": folder / "sky.exr",
+            "camera": f"{folder / 'cameras.json'}:a",
+        }
+        arguments = _arguments(files, folder / "out", frames=part, raster=raster, size=None, **named)
+        assert main(arguments) == 0
+    assert len(list((tmp_path / "out/frames").iterdir())) == FRAMES and not capsys.readouterr().err
+    assert main(_arguments(files, tmp_path / "out")) == 0
+    left = f"{FRAMES + 2} files that another run had left in {tmp_path / 'out'} were removed"
+    assert left in capsys.readouterr().err
+
+
 @pytest.mark.skipif(shutil.which("parallel") is None, reason="needs GNU parallel")
 def test_the_readmes_line_for_a_queue_makes_the_whole(tmp_path):
     readme = (ASSETS.parent / "README.md").read_text(encoding="utf-8")

@@ -162,6 +162,32 @@ def test_a_loss_that_was_no_number_is_left_out_of_its_curve(run):
     assert "image, last 0.5" in page.text and "normal, last" not in page.text
 
 
+def test_a_line_that_was_begun_when_the_training_was_ended_is_left_out(run):
+    rows = [{"step": 1, "image": 0.5}, {"step": 0, "image": 1e305}]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 2, "ima')
+    _, page = _write(run)
+    assert "image, last 0.5" in page.text and "2 steps" in page.text
+
+
+def test_what_is_wrong_with_motion_and_light_is_told(run, tmp_path, capsys):
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    np.savez(tmp_path / "still.npz", poses=np.zeros((2, 72)), trans=np.zeros((2, 3)))
+    _, page = _write(run, "--hdr", str(tmp_path / "nan.exr"), "--motion", str(tmp_path / "still.npz"))
+    printed = capsys.readouterr().out
+    for note in (
+        "nan.exr: 1 texels of the light were NaN",
+        "no frame rate in the file: 60 frames per second",
+    ):
+        assert f"Note: {note}" in page.text and f"note: {note}" in printed
+
+
+def test_a_folder_of_charts_that_is_not_there_is_refused(run, capsys):
+    assert main([str(run), "--bench", str(run / "bemch")]) == 2
+    assert capsys.readouterr().err == f"rnd-report: {run / 'bemch'}: folder of --bench not found\n"
+
+
 def test_a_curve_goes_through_the_points():
     figure = curve(range(100), [10.0 ** (-k / 99) for k in range(100)], "image", 25)
     (path,) = re.findall(r'<path d="([^"]+)"', figure)
@@ -179,7 +205,21 @@ def test_a_curve_goes_through_the_points():
     [
         ("config.json", None, "config.json: config.json of rnd-train not found"),
         ("eval.json", "{", "eval.json: not JSON"),
-        ("metrics.jsonl", '{"step": 0', "metrics.jsonl: not JSON lines"),
+        ("metrics.jsonl", '{"step": 0\n', "metrics.jsonl: not JSON lines"),
+        ("metrics.jsonl", '{"step": NaN}', "metrics.jsonl: step: expected a number, 0 to 1e+12, got NaN"),
+        (
+            "metrics.jsonl",
+            '{"step": 1e999}',
+            "metrics.jsonl: step: expected a number, 0 to 1e+12, got Infinity",
+        ),
+        ("metrics.jsonl", f'{{"step": 1, "image": 1{"0" * 400}}}', "image: expected a number, got 1000"),
+        ("eval.json", f'[{{"split": "a", "psnr": 1{"0" * 400}}}]', "psnr: expected a number, got 1000"),
+        (
+            "config.json",
+            '{"steps": -Infinity}',
+            "config.json: steps: expected a number, 0 to 1e+12, got -Inf",
+        ),
+        ("config.json", '{"stage1_fraction": NaN}', "stage1_fraction: expected a number, 0 to 1, got NaN"),
         ("metrics.jsonl", "3", "metrics.jsonl: expected a step in every line"),
         ("metrics.jsonl", '{"step": "1"}', 'metrics.jsonl: step: expected a number, got "1"'),
         ("metrics.jsonl", '{"step": null}', "metrics.jsonl: step: expected a number, got null"),

@@ -158,6 +158,20 @@ def test_drag_turns_and_reset_comes_back(page):
     assert (_picture(page) == before).all()
 
 
+def test_keys_are_the_pages_where_they_are_nobody_elses(page):
+    page.run("document.getElementById('skeleton').focus()")
+    page.press("Space")  # presses the box
+    assert page.run("rnd.picture().then(() => document.getElementById('play').textContent)") == "▶"
+    page.run("document.activeElement.blur(); rnd.state.azimuth += 1")
+    turned = page.run("rnd.state.azimuth")
+    for held in ("ctrlKey", "metaKey"):
+        key = f"new KeyboardEvent('keydown', {{ code: 'KeyR', {held}: true, bubbles: true }})"
+        page.run(f"document.body.dispatchEvent({key})")
+        assert page.run("rnd.state.azimuth") == turned
+    page.press("KeyR")
+    assert page.run("rnd.state.azimuth") != turned
+
+
 def test_outputs_sliders_and_skeleton(page):
     seen = {_picture(page).tobytes()}
     for name in ("light", "albedo", "normal", "roughness", "visibility", "lit"):
@@ -184,10 +198,12 @@ def test_ground_truth_stands_beside(page):
     picture = _picture(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
     assert picture.shape == image.shape
     assert (_pixels(page, "truth") == image).all()
+    assert page.run("document.getElementById('clip').disabled")  # it would film something else
     # the avatar was trained on this capture: 20 dB over the whole picture is far from what another pose gives
     assert np.mean((picture.astype(float) - image) ** 2) < 255**2 / 10**2.0
     page.run("document.getElementById('truth-on').click()")
     assert page.run("document.getElementById('truth-pane').hidden")
+    assert not page.run("document.getElementById('clip').disabled")
     _set(page, "size", str(SIZE))
 
 
@@ -216,7 +232,8 @@ def test_ground_truth_that_the_browser_cannot_decode_is_said_and_leaves_its_pane
 def test_screenshot_and_clip_are_downloads(page, tmp_path):
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     shown = _picture(page)
-    page.run("document.getElementById('screenshot').click()")
+    time_s = page.run("rnd.state.time")
+    page.run("document.getElementById('screenshot').click(); rnd.state.time += 0.1")
     _set(page, "size", "128")
     page.run("document.getElementById('clip').click()")
     page.wait("!document.getElementById('clip').disabled")
@@ -226,6 +243,7 @@ def test_screenshot_and_clip_are_downloads(page, tmp_path):
             break
         page.wait("new Promise(done => setTimeout(() => done(true), 50))")
     assert (read_image(files[".png"])[..., :3] == shown).all()
+    assert files[".png"].name == f"avatar_{time_s:.2f}s.png"
     assert files[".mp4"].stat().st_size > 10_000
 
 
@@ -272,6 +290,10 @@ def test_what_is_asked_of_a_viewer_that_is_gone_fails_at_once(page, scene):
     assert page.run(OUTCOME) == gone
     page.run("document.getElementById('clip').click()")
     assert page.run(MESSAGE) == gone and not page.run("document.getElementById('clip').disabled")
+    shown = (
+        "new Promise((done) => setTimeout(done, 300)).then(() => document.getElementById('play').textContent)"
+    )
+    assert page.run(f"rnd.play(true); {shown}") == "▶"  # and not said once more for every picture
     page.open(back)
     page.wait("!window.socket && window.rnd && rnd.scene()")
 
@@ -286,6 +308,6 @@ def test_a_picture_that_the_browser_cannot_decode_is_said(page, scene, monkeypat
         wrong = "this browser cannot decode a picture that rnd-view sent"
         assert page.run(OUTCOME) == wrong == page.run(MESSAGE)
         monkeypatch.undo()
-        assert page.run(OUTCOME) == "drawn"
+        assert page.run(OUTCOME) == "drawn" and page.run(MESSAGE) == ""
         page.open(back)
         page.wait("!location.search && window.rnd && rnd.scene()")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 import socket
 import threading
 import urllib.request
@@ -257,6 +258,35 @@ def test_on_loopback_other_names_and_other_sites_are_refused(options):
                 _knock(port, origin=origin)
 
 
+def test_what_is_no_request_is_answered_as_such(options):
+    for token in (None, "s3cret"):
+        with _serving(options, token=token) as (port, _):
+            assert _get(port, "//[")[0] == 400
+            assert _get(port, "/", Origin="http://[")[0] == 400
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as knocking:
+                knocking.sendall(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n")
+                assert knocking.recv(1000).startswith(b"HTTP/1.1 400 ")
+
+
+def test_what_is_wrong_with_a_light_is_told_with_its_pictures_and_the_whole_map_is_not_kept(
+    options, tmp_path
+):
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    with _serving(replace(options, hdr=(*options.hdr, tmp_path / "nan.exr"))) as (port, scene):
+        with _visiting(port) as visitor:
+            for light, notes in (
+                (1, []),
+                (2, ["1 texels of the light were NaN, infinite or negative and were filled in"]),
+            ):
+                header = visitor.ask(ask="render", number=1, state=visitor.state(light=light))
+                assert header["notes"] == notes
+                assert max(len(str(x)) for joint in header["joints"] for x in joint) < 9
+                visitor.socket.recv()
+        assert scene._light.cache_info().currsize == 0
+
+
 def test_on_the_port_of_http_browsers_name_no_port():
     for host in ("127.0.0.1", "localhost", "127.0.0.1:80"):
         assert Access.local("127.0.0.1", 80).refusal("/", {"Host": host}) is None
@@ -334,7 +364,9 @@ def test_a_token_is_asked_for_everywhere(options):
         status, _, headers = _get(port, "/?token=s3cret")
         cookie = headers["Set-Cookie"]
         assert status == 200 and "HttpOnly" in cookie and "SameSite=Strict" in cookie
-        given = {"Cookie": cookie.split(";")[0]}
+        given = {
+            "Cookie": f'a b=1; json={{"x": [1]}}; {cookie.split(";")[0]}; other=2'
+        }  # beside other programs'
         assert _get(port, "/app.js", **given)[0] == 200
         with _visiting(port, additional_headers=given) as visitor:
             assert visitor.picture().any()
@@ -344,8 +376,8 @@ def test_a_token_is_asked_for_everywhere(options):
 
 def test_any_other_address_asks_for_the_token_that_is_printed():
     with running(str(ASSETS / "avatar.onnx"), "--host", "0.0.0.0", "--size", "64") as address:
-        port, token = address.removeprefix("http://0.0.0.0:").split("/?token=")
-        assert len(token) > 20
+        name, port, token = re.fullmatch(r"http://(.+):(\d+)/\?token=(.+)", address).groups()
+        assert name != "0.0.0.0" and len(token) > 20  # which no other machine can open
         for path in ("/", "/app.js", "/socket", f"/?token={token[:-1]}"):
             assert _get(int(port), path)[0] == 401, path
         assert _get(int(port), f"/?token={token}")[0] == 200

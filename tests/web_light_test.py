@@ -43,7 +43,7 @@ def _page(file: Path) -> Any:
     """What the page's code makes of a probe, in Node.js."""
     assert NODE is not None
     command = [NODE, "--input-type=module", "--eval", _READER, WEB.as_uri() + "/src", str(file)]
-    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    return json.loads(subprocess.run(command, capture_output=True, check=True, timeout=60).stdout)
 
 
 def _exr(
@@ -173,3 +173,11 @@ def test_radiance_files_of_another_colour_space_are_refused(tmp_path):
     with pytest.raises(InputError):
         load_light(file)
     assert "expected FORMAT=32-bit_rle_rgbe, got FORMAT=32-bit_rle_xyze" in _page(file)["refused"]
+
+
+def test_an_attribute_of_negative_size_ends(tmp_path):
+    """It led back to its own name, for ever."""
+    file = tmp_path / "a.exr"
+    size = (-10).to_bytes(4, "little", signed=True)
+    file.write_bytes(b"\x76\x2f\x31\x01\x02\x00\x00\x00" + b"a\x00int\x00" + size + bytes(8))
+    assert "the .exr file is damaged" in _page(file)["refused"]

@@ -320,6 +320,7 @@ REFUSED: dict[str, tuple[dict[str, object], str]] = {
     "two rates": (SMPL | {"fps": [30, 29.97]}, "got [30.0, 29.97]"),
     "endless rate": (SMPL | {"fps": np.inf}, "fps: expected finite"),
     "wild rate": (SMPL | {"mocap_framerate": 1e5}, "mocap_framerate"),
+    "hardly a rate": (SMPL | {"fps": 0.0005}, "per second, 0.001 to 10000"),
     "rate of text": (SMPL | {"fps": "thirty"}, "fps: expected numbers"),
     "X up": (SMPL | {"up_axis": "x"}, "expected y or z"),
     "up by number": (SMPL | {"up_axis": 1}, "up_axis: expected strings"),

@@ -13,6 +13,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import av
 import msgspec
@@ -76,6 +77,8 @@ def site(tmp_path_factory) -> Path:
     save_motion(folder / "fast.npz", fast)
     slow = replace(walk, rotations=walk.rotations[:21], translations=walk.translations[:21], fps=10.0)
     save_motion(folder / "slow.npz", slow)
+    save_motion(folder / "whole.npz", walk)
+    save_motion(folder / "a #1, 50%.npz", first)
     rng = np.random.default_rng(3)
     # AMASS' SMPL-H: Z up, joints by number, fingers beside
     poses = np.zeros((8, 52, 3))
@@ -223,7 +226,7 @@ def _drop(page: Page, *names: str) -> str:
     asked = _let_go(page, *names)  # "reading …"
     page.run(f"""(async () => {{
         const message = document.getElementById("message");
-        const unanswered = ["", {json.dumps(asked)}];  // a picture takes it away
+        const unanswered = ["", {json.dumps(asked)}];  // the scene takes it away
         while (rnd.scene() === before && unanswered.includes(message.textContent))
             await new Promise((done) => setTimeout(done, 20));
     }})()""")
@@ -388,6 +391,65 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
     _drop(loaded, "walk.npz")
 
 
+def test_the_time_slider_reaches_the_last_frame_and_is_off_without_a_motion(fresh):
+    """Of 131 steps of 1/30 s, which rounding makes longer than 131/30 s."""
+    _drop(fresh, "avatar.onnx")
+    assert fresh.run("document.getElementById('time').disabled")
+    _drop(fresh, "whole.npz")
+    fresh.run("""
+        const slider = document.getElementById("time");
+        slider.value = 1e9;
+        slider.dispatchEvent(new Event("input"));
+    """)
+    assert fresh.run("rnd.state.time") == pytest.approx(131 / 30, abs=1e-6)
+    assert not fresh.run("slider.disabled")
+
+
+def test_a_light_that_came_before_the_avatar_shines_and_comes_again_in_its_own_place(fresh):
+    _drop(fresh, "window.hdr")
+    _drop(fresh, "avatar.onnx", "walk.npz")
+    for _ in range(2):
+        assert fresh.run("[rnd.state.light, ...rnd.scene().lights]") == [1, "the avatar's own", "window.hdr"]
+        _drop(fresh, "window.hdr")
+    _drop(fresh, "walk.npz")
+    assert fresh.run("rnd.state.light") == 1
+
+
+def test_files_are_chosen_by_keyboard_and_the_same_ones_again(fresh):
+    fresh.run("document.getElementById('choose').focus()")
+    assert fresh.run("document.activeElement.id") == "choose"
+    fresh.run("""
+        const choose = document.getElementById("choose"), data = new DataTransfer();
+        data.items.add(new File(["?"], "torn.npz"));
+        choose.files = data.files;
+        choose.dispatchEvent(new Event("change"));
+    """)
+    fresh.wait("document.getElementById('message').textContent.includes('torn.npz: ')")
+    assert fresh.run("choose.files.length") == 0
+
+
+def test_addresses_name_files_of_any_name(address, tmp_path):
+    with chromium(tmp_path, webgl=True) as browser:
+        browser.open(f"{address}?avatar=avatar.onnx&motion={quote('a #1, 50%.npz')}&hdr=sky.exr,window.hdr")
+        browser.wait("window.rnd && rnd.scene()")
+        assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
+        assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
+
+
+def test_without_webgl_the_reason_stays(address, site, tmp_path):
+    (site / "without").mkdir()
+    for entry in DIST.iterdir():
+        if entry.name != "worker.js":
+            (site / "without" / entry.name).symlink_to(entry)
+    none = "OffscreenCanvas.prototype.getContext = () => null;"
+    (site / "without/worker.js").write_text(none + (DIST / "worker.js").read_text())
+    with chromium(tmp_path, webgl=True) as browser:
+        browser.open(address + "without/")
+        browser.wait("window.rnd && document.getElementById('message').textContent.includes('WebGL')")
+        said = _drop(browser, "avatar.onnx")
+        assert "WebGL2" in said and _is_refusal(browser)
+
+
 def _clip(page: Page, folder: Path, size: int) -> Path:
     """The clip of ``size``² pixels that the page offers as a download to ``folder``."""
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))
@@ -425,7 +487,8 @@ def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_
     """)
     _clip(fresh, tmp_path, 64)
     progress = [(text, closed) for text, closed in fresh.run("said") if text.endswith(" of 16")]
-    assert progress == [(f"making a clip: {done} of 16", done) for done in range(1, 17)]
+    assert [text for text, _ in progress] == [f"making a clip: {done} of 16" for done in range(1, 17)]
+    assert all(closed >= done for done, (_, closed) in enumerate(progress, 1))  # and the page's own
 
 
 @pytest.mark.parametrize(

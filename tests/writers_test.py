@@ -106,6 +106,14 @@ def test_webp_moves_forever_in_its_colours_and_is_transparent(tmp_path):
             assert np.abs(decoded[middle][..., :3] - image[middle][..., :3]).max() <= DECODED_WEBP
 
 
+def test_webp_has_no_two_frames_in_a_millisecond(tmp_path):
+    with (
+        pytest.raises(InputError, match="webp: expected at most 1000 frames per second, got 1200"),
+        clip_writer(tmp_path / "a.webp", fps=1200),
+    ):
+        pass
+
+
 def test_webp_over_a_background_is_opaque(tmp_path, frame):
     _write(tmp_path, dataclasses.replace(frame, behind=np.ones(3, np.float32)), ("webp",))
     with Image.open(tmp_path / "play.webp") as clip:

@@ -5,7 +5,7 @@ while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NE
 machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``);
 no other liberty is taken, so a NaN fails every comparison.
 
-numba's cache looks only at the file of the kernel it stored: after editing this file, touch its importers.
+numba's cache looks only at the file of the kernel it stored; after an edit of this one, :mod:`._kernel_cache` does.
 """
 
 from __future__ import annotations

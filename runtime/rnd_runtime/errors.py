@@ -16,6 +16,8 @@ from types import FrameType
 from typing import TypeVar
 
 Parsed = TypeVar("Parsed")
+# By which queues, systems and terminals that are closed end a program.
+_ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 # No permission, a file system that is read-only, full, full for this user, or that takes no such name: nobody's
 # mistake in the program.
 _OF_THE_MACHINE = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
@@ -54,7 +56,7 @@ class InputError(Exception):
             line += f" ({hint})"
         self.what, self.expected, self.got, self.hint = what, expected, got, hint
         self.file, self.frame = file, frame
-        super().__init__(" ".join(line.split()))
+        super().__init__(" ".join(filter(None, map(str.strip, line.splitlines()))))
 
     def at(self, *, file: str | Path | None = None, frame: int | None = None) -> InputError:
         """The same mistake with the place it lacked, for callers who know the file or the frame."""
@@ -91,7 +93,7 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 
     2 for an :class:`InputError` and for a file that the machine withholds (one line on stderr), 130 for Ctrl-C and for
-    SIGTERM, which is the same to us, 141 in silence where nobody reads the output to its end
+    SIGTERM and SIGHUP, which are the same to us, 141 in silence where nobody reads the output to its end
     (``rnd-play --help | head``), otherwise what ``main`` returns. A terminal that cannot show a letter shows a ?. What
     is said to a stream that was closed is lost.
     """
@@ -126,7 +128,7 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
 
 @contextlib.contextmanager
 def _ended_as_interrupted() -> Iterator[None]:
-    """Take SIGTERM, by which queues and systems end a program, for Ctrl-C: what is begun is saved or taken away."""
+    """Take what else ends a program, if not ignored (``nohup``), for Ctrl-C: what is begun is saved or taken away."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         on_interrupt = signal.getsignal(signal.SIGINT)
@@ -137,11 +139,13 @@ def _ended_as_interrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
-    before = signal.signal(signal.SIGTERM, interrupt)
+    endings = [number for number in _ENDINGS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, interrupt) for number in endings}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def parse_options(parse: Callable[[], Parsed]) -> Parsed:

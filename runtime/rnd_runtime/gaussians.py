@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -38,6 +38,11 @@ class Gaussians:
     roughness: Floats32
     visibility: Floats32
     root_rotation: Floats32
+
+    def only(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Gaussians:
+        """Those of a mask [N] or of indices."""
+        names = (name for name in vars(self) if name != "root_rotation")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,9 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 _MOST_COMPRESSED = 2000
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
+# Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
+_UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
+_LARGEST_UNBOUNDED = 1 << 31
 
 
 def linear_to_srgb(linear: ArrayLike) -> Floats:
@@ -57,6 +60,9 @@ class ImageHeader:
     height: int
     channels: tuple[str, ...]
     pixel_type: str  # uint8, uint16, half, float, …
+    chromaticities: tuple[float, ...] | None = (
+        None  # of an EXR that says: x and y of red, green, blue and white
+    )
 
 
 def read_header(path: str | Path) -> ImageHeader:
@@ -175,12 +181,20 @@ def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
         )
     claimed = spec.width * spec.height * spec.nchannels * spec.format.size()
     file_bytes = Path(path).stat().st_size
-    if claimed > _MOST_COMPRESSED * file_bytes + _SMALL_IMAGE:
+    unbounded = spec.get_string_attribute("compression").startswith(_UNBOUNDED_CODECS)
+    if claimed > (_LARGEST_UNBOUNDED if unbounded else _MOST_COMPRESSED * file_bytes + _SMALL_IMAGE):
         expected = f"{claimed} bytes of pixels"
         raise InputError(
             "image is cut short or damaged", expected=expected, got=f"{file_bytes} stored", file=path
         )
-    return ImageHeader(spec.width, spec.height, tuple(spec.channelnames), str(spec.format))
+    primaries = spec.getattribute("chromaticities")
+    return ImageHeader(
+        spec.width,
+        spec.height,
+        tuple(spec.channelnames),
+        str(spec.format),
+        tuple(primaries) if isinstance(primaries, tuple) and len(primaries) == 8 else None,
+    )
 
 
 _BEGINNINGS = {

@@ -17,6 +17,10 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Up = Literal["y", "z", "-y"]
 
+REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+"""x and y of Rec.709's red, green, blue and white (ITU-R BT.709-6, section 1)"""
+_SAME_COLOUR = 2e-3  # by which x and y may miss them: D65 has more digits
+
 _MAX_STOPS = 64  # beyond it radiance leaves float32
 
 _TO_Y_UP: dict[str, Floats] = {
@@ -40,12 +44,14 @@ class Light:
             φ + yaw, so it moves from +X towards +Z.
         up: which axis of the map's frame points up in the world it was made for.
         repaired: texels that had to be filled in when it was read.
+        notes: what its file says that was not followed, one sentence each, for the user to see.
     """
 
     radiance: Floats32
     yaw: float = 0.0
     up: Up = "y"
     repaired: int = 0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         radiance = np.ascontiguousarray(self.radiance, np.float32)
@@ -128,16 +134,14 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         exposure: in stops; radiance is multiplied by 2^exposure.
 
     Raises:
-        InputError: unreadable, not 2:1, without channels R, G, B, or without one valid texel.
+        InputError: unreadable, not 2:1, without channels R, G, B of one layer, or without one valid texel.
     """
     if Path(path).suffix.lower() not in (".exr", ".hdr"):
         raise InputError("light probe", expected="an .exr or .hdr file", got=Path(path).suffix, file=path)
     if not abs(exposure) <= _MAX_STOPS:
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
-    names = [name.split(".")[-1] for name in read_header(path).channels]  # layers read "view.R"
-    if not set("RGB") <= set(names):
-        raise InputError("light probe", expected="channels R, G and B", got=", ".join(names), file=path)
-    channels = [names.index(name) for name in "RGB"]
+    header = read_header(path)
+    channels = _colour_channels(header.channels, path)
     radiance = read_image(path)[..., channels].astype(np.float32)
     height, width = radiance.shape[:2]
     if width != 2 * height:
@@ -147,7 +151,28 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     except InputError as error:
         raise error.at(file=path) from error
     radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure))
-    return Light(radiance, yaw=yaw, up=up, repaired=repaired)
+    return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=_colour_notes(header.chromaticities))
+
+
+def _colour_channels(names: tuple[str, ...], path: str | Path) -> list[int]:
+    """Where R, G and B are: those of no layer, or else of the only layer ("view.R") that has all three."""
+    layers = dict.fromkeys(name.removesuffix("R") for name in names if name.split(".")[-1] == "R")
+    whole = [layer for layer in layers if {f"{layer}{colour}" for colour in "RGB"} <= set(names)]
+    if "" not in whole and len(whole) != 1:
+        expected = "channels R, G and B" + (" of one layer" if whole else "")
+        raise InputError("light probe", expected=expected, got=", ".join(names), file=path)
+    layer = "" if "" in whole else whole[0]
+    return [names.index(f"{layer}{colour}") for colour in "RGB"]
+
+
+def _colour_notes(chromaticities: tuple[float, ...] | None) -> tuple[str, ...]:
+    if chromaticities is None or np.allclose(chromaticities, REC709, rtol=0, atol=_SAME_COLOUR):
+        return ()
+    red, green, blue, white = (
+        f"({x:.4g}, {y:.4g})" for x, y in zip(chromaticities[::2], chromaticities[1::2])
+    )
+    stated = f"red {red}, green {green}, blue {blue} and white {white}"
+    return (f"the light is taken as Rec.709, but its file states {stated}",)
 
 
 def repair(radiance: Floats32) -> tuple[Floats32, int]:

@@ -251,10 +251,10 @@ def asf_beside(path: Path) -> Path:
     """The skeleton of the AMC ``path``: ``NAME.asf``, else ``SUBJECT.asf`` of a CMU name ``SUBJECT_TRIAL.amc``, else
     the folder's only one.
     """
+    others = sorted(path.parent.glob("*.[aA][sS][fF]"))
     for stem in (path.stem, path.stem.rsplit("_", 1)[0]):
-        if (candidate := path.with_name(f"{stem}.asf")).is_file():
-            return candidate
-    others = sorted(path.parent.glob("*.asf"))
+        if own := [candidate for candidate in others if candidate.stem == stem]:
+            return own[0]
     if len(others) == 1:
         return others[0]
     got = f"{len(others)} of other names" if others else "none"
@@ -277,7 +277,7 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
     degrees = units.get("angle", "deg").lower().startswith("deg")
     root_lines = {words[0].lower(): words[1:] for words in sections["root"] if words}
     root = _Bone("root", freedoms=tuple(word.lower() for word in root_lines["order"]))
-    orientation = _finite(root_lines.get("orientation", ["0", "0", "0"]))
+    orientation = _three(root_lines.get("orientation", ["0", "0", "0"]))
     root.axes = _axes(orientation, root_lines.get("axis", ["XYZ"])[0], degrees)
     bones = {"root": root}
     bone = root
@@ -286,11 +286,11 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
         if key == "name":
             bone = bones[rest[0]] = _Bone(rest[0])
         elif key == "direction":
-            bone.reach = np.array(_finite(rest[:3]))
+            bone.reach = np.array(_three(rest))
         elif key == "length":
             bone.reach = bone.reach / max(float(np.linalg.norm(bone.reach)), 1e-12) * _finite(rest[:1])[0]
         elif key == "axis":
-            bone.axes = _axes(_finite(rest[:3]), rest[3], degrees)
+            bone.axes = _axes(_three(rest), rest[3], degrees)
         elif key == "dof":
             bone.freedoms = tuple(word.lower() for word in rest)
     for bone in bones.values():
@@ -302,7 +302,16 @@ def _read_asf(path: Path) -> tuple[list[_Bone], bool]:
             for child in words[1:]:
                 bones[child].parent = words[0]
                 ordered.append(bones[child])
+    reached = {bone.name for bone in ordered}
+    if apart := [bone.name for bone in ordered if bone.parent not in (None, *reached)]:
+        raise ValueError(f"{apart[0]} that no line of the hierarchy joins to the root")
     return ordered, degrees
+
+
+def _three(words: Sequence[str]) -> list[float]:
+    if len(words) < 3:
+        raise ValueError(f"{len(words)} numbers of three: {' '.join(words)}")
+    return _finite(words[:3])
 
 
 def _finite(words: Sequence[str]) -> list[float]:

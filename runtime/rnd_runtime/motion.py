@@ -86,6 +86,14 @@ class Motion:
         frames = self.duration * fps
         return self.closed and abs(frames - round(frames)) < _PART_OF_A_FRAME
 
+    def loop_notes(self, fps: float) -> tuple[str, ...]:
+        """What is to be said of it at ``fps``: that it is closed, and does not go round evenly."""
+        if not self.closed or self.goes_round_at(fps):
+            return ()
+        even = max(round(self.duration * fps), 1) / self.duration
+        what = f"the loop of {self.duration:.4g} s is no whole number of frames at {fps:g} per second"
+        return (f"{what}: it jerks where it begins anew ({even:.6g} go round)",)
+
     def at(self, times_s: ArrayLike) -> Motion:
         """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames.
 

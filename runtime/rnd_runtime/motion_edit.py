@@ -94,11 +94,11 @@ def looped(motion: Motion, seam_seconds: float = _SEAM_SECONDS) -> Motion:
     The frame after the last is the first. Where the root ends elsewhere than it begins, the way back is spread
     evenly over the clip, which slides the feet: noted, and absent in place.
     """
-    seam = min(round(seam_seconds * motion.fps), motion.frame_count // 3)
-    if motion.frame_count < _LEAST_LOOP or seam < 1:
+    if motion.frame_count < _LEAST_LOOP:
         raise InputError(
             "--loop", expected=f"a motion of at least {_LEAST_LOOP} frames", got=motion.frame_count
         )
+    seam = min(max(round(seam_seconds * motion.fps), 1), motion.frame_count // 3)
     length = motion.frame_count - seam
     drift = (motion.translations[length:] - motion.translations[:seam]).mean(0) * [1, 0, 1]
     steps = (np.arange(motion.frame_count) / length)[:, None]

@@ -28,6 +28,7 @@ _MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and
 _MANY_BEYOND_A_TURN = 0.2
 _MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
 _DEFAULT_FPS = 60.0
+FPS_LIMITS = (1e-3, 1e4)  # of a recording, least and most frames per second
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,10 +241,11 @@ def _frame_rate(archive: Members, notes: list[str]) -> float:
         notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
         return _DEFAULT_FPS
     value = archive.numbers(member)
-    if value.size != 1 or not 0 < value.item() <= 10_000:
+    low, high = FPS_LIMITS
+    if value.size != 1 or not low <= value.item() <= high:
         raise InputError(
             member,
-            expected="frames per second, above 0",
+            expected=f"frames per second, {low:g} to {high:g}",
             got=value.reshape(-1)[:4].tolist(),
             file=archive.path,
         )

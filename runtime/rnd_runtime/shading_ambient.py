@@ -26,6 +26,7 @@ from .shading_lanes import (
     leave,
     lobes_in_lanes,
     mean_direction,
+    no_number,
     three,
     transposed,
     unit,
@@ -112,6 +113,7 @@ def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, colum
     at_lobe = compiled_sh_columns(*mean_direction(columns, normal, view, n_dot_v))
     at_normal = compiled_sh_columns(*normal)
     visibility_in_lanes(members, visibility, rows, columns)
+    broken = no_number(room, columns)
 
     occlusion = lanes(ZERO)
     for j in range(9):
@@ -126,4 +128,4 @@ def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, colum
             shine += left * (at_lobe[j] * light[j, channel])
         at = channel * WIDTH
         matt = load(room, ALBEDO + at) * at_least(diffuse, ZERO)
-        store(room, RADIANCE + at, occlusion * (matt + energy * at_least(shine, ZERO)))
+        store(room, RADIANCE + at, occlusion * (matt + energy * at_least(shine, ZERO)) + broken)

@@ -86,6 +86,20 @@ def visibility_in_lanes(members, visibility, rows, columns):  # type: ignore[no-
 
 
 @njit(inline="always")
+def no_number(room, visibility):  # type: ignore[no-untyped-def]
+    """NaN in the lanes of Gaussians that have a number that is not finite, else 0: :func:`at_least` may lose that.
+
+    Asks for all that entered in ``room``, and for the visibility as [16, lanes].
+    """
+    sum_of_all = load(room, 0)
+    for at in range(WIDTH, _ENTERED, WIDTH):
+        sum_of_all += load(room, at)
+    for at in range(0, WIDTH * WIDTH, WIDTH):
+        sum_of_all += load(visibility, at)
+    return sum_of_all - sum_of_all
+
+
+@njit(inline="always")
 def lobes_in_lanes(lobes, n_dot_v, room, rows, columns):  # type: ignore[no-untyped-def]
     """The sixteen columns of ``lobes`` [16, 49, 16] at each Gaussian's roughness and n·v, in ``columns``."""
     a = (load(room, ROUGHNESS) - ROUGHNESS_LOW) / ROUGHNESS_SPAN * np.float32(ROUGHNESS_COUNT - 1)

@@ -40,6 +40,7 @@ from .shading_lanes import (
     leave,
     lobes_in_lanes,
     mean_direction,
+    no_number,
     store_cell,
     three,
     transposed,
@@ -98,6 +99,7 @@ def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):
     mean = mean_direction(columns, normal, view, n_dot_v)
     shrink = three(columns, 4 * WIDTH)
     visibility_in_lanes(members, visibility, rows, columns)
+    broken = no_number(room, columns)
     energy = energy * at_least(_open_share(root_to_light, mean, shrink, columns), ZERO)
 
     _place_in_square(mean[0], mean[1], mean[2], SPECULAR_SIZE, room)
@@ -129,7 +131,7 @@ def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):
         shine = load(columns, at) + load(columns, at + 4 * WIDTH)
         shine += load(columns, at + 8 * WIDTH) + load(columns, at + 12 * WIDTH)
         matt = load(room, ALBEDO + at) * _ONE_OVER_PI * load(room, _IRRADIANCE + at)
-        store(room, RADIANCE + at, at_least(matt + energy * shine, ZERO))
+        store(room, RADIANCE + at, at_least(matt + energy * shine, ZERO) + broken)
 
 
 @njit(inline="always")

@@ -22,7 +22,8 @@ from .sh import sh_basis
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-_ZERO = np.float32(0)
+_EXPONENT = np.int32(0x7F800000)  # of a float32: all ones in what is infinite or no number
+_ZERO, _NAN = np.float32(0), np.float32(np.nan)
 _ONE_OVER_PI = np.float32(1 / np.pi)
 _HALF_FLOOR = np.float32(1e-8)  # |l + v|² where light and camera are opposite
 _CUT_TEXELS = (128, 256)  # the grid a median cut works on
@@ -91,15 +92,19 @@ class DistantLights:
             directions @ np.asarray(gaussians.root_rotation, np.float64)
         )  # rows times R: root's frame
         radiance = np.zeros((len(gaussians.means), 3), np.float32)
+        means, normals, albedo = (floats(a) for a in (gaussians.means, gaussians.normals, gaussians.albedo))
+        visibility, seen = floats(gaussians.visibility), mask(seen, len(radiance))
+        surfaces = (means, normals, albedo, floats(gaussians.roughness), visibility)
         _sum_lights(
-            floats(gaussians.means),
-            floats(gaussians.normals),
-            floats(gaussians.albedo),
+            means,
+            normals,
+            albedo,
             floats(roughness_to_alpha(gaussians.roughness)),
-            floats(gaussians.visibility),
+            visibility,
+            tuple(array.view(np.int32) for array in surfaces),
             np.array(camera_position, np.float32),
             *(np.array(a.T, np.float32, order="C") for a in (directions, basis, self.flux)),
-            mask(seen, len(radiance)),
+            seen,
             radiance,
         )
         return radiance
@@ -137,13 +142,33 @@ def _sum(total: Floats, top: int, bottom: int, left: int, right: int) -> float:
     return float(max(total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left], 0))
 
 
+@numba.njit(error_model="numpy")
+def _is_finite(bits, i):  # type: ignore[no-untyped-def]
+    """Whether all of Gaussian ``i`` is a number, by its bits: ``fastmath`` takes for granted that it is."""
+    means, normals, albedo, roughness, visibility = bits
+    broken = (roughness[i] & _EXPONENT) == _EXPONENT
+    for k in range(3):
+        broken |= (means[i, k] & _EXPONENT) == _EXPONENT
+        broken |= (normals[i, k] & _EXPONENT) == _EXPONENT
+        broken |= (albedo[i, k] & _EXPONENT) == _EXPONENT
+    for k in range(16):
+        broken |= (visibility[i, k] & _EXPONENT) == _EXPONENT
+    return not broken
+
+
 @numba.njit(parallel=True, nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _sum_lights(  # type: ignore[no-untyped-def]
-    means, normals, albedo, alpha, visibility, camera, directions, basis, flux, seen, radiance
+    means, normals, albedo, alpha, visibility, bits, camera, directions, basis, flux, seen, radiance
 ):
-    """Arrays of lights come transposed, [3, K] and [16, K], so that the inner loop runs in vector registers."""
+    """Arrays of lights come transposed, [3, K] and [16, K], so that the inner loop runs in vector registers.
+
+    ``bits``: of a Gaussian's numbers, see :func:`_is_finite`.
+    """
     for i in numba.prange(len(means)):
         if not seen[i]:
+            continue
+        if not _is_finite(bits, i):
+            radiance[i, 0] = radiance[i, 1] = radiance[i, 2] = _NAN
             continue
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]

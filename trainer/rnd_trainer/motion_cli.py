@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -56,7 +57,8 @@ def motion(
     skeleton = _skeleton(body)
     made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
     if fps is not None:
-        made = resampled(made, fps)
+        notes = made.notes + made.loop_notes(fps)
+        made = replace(resampled(made, fps), notes=notes)
     lost = write_amass(out, made, skeleton)
     console = Console()
     for note in [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,19 @@ from rnd_runtime.skeleton import Skeleton
 
 from .cameras import CameraOptions, CameraPath, file_path, frame_motion, front_path
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
-from .lights import chosen_light
+from .lights import chosen_light, light_notes
 from .mesh_files import posed_vertices, write_obj, write_rigged_glb
 from .options import parse_frames, refuse_outside
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
-from .splats import Splats, fixed_colour, make_splats, stored_colours, turned_over, view_dependent_colour
+from .splats import (
+    Splats,
+    are_finite,
+    fixed_colour,
+    make_splats,
+    stored_colours,
+    turned_over,
+    view_dependent_colour,
+)
 from .visionary import check_clip, write_visionary
 
 Floats = NDArray[np.float64]
@@ -56,17 +64,24 @@ def _splats(options: SplatOptions) -> Iterator[str]:
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
     motion = options.read_motion(options.motion, avatar.skeleton)
-    yield from _noted(motion)
+    yield from _notes(motion.notes)
     frames = parse_frames(options.frames, motion.frame_count)
     if "visionary" in formats:
         check_clip(len(frames), avatar.gaussians)
-    shader = Shader(_light(options, avatar), mode=options.shade)
+    light = _light(options, avatar)
+    if options.colour == "lit":
+        yield from _notes(light_notes(light))
+    shader = Shader(light, mode=options.shade)
     camera_at = _camera_path(options.camera, avatar.skeleton, motion, frames)
     out = output_folder(options.out)
     clip: list[Splats] = []
+    left_out = 0
     for number in frames:
         encoded = avatar.encode(motion, number / motion.fps)
-        gaussians, lit = avatar.posed(encoded.in_world()), _lit_as_played(avatar, encoded, shader)
+        gaussians = avatar.posed(encoded.in_world())
+        finite = are_finite(gaussians)
+        left_out = max(left_out, int((~finite).sum()))
+        gaussians, lit = gaussians.only(finite), _lit_as_played(avatar, encoded, shader, finite)
         eye = camera_at(number, number / motion.fps).position
         splats = make_splats(gaussians, _harmonics(options, avatar, gaussians, lit, eye))
         stored = turned_over(splats) if options.ply_axes == "3dgs" else splats
@@ -78,16 +93,24 @@ def _splats(options: SplatOptions) -> Iterator[str]:
             _transformed(program, out / f"{number:06d}", stored, formats)
         if "visionary" in formats:
             clip.append(stored)
+    if left_out:
+        yield from _notes(
+            [f"Gaussians with numbers that are not finite were left out, {left_out} of a frame at most"]
+        )
     if clip:
         write_visionary(out / "visionary.onnx", clip, motion.fps)
     files = {suffix: f"{number:06d}.{suffix}" for suffix in formats} | {"visionary": "visionary.onnx"}
     listed = ", ".join(f"{name} ({(out / files[name]).stat().st_size / 1e6:.2f} MB)" for name in formats)
-    yield f"{len(frames)} frames of {avatar.gaussians} Gaussians in {out}: {listed}"
+    yield f"{len(frames)} frames of {avatar.gaussians - left_out} Gaussians in {out}: {listed}"
 
 
-def _lit_as_played(avatar: Avatar, encoded: Encoded, shader: Shader) -> Callable[[Floats], Floats32]:
-    """Radiance [N, 3] towards a place in the world; shaded in the root's frame, where the player's shadow maps lie."""
-    gaussians, turn, place = avatar.posed(encoded), encoded.root[:3, :3], encoded.root[:3, 3]
+def _lit_as_played(
+    avatar: Avatar, encoded: Encoded, shader: Shader, kept: NDArray[np.bool_]
+) -> Callable[[Floats], Floats32]:
+    """Radiance of the Gaussians ``kept`` [N] towards a place in the world; shaded in the root's frame, where the
+    player's shadow maps lie.
+    """
+    gaussians, turn, place = avatar.posed(encoded).only(kept), encoded.root[:3, :3], encoded.root[:3, 3]
     here = shader.in_frame(turn)
     return lambda eye: here.shade(gaussians, turn.T @ (eye - place))
 
@@ -123,7 +146,7 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
     options.refuse_unfit(formats)
     body = Body.load(options.body)
     motion = options.read_motion(options.motion, body.skeleton)
-    yield from _noted(motion)
+    yield from _notes(motion.notes)
     frames = parse_frames(options.frames, motion.frame_count)
     out = output_folder(options.out)
     if "glb" in formats:
@@ -139,18 +162,17 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
 def _motion(options: AmassOptions) -> Iterator[str]:
     check_option(options.out.suffix.lower() == ".npz", "--out", "a name in .npz", options.out)
     file = existing_file(options.skeleton, what="avatar or body")
-    skeleton = Body.load(file).skeleton if file.suffix == ".npz" else Avatar.load(file).skeleton
+    skeleton = Body.load(file).skeleton if file.suffix.lower() == ".npz" else Avatar.load(file).skeleton
     motion = options.read_motion(options.motion, skeleton)
-    yield from _noted(motion)
+    yield from _notes(motion.notes)
     lost = write_amass(options.out, motion, skeleton)
     if lost:
         yield f"joints that SMPL-H lacks were left out: {', '.join(lost)}"
     yield f"{options.out}: {motion.frame_count} frames at {motion.fps:g} per second"
 
 
-def _noted(motion: Motion) -> Iterator[str]:
-    """What the motion's reader assumed or left out."""
-    return (f"note: {note}" for note in motion.notes)
+def _notes(notes: Iterable[str]) -> Iterator[str]:
+    return (f"note: {note}" for note in notes)
 
 
 def _light(options: SplatOptions, avatar: Avatar) -> Light:

@@ -18,6 +18,7 @@ from rnd_runtime.images import write_image
 WIDTH, HEIGHT = 320, 150  # of a curve, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 42, 8, 8, 16  # margins for ticks
 POINTS = 300  # of a curve
+LARGEST = 1e300  # value of a curve: its ticks and margins are floats too
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -69,17 +70,17 @@ def compare(left: str, right: str, label: str) -> str:
 def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | None) -> str:
     """``values`` over ``steps`` with a logarithmic scale, as SVG; ``mark``: a step with a line through it.
 
-    Each point is the mean of its bin; what is not a positive number is left out.
+    Each point is the mean of its bin; what is not a positive number, 1e300 at most, is left out.
     """
-    width = max(1, math.ceil((steps[-1] + 1) / POINTS)) if steps else 1
+    last = max(steps, default=0)
+    width = max(1, math.ceil((last + 1) / POINTS))
     bins: dict[int, list[float]] = {}
     for step, value in zip(steps, values):
-        if 0 < value < math.inf:
+        if 0 < value < LARGEST:
             bins.setdefault(step // width, []).append(math.log10(value))
     if not bins:
         return figure("", f"{name}: nothing to draw")
-    last = max(steps[-1], 1)
-    points = [(k * width / last, sum(logs) / len(logs)) for k, logs in sorted(bins.items())]
+    points = [(k * width / max(last, 1), sum(logs) / len(logs)) for k, logs in sorted(bins.items())]
     low, high = (choose(y for _, y in points) for choose in (min, max))
     low, high = low - 0.03, max(high, low + 0.1) + 0.03
 
@@ -98,7 +99,7 @@ def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | 
         at = x(mark / last)
         lines.append(f'<line class="stage" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
     lines.append(f'<text x="{LEFT}" y="{HEIGHT - 4}">0</text>')
-    lines.append(f'<text x="{WIDTH - RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{steps[-1] + 1} steps</text>')
+    lines.append(f'<text x="{WIDTH - RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{last + 1} steps</text>')
     path = "".join(f"{'L' if k else 'M'}{x(share):.1f} {y(log):.1f}" for k, (share, log) in enumerate(points))
     svg = f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(lines)}<path d="{path}"/></svg>'
     return figure(svg, f"{name}, last {10 ** points[-1][1]:.3g}")

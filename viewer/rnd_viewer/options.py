@@ -12,6 +12,7 @@ import tyro
 from rnd_runtime.errors import InputError, check_option, flag, refuse_changed
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
+from rnd_runtime.motion_files import FPS_LIMITS
 from rnd_runtime.skeleton import Skeleton
 
 _EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
@@ -67,7 +68,7 @@ class MotionOptions:
         refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 
     def __post_init__(self) -> None:
-        refuse_outside(self, {"motion_fps": (1e-3, 1e4), "smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
+        refuse_outside(self, {"motion_fps": FPS_LIMITS, "smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
 
 
 def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:

@@ -16,7 +16,6 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
-from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
@@ -35,7 +34,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
-from .lights import chosen_light
+from .lights import chosen_light, light_notes
 from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
@@ -50,8 +49,9 @@ OWN_TO_A_PROCESS = (
     "threads",
     "format",
     "pipeline",
+    "raster",
 )  # options that do not tell one run from another
-DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
+FILES = ("avatar", "motion", "hdr", "joint_map")  # a run goes by what they are, however their paths are spelt
 
 
 def play(options: PlayOptions) -> int:
@@ -88,6 +88,7 @@ class _Run:
         notes: what the inputs' readers found, and what the run itself has to say.
         qualities: of every frame that was drawn, in turn.
         in_view: whether anything of the avatar was seen yet.
+        removed: files that another run had left in the folder.
     """
 
     options: PlayOptions
@@ -105,6 +106,7 @@ class _Run:
     governor: Governor | None
     qualities: list[Quality] = field(default_factory=list)
     in_view: bool = False
+    removed: int = 0
 
     @classmethod
     def of(cls, options: PlayOptions) -> _Run:
@@ -139,7 +141,7 @@ class _Run:
             count=count,
             framing=framing,
             camera_at=_camera_path(options, size, framing, frames),
-            notes=[*motion.notes, *_light_notes(light)],
+            notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light)],
             governor=Governor(options.fps_floor) if options.fps_floor else None,
         )
 
@@ -160,7 +162,7 @@ class _Run:
 
             def put(number: int, drawn: tuple[Frame, Camera]) -> None:
                 if number == self.frames.start:  # not before: what fails at once leaves the folder as it was
-                    claim(self.out, _common(self.options), _inputs(self.options))
+                    self.removed = claim(self.out, _common(self.options), _inputs(self.options))
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
             for _ in with_progress(
@@ -199,6 +201,8 @@ class _Run:
 
     def afterthoughts(self) -> Iterator[str]:
         """What can be said of the frames only once they are there."""
+        if self.removed:
+            yield f"{self.removed} files that another run had left in {self.out} were removed"
         if lowered := sum(quality != FULL for quality in self.qualities):
             share = f"{lowered} of {len(self.frames)} frames"
             yield f"{share} at less than full quality, for {self.options.fps_floor:g} frames/s"
@@ -227,8 +231,10 @@ class _Run:
 
 
 def _common(options: PlayOptions) -> dict[str, object]:
-    """The settings that all processes of one run share."""
-    return {key: value for key, value in _settings(options).items() if key not in OWN_TO_A_PROCESS}
+    """The settings that all processes of one run share, beside its :func:`_inputs`."""
+    camera = options.camera if options.camera in OWN_CAMERAS else split_camera(options.camera)[1]
+    settings = _settings(options) | {"camera": camera}
+    return {key: value for key, value in settings.items() if key not in (*OWN_TO_A_PROCESS, *FILES)}
 
 
 def _settings(options: PlayOptions) -> dict[str, object]:
@@ -260,17 +266,6 @@ def _inputs(options: PlayOptions) -> list[Path]:
     if options.camera not in OWN_CAMERAS:
         given.append(split_camera(options.camera)[0])
     return [path for path in given if path is not None]
-
-
-def _light_notes(light: Light) -> list[str]:
-    notes = []
-    if light.repaired:
-        notes.append(
-            f"{light.repaired} texels of the light were NaN, infinite or negative and were filled in"
-        )
-    if light.maximum < DIM:
-        notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
-    return notes
 
 
 def _camera_path(

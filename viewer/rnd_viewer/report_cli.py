@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from rnd_runtime.errors import InputError, check_option, flag, parse_options, run_command
+from rnd_runtime.files import is_folder
 
 from .options import MotionOptions
 
@@ -47,14 +48,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not (options.run / "avatar.onnx").is_file():
             for name in ("motion", "hdr"):  # played and lit by the avatar alone
                 check_option(not getattr(options, name), flag(name), "an avatar.onnx in RUN", "none")
+        if options.bench is not None and not is_folder(options.bench):
+            raise InputError("folder of --bench not found", file=options.bench)
         from .report import say
         from .run_report import write_run_report
 
         out = options.out or options.run / "report.html"
         motion = None if options.motion is None else partial(options.read_motion, options.motion)
-        write_run_report(
+        notes = write_run_report(
             options.run, out, motion=motion, hdrs=options.hdr, bench=options.bench, pictures=options.pictures
         )
+        for note in notes:
+            say(f"note: {note}")
         say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
         return 0
 

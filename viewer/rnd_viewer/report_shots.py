@@ -19,6 +19,7 @@ from rnd_runtime.skeleton import Skeleton
 
 from .aov import aov_picture
 from .cameras import CameraOptions, frame_motion, front_path, orbit_path
+from .lights import light_notes
 from .player import Player
 from .video import clip_writer
 
@@ -30,7 +31,11 @@ MODE = "table+sun"
 
 
 class Shots:
-    """An avatar in one motion (the rest pose where none is given), ready to be filmed."""
+    """An avatar in one motion (the rest pose where none is given), ready to be filmed.
+
+    Attributes:
+        notes: what is to be said of the motion, and of every light that was read.
+    """
 
     def __init__(self, avatar_file: Path, read_motion: Callable[[Skeleton], Motion] | None) -> None:
         self.avatar = Avatar.load(avatar_file)
@@ -40,6 +45,7 @@ class Shots:
             if read_motion is None
             else read_motion(skeleton)
         )
+        self.notes = list(self.motion.notes)
         view = CameraOptions(SIDE, SIDE, math.radians(35), math.radians(5))
         framing = frame_motion(skeleton, self.motion)
         self._orbit = orbit_path(framing, view, SECONDS)
@@ -60,13 +66,18 @@ class Shots:
     def relights(self, hdrs: tuple[Path, ...]) -> Iterator[tuple[str, Bytes]]:
         """Captions and pictures: the learned light turned, then each of ``hdrs``, of the motion's middle."""
         lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
-        lights += [(hdr.stem, load_light(hdr)) for hdr in hdrs]
+        lights += [(hdr.stem, self._read_light(hdr)) for hdr in hdrs]
         time_s = self.motion.duration / 2
         camera = self._front(0, time_s)
         with make_rasterizer("auto") as rasterizer:
             for caption, light in lights:
                 player = Player(self.avatar, light, Shader(light, MODE), rasterizer)
                 yield caption, player.render(self.motion, time_s, camera).srgb
+
+    def _read_light(self, hdr: Path) -> Light:
+        light = load_light(hdr)
+        self.notes += [f"{hdr.name}: {note}" for note in light_notes(light)]
+        return light
 
     def materials(self) -> Iterator[tuple[str, Bytes]]:
         """Captions and pictures of what the light is taken from: albedo, normals, roughness, visibility."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import are_rows, existing_file
 
 Row = dict[str, Any]
+MOST_STEPS = 1e12
+LARGEST_NUMBER = 1e300  # of whole numbers, which JSON does not bound
 
 
 def read_config(run: Path) -> Row:
@@ -24,6 +27,8 @@ def read_config(run: Path) -> Row:
     if not isinstance(config, dict):
         raise InputError("config.json of rnd-train", expected="an object", got="another", file=file)
     _check_numbers([config], ("steps", "stage1_fraction"), file)
+    _check_within([config], "steps", MOST_STEPS, file)
+    _check_within([config], "stage1_fraction", 1, file)
     return config
 
 
@@ -45,18 +50,25 @@ def read_scores(run: Path, words: Sequence[str], numbers: Iterable[str]) -> list
 
 
 def read_losses(run: Path) -> list[Row]:
-    """``metrics.jsonl``: one row of numbers for each step, none where there is no such file."""
+    """``metrics.jsonl``: one row of numbers for each step, none where there is no such file.
+
+    A last line that was begun when the training was ended is left out.
+    """
     file = run / "metrics.jsonl"
     if not file.is_file():
         return []
     try:
-        rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line]
+        *whole, last = file.read_text(encoding="utf-8").split("\n")
+        rows = [json.loads(line) for line in whole if line.strip()]
     except (ValueError, RecursionError) as error:
         raise InputError("not JSON lines", got=error, file=file) from error
+    with suppress(ValueError, RecursionError):
+        rows.append(json.loads(last))
     _check_rows(rows, file, "a step in every line", "step")
     _check_numbers(rows, {name for row in rows for name in row}, file)
     if any(row["step"] is None for row in rows):
         raise InputError("step", expected="a number", got="null", file=file)
+    _check_within(rows, "step", MOST_STEPS, file)
     return rows
 
 
@@ -83,5 +95,13 @@ def _check_numbers(rows: Iterable[Row], names: Iterable[str], file: Path) -> Non
     wanted = set(names)
     for row in rows:
         for name in row.keys() & wanted:
-            if not isinstance(row[name], int | float | None):  # a bool is an int here: "skipped"
-                raise InputError(name, expected="a number", got=json.dumps(row[name])[:80], file=file)
+            value = row[name]
+            good = isinstance(value, int | float | None)  # a bool is an int here: "skipped"
+            if not good or (isinstance(value, int) and abs(value) > LARGEST_NUMBER):
+                raise InputError(name, expected="a number", got=json.dumps(value)[:80], file=file)
+
+
+def _check_within(rows: Iterable[Row], name: str, most: float, file: Path) -> None:
+    for value in (row.get(name) for row in rows):
+        if value is not None and not 0 <= value <= most:  # false for NaN
+            raise InputError(name, expected=f"a number, 0 to {most:g}", got=json.dumps(value)[:80], file=file)

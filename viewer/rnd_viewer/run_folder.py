@@ -21,27 +21,31 @@ _PICTURES = ("frames/*", "frames_exr/*", "aov/*/*")  # and nothing deeper, see w
 _WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp)")  # beside them, see part_name
 
 
-def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> None:
-    """Make ``folder`` the folder of the run with ``settings`` on the files ``inputs``, and free of others'."""
+def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> int:
+    """Make ``folder`` the folder of the run with ``settings`` on the files ``inputs``, and free of others'.
+
+    How many files of other runs were removed.
+    """
     mark = folder / f"{_MARK}{_identity(settings, inputs)}"
     try:
         mark.touch(exist_ok=False)
     except FileExistsError:
-        return
+        return 0
     others = [other for other in folder.glob(f"{_MARK}*") if other != mark]
     if not others:
-        return
+        return 0
     try:
         oldest = mark.stat().st_mtime_ns
     except FileNotFoundError:  # another run has claimed the folder since
-        return
+        return 0
     frames = (file for place in _PICTURES for file in folder.glob(place) if _FRAME.fullmatch(file.name))
     whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
-    for file in [*frames, *whole]:
-        if file.is_file() and file.stat().st_mtime_ns < oldest:
-            file.unlink(missing_ok=True)
+    left = [file for file in [*frames, *whole] if file.is_file() and file.stat().st_mtime_ns < oldest]
+    for file in left:
+        file.unlink(missing_ok=True)
     for other in others:
         other.unlink(missing_ok=True)
+    return len(left)
 
 
 def part_name(stem: str, frames: range, count: int) -> str:

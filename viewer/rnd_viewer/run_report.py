@@ -54,8 +54,10 @@ def write_run_report(
     hdrs: tuple[Path, ...] = (),
     bench: Path | None = None,
     pictures: int = 3,
-) -> None:
+) -> list[str]:
     """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
+
+    What is to be said of the motion and the lights, which the page says too.
 
     Args:
         motion: played in the turntable, read for the avatar's skeleton.
@@ -72,11 +74,13 @@ def write_run_report(
     # before the avatar is filmed: what is damaged is found at once
     read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run), config)]
     read += [_bench(bench), _configuration(config)]
-    sections = [f"<h1>{escape(name)}</h1>", _facts(rows), _turntable_and_relights(run, motion, hdrs), *read]
+    avatar, notes = _turntable_and_relights(run, motion, hdrs)
+    sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
     page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
         text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
         temporary.write_text(text, encoding="utf-8")
+    return notes
 
 
 def _facts(rows: Sequence[dict[str, Any]]) -> str:
@@ -87,10 +91,12 @@ def _facts(rows: Sequence[dict[str, Any]]) -> str:
 
 def _turntable_and_relights(
     run: Path, motion: Callable[[Skeleton], Motion] | None, hdrs: tuple[Path, ...]
-) -> str:
+) -> tuple[str, list[str]]:
+    """The section of the avatar, and the notes that it ends with."""
     avatar = run / "avatar.onnx"
     if not avatar.is_file():
-        return _missing("The avatar", f"no avatar.onnx in the run: rnd-export {run / 'avatar.ckpt'} makes it")
+        how = f"no avatar.onnx in the run: rnd-export {run / 'avatar.ckpt'} makes it"
+        return _missing("The avatar", how), []
     shots = Shots(avatar, motion)
     cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs)]
     if importlib.util.find_spec("av"):
@@ -100,10 +106,12 @@ def _turntable_and_relights(
     else:
         cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
     materials = [figure(png(picture, caption), caption) for caption, picture in shots.materials()]
-    return (
+    html = (
         f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
         f'<h3>What the light falls on</h3><div class="grid tiles">{"".join(materials)}</div>'
     )
+    html += "".join(f"<p>Note: {escape(note)}</p>" for note in shots.notes)
+    return html, shots.notes
 
 
 def _metrics(rows: Sequence[dict[str, Any]]) -> str:

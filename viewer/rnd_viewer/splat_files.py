@@ -12,7 +12,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
 
 from .glb import FLOAT, GlbBuilder
-from .splats import Coding, Splats
+from .splats import SH_0, Coding, Splats
 
 # In the order of the 3DGS authors' writer. All 45 higher coefficients, zero or not: some readers count bytes.
 PLY_FIELDS = (
@@ -56,7 +56,7 @@ def write_splat_glb(path: Path, splats: Splats, coding: Coding) -> None:
     Points with COLOR_0 for viewers that do not know the extension. Degrees that are all zero are left out.
     """
     glb = GlbBuilder()
-    colour = 0.5 + splats.harmonics[:, 0] * 0.28209479177387814
+    colour = 0.5 + splats.harmonics[:, 0] * SH_0
     attributes = {
         "POSITION": glb.accessor(splats.means, "VEC3", FLOAT, bounds=True),
         "COLOR_0": glb.accessor(np.clip(np.c_[colour, splats.opacities], 0, 1), "VEC4", FLOAT),

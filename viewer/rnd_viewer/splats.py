@@ -52,8 +52,17 @@ class Splats:
     harmonics: Floats
 
 
+def are_finite(gaussians: Gaussians) -> NDArray[np.bool_]:
+    """[N], which of ``gaussians`` have no number that is not finite."""
+    arrays = (array for name, array in vars(gaussians).items() if name != "root_rotation")
+    rows = np.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)
+    return np.asarray(np.isfinite(rows).all(axis=1))
+
+
 def make_splats(gaussians: Gaussians, harmonics: Floats) -> Splats:
-    """``gaussians`` with ``harmonics`` [N, 16, 3] from :func:`fixed_colour` or :func:`view_dependent_colour`."""
+    """``gaussians``, all of them finite, with ``harmonics`` [N, 16, 3] from :func:`fixed_colour` or
+    :func:`view_dependent_colour`.
+    """
     xx, xy, xz, yy, yz, zz = gaussians.covariances.astype(np.float64).T
     matrices = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
     variances, axes = np.linalg.eigh(matrices)

@@ -47,16 +47,18 @@ X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtre
 WEBP = {"quality": "85", "compression_level": "4"}
 
 
+WEBP_MOST_FPS = 1000  # its frames begin at whole milliseconds
+
 INSTALL = "pip install 'rnd-avatar[video]'"
 
 
-def load_pyav() -> ModuleType:
-    """Import PyAV or say which extra brings it."""
+def load_pyav(otherwise: str = "") -> ModuleType:
+    """Import PyAV, or say which extra brings it and what could be done ``otherwise``."""
     try:
         import av
     except ImportError as error:
         raise InputError(
-            "mp4 and webp need PyAV, which is not installed", hint=f"{INSTALL}, or --format png"
+            "mp4 and webp need PyAV, which is not installed", hint=INSTALL + otherwise
         ) from error
     return av
 
@@ -133,10 +135,17 @@ def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], N
         fps: frames per second.
 
     The size is that of the first frame (mp4: rounded up to even). The same frames give the same bytes. Raises
-    InputError when PyAV is missing or the encoder refuses the size.
+    InputError when PyAV is missing, the encoder refuses the size, or a WebP has more than 1000 frames per second.
     """
     av, name = load_pyav(), Path(path).suffix[1:]
     kind = _KINDS[name]
+    if name == "webp" and fps > WEBP_MOST_FPS:
+        raise InputError(
+            "webp",
+            expected=f"at most {WEBP_MOST_FPS} frames per second",
+            got=f"{fps:g}",
+            hint="--fps sets them",
+        )
     with (
         atomic_path(path) as temporary,
         av.open(str(temporary), "w", format=name, options=kind.container) as container,

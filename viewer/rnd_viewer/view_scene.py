@@ -29,6 +29,7 @@ from rnd_runtime.tone import tone_map
 from .aov import aov_picture, aov_values, splat_features
 from .background import Background
 from .cameras import CameraOptions, frame_motion, front_path
+from .lights import light_notes
 from .view_options import ViewOptions
 from .view_state import ViewState
 
@@ -71,6 +72,7 @@ class Scene:
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
         self._sky = lru_cache(SHADERS_KEPT // 2)(self._smaller_light)
+        self._light_notes: dict[str | Path | None, list[str]] = {}
         self._behind: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
 
@@ -132,6 +134,10 @@ class Scene:
             srgb = np.broadcast_to(shown, (*raster.alpha.shape, 3))
         seconds |= {**raster.seconds, "tone map": perf_counter() - started}
         return Picture(srgb, self._joints(motion, time_s, camera), seconds)
+
+    def notes_of_light(self, state: ViewState) -> list[str]:
+        """What the user should know of the light of a ``state`` that was drawn."""
+        return self._light_notes[self._light_name(state)]
 
     def truth_file(self, index: int) -> Path:
         """The capture's picture ``index``."""
@@ -219,9 +225,15 @@ class Scene:
     def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
         shader = Shader(self._light(name), shade)
         shader.light = self._sky(name)  # from here on it is only turned
+        self._light.cache_clear()
         return shader
 
     def _load_light(self, name: str | Path | None) -> Light:
+        light = self._read_light(name)
+        self._light_notes[name] = light_notes(light)
+        return light
+
+    def _read_light(self, name: str | Path | None) -> Light:
         if name is None:
             return Light(self.avatar.trained_light)
         if isinstance(name, Path):
@@ -231,6 +243,7 @@ class Scene:
 
     def _smaller_light(self, name: str | Path | None) -> Light:
         light = self._light(name)
+        self._light.cache_clear()
         if len(light.radiance) <= LARGEST_SKY:
             return light
         return replace(light, radiance=downsize(light.radiance, LARGEST_SKY, 2 * LARGEST_SKY))
@@ -264,16 +277,8 @@ def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
     if count is None or count >= total:
         return gaussians
     kept = np.arange(count) * total // count
-    return Gaussians(
-        gaussians.means[kept],
-        gaussians.covariances[kept] * np.float32(total / count),
-        gaussians.opacities[kept],
-        gaussians.normals[kept],
-        gaussians.albedo[kept],
-        gaussians.roughness[kept],
-        gaussians.visibility[kept],
-        gaussians.root_rotation,
-    )
+    fewer = gaussians.only(kept)
+    return replace(fewer, covariances=fewer.covariances * np.float32(total / count))
 
 
 def _probes(paths: tuple[Path, ...]) -> list[Path]:

@@ -16,11 +16,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from socket import AF_INET, AF_INET6
+from socket import AF_INET, AF_INET6, SOCK_DGRAM, gethostname, socket
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from types import ModuleType
@@ -41,6 +40,7 @@ INSTALL = "pip install 'rnd-avatar[view]'"
 COOKIE = "rnd_view_token"
 JPEG_QUALITY = 90
 HTTP_PORT = 80  # which browsers leave out of the host's name
+_ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one, for examples, that lies elsewhere
 MOST_BYTES_IN = 1 << 16  # a request is a few hundred
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -78,22 +78,27 @@ class Access:
 
     def refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
         """Why a request is not answered, or None if it is."""
+        try:
+            return self._refusal(path, headers)
+        except (ValueError, LookupError):  # an address that is none, a header that is there twice
+            return HTTPStatus.BAD_REQUEST, "not a request that rnd-view understands\n"
+
+    def _refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
+        query = urlsplit(path).query
         host, origin = headers.get("Host", "").lower(), headers.get("Origin")
         if self.hosts is not None and host not in self.hosts:
             return HTTPStatus.FORBIDDEN, "rnd-view answers to this machine's own address only\n"
         if origin is not None and urlsplit(origin).netloc.lower() != host:
             return HTTPStatus.FORBIDDEN, "another site's page may not use rnd-view\n"
-        if self.token is not None and not self._has_token(path, headers):
+        if self.token is not None and not self._has_token(query, headers):
             return HTTPStatus.UNAUTHORIZED, "open the address that rnd-view printed, token included\n"
         return None
 
-    def _has_token(self, path: str, headers: Any) -> bool:
+    def _has_token(self, query: str, headers: Any) -> bool:
         assert self.token is not None
-        try:
-            cookie = SimpleCookie(headers.get("Cookie", "")).get(COOKIE)
-        except CookieError:
-            cookie = None
-        given = [*parse_qs(urlsplit(path).query).get("token", []), *([cookie.value] if cookie else [])]
+        # By hand: Python's own parser stops at the first cookie, of whatever other program, that it does not like.
+        cookies = (cookie.strip().partition("=") for cookie in headers.get("Cookie", "").split(";"))
+        given = parse_qs(query).get("token", []) + [value for name, _, value in cookies if name == COOKIE]
         return any(hmac.compare_digest(text.encode(), self.token.encode()) for text in given)
 
 
@@ -143,7 +148,7 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
     try:
         port = server.socket.getsockname()[1]
         access.append(Access(token, None) if token else Access.local(host, port))
-        name = f"[{host}]" if ":" in host else host
+        name = _name_from_elsewhere(host)
         yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
     finally:
         server.socket.close()
@@ -151,6 +156,21 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
         if not server.socket_closed.is_set():
             server.serve_forever()
         server.shutdown()
+
+
+def _name_from_elsewhere(host: str) -> str:
+    """What stands for ``host`` in an address; where that is all of this machine's addresses, one of them."""
+    family = AF_INET6 if ":" in host else AF_INET
+    if host in _ALL_ADDRESSES:
+        with socket(family, SOCK_DGRAM) as unused:
+            try:
+                unused.connect(
+                    (_ALL_ADDRESSES[host], HTTP_PORT)
+                )  # nothing is sent: it only picks our own address
+                host = unused.getsockname()[0]
+            except OSError:  # no network
+                host = gethostname()
+    return f"[{host}]" if ":" in host else host
 
 
 def _static(connection: Any, path: str, access: Access) -> Any:
@@ -212,6 +232,7 @@ class _Visitor:
     def _render(self, socket: Any, request: RenderRequest) -> None:
         with self._drawing:
             picture = self._scene.render(request.state)
+            notes = self._scene.notes_of_light(request.state)
         pixels, encoding_ms = encode(picture, request.state.encoding)
         header = {
             "kind": "picture",
@@ -219,7 +240,8 @@ class _Visitor:
             "width": picture.srgb.shape[1],
             "height": picture.srgb.shape[0],
             "encoding": request.state.encoding,
-            "joints": picture.joints.round(2).tolist(),
+            "joints": picture.joints.astype(np.float64).round(2).tolist(),
+            "notes": notes,
             "times": {name: 1e3 * seconds for name, seconds in picture.seconds.items()}
             | {"encoding": encoding_ms},
         }

@@ -65,7 +65,15 @@ def check_clip(frames: int, gaussians: int) -> None:
 
 
 def write_visionary(path: Path, frames: Sequence[Splats], fps: float) -> None:
-    """Write a clip of ``frames``, all of N Gaussians."""
+    """Write a clip of ``frames``.
+
+    Raises:
+        InputError: they have not as many Gaussians each.
+    """
+    counts = [len(splats.means) for splats in frames]
+    if min(counts) < max(counts):
+        got = f"{min(counts)} to {max(counts)}"
+        raise InputError("visionary", expected="as many finite Gaussians in every frame", got=got, file=path)
     gaussians, colours = (np.stack(parts) for parts in zip(*map(packed, frames)))
     with atomic_path(path) as temporary:
         temporary.write_bytes(_model(gaussians, colours, fps))

@@ -43,7 +43,7 @@ def parse_formats(text: str | None) -> tuple[str, ...]:
     if not names or names - set(FORMATS):
         raise InputError("--format", expected=f"some of {','.join(FORMATS)}", got=text or "nothing")
     if names & set(CLIPS):
-        load_pyav()
+        load_pyav(", or --format png")
     return tuple(name for name in FORMATS if name in names)
 
 

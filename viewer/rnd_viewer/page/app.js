@@ -18,6 +18,7 @@ let number = 0, shown = 0, wanted = false, flying = new Map();
 let waiting = [];  // {number, done, failed} of those who want a picture for themselves
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [];
+let passing = true;  // the message goes when a picture comes
 
 function redraw() { wanted = true; }
 
@@ -42,7 +43,7 @@ function ask(exact) {
 }
 
 function show(picture) {
-  if (picture.number < shown) return;  // it took longer to decode than the one after it
+  if (picture.number < shown) return picture.image.close?.();  // it took longer to decode than the one after it
   shown = picture.number;
   const sent = flying.get(picture.number);
   for (const old of [...flying.keys()]) if (old <= picture.number) flying.delete(old);
@@ -53,14 +54,22 @@ function show(picture) {
   }
   if (picture.image instanceof ImageData) context.putImageData(picture.image, 0, 0);
   else context.drawImage(picture.image, 0, 0);
+  picture.image.close?.();
   drawSkeleton(picture);
+  showNotes(picture.notes);
   const now = performance.now();
   rates = [...rates.filter((at) => now - at < 1000), now];
   times = picture.times;
   times["to the page and back"] = Math.max(now - sent - Object.values(times).reduce((a, b) => a + b, 0), 0);
   for (const one of waiting) if (one.number <= picture.number) one.done(picture);
   waiting = waiting.filter((one) => one.number > picture.number);
-  if ($("message").textContent && !$("message").classList.contains("wrong")) say("");
+  if ($("message").textContent && passing) say("");
+}
+
+/** What is to be said of the scene, and of the light of a picture. */
+function showNotes(ofLight = []) {
+  const text = [...scene.notes, ...ofLight].join(" · ");
+  if ($("notes").textContent !== text) $("notes").textContent = text;
 }
 
 function drawSkeleton(picture) {
@@ -122,7 +131,9 @@ function play(on) {
   redraw();
 }
 
-function say(text, wrong = false) {
+/** Show a message until another comes, or a picture where it is `untilPicture`. */
+function say(text, { wrong = false, untilPicture = false } = {}) {
+  passing = untilPicture;
   $("message").textContent = text;
   $("message").classList.toggle("wrong", wrong);
 }
@@ -146,8 +157,9 @@ function setScene(description) {
   options($("shade"), SHADES.map((name) => [name, name]));
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
-  $("time").max = scene.motion.duration || 1;
   $("time").step = 1 / scene.motion.fps;
+  $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // a slider stops short of an end that rounding put off its steps
+  $("time").disabled = scene.motion.duration === 0;
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
   $("play").disabled = scene.motion.duration === 0;
   freeClip();
@@ -156,7 +168,8 @@ function setScene(description) {
   setGaussians();
   if (first) Object.assign(state, { width: scene.size, height: scene.size });
   if (moved) home();
-  $("notes").textContent = scene.notes.join(" · ");
+  showNotes();
+  say("");
   redraw();
 }
 
@@ -172,6 +185,7 @@ async function setTruth() {
   $("truth-pane").hidden = !on;
   $("light").disabled = on;  // the picture's own shines
   say("");  // what was said of another picture
+  freeClip();
   if (on) {
     play(false);
     engine.truth(index);
@@ -180,13 +194,14 @@ async function setTruth() {
 }
 
 function showTruth(index, bitmap) {
-  if (index !== state.truth) return;  // another was asked for since
+  if (index !== state.truth) return bitmap?.close();  // another was asked for since
   const canvas = $("truth"), { label, width, height } = scene.truths[index];
   canvas.dataset.index = index;
   canvas.width = bitmap?.width ?? width;  // and it is blank
   canvas.height = bitmap?.height ?? height;
-  if (bitmap) canvas.getContext("2d").drawImage(bitmap, 0, 0);
-  else say(`${label}: this browser cannot decode the picture`, true);
+  if (!bitmap) return say(`${label}: this browser cannot decode the picture`, { wrong: true });
+  canvas.getContext("2d").drawImage(bitmap, 0, 0);
+  bitmap.close();
 }
 
 function download(blob, name) {
@@ -203,12 +218,13 @@ function picture(exact = true) {
 }
 
 async function screenshot() {
+  const name = `avatar_${state.time.toFixed(2)}s.png`;
   if (!await picture().catch(() => null)) return;  // the page says why
   const canvas = document.createElement("canvas");
   Object.assign(canvas, { width: $("picture").width, height: $("picture").height });
   canvas.getContext("2d").drawImage($("picture"), 0, 0);
   canvas.getContext("2d").drawImage($("overlay"), 0, 0, canvas.width, canvas.height);
-  canvas.toBlob((blob) => download(blob, `avatar_${state.time.toFixed(2)}s.png`));
+  canvas.toBlob((blob) => download(blob, name));
 }
 
 function clip() {
@@ -228,7 +244,11 @@ function endClip() {
   freeClip();
 }
 
-function freeClip() { $("clip").disabled = clipMade !== null || !scene?.motion.duration; }
+function freeClip() {
+  const compared = state.truth !== null;
+  $("clip").disabled = clipMade !== null || compared || !scene?.motion.duration;
+  $("clip").title = compared ? "a clip films the motion: switch “ground truth beside” off" : "";
+}
 
 function slider(id, apply) {
   $(id).addEventListener("input", () => { apply(Number($(id).value)); redraw(); });
@@ -239,7 +259,7 @@ function bind() {
   slider("exposure", (stops) => { state.exposure = stops; });
   slider("size", (pixels) => { state.width = state.height = pixels; });
   slider("gaussians", setGaussians);
-  slider("time", (seconds) => { state.time = seconds; play(false); });
+  slider("time", (seconds) => { state.time = Math.min(seconds, scene.motion.duration); play(false); });
   for (const name of ["shade", "background"])
     $(name).addEventListener("change", () => { state[name] = $(name).value; redraw(); });
   $("light").addEventListener("change", () => { state.light = Number($("light").value); redraw(); });
@@ -255,9 +275,12 @@ function bind() {
   $("screenshot").addEventListener("click", screenshot);
   $("clip").addEventListener("click", clip);
   document.addEventListener("keydown", (event) => {
-    if (event.target.matches("select") || !scene) return;
-    if (event.code === "Space") { event.preventDefault(); event.target.blur?.(); play(!playing); }
-    else if (event.code === "KeyR") home();
+    if (event.target.matches("select") || !scene || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.code === "Space") {
+      if (event.target.matches("button, [type=checkbox], [type=file]")) return;  // which it presses
+      event.preventDefault();
+      play(!playing);
+    } else if (event.code === "KeyR") home();
     else if (event.code === "Comma" || event.code === "Period") {
       const frames = event.code === "Comma" ? -1 : 1;
       state.time = Math.min(Math.max(state.time + frames / scene.motion.fps, 0), scene.motion.duration);
@@ -271,12 +294,15 @@ function bindFiles() {
   $("files").hidden = false;
   const load = async (files) => {
     const list = [...files];  // the browser takes its own list away when this function waits
-    if (!list.length) return say("expected files, got something else", true);
+    if (!list.length) return say("expected files, got something else", { wrong: true });
     if (clipMade) await clipMade.promise;  // which is of one scene
     say(`reading ${list.map((file) => file.name).join(", ")} …`);
     await engine.load(list);
   };
-  $("choose").addEventListener("change", () => load($("choose").files));
+  $("choose").addEventListener("change", () => {
+    load($("choose").files);
+    $("choose").value = "";  // or the same file, changed meanwhile, could not be chosen again
+  });
   document.addEventListener("dragover", (event) => { event.preventDefault(); document.body.classList.add("over"); });
   document.addEventListener("dragleave", () => document.body.classList.remove("over"));
   document.addEventListener("drop", (event) => {
@@ -287,7 +313,9 @@ function bindFiles() {
 }
 
 function fail(text, endsClip = true) {
-  say(text, true);
+  say(text, { wrong: true, untilPicture: !(endsClip && clipMade) });
+  playing = false;  // or it would fail for every picture of a second
+  if (scene) showState();
   if (endsClip) endClip();
   flying.clear();
   for (const one of waiting) one.failed(new Error(text));
@@ -298,10 +326,10 @@ const handlers = {
   scene: setScene,
   picture: show,
   truth: showTruth,
-  message: (text) => say(text),
+  message: (text) => say(text, { untilPicture: true }),
   progress: (done, of) => say(`making a clip: ${done} of ${of}`),
   clip: (blob, name) => { endClip(); say(""); download(blob, name); },
-  refused: (text) => say(text, true),
+  refused: (text) => say(text, { wrong: true }),
   error: fail,
 };
 

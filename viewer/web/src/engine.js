@@ -13,13 +13,16 @@ const CLIP_TYPES = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "vi
 export async function connect(on) {
   const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
   const taken = new Map();  // pictures that are not for the page: number → {done, failed}
+  let answered = false, dead = null;  // why the worker could not start
   worker.onerror = (event) => {
     const what = event.message || "the worker cannot start";
     for (const { failed } of taken.values()) failed(new Error(what));
     taken.clear();
+    if (!answered) dead = what;
     on.error(what, false);
   };
   worker.onmessage = ({ data }) => {
+    answered = true;
     if (data.kind === "scene") on.scene(data.scene);
     else if (data.kind === "message") on.message(data.text);
     else if (taken.has(data.number)) settle(taken, data);
@@ -29,7 +32,8 @@ export async function connect(on) {
   const render = (number, state) => worker.postMessage({ ask: "render", number, state });
   const load = async (files) => {
     const contents = await Promise.all(files.map(read)).catch((error) => on.refused(error.message));
-    if (contents) worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
+    if (contents && dead) on.refused(dead);
+    else if (contents) worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
   };
   let clipNumber = 0;
   const picture = (state) => new Promise((done, failed) => {
@@ -59,15 +63,31 @@ async function read(file) {
 }
 
 function addressed() {
-  const query = new URLSearchParams(location.search);
-  return ["avatar", "motion", "hdr"].flatMap((key) => (query.get(key) ?? "").split(",").filter(Boolean));
+  const values = new Map(location.search.slice(1).split("&").map((pair) => pair.split(/=(.*)/s, 2)));
+  const names = (key) => (values.get(key) ?? "").split(",").filter(Boolean);  // before a name's own comma is decoded
+  return ["avatar", "motion", "hdr"].flatMap(names).map((text) => new URLSearchParams(`name=${text}`).get("name"));
+}
+
+/** What is fetched for a name: itself where it is a whole address, else a path that may have # and % in it. */
+function addressOf(name) {
+  const address = /^[a-z][a-z0-9+.-]*:/i.test(name) ? name : name.replaceAll("%", "%25").replaceAll("#", "%23");
+  return new URL(address, location.href);
+}
+
+function shownName(address) {
+  const name = address.pathname.split("/").pop();
+  try {
+    return decodeURIComponent(name);
+  } catch {
+    return name;  // bytes that are no UTF-8
+  }
 }
 
 function fetchFiles(names) {
   return Promise.all(names.map(async (name) => {
-    const answer = await fetch(name);
+    const address = addressOf(name), answer = await fetch(address);
     if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
-    return new File([await answer.blob()], new URL(name, location.href).pathname.split("/").pop());
+    return new File([await answer.blob()], shownName(address));
   }));
 }
 

@@ -51,6 +51,7 @@ function readHeader(bytes) {
     for (let name = word(); name; name = word()) {
       word();  // its type, which its name tells
       const end = number() + at;
+      if (end < at) throw refusal("the .exr file is damaged");  // a negative size would lead back here for ever
       readers[name]?.(end);
       at = end;
     }

@@ -9,7 +9,7 @@ import { axisAngleToMatrix, multiply, rotate } from "./rotations.js";
 const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length"];
 const MAX_ANGLE = 100, MANY_BEYOND_A_TURN = 0.2;  // rad; share of the rotations
 const MAX_DISTANCE = 1000;  // m
-const DEFAULT_FPS = 60, MAX_FPS = 10_000;
+const DEFAULT_FPS = 60, MIN_FPS = 0.001, MAX_FPS = 10_000;
 const FINGERS = 30;
 
 /** {name, rotations [F·J·9] local, translations [F·3] m, added to the root's rest position, restRoot [3] m that they were made
@@ -149,9 +149,9 @@ function readFrameRate(members, notes) {
     return DEFAULT_FPS;
   }
   const { numbers } = members.numbers(key);
-  if (numbers.length === 1 && numbers[0] > 0 && numbers[0] <= MAX_FPS) return numbers[0];
+  if (numbers.length === 1 && numbers[0] >= MIN_FPS && numbers[0] <= MAX_FPS) return numbers[0];
   const few = Array.from(numbers.subarray(0, 4), (value) => (Number.isInteger(value) ? value.toFixed(1) : String(value)));
-  throw refusal(key, { expected: "frames per second, above 0", got: `[${few.join(", ")}]`, file: members.file });
+  throw refusal(key, { expected: `frames per second, ${MIN_FPS} to ${MAX_FPS}`, got: `[${few.join(", ")}]`, file: members.file });
 }
 
 function readUpAxis(members, otherwise) {

@@ -32,7 +32,9 @@ async function load(files) {
     if (next.avatar) {
       const { skeleton } = next.avatar;
       next.motion = next.record ? fitMotion(next.record, skeleton) : restMotion(skeleton);
-      answer = { kind: "scene", scene: description(next, files) };
+      const waited = !before.avatar && next.lights.length > 1;  // lights for their avatar
+      const lit = waited || files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
+      answer = { kind: "scene", scene: description(next, lit) };
     }
     scene = next;
     posed = null;
@@ -52,12 +54,12 @@ async function take({ name, bytes }, next, opened) {
     next.lights = [{ name: "the avatar's own", own: true, light: own, shaders: new Map() }, ...others];
   } else if (kind === "npz") next.record = readMotionFile(bytes, name);
   else if (kind === "hdr" || kind === "exr") {
-    next.lights = [...next.lights, { name, light: readLight(bytes, name), shaders: new Map() }];
+    next.lights = [...next.lights.filter((light) => light.own || light.name !== name), { name, light: readLight(bytes, name), shaders: new Map() }];
   } else throw refusal("kind of file", { expected: ".onnx, .npz, .hdr or .exr", got: `.${kind}`, file: name });
 }
 
-function description({ avatar, motion, lights }, files) {
-  const lit = files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
+/** What the page needs to know; where the scene is `lit` anew, by the last of its lights. */
+function description({ avatar, motion, lights }, lit) {
   const repaired = lights.filter(({ light }) => light.repaired).map(({ name, light }) => `${name}: ${light.repaired} broken texels filled in`);
   return {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
