@@ -60,9 +60,7 @@ class ImageHeader:
     height: int
     channels: tuple[str, ...]
     pixel_type: str  # uint8, uint16, half, float, …
-    chromaticities: tuple[float, ...] | None = (
-        None  # of an EXR that says: x and y of red, green, blue and white
-    )
+    chromaticities: tuple[float, ...] | None = None  # x, y of red, green, blue and white, where an EXR says
 
 
 def read_header(path: str | Path) -> ImageHeader:
@@ -122,9 +120,8 @@ def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str,
         reason = target.geterror()
         if not (target.close() and written):
             raise InputError("image cannot be written", got=_reason(reason or target.geterror()), file=path)
-        if suffix == ".png" and not temporary.read_bytes().endswith(
-            _PNG_END
-        ):  # of a full disk its writer is silent
+        # of a full disk its writer says nothing
+        if suffix == ".png" and not temporary.read_bytes().endswith(_PNG_END):
             raise InputError("image cannot be written", got="half a file: the disk may be full", file=path)
 
 
