@@ -49,7 +49,8 @@ class TrainOptions:
     seed: int = 0
     """of every random draw"""
     perceptual_weights: Path | None = None
-    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses"""
+    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses (with --light none the
+    first alone)"""
     unseen_poses: bool = True
     """when the pictures are done, teach the skinning poses that nobody filmed: a squat then tears less, and what was
     filmed hardly changes"""

@@ -67,7 +67,7 @@ def grey_prior(radiance: Tensor, solid_angles: Tensor) -> Tensor:
 
 
 def sky_prior(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Tensor:
-    """Mean of d² / (1 + d²), d the logarithm of a probe [32, 64, 3] beside a natural sky of the same level.
+    """Mean of d² / (1 + d²), d the logarithm of a probe [32, 64, 3] beside a natural sky of the same median.
 
     Geman and McClure's function: a sun, which is far from any sky, is left alone, and near the level nothing holds
     the sky back when all of it darkens beside the sun (an absolute value would).

@@ -1,7 +1,8 @@
 """Corrections of estimated body poses, learned with the avatar: bounded, delayed, one row a picture.
 
-What is corrected in training is where the bones are; windows and velocities stay those of the estimate. Poses between
-the training frames are nobody's to correct, and keep what they had.
+What is corrected in training is where the bones are; windows and velocities are those of the estimate there, and in
+playback those of the motion that is played, corrected or not. Poses between the training frames are nobody's to
+correct, and keep what they had.
 """
 
 from __future__ import annotations
