@@ -11,7 +11,7 @@ import gl_devices
 from gl_devices import BACKENDS
 from posing_test import _scene
 from raster_scenes import off_centre_camera, random_scene
-from rnd_runtime._raster_project import view_of
+from rnd_runtime._raster_project import pinhole
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.gaussians import Gaussians
@@ -116,7 +116,7 @@ def _gaussians(scene, normals=None):
 @pytest.mark.parametrize("eye", [(0.4, 0.3, -2.5), (0.1, 0.0, 0.1)])
 def test_projection_is_the_cpus(device, width, height, eye):
     scene, camera = random_scene(1, 2500), off_centre_camera(width, height, eye)
-    expected = sorted_ellipses(*scene, view_of(camera))
+    expected = sorted_ellipses(*scene, pinhole(camera))
     projected = device.projection.project(device.upload.write(_gaussians(scene)), camera, None)
     order = np.frombuffer(projected.order.read(), np.int32)[: projected.ranks]
     both = np.intersect1d(order, expected.order)
