@@ -73,7 +73,7 @@ FRAMES = 40
 """pictures that are looked at, spread evenly over the capture"""
 FACING = 0.3
 """cosine between normal and view below which a point's colour is not trusted"""
-LEAST_SIGHTINGS = 4
+LEAST_SIGHTINGS = 3
 """of a point before it has a say in where suns are: a sun that shines only on what is seen once or twice, its albedo
 unknown, contradicts nothing, and the search would give it all the light"""
 OCCLUSION = 0.03
