@@ -69,9 +69,8 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
     first = _reference_frames(rotations[:, limbs])
     quarters = _quarters_to_front(turned[first, 0])
-    turn = axis_angle_to_matrix(
-        [0, quarters * np.pi / 2, 0]
-    )  # of the root: in their parents' frames others stay
+    # of the root alone: in their parents' frames others stay
+    turn = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
     rotations, world = rotations[first:], turn @ world
     rotations[:, 0] = turn @ rotations[:, 0]
 

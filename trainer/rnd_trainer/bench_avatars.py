@@ -106,7 +106,7 @@ def sources(package: str) -> list[Path]:
     """The source files of ``package``, found without importing it; none where it is not installed."""
     found = importlib.util.find_spec(package)
     folders = () if found is None else found.submodule_search_locations or ()
-    return sorted(file for folder in folders for file in Path(folder).glob("*.py"))
+    return sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
 
 
 def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:

@@ -49,8 +49,12 @@ class Checkpoint:
         """Whether this is the capture.json that the avatar was trained on."""
         digest = self.info.get("capture_sha256")
         if digest is None:  # checkpoints of before have none
-            return bool(self.info.get("capture") == capture.parent.resolve().name)
+            return self.learned_in(capture.parent)
         return bool(digest == sha256_of(capture))
+
+    def learned_in(self, folder: Path) -> bool:
+        """Whether the capture that the avatar was trained on lay in a folder of this name, edited since or not."""
+        return bool(self.info.get("capture") == folder.resolve().name)
 
     def note(self) -> str | None:
         """What a user should know of an avatar whose training was stopped before there was a light; else None."""

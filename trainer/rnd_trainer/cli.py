@@ -96,9 +96,7 @@ def _train(options: TrainOptions) -> None:
     folder = options.out
     state = folder / STATE_FILE
     if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
-        hint = (
-            "choose another --out" if not state.exists() else "--resume continues it; or choose another --out"
-        )
+        hint = ("--resume continues it; or " if state.exists() else "") + "choose another --out"
         raise InputError("holds a training already", file=folder, hint=hint)
     perceptual = load_lpips(options.perceptual_weights)
     with _memory_runs_out():

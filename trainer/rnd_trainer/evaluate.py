@@ -56,7 +56,7 @@ class Judge:
     ) -> None:
         self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
         self.motion = capture.motion if motion is None else motion
-        own = checkpoint.info.get("capture") == capture.folder.resolve().name  # edited since or not
+        own = checkpoint.learned_in(capture.folder)
         self._trained = {frame.light for frame in capture.split("train")} if own else set()
         self._shaders: dict[str | None, Shader | None] = {}
 

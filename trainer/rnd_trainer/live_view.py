@@ -18,6 +18,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from .metrics_log import row_of
+
 PORT = 7860
 """tried first; any free one when it is taken"""
 POINTS = 300
@@ -50,17 +52,9 @@ class Metrics:
                 stream.seek(self._offset)
                 content = stream.read()
             whole = content[: content.rfind(b"\n") + 1]
-            self.rows += [row for line in whole.splitlines() if (row := _row(line)) is not None]
+            self.rows += [row for line in whole.splitlines() if (row := row_of(line)) is not None]
             self._offset += len(whole)
             return list(self.rows)
-
-
-def _row(line: bytes) -> dict[str, Any] | None:
-    try:
-        row = json.loads(line)
-    except (ValueError, RecursionError):
-        return None
-    return row if isinstance(row, dict) and "step" in row else None
 
 
 def state(rows: list[dict[str, Any]], total: int, previews: list[str]) -> dict[str, Any]:

@@ -33,6 +33,7 @@ from .checkpoint import save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
 from .data import TrainingView, load_views, pose_input, training_light, training_light_name
 from .light import PROBE_SHAPE, LightProbe, as_probe
+from .metrics_log import row_of
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
 from .perceptual import Perceptual
@@ -441,19 +442,10 @@ def _keep_until(path: Path, step: int) -> TextIO:
     kept = []
     if path.exists():
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        kept = [line for line in lines if (done := _step_of(line)) is not None and done < step]
+        kept = [line for line in lines if (row := row_of(line)) is not None and row["step"] < step]
     with atomic_path(path) as temporary:
         temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
     return path.open("a", encoding="utf-8", buffering=1)  # line by line: --view reads along
-
-
-def _step_of(line: str) -> int | None:
-    """Of a row of the metrics log; None for a line that is cut, or no row at all."""
-    try:
-        step = json.loads(line)["step"]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return None
-    return step if isinstance(step, int) else None
 
 
 @contextmanager

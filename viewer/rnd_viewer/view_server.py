@@ -164,9 +164,8 @@ def _name_from_elsewhere(host: str) -> str:
     if host in _ALL_ADDRESSES:
         with socket(family, SOCK_DGRAM) as unused:
             try:
-                unused.connect(
-                    (_ALL_ADDRESSES[host], HTTP_PORT)
-                )  # nothing is sent: it only picks our own address
+                # nothing is sent: it only picks our own address
+                unused.connect((_ALL_ADDRESSES[host], HTTP_PORT))
                 host = unused.getsockname()[0]
             except OSError:  # no network
                 host = gethostname()

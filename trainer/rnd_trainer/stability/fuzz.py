@@ -23,10 +23,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import rnd_runtime
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import write_json
-from rnd_trainer.bench_avatars import content_key
+from rnd_trainer.bench_avatars import content_key, sources
 
 from .commands import environment
 from .figures import Figure, at_most, holds
@@ -377,8 +376,7 @@ def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], obj
 
 def _readers_key() -> str:
     """Of the code that reads: what another one did says nothing of this one."""
-    packages = Path(rnd_runtime.__file__).parent, Path(__file__).parents[1]
-    return content_key(*(file for package in packages for file in sorted(package.rglob("*.py"))))
+    return content_key(*sources("rnd_runtime"), *sources("rnd_trainer"))
 
 
 def _batch(folder: Path, name: str, seed: int, size: int) -> dict[str, Any]:
