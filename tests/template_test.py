@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rnd_runtime.errors import InputError
-from rnd_trainer.template import sample_template, skin
+from rnd_trainer.template import BUCKET, farthest_points, sample_template, skin
 from tiny import body
 
 
@@ -44,6 +44,20 @@ def test_interpolation_is_smooth(template) -> None:
     assert (
         np.abs(interpolated - template.codes[:, 1]).max() < 2 * template.spacing * 2
     )  # within two node spacings
+
+
+@pytest.mark.parametrize("candidates", (1, BUCKET - 1, 10 * BUCKET + 1))
+@pytest.mark.parametrize("lattice", (False, True), ids=("scattered", "ties"))
+def test_farthest_points_are_those_of_the_plain_search(candidates, lattice) -> None:
+    rng = np.random.default_rng(candidates)
+    points = rng.integers(0, 5, (candidates, 3)) if lattice else rng.normal(size=(candidates, 3))
+    points, first = points.astype(np.float32), candidates // 3
+    plain, nearest = [first], np.full(candidates, np.inf, np.float32)
+    while len(plain) < candidates:
+        x, y, z = (points - points[plain[-1]]).T
+        nearest = np.minimum(nearest, x * x + y * y + z * z)
+        plain.append(int(nearest.argmax()))
+    assert np.array_equal(farthest_points(points, candidates, first), plain)
 
 
 def test_same_seed_same_points(template) -> None:
