@@ -288,11 +288,21 @@ def test_rows_of_other_files_are_measured_again(tmp_path, monkeypatch) -> None:
     assert [new_rows(), new_rows()] == [{True}, {False}]
     body.write_bytes(b"another")
     assert [new_rows(), new_rows()] == [{True}, {False}]
+    monkeypatch.setattr(bench_grid, "checkpoint_model", lambda file: {"gaussians": len(file.read_bytes())})
     (tmp_path / "avatar.ckpt").write_bytes(b"trained")
-    trained = dataclasses.replace(inputs, checkpoint=tmp_path / "avatar.ckpt")
+    trained = dataclasses.replace(inputs, checkpoints=(tmp_path / "avatar.ckpt",))
     assert [new_rows(trained), new_rows(trained)] == [{True}, {False}]
     with pytest.raises(InputError, match="checkpoint not found"):
-        new_rows(dataclasses.replace(inputs, checkpoint=tmp_path / "nowhere.ckpt"))
+        new_rows(dataclasses.replace(inputs, checkpoints=(tmp_path / "nowhere.ckpt",)))
+    (tmp_path / "other.ckpt").write_bytes(b"trained")
+    both = dataclasses.replace(inputs, checkpoints=(tmp_path / "avatar.ckpt", tmp_path / "other.ckpt"))
+    with pytest.raises(InputError, match="one avatar of 7 Gaussians"):
+        new_rows(both)
+    (tmp_path / "other.ckpt").write_bytes(b"a smaller one")
+    assert both.source(7)[0].name == "avatar.ckpt" and both.source(13) == (tmp_path / "other.ckpt", "trained")
+    assert [new_rows(both), new_rows(both)] == [{True}, {False}]
+    monkeypatch.setattr(bench_grid, "sources", lambda package: [body])  # other code is measured again
+    assert [new_rows(both), new_rows(both)] == [{True}, {False}]
 
 
 def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, monkeypatch) -> None:
@@ -395,7 +405,7 @@ def test_the_front_is_what_nothing_beats() -> None:
 def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
     rows = [
         {**dataclasses.asdict(Setting(n=n, encoder=encoder)), "ms_median": n / 1000, "psnr_db": 40 + n / 1e4,
-         "stages": {"encoders": 3.0, "raster": n / 1e4}, "machine": "this one"}
+         "stages": {"encoders": 3.0, "raster": n / 1e4}, "machine": "this one", "avatar": "trained"}
         for n in (8_000, 30_000) for encoder in ("full", "coarse")
     ]  # fmt: skip
     files = [tmp_path / "chart.svg", tmp_path / "chart.png"]
@@ -413,7 +423,9 @@ def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
         assert words in svg, words
     assert files[1].read_bytes()[:4] == b"\x89PNG"
     draw_chart(rows, [tmp_path / "again.svg"])
-    assert (tmp_path / "again.svg").read_text("utf-8") == svg
+    assert (tmp_path / "again.svg").read_text("utf-8") == svg and "untrained" not in svg
+    draw_chart([rows[0], rows[1] | {"avatar": "seeded"}], [tmp_path / "other.svg"])
+    assert "hollow: an untrained avatar" in (tmp_path / "other.svg").read_text("utf-8")
     with pytest.raises(InputError, match="at least one measured point"):
         draw_chart([{"failed": "x"}], files)
 

@@ -3,7 +3,9 @@
 **The seeded avatar** stands on the embedded body. Its networks are drawn at random, their highest frequencies damped
 as in trained ones, and scaled so that they say what trained ones say: weights that move a few per cent, offsets of
 millimetres, visibility around 1. Its albedo follows from the place by a formula (stripes and patches), opacities are
-those of a training's start. It is no likeness of anybody: it has a trained avatar's cost and its kind of errors.
+those of a training's start. It is no likeness of anybody. Its frames cost what a trained avatar's cost, and
+err alike by shading and rasteriser; by encoder they err less (the static one by 1 mm where the trained dancer's errs by
+17), as its networks say less.
 """
 
 from __future__ import annotations

@@ -17,6 +17,8 @@ from .charts import chart
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
 USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
+SEEDED = "seeded"
+"""``avatar`` of a row whose networks nobody trained"""
 MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
 CEILING_DB = 60.0
 """points above it are drawn on it: a picture that is the reference's has a hundred"""
@@ -87,6 +89,10 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
     handles += [
         axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()
     ]
+    if any(row["avatar"] == SEEDED for row in rows):
+        handles.append(
+            axes.scatter([], [], facecolor="none", edgecolor="#555", label="hollow: an untrained avatar")
+        )
     words.legend(handles=handles, loc="lower left", fontsize=8, frameon=False, borderaxespad=0)
 
 
@@ -108,9 +114,10 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
     import matplotlib.ticker
 
     for row in rows:
+        colour, seeded = COLOURS.get(row["n"], "#333"), row["avatar"] == SEEDED
         axes.scatter(
-            row[cost], _shown_db(row), color=COLOURS.get(row["n"], "#333"), marker=MARKERS[row["encoder"]],
-            s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, edgecolor="white", zorder=2,
+            row[cost], _shown_db(row), facecolor="none" if seeded else colour, edgecolor=colour if seeded else "white",
+            marker=MARKERS[row["encoder"]], s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, zorder=2,
         )  # fmt: skip
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))

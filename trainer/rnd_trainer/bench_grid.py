@@ -2,7 +2,7 @@
 are crossed with one another, all combinations of them or some drawn at random.
 
 Every point is one row of JSON. Rows that are there already, measured on this machine, of the same files and by the same
-version, are not measured again: an interrupted run goes on where it stopped.
+code, are not measured again: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -20,7 +20,15 @@ from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import earlier_rows, existing_file, output_folder, write_json
 
-from .bench_avatars import Encoders, checkpoint_model, content_key, exported, forget, seeded_checkpoint
+from .bench_avatars import (
+    Encoders,
+    checkpoint_model,
+    content_key,
+    exported,
+    forget,
+    seeded_checkpoint,
+    sources,
+)
 from .bench_frame import Point, measure
 from .bench_reference import errors, reference
 
@@ -47,32 +55,38 @@ class Setting:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Files that the points share. ``checkpoint`` stands in for the seeded avatar where N is its own."""
+    """Files that the points share. Of ``checkpoints`` each stands in for the seeded avatar where N is its own."""
 
     body: Path
     motion: Path
     hdr: Path
     work: Path
-    checkpoint: Path | None = None
+    checkpoints: tuple[Path, ...] = ()
 
     def checked(self) -> Inputs:
-        """Refuse missing files before minutes are spent."""
+        """Refuse missing files, and two checkpoints for one N, before minutes are spent."""
         for what, file in (("body", self.body), ("motion", self.motion), ("light", self.hdr)):
             existing_file(file, what=what)
-        if self.checkpoint is not None:
-            existing_file(self.checkpoint, what="checkpoint")
+        by_size: dict[int, Path] = {}
+        for file in self.checkpoints:
+            n = checkpoint_model(existing_file(file, what="checkpoint"))["gaussians"]
+            check_option(
+                n not in by_size, "--checkpoint", f"one avatar of {n} Gaussians", f"{by_size.get(n)}, {file}"
+            )
+            by_size[n] = file
         output_folder(self.work)
         return self
 
     def key(self) -> str:
-        """What tells rows of these files, by this version, from rows of others."""
-        own = "none" if self.checkpoint is None else self.checkpoint
-        return content_key(self.body, self.motion, self.hdr, own)
+        """What tells rows of these files, by this code, from rows of others."""
+        code = (*sources("rnd_runtime"), *sources("rnd_export"))
+        return content_key(self.body, self.motion, self.hdr, *(self.checkpoints or ("none",)), *code)
 
     def source(self, n: int) -> tuple[Path, str]:
         """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
-        if self.checkpoint is not None and checkpoint_model(self.checkpoint)["gaussians"] == n:
-            return self.checkpoint, "trained"
+        for file in self.checkpoints:
+            if checkpoint_model(file)["gaussians"] == n:
+                return file, "trained"
         return seeded_checkpoint(n, self.body, self.work), "seeded"
 
     def avatar(self, n: int, encoders: Encoders) -> tuple[Path, str]:
@@ -160,7 +174,7 @@ def measured(
     """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
 
     ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
-    ones follow one formula, so that is what fewer Gaussians cost.
+    ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost.
     """
     encoders = Encoders(setting.encoder, setting.precision, setting.window)
     file, which = inputs.avatar(setting.n, encoders)

@@ -73,7 +73,7 @@ def growth(inputs: Inputs, amounts: Amounts, size: int, threads: int) -> list[Ro
 
 
 def _frames(inputs: Inputs, amounts: Amounts, size: int, threads: int, rates: Rates) -> Iterator[Row]:
-    seeded = replace(inputs, checkpoint=None)
+    seeded = replace(inputs, checkpoints=())
     usual = Setting(n=amounts.gaussians[-2], size=size, shade="table", threads=threads)
     series = (
         ("Gaussians", amounts.gaussians, PER_GAUSSIAN, [replace(usual, n=n) for n in amounts.gaussians]),

@@ -13,8 +13,8 @@ import tyro
 class Files:
     """What is drawn; the defaults are those of a clone."""
 
-    checkpoint: Path | None = None
-    """a trained avatar.ckpt, used where N is its own; elsewhere a seeded, untrained avatar on the body stands in"""
+    checkpoint: tuple[Path, ...] = ()
+    """trained avatar.ckpt files, each used where N is its own; else a seeded, untrained avatar on the body stands in"""
     body: Path = Path("assets/body.npz")
     """of the seeded avatar"""
     motion: Path = Path("assets/walk.npz")
@@ -77,15 +77,15 @@ class Grid:
     quick: bool = False
     """the small grid, in two minutes"""
     cross: Annotated[str, tyro.conf.arg(metavar="LIST")] = ""
-    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (300 points, an hour);
+    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (300 points, half an
+    hour);
     also precision, window, raster, threads, cull: all nine are days"""
     sample: int | None = None
     """so many of the combinations of --cross, or of all nine factors, drawn at random; more of them go on with fewer"""
     json: Path = Path("assets/bench/grid.json")
-    """rows; those measured on this machine, of the same files, are not measured again"""
+    """rows; those measured on this machine, of the same files and by the same code, are not measured again"""
     fresh: bool = False
-    """measure all again, kept avatars and references too: after a change of the code, or on another machine of the same
-    name"""
+    """measure all again, kept avatars and references too: on another machine of the same name"""
     chart: tuple[Path, ...] = (Path("assets/bench/grid.svg"), Path("assets/bench/grid.png"))
     """the chart, SVG or PNG by suffix"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
