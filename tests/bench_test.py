@@ -21,6 +21,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
+from rnd_runtime.rotations import matrix_to_axis_angle
 from rnd_trainer import (
     bench_avatars,
     bench_chart,
@@ -35,11 +36,12 @@ from rnd_trainer import (
 )
 from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
-from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point, bench_camera
+from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
 from rnd_trainer.bench_pass import one_call, showing, three_calls
 from rnd_trainer.bench_raster import body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
+from rnd_trainer.bench_scenes import HARDEST, INSIDE, SQUAT, SUN, USUAL, Scene, bench_camera, scene
 from rnd_trainer.checkpoint import load_checkpoint
 from tiny import ASSETS
 
@@ -52,7 +54,7 @@ BRUTE_DB = 65.0
 
 
 def test_the_reference_is_what_the_slowest_mode_approaches(tiny_avatar, tmp_path) -> None:
-    truth = reference(tiny_avatar, WALK, SKY, 64, tmp_path)
+    truth = reference(tiny_avatar, Scene(WALK, SKY, USUAL), 64, tmp_path)
     avatar = Avatar.load(tiny_avatar)
     motion = load_motion(WALK, avatar.skeleton)
     decibels = {}
@@ -68,7 +70,7 @@ def test_the_reference_is_what_the_slowest_mode_approaches(tiny_avatar, tmp_path
         assert found["position_mm"] < 0.01
     assert decibels["brute"] > BRUTE_DB and decibels["ao"] < decibels["brute"] - 20
     assert truth.radiance.max() > 0.01
-    kept = reference(tiny_avatar, WALK, SKY, 64, tmp_path)  # the second time from the folder
+    kept = reference(tiny_avatar, Scene(WALK, SKY, USUAL), 64, tmp_path)  # the second time from the folder
     assert (kept.radiance == truth.radiance).all()
 
 
@@ -99,6 +101,26 @@ def test_a_point_is_measured_in_a_process_of_its_own(tiny_avatar) -> None:
     assert drawn.radiance.shape == (len(COMPARED), 48, 48, 3) and drawn.radiance.max() > 0
     with pytest.raises(InputError, match="optix, table"):
         bench_frame.measure(Point(str(tiny_avatar), str(WALK), str(SKY), 48, "table", "optix", 1, 1))
+
+
+def test_the_hardest_scenes_are_what_they_say(tiny_avatar, tmp_path) -> None:
+    body = ASSETS / "body.npz"
+    scenes = {name: scene(name, body, WALK, SKY, tmp_path, "key") for name in (USUAL, *HARDEST)}
+    assert scenes[USUAL] == Scene(WALK, SKY, USUAL) and scenes[INSIDE] == Scene(WALK, SKY, INSIDE)
+    assert load_light(scenes[SUN].hdr).radiance.max() > 0.5e6 and scenes[SUN].motion == WALK
+    skeleton = Avatar.load(tiny_avatar).skeleton
+    walking, squatting = (load_motion(scenes[name].motion, skeleton) for name in (USUAL, SQUAT))
+    angles = matrix_to_axis_angle(squatting.rotations[:, squatting.joint_names.index("left_knee")])
+    assert np.allclose(angles, [2.2, 0, 0], atol=1e-6) and squatting.frame_count == walking.frame_count
+    neck = walking.joint_names.index("neck")
+    assert np.allclose(walking.rotations[:, neck], squatting.rotations[:, neck], atol=1e-6)
+    gaussians = Avatar.load(tiny_avatar).pose(walking, 0.0)
+    low, high = gaussians.means.min(0), gaussians.means.max(0)
+    inside, outside = (bench_camera(64, view).position for view in (INSIDE, USUAL))
+    assert (low < inside).all() and (inside < high).all() and outside[2] > high[2] + 1
+    for hard in scenes.values():
+        truth = reference(tiny_avatar, hard, 32, tmp_path)
+        assert np.isfinite(truth.radiance).all() and truth.radiance.max() > 0
 
 
 def test_one_compiled_function_draws_what_three_kernels_draw() -> None:
@@ -332,8 +354,8 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
 
     lit: list[Path] = []
 
-    def shine(avatar: Path, motion: Path, hdr: Path) -> dict[str, np.ndarray]:
-        lit.append(motion)
+    def shine(avatar: Path, scene: Scene) -> dict[str, np.ndarray]:
+        lit.append(scene.motion)
         return {"means": np.zeros((0, 0, 3))}
 
     monkeypatch.setattr(bench_reference, "_lit", shine)
@@ -342,10 +364,10 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "walk.npz").write_text(folder)
     for folder in ("a", "b", "a"):
-        reference(tiny_avatar, tmp_path / folder / "walk.npz", SKY, 8, tmp_path)
+        reference(tiny_avatar, Scene(tmp_path / folder / "walk.npz", SKY, USUAL), 8, tmp_path)
     assert lit == [tmp_path / "a" / "walk.npz", tmp_path / "b" / "walk.npz"]
     monkeypatch.setattr(bench_reference, "sources", lambda package: [code])
-    reference(tiny_avatar, tmp_path / "a" / "walk.npz", SKY, 8, tmp_path)
+    reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path)
     assert len(lit) == 3  # by another formula
 
 
@@ -424,8 +446,15 @@ def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
     assert files[1].read_bytes()[:4] == b"\x89PNG"
     draw_chart(rows, [tmp_path / "again.svg"])
     assert (tmp_path / "again.svg").read_text("utf-8") == svg and "untrained" not in svg
-    draw_chart([rows[0], rows[1] | {"avatar": "seeded"}], [tmp_path / "other.svg"])
-    assert "hollow: an untrained avatar" in (tmp_path / "other.svg").read_text("utf-8")
+    others = [
+        rows[0],
+        rows[1] | {"avatar": "seeded"},
+        rows[0] | {"scene": SQUAT, "ms_median": 1.0, "psnr_db": 99.0},
+    ]
+    draw_chart(others, [tmp_path / "other.svg"])
+    svg = (tmp_path / "other.svg").read_text("utf-8")
+    assert "hollow: an untrained avatar" in svg and SQUAT in svg
+    assert "99.0 dB" not in svg  # the front is of the usual scene
     with pytest.raises(InputError, match="at least one measured point"):
         draw_chart([{"failed": "x"}], files)
 

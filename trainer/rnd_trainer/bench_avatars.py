@@ -30,7 +30,7 @@ SEED = 7
 # out layers of the networks, as multiples of their usual start: set by eye on trained ones
 LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
 OPACITY = 2.5  # raw: 0.99 after the sigmoid of model.py, as trained avatars come out
-KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz")
+KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", "sun_*.exr")
 """what rnd-bench keeps between runs; the key of its inputs (:func:`content_key`) is in every name"""
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from rnd_runtime.errors import InputError
 
 from .bench_grid import Row, pareto
+from .bench_scenes import USUAL as USUAL_SCENE
 from .charts import chart
 
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
@@ -19,6 +20,8 @@ USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu",
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
 SEEDED = "seeded"
 """``avatar`` of a row whose networks nobody trained"""
+HARD = "X"
+"""marks a frame of one of the hardest scenes"""
 MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
 CEILING_DB = 60.0
 """points above it are drawn on it: a picture that is the reference's has a hundred"""
@@ -55,10 +58,11 @@ def draw_chart(rows: list[Row], files: list[Path]) -> None:
 def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
     """All points, and what the usual front is in ``words`` beside them.
 
-    Fronts are drawn for pictures of one size, since smaller ones are always faster.
+    Fronts are drawn for pictures of one size, since smaller ones are always faster, and of the usual scene.
     """
     usual, size = rows[0]["n"], rows[0]["size"]
-    fronts = {n: list(pareto([row for row in rows if (row["n"], row["size"]) == (n, size)])) for n in COLOURS}
+    easy = [row for row in rows if row["size"] == size and not _hard(row)]
+    fronts = {n: list(pareto([row for row in easy if row["n"] == n])) for n in COLOURS}
     for n, along in fronts.items():
         axes.plot(
             [r["ms_median"] for r in along],
@@ -89,6 +93,9 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
     handles += [
         axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()
     ]
+    if any(_hard(row) for row in rows):
+        hard = ", ".join(row["scene"] for row in rows if _hard(row))
+        handles.append(axes.scatter([], [], color="#555", marker=HARD, label=hard))
     if any(row["avatar"] == SEEDED for row in rows):
         handles.append(
             axes.scatter([], [], facecolor="none", edgecolor="#555", label="hollow: an untrained avatar")
@@ -106,6 +113,10 @@ def _stage(axes: Any, rows: list[Row], stage: str) -> None:
     axes.set_xlim(least * math.exp(-short), most * math.exp(short))
 
 
+def _hard(row: Row) -> bool:
+    return str(row.get("scene", USUAL_SCENE)) != USUAL_SCENE
+
+
 def _shown_db(row: Row) -> float:
     return min(float(row["psnr_db"]), CEILING_DB)
 
@@ -116,8 +127,9 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
     for row in rows:
         colour, seeded = COLOURS.get(row["n"], "#333"), row["avatar"] == SEEDED
         axes.scatter(
-            row[cost], _shown_db(row), facecolor="none" if seeded else colour, edgecolor=colour if seeded else "white",
-            marker=MARKERS[row["encoder"]], s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, zorder=2,
+            row[cost], _shown_db(row), s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, zorder=2,
+            marker=HARD if _hard(row) else MARKERS[row["encoder"]],
+            facecolor="none" if seeded else colour, edgecolor=colour if seeded else "white",
         )  # fmt: skip
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))
@@ -137,6 +149,8 @@ def _label(row: Row) -> str:
     ]
     if row["window"] is not None:
         words.append(f"d={row['window']}")
+    if _hard(row):
+        words.append(row["scene"])
     if row["cull"] is not None:
         words.append(f"n·v ≥ {row['cull']:g}")
     if row["threads"] != USUAL["threads"]:

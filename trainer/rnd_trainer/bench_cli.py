@@ -14,6 +14,7 @@ from rnd_runtime.errors import check_option, flag, parse_options, run_command
 from rnd_runtime.files import earlier_rows, write_json
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
+from .bench_scenes import USUAL
 
 _DESCRIPTION = """Time and error of the same calls. Without the name of a command it is grid: rnd-bench --quick is the
 small grid. --stability runs the stability list."""
@@ -83,7 +84,7 @@ def _frame(options: Frame) -> None:
 
     setting = Setting(
         options.n, options.size, options.shade, options.encoder, options.window, options.precision,
-        options.raster, options.threads, options.cull,
+        options.raster, options.threads, options.cull, options.scene,
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
     console = Console()
@@ -209,9 +210,10 @@ def _line(row: dict[str, Any]) -> str:
     """A row in words."""
     window = "" if row["window"] is None else f" d={row['window']}"
     cull = "" if row["cull"] is None else f", n·v ≥ {row['cull']:g}"
+    hard = "" if row["scene"] == USUAL else f", {row['scene']}"
     words = (
         f"{row['n']:6} {row['size']:4}² {row['shade']:9} {row['encoder']}{window} {row['precision']} {row['raster']} "
-        f"{row['threads']} threads{cull}: "
+        f"{row['threads']} threads{cull}{hard}: "
     )
     if "failed" in row:
         return words + row["failed"]

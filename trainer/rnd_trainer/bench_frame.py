@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from rnd_runtime.errors import InputError
 
 from .bench_clock import summary
+from .bench_scenes import USUAL, bench_camera
 
 Floats32 = NDArray[np.float32]
 
@@ -36,7 +37,7 @@ DEADLINE_S = 300.0
 class Point:
     """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames.
 
-    ``cull`` as of :class:`rnd_runtime.frame.FrameRenderer`.
+    ``cull`` as of :class:`rnd_runtime.frame.FrameRenderer`, ``view`` as of :func:`bench_scenes.bench_camera`.
     """
 
     avatar: str
@@ -49,6 +50,7 @@ class Point:
     frames: int = 90
     seconds: float = 6.0
     cull: float | None = None
+    view: str = USUAL
 
 
 class Drawn(NamedTuple):
@@ -104,9 +106,8 @@ def draw(folder: str, spawned: float) -> None:
     motion = load_motion(Path(point.motion), avatar.skeleton)
     light = load_light(Path(point.hdr))
     raster: Any = point.raster
-    renderer = FrameRenderer(
-        avatar, light, bench_camera(point.size), shade=point.shade, raster=raster, cull=point.cull
-    )
+    camera = bench_camera(point.size, point.view)
+    renderer = FrameRenderer(avatar, light, camera, shade=point.shade, raster=raster, cull=point.cull)
 
     def frame(number: int) -> Any:
         renderer.turn(TURN * number)
@@ -141,16 +142,6 @@ def draw(folder: str, spawned: float) -> None:
     (out / "row.json").write_text(json.dumps(row), encoding="utf-8")
     np.savez(out / "drawn.npz", radiance=np.array(compared), means=np.array(means))
     renderer.close()
-
-
-def bench_camera(size: int) -> Any:
-    """A square view of a standing person, 1.75 m filling 70 % of the height, 20° to the side."""
-    from rnd_runtime.camera import Camera
-
-    distance, angle = 3.4, np.radians(20)
-    eye = [distance * np.sin(angle), 0.9, distance * np.cos(angle)]
-    fov = 2 * np.arctan(0.5 * 1.75 / 0.7 / distance)
-    return Camera.look_at(eye, [0, 0.875, 0], width=size, height=size, fov_y=fov)
 
 
 def _peak_mb() -> float:

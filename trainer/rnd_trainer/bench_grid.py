@@ -31,6 +31,7 @@ from .bench_avatars import (
 )
 from .bench_frame import Point, measure
 from .bench_reference import errors, reference
+from .bench_scenes import HARDEST, USUAL, Scene, scene
 
 FULL_N = 30_000
 CULLS = (-0.2, -0.5)
@@ -51,6 +52,7 @@ class Setting:
     raster: str = "cpu"
     threads: int = 2
     cull: float | None = None
+    scene: str = USUAL
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,11 @@ class Inputs:
         """What tells rows of these files, by this code, from rows of others."""
         code = (*sources("rnd_runtime"), *sources("rnd_export"))
         return content_key(self.body, self.motion, self.hdr, *(self.checkpoints or ("none",)), *code)
+
+    def scene(self, name: str) -> Scene:
+        """The scene ``name`` of :mod:`bench_scenes`."""
+        key = content_key(self.body, self.motion, *sources("rnd_trainer"))
+        return scene(name, self.body, self.motion, self.hdr, self.work, key)
 
     def source(self, n: int) -> tuple[Path, str]:
         """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
@@ -141,6 +148,7 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
         core = product((8_000, 15_000, FULL_N), FACTORS["encoder"], ("table", "table+sun"))
         points += [Setting(n=n, encoder=encoder, shade=shade) for n, encoder, shade in core]
         points += [Setting(shade="table", cull=cull) for cull in CULLS]
+        points += [Setting(scene=name) for name in HARDEST]
     return list(dict.fromkeys(points))
 
 
@@ -178,9 +186,10 @@ def measured(
     """
     encoders = Encoders(setting.encoder, setting.precision, setting.window)
     file, which = inputs.avatar(setting.n, encoders)
+    filmed = inputs.scene(setting.scene)
     point = Point(
-        str(file), str(inputs.motion), str(inputs.hdr), setting.size, setting.shade, setting.raster,
-        setting.threads, seconds=seconds, cull=setting.cull,
+        str(file), str(filmed.motion), str(filmed.hdr), setting.size, setting.shade, setting.raster,
+        setting.threads, seconds=seconds, cull=setting.cull, view=filmed.view,
     )  # fmt: skip
     # a cold start is one of a machine whose numba cache has the kernels: compile what it lacks
     measure(replace(point, frames=1))
@@ -188,10 +197,10 @@ def measured(
     row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
     if compare:
         whole, _ = inputs.avatar(setting.n, Encoders())
-        row |= errors(drawn, reference(whole, inputs.motion, inputs.hdr, setting.size, inputs.work))
+        row |= errors(drawn, reference(whole, filmed, setting.size, inputs.work))
         largest, kind = inputs.avatar(full_n or setting.n, Encoders())
         if kind == which:
-            truth = reference(largest, inputs.motion, inputs.hdr, setting.size, inputs.work)
+            truth = reference(largest, filmed, setting.size, inputs.work)
             row["psnr_full_db"], row["full_n"] = errors(drawn, truth)["psnr_db"], full_n or setting.n
     return row
 
@@ -213,7 +222,7 @@ def grid(
     inputs.checked()
     if fresh:
         forget(inputs.work)
-    rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *asdict(Setting())))
+    rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *FACTORS))
     wanted, key = settings(quick, cross, sample), inputs.key()
     here = {
         _key(row): row
@@ -247,4 +256,6 @@ def pareto(rows: list[Row], cost: str = "ms_median", worth: str = "psnr_db") -> 
 
 
 def _key(row: Row) -> tuple[Any, ...]:
-    return tuple(row[name] for name in asdict(Setting()))
+    return tuple(
+        row.get(name, usual) for name, usual in asdict(Setting()).items()
+    )  # older rows have no scene

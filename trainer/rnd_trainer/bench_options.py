@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+SceneName = Literal["usual", "inside the body", "squat", "sun of 1e6"]
+
 
 @dataclass(frozen=True)
 class Files:
@@ -65,6 +67,8 @@ class Frame:
     """of onnxruntime and of the kernels"""
     cull: float | None = None
     """leave out Gaussians whose n·v is below this cosine, such as -0.5: the back of the body; by default none"""
+    scene: SceneName = "usual"
+    """the walk under the light of --hdr, or what is hardest"""
     compare: bool = True
     """measure the error too: the reference takes half a minute the first time"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)

@@ -26,8 +26,8 @@ from rnd_runtime.projection_gl import GlProjection, Sorting
 from rnd_runtime.surfaces_gl import SurfaceUpload
 
 from .bench_clock import REPEATS, times
-from .bench_frame import bench_camera
 from .bench_raster import Row, Scene, bench_raster, body_scene
+from .bench_scenes import bench_camera
 from .checkpoint import load_checkpoint
 from .model import AvatarModel
 

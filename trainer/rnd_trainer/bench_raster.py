@@ -30,8 +30,8 @@ from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
 from .bench_clock import summary
-from .bench_frame import bench_camera
 from .bench_pass import one_call, showing, three_calls
+from .bench_scenes import bench_camera
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -28,7 +28,8 @@ from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 
 from .bench_avatars import content_key, sources
-from .bench_frame import COMPARED, STEP_S, TURN, Drawn, bench_camera
+from .bench_frame import COMPARED, STEP_S, TURN, Drawn
+from .bench_scenes import Scene, bench_camera
 
 MOST_DB = 120.0  # of two equal pictures
 Floats = NDArray[np.float64]
@@ -41,16 +42,17 @@ class Reference(NamedTuple):
     means: Floats
 
 
-def reference(avatar_file: Path, motion_file: Path, hdr: Path, size: int, folder: Path) -> Reference:
-    """The reference of a whole avatar; what is slow about it is kept in ``folder``, by what the files hold.
+def reference(avatar_file: Path, scene: Scene, size: int, folder: Path) -> Reference:
+    """The reference of a whole avatar in ``scene``; what is slow of it is kept in ``folder``, by what the files hold.
 
     And by the sources of the runtime: another formula is another reference.
     """
-    stem = f"reference_{content_key(avatar_file, motion_file, hdr, *sources('rnd_runtime'))}"
-    lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, motion_file, hdr))
+    inputs = (avatar_file, scene.motion, scene.hdr, scene.view)
+    stem = f"reference_{content_key(*inputs, *sources('rnd_runtime'))}"
+    lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, scene))
 
     def drawn() -> dict[str, Any]:
-        camera, pictures = bench_camera(size), []
+        camera, pictures = bench_camera(size, scene.view), []
         for k in range(len(COMPARED)):
             arrays = (lit["means"][k], lit["covariances"][k], lit["opacities"], lit["radiance"][k])
             pictures.append(raster_oracle.rasterize(*arrays, camera).image)
@@ -92,10 +94,10 @@ def posed_reference(avatar: Avatar, motion: Any, time: float) -> Gaussians:
     return replace(static, means=means, covariances=covariances, normals=normals, visibility=harmonics)  # type: ignore[arg-type]
 
 
-def _lit(avatar_file: Path, motion_file: Path, hdr: Path) -> dict[str, Any]:
+def _lit(avatar_file: Path, scene: Scene) -> dict[str, Any]:
     avatar = Avatar.load(avatar_file)
-    motion = load_motion(motion_file, avatar.skeleton)
-    light, eye = load_light(hdr), bench_camera(64).position
+    motion = load_motion(scene.motion, avatar.skeleton)
+    light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position
     values: dict[str, list[Any]] = {"means": [], "covariances": [], "radiance": []}
     for number in COMPARED:
         posed = posed_reference(avatar, motion, STEP_S * number)
