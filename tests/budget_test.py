@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from numba import get_num_threads
 from scipy.spatial import cKDTree
 
 from rnd_export.bake import BakedAvatar, bake
@@ -19,16 +20,20 @@ from rnd_export.cli import main
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
 from rnd_export.places import moving_sites
+from rnd_export.shots import COUNT, resized, shots_of
 from rnd_export.stopwatch import Stopwatch
 from rnd_export.variant import OWN_NODES, Variant, reduced, static_where
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.avatar_file import read_metadata
+from rnd_runtime.camera import Camera
+from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.light import Light
 from rnd_runtime.onnx_parts import OnnxFile
 from rnd_runtime.raster_cpu import rasterize
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.config import ModelConfig
+from tiny import ASSETS
 
 
 def _clock(avatar: Avatar) -> float:
@@ -75,6 +80,13 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
     )
     assert (tmp_path / "small.onnx").stat().st_size / 1e6 == pytest.approx(second["mb"], rel=1e-3)
     assert second["mb"] <= most and second["given_up"] in capsys.readouterr().out.replace("\n", "")
+    assert (second["shots"], second["threads"]) == ("around", get_num_threads())
+    assert 0 < second["ms_median"] <= second["ms_p95"]
+    assert run("--max-mb", "100", "--json", str(rows), "--capture", str(ASSETS / "capture")) == 2
+    assert (
+        "--frames: expected the default, got 30 (--capture has a motion of its own)"
+        in capsys.readouterr().err
+    )
     rows.write_text('[{"fps": 60}]')
     assert run("--max-mb", "1", "--json", str(rows)) == 2
     assert "rows of an earlier search" in capsys.readouterr().err
@@ -435,6 +447,41 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
     left = opacities.type.tensor_type.shape.dim[0].dim_value
     assert plan.recipe(bench.config).gaussians == left
     assert given_up(bench, plan)[0].startswith(f"{left} of {bench.config.gaussians} Gaussians")
+
+
+def test_a_search_looks_at_the_captures_views(tiny_checkpoint, tmp_path, monkeypatch) -> None:
+    capture = load_capture(ASSETS / "capture")
+    seen, held_out = shots_of(capture, 40)
+
+    def views(split) -> set[tuple[float, bytes]]:
+        cameras = capture.cameras
+        return {(f.frame / capture.fps, cameras[f.camera].position.tobytes()) for f in capture.split(split)}
+
+    for shots, split in ((seen, "train"), (held_out, "novel_pose")):
+        assert len(shots) == COUNT and {(s.time, s.camera.position.tobytes()) for s in shots} <= views(split)
+        assert len({shot.time for shot in shots}) >= COUNT / 2  # spread over the split
+        assert {max(shot.camera.width, shot.camera.height) for shot in shots} == {40}
+    train = tuple(capture.split("train"))
+    seen, held_out = shots_of(replace(capture, frames=train[:5]), 40)
+    assert len(seen) == 3 and len(held_out) == 2
+    assert not {shot.time for shot in seen} & {shot.time for shot in held_out}
+    with pytest.raises(InputError, match="training views of the capture: expected at least 2, got 1"):
+        shots_of(replace(capture, frames=train[:1]), 40)
+
+    rows = tmp_path / "bounds.json"
+    words = ["rnd-export", str(tiny_checkpoint), "--max-mb", "100", "--size", "48", "--json", str(rows)]
+    words += ["--capture", str(ASSETS / "capture"), "--out", str(tmp_path / "small.onnx")]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0 and json.loads(rows.read_text())[0]["shots"] == "capture"
+
+
+def test_a_wide_view_stays_wide() -> None:
+    camera = Camera.look_at([0, 1, 3], [0, 1, 0], width=1920, height=1080, fov_y=0.6)
+    small = resized(camera, 256)
+    assert (small.width, small.height) == (256, 144)
+    assert np.allclose(small.K[:2], camera.K[:2] * 256 / 1920)
 
 
 def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint) -> None:

@@ -28,26 +28,26 @@ from .bake import BakedAvatar, bake
 from .export import refuse_ablations, written
 from .merge import contributions, fitted_albedo, merged
 from .places import gaussians_by_place
-from .stopwatch import Stopwatch
+from .shots import Shot, Shots, resized, shots_around
+from .stopwatch import Stopwatch, milliseconds
 from .variant import Variant, reduced, static_where
 
 Floats = NDArray[np.float64]
 
-POSES = 6
-"""to search on; as many others, between them, are held out"""
+USUAL_FRAMES = 90
 FIT_SIDE = 256
 """of the pictures that colours are fitted to"""
-FIELD_OF_VIEW = 0.6
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What an avatar is judged in."""
+    """What an avatar is judged in; without ``shots`` those of :func:`shots_around`, of ``size`` pixels."""
 
     motion: Motion
     light: Light
     size: int = 512
     shade: str = "table+sun"
+    shots: Shots | None = None
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,6 @@ class Recipe:
     variant: Variant = field(default_factory=Variant)
     gaussians: int | None = None
     dynamic_mm: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A moment of the motion and where it is seen from; equal to itself alone, since those of one pose share a time."""
-
-    time: float
-    camera: Camera
 
 
 class Measured(NamedTuple):
@@ -89,13 +81,13 @@ class Workbench:
         self.config, self._checkpoint, self._scene = checkpoint.config.model, checkpoint, scene
         self._baked = gaussians_by_place(bake(checkpoint.model))
         self._whole = _loaded(self.model(Recipe()))
-        times = (np.arange(2 * POSES) + 0.5) / (2 * POSES) * scene.motion.duration
-        shots = [Shot(float(t), self._view(float(t), k)) for k, t in enumerate(times)]
-        self.seen, self.held_out = shots[::2], shots[1::2]
+        self.seen, self.held_out = scene.shots or shots_around(
+            scene.motion, scene.size, lambda time: self._whole.pose(scene.motion, time)
+        )
         renderer = self._renderer(self._whole)
-        self._truth = {shot: self._picture(renderer, shot) for shot in shots}
+        self._truth = {shot: self._picture(renderer, shot) for shot in (*self.seen, *self.held_out)}
         self._clock = clock or self._stopwatch()
-        self._fit = [Shot(shot.time, shot.camera.resized(FIT_SIDE, FIT_SIDE)) for shot in self.seen]
+        self._fit = [Shot(shot.time, resized(shot.camera, FIT_SIDE)) for shot in self.seen]
         self._shares = contributions(self._posed(self._whole))
         self._moves = self._gaussian_moves()
 
@@ -118,6 +110,11 @@ class Workbench:
         squares = [np.mean((self._picture(renderer, shot) - self._truth[shot]) ** 2) for shot in shots]
         psnr = -10 * np.log10(max(float(max(squares)), 1e-12))
         return Measured(float(psnr), self._clock(avatar), model.ByteSize() / 1e6)
+
+    def usual_times(self, model: onnx.ModelProto) -> Floats:
+        """Milliseconds of ``USUAL_FRAMES`` frames of ``model`` as this machine draws them now, busy moments and all."""
+        draw = self._frames(_loaded(model))
+        return milliseconds(draw, USUAL_FRAMES)
 
     def still_share(self, recipe: Recipe) -> float:
         """Share of the skinning network's nodes that ``recipe`` gives the template's weights."""
@@ -146,17 +143,6 @@ class Workbench:
             return renderer.render(self._scene.motion, shot.time)
 
         return draw
-
-    def _view(self, time: float, number: int) -> Camera:
-        """A picture that the avatar just fills, from another side for each shot."""
-        means = self._whole.pose(self._scene.motion, time).means
-        low, high = means.min(0), means.max(0)
-        centre = (low + high) / 2
-        distance = 0.6 * float(np.linalg.norm(high - low)) / np.tan(FIELD_OF_VIEW / 2)
-        angle = 2 * np.pi * 0.381966 * number  # the golden angle: no two from one side
-        eye = centre + distance * np.array([np.sin(angle), 0.1, np.cos(angle)])
-        size = self._scene.size
-        return Camera.look_at(eye, centre, width=size, height=size, fov_y=FIELD_OF_VIEW)
 
     def _posed(self, avatar: Avatar) -> list[tuple[Gaussians, Camera]]:
         return [(avatar.pose(self._scene.motion, shot.time), shot.camera) for shot in self._fit]

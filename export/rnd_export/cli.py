@@ -52,12 +52,15 @@ class Options:
     """picture side of that search"""
     hdr: Path | None = None
     """light of that search; by default the one that was learned"""
+    capture: Path | None = None
+    """search in the training views of this capture (a folder with capture.json) and test what is found in its other
+    poses; by default in views all around --motion, or around random poses"""
     json: Path | None = None
     """add what that search found to the rows of this file, in place of an earlier one of the same bound"""
 
 
 BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
-SEARCHES = ("size", "hdr", "json")
+SEARCHES = ("size", "hdr", "capture", "json")
 """options that say how a bound's search goes"""
 CHOICES = (
     "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
@@ -130,3 +133,5 @@ def _refuse_idle(options: Options, *, bounded: bool) -> None:
         refuse_changed(options, SEARCHES, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
     if options.motion is not None:
         refuse_changed(options, ("frames",), "of random motion: --motion has frames of its own")
+    if options.capture is not None:
+        refuse_changed(options, ("motion", "frames"), "--capture has a motion of its own")

@@ -6,11 +6,24 @@ from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import NDArray
 
 TIMED, UNTIMED = 12, 2
 """frames that are measured, and those before them that warm up"""
 CALIBRATED = 36
 """frames of the reference alone, at first, whose calmest sixth says what it takes"""
+
+
+def milliseconds(
+    draw: Callable[[int], object], count: int, clock: Callable[[], float] = perf_counter
+) -> NDArray[np.float64]:
+    """What each of ``count`` frames of ``draw`` takes [count], after ``UNTIMED`` that warm up."""
+    taken = []
+    for frame in range(UNTIMED + count):
+        started = clock()
+        draw(frame)
+        taken.append(1e3 * (clock() - started))
+    return np.array(taken[UNTIMED:])
 
 
 class Stopwatch:
@@ -26,7 +39,7 @@ class Stopwatch:
 
     def __init__(self, reference: Callable[[int], object], clock: Callable[[], float] = perf_counter) -> None:
         self._reference, self._clock = reference, clock
-        frames = [self._timed(reference, k) for k in range(UNTIMED + CALIBRATED)][UNTIMED:]
+        frames = milliseconds(reference, CALIBRATED, clock)
         self._calm = float(np.sort(frames)[: CALIBRATED // 6].mean())
 
     def ms(self, draw: Callable[[int], object]) -> float:

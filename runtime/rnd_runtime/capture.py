@@ -20,6 +20,7 @@ from .errors import InputError
 from .files import atomic_path, existing_file, is_folder
 from .light import Light
 from .motion import Motion, load_motion, save_motion
+from .skeleton import Skeleton
 
 Floats32 = NDArray[np.float32]
 
@@ -72,6 +73,12 @@ class Capture:
     @property
     def fps(self) -> float:
         return self.motion.fps
+
+    def motion_for(self, skeleton: Skeleton) -> Motion:
+        """Its motion for an avatar of ``skeleton``, which may not be the one it was captured with."""
+        if self.motion.joint_names == skeleton.names:
+            return self.motion
+        return load_motion(self.motion.source, skeleton, joint_names=self.body.skeleton.names)
 
     def split(self, name: Split) -> list[Frame]:
         """The frames of one split, in file order."""

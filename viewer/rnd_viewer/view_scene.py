@@ -20,7 +20,7 @@ from rnd_runtime.files import existing_file
 from rnd_runtime.frame import as_seen_from, draw
 from rnd_runtime.gaussians import Gaussians, Raster
 from rnd_runtime.light import Light, downsize, load_light
-from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.motion import Motion
 from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
@@ -158,12 +158,8 @@ class Scene:
 
     @cached_property
     def _captured_motion(self) -> Motion:
-        """The capture's motion for the avatar's skeleton; it may have been captured with another."""
         assert self.capture
-        motion = self.capture.motion
-        if motion.joint_names == self.avatar.skeleton.names:
-            return motion
-        return load_motion(motion.source, self.avatar.skeleton, joint_names=self.capture.body.skeleton.names)
+        return self.capture.motion_for(self.avatar.skeleton)
 
     def _truths(self) -> list[dict[str, Any]]:
         if not self.capture:
