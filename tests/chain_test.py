@@ -77,6 +77,8 @@ def test_evaluation_rows_say_what_they_are(played) -> None:
 def test_a_finished_folder_is_not_overwritten(played, tiny_capture) -> None:
     line = _refused("rnd-train", tiny_capture.folder, "--out", played / "run")
     assert "holds a training already" in line and "--resume" in line
+    line = _refused("rnd-train", tiny_capture.folder, "--out", played / "none", "--resume")
+    assert "state of a training to resume not found" in line and "none/training.state" in line
 
 
 def test_training_refuses_bad_captures(tiny_capture, tmp_path) -> None:

@@ -18,7 +18,7 @@ from msgspec import structs
 import rnd_trainer.ablate
 import rnd_trainer.evaluate
 import rnd_trainer.held_out
-from rnd_runtime.capture import Capture
+from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import sha256_of, write_json
 from rnd_runtime.images import linear_to_srgb, srgb_to_linear
@@ -50,6 +50,7 @@ from rnd_trainer.scores import frame_scores, normal_picture, outline_length, sil
 from rnd_trainer.template import sample_template
 from rnd_trainer.train import Training
 from rnd_trainer.training_state import STATE_FILE, STATE_SCHEMA
+from tiny import ASSETS
 
 OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
 CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
@@ -319,10 +320,30 @@ def test_the_training_light_is_the_learned_one_and_others_the_captures(
     monkeypatch.setattr(Capture, "load_light", lambda self, name: f"the true {name}")
     monkeypatch.setattr(rnd_trainer.evaluate, "Shader", lambda light, mode: light)
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    checkpoint.info["lights"] = {"noon": None}  # the capture has no map of it
     judge = Judge(checkpoint, capture)
     assert judge._shader("dusk") == "the true dusk"
     for name in ("noon", None):
         assert np.array_equal(judge._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
+
+
+def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:
+    """A renamed or edited capture keeps it; another map of the same name, in a folder of the same name, is another."""
+    shutil.copytree(ASSETS / "capture", tmp_path / "me/capture")
+    mine = load_capture(tmp_path / "me/capture")
+    training = Training(mine, dataclasses.replace(tiny_config, image_scale=0.1))
+    training.save(tmp_path)
+    name = mine.split("train")[0].light
+    checkpoint = load_checkpoint(tmp_path / "avatar.ckpt")
+    assert checkpoint.learned_under(mine) == {name}
+    shutil.copytree(tmp_path / "me/capture", tmp_path / "renamed")
+    assert checkpoint.learned_under(load_capture(tmp_path / "renamed")) == {name}
+    lights = mine.lights | {name: structs.replace(mine.lights[name], yaw=1.0)}
+    assert checkpoint.learned_under(dataclasses.replace(mine, lights=lights)) == set()
+    assert checkpoint.learned_under(dataclasses.replace(mine, lights={})) == set()
+    old = dataclasses.replace(checkpoint, info={k: v for k, v in checkpoint.info.items() if k != "lights"})
+    assert old.learned_under(mine) == {name}
+    assert old.learned_under(load_capture(tmp_path / "renamed")) == set()
 
 
 def test_the_albedos_scale_is_fitted_to_training_frames() -> None:

@@ -251,11 +251,27 @@ def test_a_body_of_alike_weights_is_exported(tiny_checkpoint, tmp_path) -> None:
     assert export(checkpoint, tmp_path / "a.onnx", motion(body(), 2)).position_m < 1e-4
 
 
+@pytest.mark.parametrize("what", ("normals", "visibility", "covariances"))
+def test_a_file_that_poses_otherwise_is_refused(what, tiny_checkpoint, tmp_path, monkeypatch) -> None:
+    run = Avatar.run
+
+    def bent(self: Avatar, inputs: object, names: tuple[str, ...]) -> list[np.ndarray]:
+        return [1.01 * a if name == what else a for name, a in zip(names, run(self, inputs, names))]
+
+    monkeypatch.setattr(Avatar, "run", bent)
+    with pytest.raises(InputError, match=f"export refused: {what} of onnxruntime and torch differ"):
+        export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body(), 2))
+
+
 @pytest.mark.parametrize(
     ("variant", "line"),
     [
         (Variant("coarse", nodes=201), "--nodes: expected 4 to 200, got 201"),
         (Variant(nodes=100), "--nodes: expected --encoder coarse, got --encoder full"),
+        (
+            Variant("static", window_poses=3),
+            "--window-poses: expected dynamic skinning, got --encoder static",
+        ),
         (Variant(window_poses=6), "--window-poses: expected 2 to 5, got 6"),
         (Variant(visibility_degree=4), "--visibility-degree: expected 0 to 3, got 4"),
     ],

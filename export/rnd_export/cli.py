@@ -92,6 +92,7 @@ def _export(options: Options) -> None:
     from rnd_trainer.checkpoint import load_checkpoint
 
     check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
+    check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
     _refuse_idle(options, bounded=bool(given))

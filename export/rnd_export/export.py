@@ -44,6 +44,8 @@ MAX_WEIGHT_ERROR = 1e-4
 """largest difference of a skinning weight between onnxruntime and torch"""
 MAX_POSITION_ERROR_M = 1e-4
 """largest difference of a position: 0.1 mm, a tenth of a pixel at 512² and arm's length"""
+MAX_RELATIVE_ERROR = 1e-3
+"""largest difference of a unit normal, a harmonic of visibility (in −1…1), and a covariance over its longest axis"""
 MAX_P99_M: dict[Precision, float] = {"f32": MAX_POSITION_ERROR_M, "f16": 1e-3, "int8": 3e-3}
 """of all places in all frames, what 99 % must be nearer than"""
 CONVENTIONS = (
@@ -128,6 +130,9 @@ def _bounds(drift: Drift, variant: Variant) -> list[tuple[str, float, float]]:
     return [
         ("skinning weights", drift.weights, MAX_WEIGHT_ERROR),
         ("positions", drift.position_m, MAX_POSITION_ERROR_M),
+        ("normals", drift.normal, MAX_RELATIVE_ERROR),
+        ("visibility", drift.visibility, MAX_RELATIVE_ERROR),
+        ("covariances", drift.covariance_relative, MAX_RELATIVE_ERROR),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from .capture_format import CaptureLight as CaptureLight
 from .capture_format import Frame as Frame
 from .capture_format import Split as Split
 from .errors import InputError
-from .files import atomic_path, existing_file, is_folder
+from .files import atomic_path, existing_file, is_folder, sha256_of
 from .light import Light
 from .motion import Motion, load_motion, save_motion
 from .skeleton import Skeleton
@@ -117,6 +118,14 @@ class Capture:
                 hint="OpenGL's have y and z the other way round",
             )
         return normals
+
+    def light_sha256(self, name: str) -> str | None:
+        """Of the map of a light, and how it is scaled and turned; None where there is no such map."""
+        entry = self.lights.get(name)
+        if entry is None or not (self.folder / entry.file).is_file():
+            return None
+        told = f"{sha256_of(self.folder / entry.file)} {entry.scale} {entry.yaw}"
+        return hashlib.sha256(told.encode()).hexdigest()
 
     def load_light(self, name: str) -> Light:
         """The light called ``name``, scaled and turned as the capture says."""

@@ -7,9 +7,14 @@ import numba
 from .errors import check_option
 
 
+def most_threads() -> int:
+    """One per core, or as many as NUMBA_NUM_THREADS says."""
+    return int(numba.config.NUMBA_NUM_THREADS)
+
+
 def check_threads(threads: int) -> None:
     """Raise :class:`rnd_runtime.errors.InputError` unless the compiled kernels can run on so many."""
-    most = numba.config.NUMBA_NUM_THREADS
+    most = most_threads()
     check_option(1 <= threads <= most, "--threads", f"1 to {most}", threads)
 
 

@@ -185,7 +185,7 @@ def ablate(
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
-            write_json(place / ROWS, [row | cost | extra | told for row in scored])
+            write_json(place / ROWS, [row | cost | extra for row in scored])
             found = _rows(place)
         rows += found
     return rows

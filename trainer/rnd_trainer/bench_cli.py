@@ -80,8 +80,11 @@ def _frame(options: Frame) -> None:
     )
     from rich.console import Console
 
+    from rnd_runtime.shading import check_mode
+
     from .bench_grid import Setting, measured
 
+    check_mode(options.shade)
     setting = Setting(
         options.n, options.size, options.shade, options.encoder, options.window, options.precision,
         options.raster, options.threads, options.cull, options.scene,

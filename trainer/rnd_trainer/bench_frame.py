@@ -84,6 +84,7 @@ def measure(point: Point) -> Drawn:
             raise InputError(what, expected=f"an answer within {DEADLINE_S:g} s", got="none") from error
         if done.returncode:
             why = (done.stderr.strip().splitlines() or ["no answer"])[-1]
+            why = why.removeprefix(f"{InputError.__module__}.{InputError.__qualname__}: ")
             raise InputError(what, got=why[:200])
         row = json.loads((out / "row.json").read_text("utf-8"))
         with np.load(out / "drawn.npz") as drawn:

@@ -11,6 +11,12 @@ import tyro
 SceneName = Literal["usual", "inside the body", "squat", "sun of 1e6"]
 
 
+def _two_at_most() -> int:
+    from rnd_runtime.threads import most_threads
+
+    return min(2, most_threads())
+
+
 @dataclass(frozen=True)
 class Files:
     """What is drawn; the defaults are those of a clone."""
@@ -63,8 +69,8 @@ class Frame:
     """poses in the motion window; by default the checkpoint's"""
     raster: Literal["cpu", "gl-egl", "gl-osmesa"] = "cpu"
     """what splats"""
-    threads: int = 2
-    """of onnxruntime and of the kernels"""
+    threads: int = field(default_factory=_two_at_most)
+    """of onnxruntime and of the kernels; by default two, where there are two cores"""
     cull: float | None = None
     """leave out Gaussians whose n·v is below this cosine, such as -0.5: the back of the body; by default none"""
     scene: SceneName = "usual"
@@ -105,8 +111,8 @@ class Peers:
     """Gaussians"""
     size: int = 512
     """picture side in pixels"""
-    threads: int = 2
-    """of everybody"""
+    threads: int = field(default_factory=_two_at_most)
+    """of everybody; by default two, where there are two cores"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
 
 

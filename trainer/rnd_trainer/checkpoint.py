@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path, existing_file, sha256_of
 from rnd_runtime.skeleton import Skeleton
@@ -49,11 +50,22 @@ class Checkpoint:
         """Whether this is the capture.json that the avatar was trained on."""
         digest = self.info.get("capture_sha256")
         if digest is None:  # checkpoints of before have none
-            return self.learned_in(capture.parent)
+            return self._learned_in(capture.parent)
         return bool(digest == sha256_of(capture))
 
-    def learned_in(self, folder: Path) -> bool:
-        """Whether the capture that the avatar was trained on lay in a folder of this name, edited since or not."""
+    def learned_under(self, capture: Capture) -> set[str | None]:
+        """Which lights of ``capture`` the avatar was trained under, by their maps; where there is none by their names.
+
+        A capture may have been renamed or edited since.
+        """
+        lights = self.info.get("lights")
+        if (
+            lights is None
+        ):  # checkpoints of before have none: a capture whose folder has the name is taken for theirs
+            return {f.light for f in capture.split("train")} if self._learned_in(capture.folder) else set()
+        return {name for name, digest in lights.items() if capture.light_sha256(name) == digest}
+
+    def _learned_in(self, folder: Path) -> bool:
         return bool(self.info.get("capture") == folder.resolve().name)
 
     def note(self) -> str | None:

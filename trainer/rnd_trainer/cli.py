@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
-from rnd_runtime.files import output_folder, write_json
+from rnd_runtime.files import existing_file, output_folder, write_json
 
 from .eval_cli import EvalOptions, evaluate_run, need_extra
 
@@ -98,6 +99,8 @@ def _train(options: TrainOptions) -> None:
     if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
         hint = ("--resume continues it; or " if state.exists() else "") + "choose another --out"
         raise InputError("holds a training already", file=folder, hint=hint)
+    if options.resume:
+        existing_file(state, what="state of a training to resume")
     perceptual = load_lpips(options.perceptual_weights)
     with _memory_runs_out():
         training = Training(capture, config, perceptual, device)
@@ -116,7 +119,8 @@ def _train(options: TrainOptions) -> None:
             interrupted = _run_with_progress(training, folder)
     print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
     if interrupted:
-        _say(f"stopped; continue with --resume --out {folder}")
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        _say(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
         raise KeyboardInterrupt
     _score_after_training(training, folder, options)
 

@@ -56,8 +56,7 @@ class Judge:
     ) -> None:
         self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
         self.motion = capture.motion if motion is None else motion
-        own = checkpoint.learned_in(capture.folder)
-        self._trained = {frame.light for frame in capture.split("train")} if own else set()
+        self._trained = checkpoint.learned_under(capture)
         self._shaders: dict[str | None, Shader | None] = {}
 
     def render(self, frame: Frame, albedo_scale: Tensor | None = None, index: int | None = None) -> Rendered:

@@ -17,6 +17,7 @@ from rnd_runtime.capture import Capture
 from rnd_runtime.capture_format import Split
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import sha256_of
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.images import write_image
 from rnd_runtime.light import Light
@@ -67,6 +68,9 @@ def score(
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
         **({} if avatar is None else playback(avatar, judge)),
         "size": sorted({(camera.width, camera.height) for camera in _seen_by(capture)}),
+        "scored_on": capture.folder.resolve().name,
+        "capture_sha256": sha256_of(capture.file),
+        "motion": Path(judge.motion.source).name,
         **_provenance(checkpoint),
     }
     names = picture_names([frame.image for split, _ in jobs for frame in capture.split(split)])
@@ -139,7 +143,8 @@ def _seen_by(capture: Capture) -> list[Camera]:
 def _provenance(checkpoint: Any) -> dict[str, Any]:
     info, config = checkpoint.info, checkpoint.config
     return {
-        "minutes": info.get("minutes"), "capture": info.get("capture"), "steps": config.steps,
+        "minutes": info.get("minutes"), "capture": info.get("capture"), "train_motion": info.get("motion"),
+        "steps": config.steps,
         "step": info.get("step"), "seed": config.seed,
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
         "train_perceptual": info.get("perceptual"), "refine_poses": config.refine_poses,

@@ -386,11 +386,17 @@ class Training:
     def _perceptual_sha256(self) -> str | None:
         return None if self.perceptual is None else self.perceptual.sha256
 
+    def _lights(self) -> list[str]:
+        """Names of the lights that its pictures were taken under."""
+        return sorted({view.frame.light for view in self.views if view.frame.light})
+
     def info(self) -> dict[str, Any]:
         """Provenance for the checkpoint."""
         return {
             "capture": self.capture.folder.resolve().name,
             "capture_sha256": sha256_of(self.capture.file),
+            "motion": Path(self.capture.motion.source).name,
+            "lights": {name: self.capture.light_sha256(name) for name in self._lights()},
             "body_license": self.capture.body.license,
             "step": self.step_index,
             "steps_planned": self.total_steps,
