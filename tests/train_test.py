@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from msgspec.structs import replace
+from safetensors.torch import save_file
 
 import rnd_trainer.cli
 from rnd_runtime.capture import load_capture
@@ -26,6 +27,8 @@ from rnd_trainer.eval_cli import EvalOptions, evaluate_run
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
+from rnd_trainer.perceptual import load_features
+from rnd_trainer.perceptual_nets import BACKBONES
 from rnd_trainer.train import MAX_BAD_STEPS, Training, run
 from rnd_trainer.training_state import STATE_SCHEMA
 
@@ -52,7 +55,7 @@ def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
 
 
 def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_config) -> None:
-    objective = Objective(tiny_config, LightProbe(), None, None, torch.Generator().manual_seed(0))
+    objective = Objective(tiny_config, LightProbe(), None, None, None, torch.Generator().manual_seed(0))
     drawn = torch.stack([objective._background() for _ in range(400)])
     black = (drawn == 0).all(dim=1)
     assert 0.4 < black.float().mean() < 0.6
@@ -223,6 +226,24 @@ def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config
     training = Training(tiny_capture, tiny_config, Demanding())
     terms = training.objective(training.model, training.views[0], training.poses[0], 0, 1)
     assert "image" in terms and "lpips" not in terms and "consistency" not in terms
+
+
+def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config, tmp_path) -> None:
+    """A network's first blocks do for it; another one does not go on with the same training."""
+    tensors = {name: torch.randn(shape) / 30 for name, shape in BACKBONES[-1].shapes(2).items()}
+    for name in ("a", "b"):
+        save_file({k: v + (name == "b") for k, v in tensors.items()}, tmp_path / f"{name}.safetensors")
+    blocks, others = (load_features(tmp_path / f"{name}.safetensors") for name in ("a", "b"))
+    config = dataclasses.replace(tiny_config, image_scale=1.0)
+    training = Training(tiny_capture, config, consistency=blocks)
+    given = (training.model, training.views[0], training.poses[0], 0, 2)
+    assert "consistency" in training.objective(*given) and "lpips" not in training.objective(*given)
+    assert "consistency" not in Training(tiny_capture, config).objective(*given)
+    training.save(tmp_path)
+    assert load_checkpoint(tmp_path / "avatar.ckpt").info["consistency"] == "vgg16[:2]"
+    Training(tiny_capture, config, consistency=blocks).resume(tmp_path / "training.state")
+    with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
+        Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from .config import TrainConfig
 from .data import check_true_normals, training_light
 from .held_out import score
 from .model import AvatarModel
-from .perceptual import Perceptual
+from .perceptual import Perceptual, networks_sha256
 from .pose_refinement import joint_error_degrees
 from .train import Step, Training, run
 from .training_state import STATE_FILE, read_state
@@ -37,7 +37,9 @@ MOTION = "motion"
 """of a row: the file of the poses that were scored in, and learned from unless the method says otherwise"""
 CAPTURE = "capture_sha256"
 """of a row: the digest of capture.json, which has the pictures of every split"""
-OLDER_LACK = (MOTION, CAPTURE)
+FEATURES = "consistency_sha256"
+"""of a row: the network whose features L_gc compared in training"""
+OLDER_LACK = (MOTION, CAPTURE, FEATURES)
 ELSEWHERE = "another folder for RUN, or delete this one"
 POSE_SECONDS = 0.3 / 9
 """between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
@@ -73,7 +75,7 @@ def _window(d: int) -> StudyRow:
 
 _NO_GC = {"weight_consistency": 0.0}
 VARIANTS = (
-    StudyRow("ours", "everything", None),
+    StudyRow("ours", "everything, L_gc too", "+ D_W"),
     StudyRow(
         "LBS, plain colour",
         "template skinning and colours that no light changes: the core of 3DGS-Avatar and GauHuman",
@@ -136,6 +138,7 @@ def ablate(
     *,
     seeds: Sequence[int],
     perceptual: Perceptual | None,
+    consistency: Perceptual | None = None,
     mode: str = "table+sun",
     on_run: Callable[[str, int, float, int], None],
 ) -> list[dict[str, Any]]:
@@ -155,6 +158,7 @@ def ablate(
             "capture": capture.folder.resolve().name, "steps": config.steps, "gaussians": config.model.gaussians,
             "image_scale": config.image_scale, "shade": mode,
             "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+            FEATURES: networks_sha256(consistency or perceptual),
             **told,
         }  # fmt: skip
 
@@ -166,10 +170,8 @@ def ablate(
             place = _place(folder, variant, seed)
             found = _done_before(place, same(config))
             if not found and (place / STATE_FILE).exists():
-                begun, weights = (
-                    read_state(place / STATE_FILE),
-                    None if perceptual is None else perceptual.sha256,
-                )
+                begun = read_state(place / STATE_FILE)
+                weights = networks_sha256(perceptual, consistency)
                 begun.refuse_other(config, weights, what="a run begun before", hint=ELSEWHERE)
             jobs.append((variant, seed, config, found))
     for done, (variant, seed, config, found) in enumerate(jobs):
@@ -181,7 +183,7 @@ def ablate(
         if not found:
             place = _place(folder, variant, seed)
             seen = _noisy(capture) if variant.noisy else capture
-            extra = _train(seen, config, place, perceptual, capture, tell)
+            extra = _train(seen, config, place, perceptual, consistency, capture, tell)
             checkpoint = load_checkpoint(place / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
             cost = encoder_cost(checkpoint.model)
@@ -316,12 +318,13 @@ def _train(
     config: TrainConfig,
     place: Path,
     perceptual: Perceptual | None,
+    consistency: Perceptual | None,
     truth: Capture,
     on_share: Callable[[float], None],
 ) -> dict[str, float]:
     """Train on ``seen``; what the poses were off by before and after, in degrees, where they were not exact."""
     place.mkdir(parents=True, exist_ok=True)
-    training = Training(seen, config, perceptual)
+    training = Training(seen, config, perceptual, consistency=consistency)
     if (place / STATE_FILE).exists():
         training.resume(place / STATE_FILE)
 

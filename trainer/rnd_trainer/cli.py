@@ -52,6 +52,8 @@ class TrainOptions:
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses (with --light none the
     first alone)"""
+    consistency_weights: Path | None = None
+    """another of them, or its first few blocks, for the consistency loss"""
     unseen_poses: bool = True
     """when the pictures are done, teach the skinning poses that nobody filmed: a squat then tears less, and what was
     filmed hardly changes"""
@@ -88,7 +90,7 @@ def _train(options: TrainOptions) -> None:
 
     from .config import to_dict
     from .live_view import live_view
-    from .perceptual import load_lpips
+    from .perceptual import load_features, load_lpips
     from .train import Training
     from .training_state import STATE_FILE
 
@@ -102,13 +104,15 @@ def _train(options: TrainOptions) -> None:
     if options.resume:
         existing_file(state, what="state of a training to resume")
     perceptual = load_lpips(options.perceptual_weights)
+    features = load_features(options.consistency_weights)
     with _memory_runs_out():
-        training = Training(capture, config, perceptual, device)
+        training = Training(capture, config, perceptual, device, consistency=features)
     if options.resume:
         training.resume(state)
     write_json(output_folder(folder) / "config.json", to_dict(config))
     if perceptual is None:
-        _say("no --perceptual-weights: multi-scale DSSIM instead of LPIPS, and no consistency loss")
+        without = "" if features is not None else ", and no consistency loss"
+        _say(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
     for frame in training.bad_masks:
         _say(f"frame {frame}: mask empty or full, skipped")
     _say(f"{folder}: {training.total_steps} steps in all")
@@ -152,6 +156,7 @@ def _config(options: TrainOptions) -> TrainConfig:
         refuse_changed(options, ["probe_channels"], f"--light {options.light} learns no light")
     if options.light == "none":
         refuse_changed(options, ["visibility"], "--light none has plain colours, which no shadow falls on")
+        refuse_changed(options, ["consistency_weights"], "--light none has no consistency loss")
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     return config

@@ -33,7 +33,8 @@ COLUMNS = {
 }
 """what the terminal's table shows of a row: heading and format"""
 OF_ONE_RUN = ("pictures", "method")
-OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds")
+OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds",
+              "consistency_weights")  # fmt: skip
 WIDTH = 140
 """characters of the widest table"""
 
@@ -52,6 +53,8 @@ class EvalOptions:
     """folder for strips: truth, render, normals, albedo, error"""
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds the LPIPS column"""
+    consistency_weights: Path | None = None
+    """of the studies' trainings, as of rnd-train"""
     shade: str = "table+sun"
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
     motion: str | None = None

@@ -147,6 +147,7 @@ def _provenance(checkpoint: Any) -> dict[str, Any]:
         "steps": config.steps,
         "step": info.get("step"), "seed": config.seed,
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,
-        "train_perceptual": info.get("perceptual"), "refine_poses": config.refine_poses,
+        "train_perceptual": info.get("perceptual"),
+        "consistency_sha256": info.get("consistency_sha256"), "refine_poses": config.refine_poses,
         "threads": numba.get_num_threads(), "machine": machine(),
     }  # fmt: skip

@@ -40,8 +40,9 @@ class Objective:
         config: weights and schedule.
         probe: the learned light.
         fixed_light: [32, 64, 3] a known light to use instead, or None.
-        perceptual: feature network of the LPIPS and consistency terms; without one both are off, and the
-            structural term looks at several scales instead.
+        perceptual: network of the LPIPS term; without one that is off, and the structural term looks at several
+            scales instead.
+        consistency: network whose features L_gc compares; without one that is off.
         generator: of all random draws.
     """
 
@@ -51,10 +52,11 @@ class Objective:
         probe: LightProbe,
         fixed_light: Tensor | None,
         perceptual: Perceptual | None,
+        consistency: Perceptual | None,
         generator: torch.Generator,
     ) -> None:
         self.config, self.probe, self.fixed_light = config, probe, fixed_light
-        self.perceptual, self.generator = perceptual, generator
+        self.perceptual, self.consistency, self.generator = perceptual, consistency, generator
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
@@ -95,8 +97,10 @@ class Objective:
             normals, known = (x.to(device) for x in estimate)
             terms["normal"] = config.weight_normal * ((picture.normals - normals).abs() * known).mean()
         due = _due(step, config.weight_consistency, config.consistency_every)
-        if due and texels is not None and self._network_for(target) is not None:
-            agreement = self._consistency(model, posed, pose, texels, view.camera, image_srgb, background)
+        network = _if_large(self.consistency, target)
+        if due and texels is not None and network is not None:
+            seen = (view.camera, image_srgb, background)
+            agreement = self._agreement(network, model, posed, pose, texels, *seen)
             if agreement is not None:
                 terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
         return terms
@@ -120,18 +124,13 @@ class Objective:
     def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
         """L1 with a structural term; LPIPS where there is a network and the picture is large enough for it."""
         config = self.config
-        seen = self._network_for(target_srgb)
+        seen = _if_large(self.perceptual, target_srgb)
         scales = 1 if seen is not None else config.dssim_scales
         terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
         if seen is not None and _due(step, config.weight_lpips, config.lpips_every):
             distance = seen(image_srgb.clamp(max=1), target_srgb)
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance
         return terms
-
-    def _network_for(self, image: Tensor) -> Perceptual | None:
-        """The feature network, where there is one and ``image`` [h, w, 3] is large enough for it."""
-        large = self.perceptual is not None and min(image.shape[:2]) >= self.perceptual.smallest
-        return self.perceptual if large else None
 
     def _texels(self, step: int) -> Texels:
         config = self.config
@@ -140,8 +139,9 @@ class Objective:
             return all_texels(*maps)
         return draw_texels(*maps, config.light_texels, self.generator)
 
-    def _consistency(
+    def _agreement(
         self,
+        network: Perceptual,
         model: AvatarModel,
         posed: Posed,
         pose: PoseInput,
@@ -151,7 +151,6 @@ class Objective:
         background: Tensor,
     ) -> Tensor | None:
         """L_gc between this picture and one from a virtual camera nearby; None where they share too little."""
-        assert self.perceptual is not None
         nodes = self.config.model.nodes
         centre = posed.means[:nodes].detach().mean(dim=0)
         virtual = virtual_camera(camera, centre, self.generator)
@@ -162,7 +161,7 @@ class Objective:
         second = _over(self._picture(model, posed, pose, texels, virtual), background)
         points = posed.means[drawn].detach()
         pixels = project(points, camera), project(points, virtual)
-        return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, self.perceptual)
+        return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, network)
 
     def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
         """Repulsion of the points, which moves each by its own residual alone: where it also moved the network that
@@ -182,6 +181,12 @@ class Objective:
         above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
         predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3].detach()).T
         return (above * (predicted - truth).square()).mean()
+
+
+def _if_large(network: Perceptual | None, image: Tensor) -> Perceptual | None:
+    """``network``, where there is one and ``image`` [h, w, 3] is large enough for it."""
+    large = network is not None and min(image.shape[:2]) >= network.smallest
+    return network if large else None
 
 
 def _due(step: int, weight: float, every: int) -> bool:

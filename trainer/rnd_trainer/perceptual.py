@@ -115,6 +115,16 @@ class Perceptual:
         return dataclasses.replace(self, weights=weights, heads=heads)
 
 
+def networks_sha256(*networks: Perceptual | None) -> str | None:
+    """Of the files of ``networks``, each once; None where there is none."""
+    return " ".join(dict.fromkeys(network.sha256 for network in networks if network is not None)) or None
+
+
+def load_features(path: Path | None) -> Perceptual | None:
+    """The network of ``--consistency-weights``, whole or its first few blocks; None where none is named."""
+    return None if path is None else load_perceptual(path)
+
+
 def load_lpips(path: Path | None) -> Perceptual | None:
     """The network of ``--perceptual-weights``, which must be whole and have its heads; None where none is named."""
     if path is None:

@@ -59,14 +59,16 @@ def _trained(options: EvalOptions, config: TrainConfig, variants: Sequence[Study
     from rnd_runtime.capture import load_capture
 
     from .ablate import ablate, check_needs
-    from .perceptual import load_lpips
+    from .perceptual import load_features, load_lpips
 
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)
     perceptual = load_lpips(options.perceptual_weights)
     console = Console(stderr=True)
     if perceptual is None:
-        console.print("rnd-eval: no --perceptual-weights: no LPIPS, and L_gc is off in every row")
+        console.print(
+            "rnd-eval: no --perceptual-weights: no LPIPS, and without --consistency-weights no L_gc"
+        )
     with Progress(console=console, speed_estimate_period=600) as progress:
         task = progress.add_task("", total=None)
 
@@ -80,6 +82,7 @@ def _trained(options: EvalOptions, config: TrainConfig, variants: Sequence[Study
             variants,
             seeds=range(options.seeds),
             perceptual=perceptual,
+            consistency=load_features(options.consistency_weights),
             mode=options.shade,
             on_run=on_run,
         )

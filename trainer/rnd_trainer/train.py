@@ -36,7 +36,7 @@ from .light import PROBE_SHAPE, LightProbe, as_probe
 from .metrics_log import row_of
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
-from .perceptual import Perceptual
+from .perceptual import Perceptual, networks_sha256
 from .pose_refinement import PoseRefinement
 from .template import sample_template
 from .training_state import STATE_FILE, STATE_SCHEMA, read_state
@@ -64,7 +64,8 @@ class Training:
     Args:
         capture: the pictures, poses and body to learn from.
         config: schedule and weights.
-        perceptual: feature network of the LPIPS and consistency losses; None leaves both out.
+        perceptual: network of the LPIPS loss; None leaves that out.
+        consistency: network whose features the consistency loss compares, by default ``perceptual``.
         device: where the tensors live; random draws are made on the CPU, so that they do not depend on it.
     """
 
@@ -74,6 +75,8 @@ class Training:
         config: TrainConfig,
         perceptual: Perceptual | None = None,
         device: torch.device | str = "cpu",
+        *,
+        consistency: Perceptual | None = None,
     ) -> None:
         if config.light == "learn":
             training_light_name(capture, "learning a light")
@@ -82,13 +85,15 @@ class Training:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.device = torch.device(device)
         self.perceptual = None if perceptual is None else perceptual.to(device=self.device)
+        self.consistency = self.perceptual if consistency is None else consistency.to(device=self.device)
         true_normals = config.normals == "true"
         self.views, self.bad_masks = load_views(capture, "train", config.image_scale, true_normals)
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
         self.model = AvatarModel(config.model, template).to(self.device)
         self.probe = LightProbe(config.probe_channels).to(self.device)
         fixed_light = self._capture_light() if config.light == "capture" else None
-        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.generator)
+        networks = (self.perceptual, self.consistency)
+        self.objective = Objective(config, self.probe, fixed_light, *networks, self.generator)
         self.poses = [self._pose(view) for view in self.views]
         self.refinement = self._refinement() if config.refine_poses else None
         self.unseen: UnseenPoses | None = None  # from the third stage on
@@ -309,7 +314,7 @@ class Training:
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
             "lit": self.lit,
-            "perceptual_sha256": self._perceptual_sha256(),
+            "perceptual_sha256": networks_sha256(self.perceptual, self.consistency),
             "learned_from_sha256": self._learned_from_sha256,
         }
         write_tensors(folder / STATE_FILE, tensors, header)
@@ -330,7 +335,7 @@ class Training:
         The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
         """
         saved = read_state(path)
-        saved.refuse_other(self.config, self._perceptual_sha256())
+        saved.refuse_other(self.config, networks_sha256(self.perceptual, self.consistency))
         header, taught = saved.header, saved.part("taught")
         if header.get("learned_from_sha256", self._learned_from_sha256) != self._learned_from_sha256:
             raise InputError(
@@ -383,9 +388,6 @@ class Training:
             add(light.radiance, _rounded(light.rotation))
         return digest.hexdigest()
 
-    def _perceptual_sha256(self) -> str | None:
-        return None if self.perceptual is None else self.perceptual.sha256
-
     def _lights(self) -> list[str]:
         """Names of the lights that its pictures were taken under."""
         return sorted({view.frame.light for view in self.views if view.frame.light})
@@ -405,7 +407,9 @@ class Training:
             "pictures": len(self.views),
             "spacing_m": float(self.model.spacing),
             "perceptual": None if self.perceptual is None else self.perceptual.backbone,
-            "perceptual_sha256": self._perceptual_sha256(),
+            "perceptual_sha256": networks_sha256(self.perceptual),
+            "consistency": None if self.consistency is None else self.consistency.backbone,
+            "consistency_sha256": networks_sha256(self.consistency),
         }
 
 
