@@ -14,7 +14,7 @@ from rich.console import Console
 
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.images import write_image
-from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, stability_main
+from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, _told, stability_main
 from rnd_trainer.stability import captures, materials, poses, relighting, soak
 from rnd_trainer.stability.figures import (
     IDENTICAL_DB,
@@ -27,7 +27,7 @@ from rnd_trainer.stability.figures import (
     not_measured,
     stated,
 )
-from rnd_trainer.stability.rows import ROWS
+from rnd_trainer.stability.rows import ROWS, SHORT
 from rnd_trainer.stability.subject import Subject
 
 MEASURED_ON = {"gaussians": 600, "machine": "this one"}
@@ -79,6 +79,15 @@ def test_the_table_keeps_other_rows_and_replaces_its_own(tmp_path):
     assert all(MEASURED_ON.items() <= row.items() for row in rows)
     assert "| L1 | suns | energy | 0.2 % | < 1 | ✓ | bilinear: 39 % |" in (tmp_path / "table.md").read_text()
     assert (tmp_path / "table" / "P1.png").exists()
+
+
+def test_a_row_that_is_not_of_the_avatar_does_not_borrow_its_size():
+    avatar = {"gaussians": 30_000, "size": 512, "checkpoint_sha256": "ab"} | (
+        where := {"threads": 2, "machine": "this one"}
+    )
+    assert _told("the avatar", avatar) == {"on": "the avatar", **avatar}
+    assert _told("a ball", avatar) == {"on": "a ball", **where}
+    assert {row.id for row in ROWS if row.on == SHORT} == {"P17", "R9", "R10", "R11"}
 
 
 def test_a_number_that_is_none_never_passes():

@@ -6,7 +6,6 @@ Rows that were measured before stay in the file until they are measured again, s
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
+from numba import get_num_threads
 
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option, parse_options, run_command
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 SHARED_CAPTURE = Path("../shared/data/capture")
 EMBEDDED_CAPTURE = Path("assets/capture")
-STUDIO_STEPS, STUDIO_SIZE, STUDIO_FRAMES = 600, 128, 24
+SMALL_STEPS = 600
+"""of the avatar that is trained where none is given"""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class StabilityOptions:
     """Run the rows of the stability list at full size; with --fuzz, --soak or --kill also what takes hours."""
 
     checkpoint: Path | None = None
-    """avatar.ckpt trained on the capture; without one a small avatar is trained for the rows, on a filmed spin"""
+    """avatar.ckpt trained on the capture; without one an avatar is trained on it in some minutes, and is no good one"""
     capture: Path | None = None
     """the pictures it was trained on; by default ../shared/data/capture where present, else assets/capture"""
     json: Path = Path("assets/bench/stability.json")
@@ -91,19 +92,18 @@ def _stability(options: StabilityOptions) -> None:
             if row.id in wanted:
                 with console.status(f"{row.id} {row.failure}"):
                     result = row.measure(subject)
-                _keep(options, measured_on, row.id, row.failure, result.figures, result)
+                _keep(options, _told(row.on, measured_on), row.id, row.failure, result.figures, result)
                 _show(console, row.id, result.figures)
-        for name, failure, figures in _long_runs(options, subject):
-            _keep(options, measured_on, name, failure, figures, None)
+        for name, failure, on, figures in _long_runs(options, subject):
+            _keep(options, _told(on, measured_on), name, failure, figures, None)
             _show(console, name, figures)
 
 
 def _subject(options: StabilityOptions, work: Path) -> Subject:
-    """The avatar of the checkpoint, exported here, or one trained in a minute on a filmed spin."""
+    """The avatar of the checkpoint, exported here, or one trained in minutes on the capture."""
     from rnd_runtime.capture import load_capture
 
     from .stability.commands import EXPORT, run_commands
-    from .stability.studio import write_studio
     from .stability.subject import Subject
     from .stability.trainings import train_small
 
@@ -112,8 +112,7 @@ def _subject(options: StabilityOptions, work: Path) -> Subject:
         folder = SHARED_CAPTURE if SHARED_CAPTURE.exists() else EMBEDDED_CAPTURE
     capture = load_capture(folder)
     if checkpoint is None:
-        capture = write_studio(work / "capture", capture.body, size=STUDIO_SIZE, frames=STUDIO_FRAMES)
-        checkpoint = train_small(work / "run", capture, STUDIO_STEPS, 30_000)
+        checkpoint = train_small(work / "run", capture, SMALL_STEPS, 30_000)
     avatar = work / "avatar.onnx"
     done = run_commands(work, [(EXPORT, [str(checkpoint.resolve()), "--out", str(avatar.resolve())])])[0]
     if done.code != 0:
@@ -124,10 +123,19 @@ def _subject(options: StabilityOptions, work: Path) -> Subject:
 
 
 def _measured_on(subject: Subject) -> dict[str, Any]:
+    """Where, and of the avatar: which, and how large it and its pictures are."""
     return {
+        "threads": get_num_threads(), "machine": machine(),
         "gaussians": subject.avatar.gaussians, "size": subject.size, "checkpoint_sha256": sha256_of(subject.checkpoint),
-        "threads": os.cpu_count(), "machine": machine(),
     }  # fmt: skip
+
+
+def _told(on: str, measured_on: dict[str, Any]) -> dict[str, Any]:
+    """What a row says of what it was measured ``on``: the avatar's numbers where that is the avatar."""
+    from .stability.figures import AVATAR
+
+    places = {name: measured_on[name] for name in ("threads", "machine")}
+    return {"on": on, **(measured_on if on == AVATAR else places)}
 
 
 def _fuzz(options: StabilityOptions, subject: Subject) -> Sequence[Figure]:
@@ -153,24 +161,29 @@ def _fuzz(options: StabilityOptions, subject: Subject) -> Sequence[Figure]:
     return figures
 
 
-def _long_runs(options: StabilityOptions, subject: Subject) -> Iterable[tuple[str, str, Sequence[Figure]]]:
-    """What is asked for by --fuzz, --soak, --kill and --determinism."""
+def _long_runs(
+    options: StabilityOptions, subject: Subject
+) -> Iterable[tuple[str, str, str, Sequence[Figure]]]:
+    """What is asked for by --fuzz, --soak, --kill and --determinism: id, failure, what it is measured on, figures."""
+    from .stability.figures import AVATAR
+    from .stability.rows import SHORT
+
     if options.fuzz:
-        yield "F", "hostile files", _fuzz(options, subject)
+        yield "F", "hostile files", "small files", _fuzz(options, subject)
     if options.soak:
         from .stability.soak import soak_playback, soak_training
 
         state = subject.work / "soak.json"
-        yield "S1", "soak, playback", soak_playback(subject, options.soak, state)
-        yield "S2", "soak, training", soak_training(subject, options.soak // 10, state)
+        yield "S1", "soak, playback", AVATAR, soak_playback(subject, options.soak, state)
+        yield "S2", "soak, training", SHORT, soak_training(subject, options.soak // 10, state)
     if options.kill:
         from .stability.kill import kill_all
 
-        yield "K", "kill -9", kill_all(subject, options.kill)
+        yield "K", "kill -9", "the avatar; trainings of 400 Gaussians", kill_all(subject, options.kill)
     if options.determinism:
         from .stability.determinism import same_bytes
 
-        yield "D", "determinism", same_bytes(subject).figures
+        yield "D", "determinism", AVATAR, same_bytes(subject).figures
 
 
 def _rows(options: StabilityOptions) -> list[dict[str, Any]]:

@@ -19,7 +19,6 @@ from rnd_runtime.light import (
     texel_directions,
     texel_solid_angles,
 )
-from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.sh import SH_COUNT
 from rnd_runtime.shading import Shader
 from rnd_runtime.shading_reference import shade_reference
@@ -36,7 +35,6 @@ from .figures import (
     decibels,
     holds,
     not_measured,
-    stated,
 )
 from .lights import SUN_RADIUS, sun_and_sky, sun_disc
 from .subject import Subject, bytes_of
@@ -340,34 +338,3 @@ def monochrome_probe(subject: Subject) -> Result:
     figure = above("PSNR under coloured lamps, RGB probe", decibels(ours, truth), 35, "dB",
                    baseline=("one channel", decibels(mono, truth)))  # fmt: skip
     return Result((figure,), (bytes_of(ours), bytes_of(truth)))
-
-
-def worst_cases(subject: Subject) -> Result:
-    """Time: the worst camera (inside the body), the worst pose and a light of 1e6, against an ordinary frame."""
-    from time import perf_counter
-
-    from rnd_runtime.camera import Camera
-
-    chest = np.median(subject.rest.means, axis=0).astype(np.float64)
-    inside = Camera.look_at(chest, chest - [0, 0, 1.0], width=subject.size, height=subject.size, fov_y=0.6)
-    fierce = Shader(sun_and_sky(128, radiance=1e6), "table+sun")
-    from .subject import EXTREMES
-
-    still = subject.motion({})
-    cases = {
-        "an ordinary frame": (still, subject.camera(), subject.shader),
-        "camera inside the body": (still, inside, subject.shader),
-        "squat": (subject.motion(EXTREMES["squat"]), subject.camera(), subject.shader),
-        "light of 1e6": (still, subject.camera(), fierce),
-    }
-    figures = []
-    for name, (motion, camera, shader) in cases.items():
-        times = []
-        for _ in range(subject.few(3, 20)):
-            started = perf_counter()
-            posed = subject.avatar.pose(motion, 0.0)
-            radiance = shader.shade(posed, camera.position)
-            rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera, depth=False)
-            times.append(perf_counter() - started)
-        figures.append(stated(f"frame time, {name}", 1e3 * min(times), "ms"))
-    return Result(tuple(figures))

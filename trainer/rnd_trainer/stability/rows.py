@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
-from . import captures, drift, files, materials, motions, playback, poses, relighting, splats, trainings
+from . import (
+    captures,
+    drift,
+    files,
+    materials,
+    motions,
+    playback,
+    poses,
+    relighting,
+    splats,
+    stress,
+    trainings,
+)
 from .figures import Row
 
+SHORT = "a training of at most 4 000 Gaussians, 96²"
+MADE = "Gaussians or a light made for it"
 ROWS: tuple[Row, ...] = (
     Row("P1", "out-of-distribution pose", poses.out_of_distribution),
     Row("P2", "candy wrapper", poses.candy_wrapper),
@@ -19,24 +33,24 @@ ROWS: tuple[Row, ...] = (
     Row("P14", "joint counts", motions.joint_counts),
     Row("P15", "betas", motions.other_betas),
     Row("P16", "wrong up axis or camera", motions.wrong_camera),
-    Row("P17", "noisy poses in training", trainings.noisy_training_poses),
+    Row("P17", "noisy poses in training", trainings.noisy_training_poses, SHORT),
     Row("G1", "needles in unseen views", splats.needles),
-    Row("G2", "zero, NaN, denormal quaternion; q and −q", splats.broken_quaternions),
+    Row("G2", "zero, NaN, denormal quaternion; q and −q", splats.broken_quaternions, MADE),
     Row("G3", "camera inside, at a Gaussian, behind", splats.fly_through),
     Row("G5", "nothing in view", splats.nothing_in_view),
-    Row("G6", "equal depths", splats.equal_depths),
-    Row("G7", "image sizes", splats.image_sizes),
-    Row("G9", "transfer functions and alpha", splats.grey_card),
+    Row("G6", "equal depths", splats.equal_depths, MADE),
+    Row("G7", "image sizes", splats.image_sizes, MADE),
+    Row("G9", "transfer functions and alpha", splats.grey_card, MADE),
     Row("G10", "rasters disagree", splats.rasters_agree),
     Row("L1", "bright suns", relighting.bright_suns),
     Row("L2", "black map", relighting.dark_maps),
     Row("L3", "broken texels", relighting.broken_texels),
-    Row("L4", "orientation of the light", relighting.orientation),
-    Row("L5", "resizing the light", relighting.resizing),
+    Row("L4", "orientation of the light", relighting.orientation, MADE),
+    Row("L5", "resizing the light", relighting.resizing, MADE),
     Row("L7", "turning the light", relighting.turning_light),
-    Row("L8", "white furnace", relighting.white_furnace),
+    Row("L8", "white furnace", relighting.white_furnace, MADE),
     Row("L9", "broken normals", relighting.broken_normals),
-    Row("L10", "grazing view", relighting.grazing),
+    Row("L10", "grazing view", relighting.grazing, MADE),
     Row("L11", "albedo–light scale", materials.relit_scale),
     Row("L12", "light baked into albedo", materials.baked_light),
     Row("L13", "visibility blind to pose", materials.crossed_arms),
@@ -47,10 +61,10 @@ ROWS: tuple[Row, ...] = (
     Row("R4", "broken checkpoint or avatar", files.broken_files),
     Row("R5", "broken capture", captures.broken_captures),
     Row("R6", "empty or full masks", captures.bad_masks),
-    Row("R9", "seeds", trainings.seeds),
-    Row("R10", "NaN while training", trainings.not_finite),
-    Row("R11", "resume", trainings.resumed),
+    Row("R9", "seeds", trainings.seeds, SHORT),
+    Row("R10", "NaN while training", trainings.not_finite, SHORT),
+    Row("R11", "resume", trainings.resumed, SHORT),
     Row("R12", "no display", files.no_display),
 )
-TIMES = Row("T", "time in the worst cases", relighting.worst_cases)
+TIMES = Row("T", "time in the worst cases", stress.worst_cases)
 """not in the list: accuracy and speed under stress belong to the same chart"""
