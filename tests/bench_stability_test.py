@@ -15,7 +15,7 @@ from rich.console import Console
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.images import write_image
 from rnd_trainer.bench_stability import StabilityOptions, _keep, _show, _told, stability_main
-from rnd_trainer.stability import captures, materials, poses, relighting, soak
+from rnd_trainer.stability import captures, materials, poses, relighting, soak, stress
 from rnd_trainer.stability.figures import (
     IDENTICAL_DB,
     Figure,
@@ -88,6 +88,14 @@ def test_a_row_that_is_not_of_the_avatar_does_not_borrow_its_size():
     assert _told("the avatar", avatar) == {"on": "the avatar", **avatar}
     assert _told("a ball", avatar) == {"on": "a ball", **where}
     assert {row.id for row in ROWS if row.on == SHORT} == {"P17", "R9", "R10", "R11"}
+
+
+def test_the_worst_cases_are_timed_and_compared(bare):
+    figures = stress.worst_cases(bare).figures
+    told = {figure.what: figure.measured for figure in figures}
+    for scene in ("an ordinary frame", "camera inside the body", "squat", "light of 1e6"):
+        assert 0 < told[f"{scene}: frame time, median"] <= told[f"{scene}: frame time, p95"]
+        assert 20 < told[f"{scene}: PSNR to the full reference"] < 120
 
 
 def test_a_number_that_is_none_never_passes():

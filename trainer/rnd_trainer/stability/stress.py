@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -45,9 +44,8 @@ def worst_cases(subject: Subject) -> Result:
             drawn = rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera, depth=False)
             times.append(1e3 * (perf_counter() - started))
         exact = posed_reference(subject.avatar, motion, 0.0)
-        lit = shade_reference(exact, shader.light, camera.position)
-        arrays: tuple[Any, ...] = (exact.means, exact.covariances, exact.opacities, lit)
-        truth = raster_oracle.rasterize(*arrays, camera).image
+        lit = shade_reference(exact, shader.light, camera.position).astype(np.float32)
+        truth = raster_oracle.rasterize(exact.means, exact.covariances, exact.opacities, lit, camera).image
         figures += [
             stated(f"{name}: frame time, median", float(np.median(times)), "ms"),
             stated(f"{name}: frame time, p95", float(np.percentile(times, 95)), "ms"),
