@@ -239,7 +239,18 @@ def test_no_gaussians(mode):
 
 
 @pytest.mark.parametrize(
-    "mode", ["", "tables", "lights", "lights:", "lights:0", "lights:-3", "lights:1e3", "lights:9999999"]
+    "mode",
+    [
+        "",
+        "tables",
+        "lights",
+        "lights:",
+        "lights:0",
+        "lights:-3",
+        "lights:1e3",
+        "lights:9999",
+        f"lights:{'9' * 5000}",
+    ],
 )
 def test_unknown_modes_are_refused_with_the_list(mode):
     with pytest.raises(InputError, match=r"ao, table, table\+sun, lights:K, brute"):

@@ -15,6 +15,7 @@ All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_refer
 from __future__ import annotations
 
 import copy
+import re
 
 import numba
 import numpy as np
@@ -151,12 +152,13 @@ def check_mode(mode: str) -> None:
 
 
 def _light_count(mode: str) -> int:
-    name, _, count = mode.partition(":")
-    if name != "lights" or not count.isdecimal() or not 1 <= int(count) <= _MOST_LIGHTS:
+    match = re.fullmatch(r"lights:(\d{1,6})", mode)
+    count = int(match[1]) if match else 0
+    if not 1 <= count <= _MOST_LIGHTS:
         raise InputError(
             "shading mode", expected=f"one of {', '.join(SHADE_MODES)} (K from 1 to {_MOST_LIGHTS})", got=mode
         )
-    return int(count)
+    return count
 
 
 def shadow_radii(gaussians: Gaussians) -> Floats32:

@@ -187,7 +187,7 @@ def parse_size(text: str | None) -> tuple[int, int | None] | None:
 
 def parse_frames(text: str | None, count: int) -> range:
     """``10:50``, ``:50`` or ``10:`` out of ``count`` frames."""
-    match = re.fullmatch(r"(\d*):(\d*)", text if text is not None else ":")
+    match = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text if text is not None else ":")
     start, end = (int(match[1] or 0), int(match[2] or count)) if match else (0, 0)
     if not 0 <= start < end <= count:
         raise InputError("--frames", expected=f"START:END within 0:{count}, START before END", got=text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -147,10 +148,11 @@ def parse_shard(text: str) -> tuple[int, int]:
     Raises:
         InputError: anything else.
     """
-    part, _, parts = text.partition("/")
-    if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
+    match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
+    part, parts = (int(match[1]), int(match[2])) if match else (0, 0)
+    if part >= parts:
         raise InputError("--shard", expected="K/N with K from 0 to N - 1", got=text)
-    return int(part), int(parts)
+    return part, parts
 
 
 def _agreement(options: Agreement) -> None:
