@@ -27,7 +27,6 @@ class MocapTree:
         names: J joint names, each once, the root first.
         parents: [J], −1 for the root, a parent before its children.
         offsets: [J, 3] from the parent in the zero pose, in which every rotation is the identity.
-        tips: [J, 3] from a joint without children to the end of its bone; zero where the file does not say.
         rotations: [F, J, 3, 3] local, on top of the zero pose.
         root_positions: [F, 3].
         fps: frames per second.
@@ -37,7 +36,6 @@ class MocapTree:
     names: tuple[str, ...]
     parents: tuple[int, ...]
     offsets: Floats
-    tips: Floats
     rotations: Floats
     root_positions: Floats
     fps: float
@@ -72,7 +70,6 @@ class _Joint:
     name: str
     parent: int
     offset: Floats = field(default_factory=lambda: np.zeros(3))
-    tip: Floats = field(default_factory=lambda: np.zeros(3))
     channels: tuple[str, ...] = ()
 
 
@@ -160,10 +157,8 @@ def _bvh_hierarchy(words: Iterator[str]) -> list[_Joint]:
             offset = np.array([float(next(words)) for _ in range(3)])
             if not np.isfinite(offset).all():
                 raise InputError("OFFSET", expected="finite numbers", got=offset.tolist())
-            if open_joints[-1] >= 0:
+            if open_joints[-1] >= 0:  # else of an end site, which is no joint
                 joints[open_joints[-1]].offset = offset
-            else:
-                joints[open_joints[-2]].tip = offset
         elif word == "CHANNELS" and open_joints:
             # a list first: in a generator the end of the file would be another error
             names = tuple([next(words).capitalize() for _ in range(int(next(words)))])
@@ -228,8 +223,7 @@ def read_acclaim(path: str | Path) -> MocapTree:
                 positions[:, axis] = values[:, column]
         rotations[:, number] = bone.axes @ turn @ bone.axes.T
     joints = [_Joint(bone.name, -1 if bone.parent is None else names.index(bone.parent)) for bone in bones]
-    for joint, bone in zip(joints, bones):
-        joint.tip = bone.reach
+    for joint in joints:
         if joint.parent >= 0:
             joint.offset = bones[joint.parent].reach
     note = f"no frame rate in the file: {_ACCLAIM_FPS:g} frames per second assumed, as CMU records"
@@ -383,7 +377,6 @@ def _tree(
         names,
         tuple(joint.parent for joint in joints),
         np.array([joint.offset for joint in joints]),
-        np.array([joint.tip for joint in joints]),
         rotations,
         positions,
         fps,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture_format import Split
 from rnd_runtime.errors import InputError
-from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
+from rnd_runtime.motion_names import NAMES_BY_COUNT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import SMPL_NAMES
 
@@ -22,8 +22,6 @@ Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 RootConvention = Literal["smpl", "easymocap", "placed"]
-
-_NAMES = {22: SMPL_NAMES[:22], 24: SMPL_NAMES, 52: SMPLH_NAMES, 55: SMPLX_NAMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +255,9 @@ def _rotations(axis_angles: ArrayLike) -> tuple[Floats, tuple[str, ...]]:
     if not angles.size:
         raise InputError("body poses", expected="at least one frame", got="none")
     joints, over = divmod(angles.size, 3 * len(angles))
-    names = None if over else _NAMES.get(joints)
+    names = None if over else NAMES_BY_COUNT.get(joints)
     if names is None:
-        known = ", ".join(map(str, _NAMES))
+        known = ", ".join(map(str, NAMES_BY_COUNT))
         raise InputError("joints of the body poses", expected=known, got=_shape(angles) if over else joints)
     return axis_angle_to_matrix(angles.reshape(-1, joints, 3)), names
 
