@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.light import load_light
@@ -31,10 +31,9 @@ from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.convert_cli import main
-from rnd_viewer.mesh_files import posed_vertices
 from rnd_viewer.player import Player
 from rnd_viewer.splat_files import TRANSFORM
-from rnd_viewer.splats import fixed_colour, make_splats, stored_colours
+from rnd_viewer.splats import fixed_colour, make_splats, stored_colours, turned_over
 from rnd_viewer.visionary import check_clip, write_visionary
 from tiny import ASSETS, body, motion
 
@@ -237,6 +236,17 @@ def test_a_probe_made_for_a_z_up_world_lights_as_the_player_has_it(tmp_path):
     assert np.mean(np.abs(y_up["f_dc_1"] - z_up["f_dc_1"]) > 0.05) > 0.5
 
 
+def test_splats_turn_over_with_quaternions_of_one_half():
+    avatar = Avatar.load(AVATAR, threads=1)
+    posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
+    splats = make_splats(posed, fixed_colour(posed.albedo))
+    turned = turned_over(splats)
+    assert splats.quaternions[:, 0].min() >= 0 and turned.quaternions[:, 0].min() >= 0
+    upright, over = (Rotation.from_quat(a.quaternions, scalar_first=True) for a in (splats, turned))
+    expected = np.diag([-1.0, -1.0, 1.0]) @ upright.as_matrix()
+    np.testing.assert_allclose(over.as_matrix(), expected, atol=1e-12)
+
+
 def test_colours_of_gaussians_that_nobody_sees_are_numbers():
     avatar = Avatar.load(AVATAR, threads=1)
     posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
@@ -415,7 +425,7 @@ def test_rigged_glb_moves_like_the_template(tmp_path):
     assert main([*line, "--out", str(tmp_path), "--format", "glb,obj", "--frames", "2:3"]) == 0
     document, arrays = _glb(tmp_path / "body.glb")
     for frame in (0, 2, 5):
-        expected = posed_vertices(template, moves, frame / moves.fps)
+        expected = posed_vertices(template, moves.rotations[frame], moves.translations[frame])
         assert np.abs(_evaluated(document, arrays, frame / moves.fps) - expected).max() < 1e-5
     rotations = [s["output"] for s in document["animations"][0]["samplers"][1:]]
     assert all((np.sum(arrays[r][1:] * arrays[r][:-1], axis=1) >= 0).all() for r in rotations)
@@ -423,7 +433,8 @@ def test_rigged_glb_moves_like_the_template(tmp_path):
     (mesh,) = scene.geometry.values()
     np.testing.assert_allclose(mesh.vertices, template.vertices, atol=1e-6)
     posed = trimesh.load(tmp_path / "000002.obj", process=False)
-    np.testing.assert_allclose(posed.vertices, posed_vertices(template, moves, 2 / moves.fps), atol=1e-6)
+    expected = posed_vertices(template, moves.rotations[2], moves.translations[2])
+    np.testing.assert_allclose(posed.vertices, expected, atol=1e-6)
     np.testing.assert_array_equal(posed.faces, template.faces)
     assert 0.03 < posed.volume < 0.15  # m³: a person, and not inside out
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from rnd_runtime.body import skin
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig, TrainConfig
@@ -16,7 +17,7 @@ from rnd_trainer.edges import BETWEEN_BONES, LEAST_LENGTH, TURNED_JOINTS, WIDEST
 from rnd_trainer.losses import ALLOWED_STRETCH, stretch_penalty
 from rnd_trainer.model import AvatarModel, PoseInput
 from rnd_trainer.stability.subject import EXTREMES
-from rnd_trainer.template import sample_template, skin
+from rnd_trainer.template import sample_template
 from rnd_trainer.unseen import KEPT_NODES, MM2, UnseenPoses
 from tiny import body
 

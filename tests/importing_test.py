@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 
 import layouts
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, cameras, motion, see, shaped_body
+from rnd_runtime.body import posed_vertices
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
@@ -21,7 +22,7 @@ from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing import nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import Choice, ImportOptions
-from rnd_trainer.silhouette import overlap, posed_vertices
+from rnd_trainer.silhouette import overlap
 
 # Measured over all layouts: 3e-7 m, nothing, nothing, cosine 0.99997
 PLACE = 1e-6  # m: some layouts store float32, transforms are float32

@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame, load_capture, save_capture
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_trainer.silhouette import DrawnMesh, draw, posed_vertices
+from rnd_trainer.silhouette import DrawnMesh, draw
 from tiny import body as embedded_body
 
 WIDTH, HEIGHT, FRAMES, FPS = 48, 64, 4, 30.0

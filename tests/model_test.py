@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from rnd_runtime.body import skin
 from rnd_runtime.brdf import ROUGHNESS_RANGE
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.data import pose_input
 from rnd_trainer.encoders import SH_DC_OF_ONE, JointAttention, positional_encoding
 from rnd_trainer.model import ALBEDO_RANGE, AvatarModel, PoseInput
-from rnd_trainer.template import sample_template, skin
+from rnd_trainer.template import sample_template
 from tiny import body, motion
 
 FLOAT32_POSITION_M = 2e-6  # float32 sums of metres

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 
 import layouts
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, axis_angles, motion, shaped_body, view_of
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
@@ -29,7 +29,7 @@ from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pictures import listed
 from rnd_trainer.importing.pose_files import read_poses
 from rnd_trainer.importing.recording import Poses, easymocap_poses, read_as, smpl_poses
-from rnd_trainer.silhouette import overlap, posed_vertices
+from rnd_trainer.silhouette import overlap
 
 PLACE = 2e-5  # m: float32 in the files and in bone transforms
 ROUGH = (

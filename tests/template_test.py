@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from rnd_runtime.body import skin
 from rnd_runtime.errors import InputError
-from rnd_trainer.template import BUCKET, farthest_points, sample_template, skin
+from rnd_trainer.template import BUCKET, farthest_points, sample_template
 from tiny import body
 
 

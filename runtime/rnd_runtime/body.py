@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .npz import Npz, save_npz
-from .skeleton import Skeleton
+from .skeleton import Skeleton, bone_transforms
+
+Floats = NDArray[np.float64]
 
 # Weights are often stored as float16 or with three digits; farther off they never were a partition of one.
 _WEIGHT_SUM_TOLERANCE = 1e-2
@@ -105,3 +107,16 @@ class Body:
                 "license": np.array([self.license]),
             },
         )
+
+
+def posed_vertices(body: Body, rotations: Floats, translation: Floats) -> Floats:
+    """Vertices [V, 3] m of ``body`` under local ``rotations`` [J, 3, 3] and root ``translation`` [3] m."""
+    bones = bone_transforms(body.skeleton, rotations, translation).astype(np.float64)
+    return skin(body.vertices, body.skinning_weights.astype(np.float64), bones)
+
+
+def skin(points: Floats, weights: Floats, bones: Floats) -> Floats:
+    """Linear blend skinning of ``points`` [N, 3] by ``weights`` [N, J] and ``bones`` [J, 3, 4]."""
+    blend = np.einsum("nj,jrc->nrc", weights, bones)
+    posed: Floats = np.einsum("nrc,nc->nr", blend[:, :, :3], points) + blend[:, :, 3]
+    return posed

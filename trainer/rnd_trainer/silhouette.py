@@ -8,11 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
-from rnd_runtime.skeleton import bone_transforms
-
-from .template import skin
 
 Floats = NDArray[np.float64]
 
@@ -30,12 +26,6 @@ class DrawnMesh(NamedTuple):
 
     mask: NDArray[np.bool_]
     normals: Floats
-
-
-def posed_vertices(body: Body, rotations: Floats, translation: Floats) -> Floats:
-    """Vertices [V, 3] m of ``body`` under local ``rotations`` [J, 3, 3] and root ``translation`` [3] m."""
-    bones = bone_transforms(body.skeleton, rotations, translation).astype(np.float64)
-    return skin(body.vertices, body.skinning_weights.astype(np.float64), bones)
 
 
 def draw(vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float = 0.0) -> DrawnMesh:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, skin
 from rnd_runtime.errors import InputError
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import bone_transforms
@@ -143,12 +143,6 @@ def along_curve(points: Floats) -> NDArray[np.int64]:
         for axis in range(3):
             keys |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
     return np.argsort(keys, kind="stable")
-
-
-def skin(points: Floats, weights: Floats, bones: Floats) -> Floats:
-    """Linear blend skinning of ``points`` [N, 3] by ``weights`` [N, J] and ``bones`` [J, 3, 4]."""
-    blend = np.einsum("nj,jrc->nrc", weights, bones)
-    return np.einsum("nrc,nc->nr", blend[:, :, :3], points) + blend[:, :, 3]
 
 
 def _vertex_normals(vertices: Floats, faces: NDArray[np.int32], crosses: Floats) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar, Encoded
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError, check_option, refuse_changed
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
@@ -24,7 +24,7 @@ from rnd_runtime.skeleton import Skeleton
 from .cameras import CameraOptions, CameraPath, file_path, frame_motion, front_path
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
 from .lights import chosen_light, light_notes
-from .mesh_files import posed_vertices, write_obj, write_rigged_glb
+from .mesh_files import write_obj, write_rigged_glb
 from .options import parse_frames, refuse_outside
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
 from .splats import (
@@ -154,7 +154,8 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
         yield f"{out / 'body.glb'}: {len(body.vertices)} vertices, {motion.duration:.1f} s of motion"
     if "obj" in formats:
         for number in frames:
-            vertices = posed_vertices(body, motion, number / motion.fps)
+            now = motion.at([number / motion.fps])
+            vertices = posed_vertices(body, now.rotations[0], now.translations[0])
             write_obj(out / f"{number:06d}.obj", vertices, body.faces)
         yield f"{len(frames)} posed meshes as obj in {out}"
 

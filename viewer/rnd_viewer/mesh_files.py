@@ -12,21 +12,11 @@ from rnd_runtime.body import Body
 from rnd_runtime.files import atomic_path
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import matrix_to_quaternion
-from rnd_runtime.skeleton import bone_transforms
 
 from .glb import ELEMENT_ARRAY_BUFFER, FLOAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT, GlbBuilder
 
 Floats = NDArray[np.float64]
 PER_SET = 4  # joints that one JOINTS_n attribute holds
-
-
-def posed_vertices(body: Body, motion: Motion, time_s: float) -> Floats:
-    """Vertices [V, 3] m of ``body`` at ``time_s`` seconds of ``motion``, by linear blend skinning."""
-    now = motion.at([time_s])
-    bones = bone_transforms(body.skeleton, now.rotations[0], now.translations[0]).astype(np.float64)
-    blend = (body.skinning_weights @ bones.reshape(len(bones), 12)).reshape(-1, 3, 4)
-    posed: Floats = np.einsum("vrc,vc->vr", blend[:, :, :3], body.vertices) + blend[:, :, 3]
-    return posed
 
 
 def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:

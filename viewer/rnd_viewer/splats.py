@@ -137,10 +137,11 @@ def turned_over(splats: Splats) -> Splats:
     probe /= np.linalg.norm(probe)
     signs = np.sign(sh_basis(probe * flip) * sh_basis(probe))[0]
     w, x, y, z = splats.quaternions.T
+    turned = np.stack([-z, -y, x, w], axis=-1)  # (0, 0, 0, 1) ⊗ q
     return Splats(
         splats.means * flip,
         splats.scales,
-        np.stack([-z, -y, x, w], axis=-1),  # (0, 0, 0, 1) ⊗ q
+        np.where(turned[:, :1] < 0, -turned, turned),
         splats.opacities,
         splats.normals * flip,
         splats.harmonics * signs[:, None],

@@ -8,11 +8,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError
 from rnd_runtime.motion import Z_UP_TO_Y_UP
 from rnd_runtime.skeleton import Skeleton
-from rnd_trainer.silhouette import posed_vertices
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body
+from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError
 from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
 from rnd_runtime.npz import Npz
 from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
 from rnd_runtime.unpickle import read_pickle
-from rnd_trainer.silhouette import posed_vertices
 
 from .anny_body import anny_body
 

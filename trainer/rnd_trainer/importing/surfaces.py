@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.body import posed_vertices
 from rnd_runtime.errors import InputError
 from rnd_trainer.checking.normals import parse_axes
-from rnd_trainer.silhouette import DrawnMesh, draw, posed_vertices
+from rnd_trainer.silhouette import DrawnMesh, draw
 
 from .masks import make_masks
 from .networks import ImageNetwork

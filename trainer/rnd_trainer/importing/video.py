@@ -11,9 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from rnd_runtime.body import posed_vertices
 from rnd_runtime.capture_format import Split
 from rnd_runtime.errors import InputError
-from rnd_trainer.silhouette import posed_vertices, silhouette
+from rnd_trainer.silhouette import silhouette
 
 from .body_models import BodyModel
 from .frames import Film
