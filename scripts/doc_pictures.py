@@ -22,7 +22,6 @@ from rnd_viewer.player import Player
 
 ROOT = Path(__file__).parent.parent
 SIDE, TIME_S = 400, 0.55
-ANGLES = math.radians(35), math.radians(5)  # field of view and elevation
 CYCLE_S = 1.1  # of the walk
 AOVS = ("albedo", "normal", "roughness", "visibility")
 
@@ -34,7 +33,7 @@ def main() -> None:
     sky = load_light(ROOT / "assets/sky.exr")
     _strip(avatar, walk, sky)
     moment = walk.at([TIME_S])
-    camera = front_path(frame_motion(avatar.skeleton, moment), CameraOptions(SIDE, SIDE, *ANGLES))(0, 0.0)
+    camera = front_path(frame_motion(avatar.skeleton, moment), CameraOptions(SIDE, SIDE))(0, 0.0)
 
     frame = Player(avatar, sky, Shader(sky), rasterize, aovs=AOVS).render(walk, TIME_S, camera)
     tiles = [frame.srgb]
@@ -57,7 +56,7 @@ def main() -> None:
     for motion, time_s in ((rest, 0.0), (walk, TIME_S)):
         view = front_path(
             frame_motion(avatar.skeleton, motion.at([time_s])),
-            CameraOptions(SIDE, SIDE, *ANGLES),
+            CameraOptions(SIDE, SIDE),
         )
         tiles.append(_weights(avatar, motion, time_s, view(0, 0.0)))
     _write("weights.png", tiles)
@@ -65,7 +64,7 @@ def main() -> None:
 
 def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
     """Six moments of one step cycle, each seen from another side and under the sun of another hour."""
-    orbit = orbit_path(frame_motion(avatar.skeleton, walk), CameraOptions(240, 384, *ANGLES), seconds=1.0)
+    orbit = orbit_path(frame_motion(avatar.skeleton, walk), CameraOptions(240, 384), seconds=1.0)
     tiles = []
     for k in range(6):
         light = replace(sky, yaw=math.radians(50 * k - 20))

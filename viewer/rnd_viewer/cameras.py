@@ -6,6 +6,7 @@ run can be rendered alone and gives the same pixels.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from rnd_runtime.files import existing_file
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton
 
-from .options import LARGEST_SIDE
+from .options import ELEVATION, FIELD_OF_VIEW, LARGEST_SIDE
 
 Floats = NDArray[np.float64]
 CameraPath = Callable[[int, float], Camera]
@@ -57,7 +58,7 @@ class Framing:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """The options of an automatic camera.
+    """The options of an automatic camera; by default of the usual view.
 
     Attributes:
         width, height: pixels.
@@ -68,8 +69,8 @@ class CameraOptions:
 
     width: int
     height: int
-    fov_y: float
-    elevation: float
+    fov_y: float = math.radians(FIELD_OF_VIEW)
+    elevation: float = math.radians(ELEVATION)
     distance: float | None = None
 
 

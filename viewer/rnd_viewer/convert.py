@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -42,7 +41,7 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog", "visionary"), ("glb", "obj")
 # The front camera of rnd-play; only where it stands matters here.
-FRONT = CameraOptions(512, 512, fov_y=math.radians(35), elevation=math.radians(5))
+FRONT = CameraOptions(512, 512)
 
 
 def convert(options: Options) -> Iterator[str]:

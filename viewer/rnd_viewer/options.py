@@ -17,6 +17,7 @@ from rnd_runtime.skeleton import Skeleton
 
 _EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
 OWN_CAMERAS = ("front", "orbit")
+ELEVATION, FIELD_OF_VIEW = 5.0, 35.0  # degrees: the usual view
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
 
@@ -113,9 +114,9 @@ class PlayOptions(MotionOptions):
     """Time of one turn of --camera orbit, in seconds; negative turns the other way."""
     distance: Annotated[float | None, option("FLOAT")] = None
     """Metres from the middle of the motion to the camera. Default: the least that shows all."""
-    elevation: float = 5.0
+    elevation: float = ELEVATION
     """Degrees by which the camera stands above the horizon."""
-    fov: float = 35.0
+    fov: float = FIELD_OF_VIEW
     """Vertical field of view in degrees."""
 
     hdr_yaw: float = 0.0

@@ -46,7 +46,7 @@ class Shots:
             else read_motion(skeleton)
         )
         self.notes = list(self.motion.notes)
-        view = CameraOptions(SIDE, SIDE, math.radians(35), math.radians(5))
+        view = CameraOptions(SIDE, SIDE)
         framing = frame_motion(skeleton, self.motion)
         self._orbit = orbit_path(framing, view, SECONDS)
         self._front = front_path(framing, view)

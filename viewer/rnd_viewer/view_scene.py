@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -37,7 +36,6 @@ Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
-ELEVATION, FIELD_OF_VIEW = math.radians(5), math.radians(35)  # rnd-play's own
 SHADERS_KEPT = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
 LARGEST_SKY = 1024  # rows of a map that is shown behind the avatar and kept: 25 MB
 
@@ -79,7 +77,7 @@ class Scene:
     def description(self) -> dict[str, Any]:
         """What a page needs to know before it asks for pictures."""
         framing = frame_motion(self.avatar.skeleton, self.motion)
-        view = CameraOptions(self.size, self.size, FIELD_OF_VIEW, ELEVATION)
+        view = CameraOptions(self.size, self.size)
         home = front_path(framing, view)(0, 0.0)
         return {
             "avatar": self.name,
@@ -96,10 +94,10 @@ class Scene:
             "raster": self.rasterizer.name,
             "view": {
                 "azimuth": framing.facing,
-                "elevation": ELEVATION,
+                "elevation": view.elevation,
                 "distance": float(np.linalg.norm(home.position - framing.centre)),
                 "target": tuple(framing.centre.tolist()),
-                "fov": FIELD_OF_VIEW,
+                "fov": view.fov_y,
             },
             "truths": self._truths(),
             "notes": list(self.motion.notes),
