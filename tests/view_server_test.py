@@ -130,7 +130,8 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     """What rnd-play draws in its first view."""
     avatar = FakeAvatar()
     motion = load_motion(options.motion, avatar.skeleton)
-    light = load_light(options.hdr[0], yaw=changes.pop("yaw", 0.0), exposure=changes.pop("exposure", 0.0))
+    turn = {"yaw": changes.pop("yaw", 0.0), "exposure": changes.pop("exposure", 0.0)}
+    light = load_light(options.hdr[0], up=options.hdr_up, **turn)
     shader = Shader(light, changes.pop("shade", "table+sun"))
     view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
@@ -148,6 +149,15 @@ def test_the_first_view_is_rnd_plays_to_the_bit(options):
         # the light is scaled before or after shading: float32 rounds differently
         assert np.abs(bright.astype(int) - _played(options, 0.0, exposure=1.3)).max() <= 1
         assert np.abs(bright.astype(int) - visitor.picture()).max() > 20
+
+
+def test_a_probe_made_for_a_z_up_world_lights_as_rnd_play_has_it(options):
+    turned = replace(options, hdr_up="z")
+    with _serving(turned) as (port, _), _visiting(port) as visitor:
+        assert (visitor.picture() == _played(turned, 0.0)).all()
+    assert (_played(turned, 0.0) != _played(options, 0.0)).any()
+    with pytest.raises(InputError, match=r"--hdr-up: .* \(needs --hdr\)"):
+        replace(turned, hdr=())
 
 
 def test_every_output_fewer_gaussians_and_jpeg(options):

@@ -28,6 +28,7 @@ from __future__ import annotations
 import base64
 import binascii
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Literal
 
 import msgspec
@@ -117,6 +118,14 @@ def read_metadata(file: OnnxFile) -> AvatarMetadata:
     if not len(tree.names) == len(tree.parents) == len(tree.rest_joints) >= 2:
         raise InputError("skeleton", expected="as many names, parents and rest joints")
     return metadata
+
+
+def checkpoint_of(avatar_file: Path) -> str:
+    """The SHA-256 of the checkpoint that ``avatar_file`` was made of. Raises :class:`InputError` naming the file."""
+    try:
+        return read_metadata(OnnxFile(avatar_file.read_bytes())).checkpoint_sha256
+    except InputError as error:
+        raise error.at(file=avatar_file) from error
 
 
 class _SchemaOnly(msgspec.Struct):

@@ -170,16 +170,11 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
 
 def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
     """Whether ``exported`` is there and was made of that checkpoint; says where only the first holds."""
-    from rnd_runtime.avatar_file import read_metadata
-    from rnd_runtime.onnx_parts import OnnxFile
+    from rnd_runtime.avatar_file import checkpoint_of
 
     if not exported.is_file():
         return False
-    try:
-        source = read_metadata(OnnxFile(exported.read_bytes())).checkpoint_sha256
-    except InputError as error:
-        raise error.at(file=exported) from error
-    if source == checkpoint_sha256:
+    if checkpoint_of(exported) == checkpoint_sha256:
         return True
     print(f"{exported}: of another checkpoint: its size and speed are left out", file=sys.stderr)  # noqa: T201
     return False

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body, posed_vertices
-from rnd_runtime.errors import InputError, check_option, refuse_changed
+from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light
@@ -177,8 +177,6 @@ def _notes(notes: Iterable[str]) -> Iterator[str]:
 
 def _light(options: SplatOptions, avatar: Avatar) -> Light:
     refuse_outside(options, {"exposure": (-30, 30), "hdr_yaw": (-1e6, 1e6)})
-    if options.hdr is None:
-        refuse_changed(options, ["hdr_up"], "needs --hdr")
     return chosen_light(
         avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure
     )

@@ -11,13 +11,13 @@ import tyro
 
 from rnd_runtime.errors import check_option, parse_options, refuse_changed, run_command
 
-from .options import MotionOptions
+from .options import LitOptions, MotionOptions
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
-class SplatOptions(MotionOptions):
+class SplatOptions(LitOptions):
     """Posed, relit frames as plain 3D Gaussians: .ply and .glb, and .spz or .sog where splat-transform is installed."""
 
     avatar: Annotated[Path, tyro.conf.Positional]
@@ -36,8 +36,6 @@ class SplatOptions(MotionOptions):
     """light probe, lat-long EXR or HDR. Default: the light the avatar was captured under"""
     hdr_yaw: float = 0.0
     """turn the light, degrees"""
-    hdr_up: Literal["y", "z"] = "y"
-    """which axis points up in the probe's file"""
     exposure: float = 0.0
     """stops by which the light is made brighter"""
     shade: str = "table+sun"

@@ -72,6 +72,19 @@ class MotionOptions:
         refuse_outside(self, {"motion_fps": FPS_LIMITS, "smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
 
 
+@dataclass(frozen=True, kw_only=True)
+class LitOptions(MotionOptions):
+    """Those of a command that lights what moves by probes, which its ``hdr`` names."""
+
+    hdr_up: Literal["y", "z"] = "y"
+    """Which axis points up in the probe's file."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not vars(self)["hdr"]:
+            refuse_changed(self, ["hdr_up"], "needs --hdr")
+
+
 def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:
     """Refuse numbers that no later step could explain: ``limits`` by field."""
     for name, (low, high) in limits.items():
@@ -81,7 +94,7 @@ def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> N
 
 
 @dataclass(frozen=True)
-class PlayOptions(MotionOptions):
+class PlayOptions(LitOptions):
     """Animate, relight and splat an avatar, with no GPU and no display needed.
 
     rnd-play avatar.onnx --motion walk.npz --hdr sky.exr --out out/
@@ -123,8 +136,6 @@ class PlayOptions(MotionOptions):
     """Turn the light about the vertical axis, in degrees; positive from +X towards +Z."""
     hdr_turn: Annotated[float | None, option("SECONDS")] = None
     """Time in which the light turns once, from --hdr-yaw on; negative turns the other way. Default: it stands still."""
-    hdr_up: Literal["y", "z"] = "y"
-    """Which axis points up in the probe's file."""
     exposure: float = 0.0
     """Stops by which the light is made brighter."""
     background: str = "none"
@@ -168,8 +179,6 @@ class PlayOptions(MotionOptions):
             refuse_changed(self, ["orbit_seconds"], "needs --camera orbit")
         if self.camera not in OWN_CAMERAS:
             refuse_changed(self, ["distance", "elevation", "fov"], "the camera's file says where it stands")
-        if self.hdr is None:
-            refuse_changed(self, ["hdr_up"], "needs --hdr")
         if self.fps_floor is not None and self.aov:
             hint = "AOVs are drawn at full quality"
             raise InputError("--fps-floor", expected="no --aov beside it", got=self.aov, hint=hint)

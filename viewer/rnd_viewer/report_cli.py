@@ -13,13 +13,13 @@ import tyro
 from rnd_runtime.errors import InputError, check_option, flag, parse_options, run_command
 from rnd_runtime.files import is_folder
 
-from .options import MotionOptions
+from .options import LitOptions
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
-class ReportOptions(MotionOptions):
+class ReportOptions(LitOptions):
     """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options."""
 
     run: Annotated[Path, tyro.conf.Positional]
@@ -56,7 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         out = options.out or options.run / "report.html"
         motion = None if options.motion is None else partial(options.read_motion, options.motion)
         notes = write_run_report(
-            options.run, out, motion=motion, hdrs=options.hdr, bench=options.bench, pictures=options.pictures
+            options.run,
+            out,
+            motion=motion,
+            hdrs=options.hdr,
+            hdr_up=options.hdr_up,
+            bench=options.bench,
+            pictures=options.pictures,
         )
         for note in notes:
             say(f"note: {note}")

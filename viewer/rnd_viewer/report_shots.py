@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.light import Light, load_light
+from rnd_runtime.light import Light, Up, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
@@ -63,10 +63,13 @@ class Shots:
                     append(player.render(self.motion, time_s, self._orbit(number, time_s)).srgb)
             return path.read_bytes()
 
-    def relights(self, hdrs: tuple[Path, ...]) -> Iterator[tuple[str, Bytes]]:
-        """Captions and pictures: the learned light turned, then each of ``hdrs``, of the motion's middle."""
+    def relights(self, hdrs: tuple[Path, ...], up: Up) -> Iterator[tuple[str, Bytes]]:
+        """Captions and pictures of the motion's middle: the learned light turned, then each of ``hdrs``.
+
+        ``up`` is the axis that points up in their files.
+        """
         lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
-        lights += [(hdr.stem, self._read_light(hdr)) for hdr in hdrs]
+        lights += [(hdr.stem, self._read_light(hdr, up)) for hdr in hdrs]
         time_s = self.motion.duration / 2
         camera = self._front(0, time_s)
         with make_rasterizer("auto") as rasterizer:
@@ -74,8 +77,8 @@ class Shots:
                 player = Player(self.avatar, light, Shader(light, MODE), rasterizer)
                 yield caption, player.render(self.motion, time_s, camera).srgb
 
-    def _read_light(self, hdr: Path) -> Light:
-        light = load_light(hdr)
+    def _read_light(self, hdr: Path, up: Up) -> Light:
+        light = load_light(hdr, up=up)
         self.notes += [f"{hdr.name}: {note}" for note in light_notes(light)]
         return light
 

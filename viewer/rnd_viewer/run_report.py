@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.avatar_file import checkpoint_of
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path
+from rnd_runtime.files import atomic_path, sha256_of
 from rnd_runtime.images import read_image
+from rnd_runtime.light import Up
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton
 
@@ -52,16 +54,17 @@ def write_run_report(
     *,
     motion: Callable[[Skeleton], Motion] | None = None,
     hdrs: tuple[Path, ...] = (),
+    hdr_up: Up = "y",
     bench: Path | None = None,
     pictures: int = 3,
 ) -> list[str]:
     """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
 
-    What is to be said of the motion and the lights, which the page says too.
+    What is to be said of the avatar, its motion and its lights, which the page says too.
 
     Args:
         motion: played in the turntable, read for the avatar's skeleton.
-        hdrs: relit under these.
+        hdrs, hdr_up: relit under these; which axis points up in their files.
         bench: a folder with charts (``*.svg``) and ``stability.json``.
         pictures: shown of each held-out split.
 
@@ -72,9 +75,13 @@ def write_run_report(
     rows = read_scores(run, WORDS, (METRICS.keys() | FACTS.keys()) - {*WORDS})
     name = run.resolve().name
     # before the avatar is filmed: what is damaged is found at once
-    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run), config)]
+    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run))]
     read += [_bench(bench), _configuration(config)]
-    avatar, notes = _turntable_and_relights(run, motion, hdrs)
+    if why_not := _why_no_avatar(run, config):
+        avatar, notes = _missing("The avatar", why_not), [why_not]
+    else:
+        shots = Shots(run / "avatar.onnx", motion)
+        avatar, notes = _turntable_and_relights(shots, hdrs, hdr_up), shots.notes
     sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
     page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
@@ -89,16 +96,21 @@ def _facts(rows: Sequence[dict[str, Any]]) -> str:
     return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
 
 
-def _turntable_and_relights(
-    run: Path, motion: Callable[[Skeleton], Motion] | None, hdrs: tuple[Path, ...]
-) -> tuple[str, list[str]]:
-    """The section of the avatar, and the notes that it ends with."""
-    avatar = run / "avatar.onnx"
+def _why_no_avatar(run: Path, config: dict[str, Any]) -> str:
+    """Why the avatar is not shown; empty where it is."""
+    avatar, checkpoint = run / "avatar.onnx", run / "avatar.ckpt"
     if not avatar.is_file():
-        how = f"no avatar.onnx in the run: rnd-export {run / 'avatar.ckpt'} makes it"
-        return _missing("The avatar", how), []
-    shots = Shots(avatar, motion)
-    cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs)]
+        ablated = config.get("light") == "none"
+        how = "--light none is not exported" if ablated else f"rnd-export {checkpoint} makes it"
+        return f"no avatar.onnx in the run: {how}"
+    if checkpoint.is_file() and checkpoint_of(avatar) != sha256_of(checkpoint):
+        return f"avatar.onnx is of another checkpoint than avatar.ckpt: rnd-export {checkpoint} makes it anew"
+    return ""
+
+
+def _turntable_and_relights(shots: Shots, hdrs: tuple[Path, ...], hdr_up: Up) -> str:
+    """The section of the avatar, with the notes that it ends with."""
+    cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs, hdr_up)]
     if importlib.util.find_spec("av"):
         clip = data_uri(shots.turntable(), "video/mp4")
         video = f'<video src="{clip}" autoplay loop muted playsinline controls></video>'
@@ -110,8 +122,7 @@ def _turntable_and_relights(
         f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
         f'<h3>What the light falls on</h3><div class="grid tiles">{"".join(materials)}</div>'
     )
-    html += "".join(f"<p>Note: {escape(note)}</p>" for note in shots.notes)
-    return html, shots.notes
+    return html + "".join(f"<p>Note: {escape(note)}</p>" for note in shots.notes)
 
 
 def _metrics(rows: Sequence[dict[str, Any]]) -> str:
@@ -162,14 +173,14 @@ def _shot(strip: Path) -> str:
     return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
 
 
-def _curves(rows: Sequence[dict[str, Any]], config: dict[str, Any]) -> str:
+def _curves(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
         return _missing("Losses", "no metrics.jsonl in the run")
     terms = dict.fromkeys(name for row in rows for name in row)
     terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
     for name in ("step", "stage", "seconds", "skipped"):
         terms.pop(name, None)
-    mark = round((config.get("stage1_fraction") or 0) * (config.get("steps") or 0)) or None
+    mark = next((row["step"] for row in rows if row.get("stage") == 2), None)
     figures = []
     for term in terms:
         having = [row for row in rows if row.get(term) is not None]
@@ -177,16 +188,18 @@ def _curves(rows: Sequence[dict[str, Any]], config: dict[str, Any]) -> str:
             figures.append(curve([row["step"] for row in having], [row[term] for row in having], term, mark))
     skipped = sum(bool(row.get("skipped")) for row in rows)
     note = f" {skipped} steps were not finite and were skipped." if skipped else ""
+    dashed = "" if mark is None else "; the dashed line is where the second stage, the light, begins"
     return (
-        "<h2>Losses</h2><p>Weighted terms of what is minimised, on a logarithmic scale; the dashed line is where "
-        f'the second stage, the light, begins.{note}</p><div class="grid curves">{"".join(figures)}</div>'
+        f"<h2>Losses</h2><p>Weighted terms of what is minimised, on a logarithmic scale{dashed}.{note}</p>"
+        f'<div class="grid curves">{"".join(figures)}</div>'
     )
 
 
 def _bench(folder: Path | None) -> str:
     """Charts and the stability table of a folder such as ``assets/bench``."""
+    title = "Speed, accuracy, stability"
     if folder is None:
-        return ""
+        return _missing(title, "no charts and no table of stability: --bench FOLDER brings them")
     # as pictures, not inline: two charts may use one id for different things
     charts = [
         (path.stem, data_uri(path.read_bytes(), "image/svg+xml")) for path in sorted(folder.glob("*.svg"))
@@ -197,8 +210,8 @@ def _bench(folder: Path | None) -> str:
         rows = read_rows(stability, "rows of rnd-bench --stability", "id", "what")
         parts.append("<h3>Stability</h3>" + rows_table(rows))
     if not parts:
-        return _missing("Speed, accuracy, stability", f"neither *.svg nor stability.json in {folder}")
-    return "<h2>Speed, accuracy, stability</h2>" + "".join(parts)
+        return _missing(title, f"neither *.svg nor stability.json in {folder}")
+    return f"<h2>{title}</h2>" + "".join(parts)
 
 
 def _configuration(config: dict[str, Any]) -> str:

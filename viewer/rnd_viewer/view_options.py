@@ -11,11 +11,11 @@ import tyro
 
 from rnd_runtime.errors import InputError
 
-from .options import MotionOptions, option
+from .options import LitOptions, option
 
 
 @dataclass(frozen=True)
-class ViewOptions(MotionOptions):
+class ViewOptions(LitOptions):
     """Look at an avatar in the browser: turn it, play it, move the light. No GPU needed.
 
     rnd-view avatar.onnx --motion walk.npz --hdr sky.exr

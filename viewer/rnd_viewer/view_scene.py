@@ -64,7 +64,7 @@ class Scene:
         self.avatar = Avatar.load(options.avatar, threads=options.threads)
         self.capture: Capture | None = load_capture(options.capture) if options.capture else None
         self.motion = self._motion(options)
-        self._files = _probes(options.hdr)
+        self._files, self._up = _probes(options.hdr), options.hdr_up
         self.rasterizer = make_rasterizer(options.raster)
         self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
@@ -231,7 +231,7 @@ class Scene:
         if name is None:
             return Light(self.avatar.trained_light)
         if isinstance(name, Path):
-            return load_light(name)
+            return load_light(name, up=self._up)
         assert self.capture
         return self.capture.load_light(name)
 
