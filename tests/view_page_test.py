@@ -21,7 +21,7 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.images import read_image
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_viewer.cli import main as play
-from rnd_viewer.view_options import ViewOptions
+from rnd_viewer.view_options import SIZES, ViewOptions
 from rnd_viewer.view_scene import Scene
 from rnd_viewer.view_server import serve
 
@@ -179,6 +179,8 @@ def test_outputs_sliders_and_skeleton(page):
         seen.add(_picture(page).tobytes())
     assert len(seen) == 6
     _set(page, "size", "256")
+    sizes = "(({ min, max }) => [Number(min), Number(max)])(document.getElementById('size'))"
+    assert page.run(sizes) == list(SIZES)
     _set(page, "gaussians", "20")
     assert page.run("rnd.picture().then(p => [p.width, p.height])") == [256, 256]
     assert page.run("rnd.state.gaussians") == round(page.run("rnd.scene().gaussians") / 5)
@@ -198,12 +200,23 @@ def test_ground_truth_stands_beside(page):
     picture = _picture(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
     assert picture.shape == image.shape
     assert (_pixels(page, "truth") == image).all()
+    assert (_picture(page, "yaw: 2, exposure: 3") == picture).all()  # its light stays as it was
+    for control in ("light", "yaw", "exposure"):
+        assert page.run(f"document.getElementById('{control}').disabled"), control
+    assert page.run("[document.getElementById('yaw').value, document.getElementById('exposure').value]") == [
+        "0",
+        "0",
+    ]
+    page.drag((300, 300), (50, 0), shift=True)
+    assert page.run("rnd.state.yaw") == 2
     assert page.run("document.getElementById('clip').disabled")  # it would film something else
     # the avatar was trained on this capture: 20 dB over the whole picture is far from what another pose gives
     assert np.mean((picture.astype(float) - image) ** 2) < 255**2 / 10**2.0
     page.run("document.getElementById('truth-on').click()")
     assert page.run("document.getElementById('truth-pane').hidden")
     assert not page.run("document.getElementById('clip').disabled")
+    assert not page.run("document.getElementById('exposure').disabled")
+    page.run("Object.assign(rnd.state, { yaw: 0, exposure: 0 })")
     _set(page, "size", str(SIZE))
 
 
@@ -258,6 +271,14 @@ def test_a_clip_has_no_more_frames_than_screens_show(page):
     page.wait("!document.getElementById('clip').disabled")
     assert page.run("asked.filter(({ ask }) => ask === 'clip').map(({ fps }) => fps)") == [60]
     page.run("WebSocket.prototype.send = send; rnd.scene().motion.fps = 30")
+
+
+def test_a_loop_that_does_not_go_round_in_its_clip_is_said(page, scene, monkeypatch):
+    monkeypatch.setattr(scene, "motion", replace(scene.motion, closed=True))
+    page.run("rnd.scene().motion.fps = 24; document.getElementById('clip').click()")
+    page.wait("!document.getElementById('clip').disabled")
+    assert page.run(MESSAGE) == scene.motion.loop_notes(24)[0]
+    page.run("rnd.scene().motion.fps = 30; rnd.picture().then(() => 1)")
 
 
 def test_with_a_token_and_in_jpeg(page, scene):

@@ -210,6 +210,17 @@ def test_the_clip_has_every_frame(options):
         assert np.abs(frames[0].astype(int) - frames[3]).max() > 50  # the camera has turned
 
 
+def test_a_clip_of_a_loop_that_does_not_go_round_says_so(options):
+    save_motion(options.motion, fake_motion(12))
+    with _serving(replace(options, loop=True)) as (port, scene), _visiting(port) as visitor:
+        for fps, notes in ((30, ()), (24, scene.motion.loop_notes(24))):
+            header = visitor.ask(ask="clip", state=visitor.state(), fps=fps)
+            while header["kind"] == "progress":
+                header = json.loads(visitor.socket.recv())
+            assert header == {"kind": "clip", "notes": list(notes)} and len(notes) == (fps == 24)
+            visitor.socket.recv()
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -13,6 +13,8 @@ from rnd_runtime.errors import InputError
 
 from .options import LitOptions, option
 
+SIZES = 64, 2048  # px: the least and the largest side of a picture
+
 
 @dataclass(frozen=True)
 class ViewOptions(LitOptions):
@@ -51,8 +53,9 @@ class ViewOptions(LitOptions):
             self.refuse_unread(f"needs --motion: {ours}", edited=captured)
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
-        if not 64 <= self.size <= 2048:
-            raise InputError("--size", expected="64 to 2048", got=self.size)
+        low, high = SIZES
+        if not low <= self.size <= high:
+            raise InputError("--size", expected=f"{low} to {high}", got=self.size)
 
     @property
     def local(self) -> bool:

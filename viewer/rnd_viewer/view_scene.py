@@ -9,6 +9,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
@@ -29,7 +30,7 @@ from .aov import aov_picture, aov_values, splat_features
 from .background import Background
 from .cameras import CameraOptions, frame_motion, front_path
 from .lights import light_notes
-from .view_options import ViewOptions
+from .view_options import SIZES, ViewOptions
 from .view_state import ViewState
 
 Floats32 = NDArray[np.float32]
@@ -91,6 +92,7 @@ class Scene:
             "lights": ["the avatar's own", *(file.name for file in self._files)],
             "light": 1 if self._files else 0,
             "size": self.size,
+            "sizes": SIZES,
             "raster": self.rasterizer.name,
             "view": {
                 "azimuth": framing.facing,
@@ -113,6 +115,8 @@ class Scene:
     def render(self, state: ViewState) -> Picture:
         """The picture of ``state`` with the time that each stage took."""
         seconds: dict[str, float] = {}
+        if state.truth is not None:
+            state = structs.replace(state, yaw=0.0, exposure=0.0)
         camera, motion, time_s = self._view(state)
         gaussians, root = self._pose(motion, time_s, seconds)
         gaussians = _fewer(gaussians, state.gaussians)

@@ -260,7 +260,8 @@ class _Visitor:
                     with self._drawing:
                         append(np.ascontiguousarray(self._scene.render(now).srgb))
                     self._send(socket, {"kind": "progress", "done": number + 1, "of": frames})
-            self._send(socket, {"kind": "clip"}, file.read_bytes())
+            notes = motion.loop_notes(request.fps)
+            self._send(socket, {"kind": "clip", "notes": notes}, file.read_bytes())
 
     def _truth(self, socket: Any, request: TruthRequest) -> None:
         data = self._scene.truth_file(request.index).read_bytes()

@@ -11,11 +11,12 @@ from msgspec import Meta
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 
+from .view_options import SIZES
+
 Output = Literal["lit", "light", "albedo", "normal", "roughness", "visibility"]
-LARGEST_SIDE = 2048  # px
 MOST_CLIP_FRAMES = 3600
 
-_Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE)]
+_Side = Annotated[int, Meta(ge=SIZES[0], le=SIZES[1])]
 _Angle = Annotated[float, Meta(ge=-1e4, le=1e4)]
 _Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
 
@@ -27,7 +28,8 @@ class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         time: s into the motion. width, height: px.
         azimuth, elevation: rad; where the camera stands as seen from ``target`` [3] m, ``distance`` m away.
         fov: vertical field of view, rad.
-        truth: index of a picture of the capture, which then decides camera, pose and light; None for neither.
+        truth: index of a picture of the capture, which then decides camera, pose and light, neither turned nor
+            exposed; None for none of them.
         light: index among the scene's lights. yaw: rad. exposure: stops.
         output: the lit picture, the light alone (on a body of one colour), or one of its materials.
         background: as ``rnd-play --background``, ``none`` being black.

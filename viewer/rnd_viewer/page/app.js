@@ -113,10 +113,11 @@ function showTimes() {
 function showState() {
   $("time").value = state.time;
   $("clock").textContent = `${state.time.toFixed(2)} of ${scene.motion.duration.toFixed(2)} s`;
-  $("yaw").value = state.yaw / RADIANS;
-  $("yaw").nextElementSibling.textContent = `${Math.round(state.yaw / RADIANS)}°`;
-  $("exposure").value = state.exposure;
-  $("exposure").nextElementSibling.textContent = `${state.exposure > 0 ? "+" : ""}${state.exposure.toFixed(1)}`;
+  const { yaw, exposure } = state.truth === null ? state : { yaw: 0, exposure: 0 };
+  $("yaw").value = yaw / RADIANS;
+  $("yaw").nextElementSibling.textContent = `${Math.round(yaw / RADIANS)}°`;
+  $("exposure").value = exposure;
+  $("exposure").nextElementSibling.textContent = `${exposure > 0 ? "+" : ""}${exposure.toFixed(1)}`;
   $("size").value = state.height;
   $("size").nextElementSibling.textContent = String(state.height);
   $("gaussians").nextElementSibling.textContent = String(state.gaussians ?? scene.gaussians);
@@ -166,6 +167,7 @@ function setScene(description) {
   state.time = Math.min(state.time, scene.motion.duration);
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
   setGaussians();
+  [$("size").min, $("size").max] = scene.sizes;
   if (first) Object.assign(state, { width: scene.size, height: scene.size });
   if (moved) home();
   showNotes();
@@ -183,7 +185,7 @@ async function setTruth() {
   const on = $("truth-on").checked, index = Number($("truth-index").value);
   state.truth = on ? index : null;
   $("truth-pane").hidden = !on;
-  $("light").disabled = on;  // the picture's own shines
+  for (const name of ["light", "yaw", "exposure"]) $(name).disabled = on;  // the picture's own shines, as it is
   say("");  // what was said of another picture
   freeClip();
   if (on) {
@@ -328,7 +330,7 @@ const handlers = {
   truth: showTruth,
   message: (text) => say(text, { untilPicture: true }),
   progress: (done, of) => say(`making a clip: ${done} of ${of}`),
-  clip: (blob, name) => { endClip(); say(""); download(blob, name); },
+  clip: (blob, name, notes = []) => { endClip(); say(notes.join(" · ")); download(blob, name); },
   refused: (text) => say(text, { wrong: true }),
   error: fail,
 };

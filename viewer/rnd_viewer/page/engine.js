@@ -5,8 +5,8 @@ const UNREACHABLE = "rnd-view does not answer; is it still running?";
 
 /**
  * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap or
- * null where the browser cannot decode it), progress(done, of), clip(blob, name), error(text, ends): of a picture or of a
- * clip, which ends with it unless told otherwise. None of them is called before what asks for it has returned.
+ * null where the browser cannot decode it), progress(done, of), clip(blob, name, notes), error(text, ends): of a
+ * picture or of a clip, which ends with it unless told otherwise. None of them is called before what asks for it has returned.
  */
 export async function connect(on) {
   const address = new URL("socket", location.href);
@@ -41,7 +41,7 @@ async function receive(header, body, on) {
   if (header.kind === "scene") on.scene(header.scene);
   else if (header.kind === "error") on.error(header.message);
   else if (header.kind === "progress") on.progress(header.done, header.of);
-  else if (header.kind === "clip") on.clip(new Blob([body], { type: "video/mp4" }), "clip.mp4");
+  else if (header.kind === "clip") on.clip(new Blob([body], { type: "video/mp4" }), "clip.mp4", header.notes);
   else if (header.kind === "truth") on.truth(header.index, await createImageBitmap(new Blob([body])).catch(() => null));
   else {
     const image = await pixels(header, body).catch(() => null);

@@ -20,7 +20,9 @@ export function orbit(element, state, changed) {
     const apart = spread(fingers), dx = event.clientX - last[0], dy = event.clientY - last[1];
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     if (fingers.size > 1) approach(state, apart / Math.max(spread(fingers), 1));
-    else if (event.shiftKey) state.yaw = wrapped(state.yaw + dx * PER_PIXEL);
+    else if (event.shiftKey) {
+      if (state.truth === null) state.yaw = wrapped(state.yaw + dx * PER_PIXEL);  // else the picture's own light shines
+    }
     else if (event.buttons & 2 || event.ctrlKey) pan(state, dx, dy, element.clientHeight);
     else {
       state.azimuth = wrapped(state.azimuth - dx * PER_PIXEL);

@@ -14,7 +14,7 @@ import { Splatter } from "./splat.js";
 
 const CLAY = 0.8;  // albedo of a body that shows the light alone
 const LARGEST_SKY = 1024;  // rows behind the avatar
-const SIZE = 512;
+const SIZE = 512, SIZES = [64, 1024];  // px: to begin with, the least and the largest
 const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
 
 const splatter = new Splatter();
@@ -65,7 +65,7 @@ function description({ avatar, motion, lights }, lit) {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light: lit ? lights.length - 1 : undefined,
-    size: SIZE, raster: splatter.name, view: homeView(avatar.skeleton, motion),
+    size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
     truths: [], notes: [...motion.notes, ...repaired],
   };
 }
