@@ -14,7 +14,8 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.light import load_light
+from rnd_runtime.light import REC709, load_light
+from rnd_viewer.lights import light_notes
 
 WEB = Path(__file__).parent.parent / "viewer/web"
 NODE = shutil.which("node")
@@ -29,11 +30,11 @@ pytestmark = [
 
 _READER = """
 import { readFileSync } from "node:fs";
-const { readLight } = await import(process.argv[1] + "/light.js");
+const { readLight, lightNotes } = await import(process.argv[1] + "/light.js");
 let answer;
 try {
-    const { height, width, radiance } = readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]);
-    answer = { height, width, radiance: [...radiance] };
+    const light = readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]);
+    answer = { ...light, radiance: [...light.radiance], notes: lightNotes(light) };
 } catch (error) { answer = { refused: error.message }; }
 console.log(JSON.stringify(answer));
 """
@@ -72,8 +73,10 @@ def _exr(
 
 
 def _assert_the_same(file: Path) -> None:
-    got, expected = _page(file), load_light(file).radiance
+    got, light = _page(file), load_light(file)
     assert "refused" not in got, got
+    assert got["notes"] == light_notes(light)
+    expected = light.radiance
     assert (got["height"], got["width"]) == expected.shape[:2]
     assert_array_equal(np.array(got["radiance"], np.float32).reshape(expected.shape), expected)
 
@@ -91,6 +94,45 @@ def test_lines_may_be_stored_from_the_bottom(tmp_path, compression, order):
 def test_tiles_and_an_alpha(tmp_path, kind, said):
     pixels = np.concatenate([RADIANCE, np.ones_like(RADIANCE[..., :1])], axis=2)
     _assert_the_same(_exr(tmp_path / "sky.exr", pixels, kind=kind, compression="zip", **said))
+
+
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+D65_IN_FULL = (*REC709[:6], 0.31271, 0.32902)
+
+
+@pytest.mark.parametrize(
+    ("primaries", "brightest", "about"),
+    [
+        (D65_IN_FULL, 1.0, []),
+        (
+            AP0,
+            1.0,
+            [
+                "Rec.709, but its file states red (0.7347, 0.2653), green (0, 1), blue (0.0001, -0.077) and white"
+            ],
+        ),
+        ((float("nan"), 1.23456e-5, 12340.0, *AP0[3:]), 1.0, ["red (nan, 1.235e-05), green (1.234e+04, 1)"]),
+        (REC709, 0.00012345, ["largest radiance is 0.000123; try --exposure"]),
+        (AP0, 3.3e-7, ["Rec.709", "3.3e-07;"]),
+        (REC709, 0.0, ["is 0;"]),
+    ],
+)
+def test_a_light_is_spoken_of_in_the_same_words(tmp_path, primaries, brightest, about):
+    pixels = np.full((4, 8, 3), brightest, np.float32)
+    spec = oiio.ImageSpec(8, 4, 3, "float")
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), primaries)
+    target = oiio.ImageOutput.create(str(tmp_path / "sky.exr"))
+    assert target.open(str(tmp_path / "sky.exr"), spec) and target.write_image(pixels) and target.close()
+    notes = light_notes(load_light(tmp_path / "sky.exr"))
+    assert len(notes) == len(about) and all(words in note for words, note in zip(about, notes))
+    assert _page(tmp_path / "sky.exr")["notes"] == notes
+
+
+def test_texels_that_are_filled_in_are_told(tmp_path):
+    pixels = RADIANCE.astype(np.float32)
+    pixels[3, 4:6, 1] = np.nan
+    _assert_the_same(_exr(tmp_path / "sky.exr", pixels, kind="float"))
+    assert _page(tmp_path / "sky.exr")["notes"][0].startswith("2 texels")
 
 
 FIVE = np.concatenate([RADIANCE, np.ones((HEIGHT, 2 * HEIGHT, 2), np.float16)], axis=2)

@@ -16,11 +16,12 @@ export function inFile(error, file) {
   return what.startsWith(file) ? error : refusal(what, { file });
 }
 
-/** A number in six digits, as Python's `g` has it. */
-export function short(value) {
+/** A number as Python's `g` has it, in six digits unless told otherwise. */
+export function short(value, digits = 6) {
   if (!Number.isFinite(value)) return String(value).replace("NaN", "nan").replace("Infinity", "inf");
-  const rounded = Number(value.toPrecision(6));
-  return Math.abs(rounded) < 1e6 ? String(rounded) : rounded.toExponential().replace(/\+(\d)$/, "+0$1");
+  const [mantissa, power] = value.toExponential(digits - 1).split("e");
+  if (power >= -4 && power < digits) return String(Number(value.toPrecision(digits)));
+  return `${Number(mantissa)}e${power.replace(/^(.)(\d)$/, "$10$2")}`;
 }
 
 /** A shape as messages have it: "5×72". */

@@ -10,7 +10,10 @@ const UINT = 0, DECREASING_Y = 1;
 const COMPRESSIONS = ["none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"];
 const BLOCK_LINES = { none: 1, RLE: 1, ZIPS: 1, ZIP: 16, PIZ: 32, PXR24: 16, DWAA: 32, DWAB: 256 };  // of those that it reads
 
-/** {height, width, radiance: Float32Array [H·W·3]} of one flat picture with channels R, G and B. */
+/**
+ * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat picture with channels R, G and B; the last
+ * [8] are x and y of red, green, blue and white, where the file states them.
+ */
 export function readExr(file) {
   const bytes = file.slice(), header = readHeader(bytes);
   check(header);
@@ -21,10 +24,11 @@ export function readExr(file) {
     for (let column = 0; column < width; column++)
       for (let c = 0; c < 3; c++)
         radiance[3 * (row * width + column) + c] = data[channels * ((height - 1 - row) * width + column) + c];
-  return { width, height, radiance };
+  return { width, height, radiance, chromaticities: header.chromaticities };
 }
 
-/** What the file says of itself: {tiled, flat, channels, compression, lineOrder, lineOrderAt, data and canvas windows, end}. */
+/** What the file says of itself: {tiled, flat, channels, chromaticities, compression, lineOrder, lineOrderAt, data and
+ * canvas windows, end}. */
 function readHeader(bytes) {
   const view = new DataView(bytes.buffer), decoder = new TextDecoder("latin1");
   if (bytes.length < 8 || view.getUint32(0, true) !== MAGIC) throw refusal("light probe", { expected: "an OpenEXR file" });
@@ -41,6 +45,9 @@ function readHeader(bytes) {
   const readers = {
     channels: (end) => {
       while (at < end - 1) header.channels.push({ name: word(), type: number(), sampling: (at += 4, [number(), number()]) });
+    },
+    chromaticities: (end) => {
+      if (end - at === 4 * 8) header.chromaticities = Array.from({ length: 8 }, () => view.getFloat32((at += 4) - 4, true));
     },
     compression: () => { header.compression = COMPRESSIONS[bytes[at]] ?? `number ${bytes[at]}`; },
     dataWindow: () => { header.data = [number(), number(), number(), number()]; },

@@ -1,20 +1,34 @@
 // Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/light.py).
 
-import { refusal } from "./errors.js";
+import { refusal, short } from "./errors.js";
 import { readExr } from "./exr.js";
 
 const LARGEST_FLOAT = 3.4028234663852886e38;
-
+const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];  // x and y of red, green, blue and white
+const SAME_COLOUR = 2e-3;  // by which x and y may miss them: D65 has more digits
+const DIM = 1e-3;  // largest radiance below which every 8-bit pixel of a body would be black or next to it
 const RGBE = "FORMAT=32-bit_rle_rgbe";
 
 /** Rec.709. */
 export const luminance = (r, g, b) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
 
-/** {height, width, radiance: Float32Array [H·W·3]} of an .exr or .hdr file. */
+/** {height, width, radiance: Float32Array [H·W·3], repaired, chromaticities} of an .exr or .hdr file. */
 export function readLight(bytes, name) {
   const image = name.toLowerCase().endsWith(".exr") ? readExr(bytes) : readHdr(bytes);
   if (image.width !== 2 * image.height) throw new Error(`${name}: expected a 2:1 lat-long map, got ${image.width} x ${image.height}`);
   return repair({ ...image, name });
+}
+
+/** What the user should know of a light, one sentence each (rnd_viewer/lights.py). */
+export function lightNotes({ radiance, repaired, chromaticities }) {
+  const notes = [], brightest = radiance.reduce((a, b) => Math.max(a, b), 0);
+  if (chromaticities?.some((value, k) => !(Math.abs(value - REC709[k]) <= SAME_COLOUR))) {
+    const [red, green, blue, white] = [0, 2, 4, 6].map((k) => `(${short(chromaticities[k], 4)}, ${short(chromaticities[k + 1], 4)})`);
+    notes.push(`the light is taken as Rec.709, but its file states red ${red}, green ${green}, blue ${blue} and white ${white}`);
+  }
+  if (repaired) notes.push(`${repaired} texels of the light were NaN, infinite or negative and were filled in`);
+  if (brightest < DIM) notes.push(`the light is dark: its largest radiance is ${short(brightest, 3)}; try --exposure`);
+  return notes;
 }
 
 /** Radiance's RGBE, run-length coded or flat (Ward 1991, "Real Pixels"). */

@@ -3,7 +3,7 @@
 import { Avatar } from "./avatar.js";
 import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
-import { downsize, readLight } from "./light.js";
+import { downsize, lightNotes, readLight } from "./light.js";
 import { fitMotion, restMotion } from "./motion.js";
 import { readMotionFile } from "./motion_files.js";
 import { project } from "./project.js";
@@ -19,7 +19,7 @@ const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j <
 
 const splatter = new Splatter();
 // What is shown: the motion as its file has it (null: at rest) and for the avatar, and
-// lights {name, light, shaders: Map of shade → function}
+// lights {name, light, notes, shaders: Map of shade → function}
 let scene = { avatar: null, record: null, motion: null, lights: [] };
 let posed = null, shownSky = null;
 
@@ -51,22 +51,23 @@ async function take({ name, bytes }, next, opened) {
     next.avatar = await Avatar.load(bytes, name);
     opened.push(next.avatar);
     const own = { height: 32, width: 64, radiance: next.avatar.trainedLight }, others = next.lights.filter((light) => !light.own);
-    next.lights = [{ name: "the avatar's own", own: true, light: own, shaders: new Map() }, ...others];
+    next.lights = [{ own: true, ...lightEntry("the avatar's own", own) }, ...others];
   } else if (kind === "npz") next.record = readMotionFile(bytes, name);
   else if (kind === "hdr" || kind === "exr") {
-    next.lights = [...next.lights.filter((light) => light.own || light.name !== name), { name, light: readLight(bytes, name), shaders: new Map() }];
+    next.lights = [...next.lights.filter((light) => light.own || light.name !== name), lightEntry(name, readLight(bytes, name))];
   } else throw refusal("kind of file", { expected: ".onnx, .npz, .hdr or .exr", got: `.${kind}`, file: name });
 }
 
+const lightEntry = (name, light) => ({ name, light, notes: lightNotes(light), shaders: new Map() });
+
 /** What the page needs to know; where the scene is `lit` anew, by the last of its lights. */
 function description({ avatar, motion, lights }, lit) {
-  const repaired = lights.filter(({ light }) => light.repaired).map(({ name, light }) => `${name}: ${light.repaired} broken texels filled in`);
   return {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light: lit ? lights.length - 1 : undefined,
     size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
-    truths: [], notes: [...motion.notes, ...repaired],
+    truths: [], notes: motion.notes,
   };
 }
 
@@ -85,7 +86,8 @@ async function render({ number, state }) {
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
-  const answer = { kind: "picture", number, width: state.width, height: state.height, image, joints, times: clock.times };
+  const { notes } = scene.lights[state.light];
+  const answer = { kind: "picture", number, width: state.width, height: state.height, image, joints, notes, times: clock.times };
   postMessage(answer, [image]);
 }
 
