@@ -21,13 +21,16 @@ export function readLight(bytes, name) {
 
 /** What the user should know of a light, one sentence each (rnd_viewer/lights.py). */
 export function lightNotes({ radiance, repaired, chromaticities }) {
-  const notes = [], brightest = radiance.reduce((a, b) => Math.max(a, b), 0);
+  const notes = [];
   if (chromaticities?.some((value, k) => !(Math.abs(value - REC709[k]) <= SAME_COLOUR))) {
     const [red, green, blue, white] = [0, 2, 4, 6].map((k) => `(${short(chromaticities[k], 4)}, ${short(chromaticities[k + 1], 4)})`);
     notes.push(`the light is taken as Rec.709, but its file states red ${red}, green ${green}, blue ${blue} and white ${white}`);
   }
   if (repaired) notes.push(`${repaired} texels of the light were NaN, infinite or negative and were filled in`);
-  if (brightest < DIM) notes.push(`the light is dark: its largest radiance is ${short(brightest, 3)}; try --exposure`);
+  if (radiance.every((value) => value < DIM)) {
+    const largest = radiance.reduce((a, b) => Math.max(a, b), 0);
+    notes.push(`the light is dark: its largest radiance is ${short(largest, 3)}; try --exposure`);
+  }
   return notes;
 }
 
