@@ -97,6 +97,7 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
     [
         (["--json", "bounds.json"], "--json: expected the default, got bounds.json (needs --target-ms"),
         (["--max-mb", "4", "--size", "0"], "--size: expected 16 to 4096, got 0"),
+        (["--max-mb", "4", "--hdr-up", "z"], "--hdr-up: expected the default, got z (needs --hdr)"),
         (["--size", "64"], "--size: expected the default, got 64 (needs --target-ms"),
         (
             ["--max-mb", "4", "--precision", "int8"],

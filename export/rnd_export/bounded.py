@@ -46,7 +46,9 @@ def export_bounded(
         else earlier_rows(options.json, what="rows of an earlier search", names=("bound",))
     )
     started = perf_counter()
-    light = Light(checkpoint.probe.numpy()) if options.hdr is None else load_light(options.hdr)
+    light = (
+        Light(checkpoint.probe.numpy()) if options.hdr is None else load_light(options.hdr, up=options.hdr_up)
+    )
     if options.capture is None:
         scene = Scene(motion, light, options.size)
     else:

@@ -12,6 +12,7 @@ import tyro
 
 from rnd_runtime.avatar_file import EncoderKind, Precision
 from rnd_runtime.errors import InputError, check_option, flag, parse_options, refuse_changed, run_command
+from rnd_runtime.light import Up
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,8 @@ class Options:
     """picture side of that search"""
     hdr: Path | None = None
     """light of that search; by default the one that was learned"""
+    hdr_up: Up = "y"
+    """which axis points up in the light's file"""
     capture: Path | None = None
     """search in the training views of this capture (a folder with capture.json) and test what is found in its other
     poses; by default in views all around --motion, or around random poses"""
@@ -60,7 +63,7 @@ class Options:
 
 
 BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
-SEARCHES = ("size", "hdr", "capture", "json")
+SEARCHES = ("size", "hdr", "hdr_up", "capture", "json")
 """options that say how a bound's search goes"""
 CHOICES = (
     "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
@@ -132,6 +135,8 @@ def _refuse_idle(options: Options, *, bounded: bool) -> None:
         refuse_changed(options, CHOICES, "a bound finds this by itself")
     else:
         refuse_changed(options, SEARCHES, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
+    if options.hdr is None:
+        refuse_changed(options, ("hdr_up",), "needs --hdr")
     if options.motion is not None:
         refuse_changed(options, ("frames",), "of random motion: --motion has frames of its own")
     if options.capture is not None:
