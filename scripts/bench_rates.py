@@ -11,6 +11,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from numba import get_num_threads
+
 from rnd_export.candidates import Recipe, Scene, Workbench
 from rnd_export.variant import Variant
 from rnd_runtime.doctor import machine
@@ -54,7 +56,7 @@ def main(checkpoint: Path, out: Path) -> None:
     rows = [
         {"networks": name, "ms": min(one.ms for one in took), "psnr_db": took[0].psnr, "mb": took[0].mb,
          "nodes": bench.config.nodes, "gaussians": bench.config.gaussians, "size": 512, "shade": "table",
-         "machine": machine()}
+         "threads": get_num_threads(), "machine": machine()}
         for name, took in found.items()
     ]  # fmt: skip
     write_json(out, rows)

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rnd_runtime.avatar import Avatar
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
 
@@ -51,12 +52,14 @@ def bench_shards(
     for _ in range(REPEATS):
         for way, taken in seconds.items():
             taken.append(_play(way, inputs, frames))
+    gaussians = Avatar.load(avatar, threads=1).gaussians
     alone = statistics.median(seconds[Way(1, 1)])
     for way, taken in seconds.items():
         median = statistics.median(taken)
         yield {
             "processes": way.processes, "threads": way.threads, "seconds": median, "fps": frames / median,
-            "speed_up": alone / median, "frames": frames, "size": size, "avatar": avatar.name, "machine": machine(),
+            "speed_up": alone / median, "frames": frames, "size": size, "avatar": avatar.name,
+            "gaussians": gaussians, "machine": machine(),
         }  # fmt: skip
 
 

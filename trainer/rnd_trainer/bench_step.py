@@ -8,12 +8,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numba
 from torch.profiler import ProfilerActivity, profile
 
 from rnd_runtime.capture import Capture
 from rnd_runtime.doctor import machine
 
 from .config import TrainConfig, resized
+from .held_out import sizes
 from .perceptual import Perceptual
 from .train import Training
 
@@ -64,7 +66,7 @@ def bench_step(
     common = {
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "repeats": repeats,
         "perceptual": None if perceptual is None else perceptual.backbone, "capture": capture.folder.resolve().name,
-        "machine": machine(),
+        "size": sizes(capture, ("train",)), "threads": numba.get_num_threads(), "machine": machine(),
     }  # fmt: skip
     ranked = sorted(spent.items(), key=lambda item: -item[1])
     return [

@@ -12,7 +12,6 @@ import numba
 from torch import Tensor
 
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture
 from rnd_runtime.capture_format import Split
 from rnd_runtime.doctor import machine
@@ -67,7 +66,7 @@ def score(
         "lpips_weights": None if perceptual is None else perceptual.backbone,
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
         **({} if avatar is None else playback(avatar, judge)),
-        "size": sorted({(camera.width, camera.height) for camera in _seen_by(capture)}),
+        "size": sizes(capture),
         "scored_on": capture.folder.resolve().name,
         "capture_sha256": sha256_of(capture.file),
         "motion": Path(judge.motion.source).name,
@@ -135,9 +134,10 @@ def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
     return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}
 
 
-def _seen_by(capture: Capture) -> list[Camera]:
-    """Cameras of the held-out pictures."""
-    return [capture.cameras[frame.camera] for split in HELD_OUT for frame in capture.split(split)]
+def sizes(capture: Capture, splits: Iterable[Split] = HELD_OUT) -> list[tuple[int, int]]:
+    """Widths and heights in pixels of the pictures of ``splits``, each once."""
+    cameras = (capture.cameras[frame.camera] for split in splits for frame in capture.split(split))
+    return sorted({(camera.width, camera.height) for camera in cameras})
 
 
 def _provenance(checkpoint: Any) -> dict[str, Any]:
