@@ -1,7 +1,8 @@
 """Fills the tables of README.md and docs from assets/bench/*.json: python scripts/doc_tables.py
 
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
-the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY. ``<!-- chart: FILE.svg -->`` …
+the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, and ``FILE.json of A; B`` shows
+those of the methods A and B alone. ``<!-- chart: FILE.svg -->`` …
 ``<!-- end -->`` holds a picture. What was not measured yet leaves its place empty.
 """
 
@@ -14,7 +15,7 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 CHART = re.compile(r"(<!-- chart: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
-TABLE = re.compile(r"(<!-- table: (\S+) \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- table: (\S+)(?: of (.+?))? \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 PAGES = {
@@ -37,14 +38,16 @@ def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
     def table(found: re.Match[str]) -> str:
         name, _, key = found[2].partition("#")
         if not (bench / name).is_file():
-            return found[1] + found[4]
+            return found[1] + found[5]
         rows = json.loads((bench / name).read_text(encoding="utf-8"))
         rows = rows[key] if key else rows
         rows = rows if isinstance(rows, list) else [rows]
-        columns = [column.strip().partition(" ")[::2] for column in found[3].split(",")]
+        methods = found[3].split("; ") if found[3] else None
+        rows = [row for row in rows if methods is None or row["method"] in methods]
+        columns = [column.strip().partition(" ")[::2] for column in found[4].split(",")]
         lines = [[name for name, _ in columns], ["---"] * len(columns)]
         lines += [[_cell(_value(row, name), form) for name, form in columns] for row in rows]
-        return found[1] + "".join(f"| {' | '.join(line)} |\n" for line in lines) + found[4]
+        return found[1] + "".join(f"| {' | '.join(line)} |\n" for line in lines) + found[5]
 
     return CHART.sub(chart, TABLE.sub(table, text))
 
