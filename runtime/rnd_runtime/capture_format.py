@@ -17,6 +17,8 @@ from .images import read_header, read_image
 
 Floats32 = NDArray[np.float32]
 Split = Literal["train", "novel_view", "novel_pose", "relight"]
+TRAIN_SHARE = 0.8
+"""of the training camera's frames, where nobody has split them: the paper's"""
 
 SCHEMA = "rnd-capture/1"
 _Row3 = tuple[float, float, float]

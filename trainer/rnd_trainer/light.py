@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rnd_runtime.light import texel_directions, texel_solid_angles
+from rnd_runtime.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
 
 PROBE_SHAPE = (32, 64)
 """rows and columns of the probe (paper, section 3.2)"""
@@ -77,7 +77,7 @@ def natural_sky(height: Tensor | NDArray[np.float64]) -> Any:
 
 def luminance(rgb: Tensor) -> Tensor:
     """Rec.709 luminance of linear RGB [..., 3]."""
-    return rgb @ rgb.new_tensor([0.2126, 0.7152, 0.0722])
+    return rgb @ rgb.new_tensor(REC709_LUMINANCE)
 
 
 def all_texels(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Texels:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from rnd_runtime.body import posed_vertices
-from rnd_runtime.capture_format import Split
+from rnd_runtime.capture_format import TRAIN_SHARE, Split
 from rnd_runtime.errors import InputError
 from rnd_trainer.silhouette import silhouette
 
@@ -23,7 +23,7 @@ from .pictures import PICTURES, Bytes, camera_of, listed, numbers_of, read_rgb, 
 from .pose_files import FoundPoses, paired
 from .recording import Floats, Lens, Recording, Shot
 from .select import select_frames, sharpness
-from .write import TRAIN_SHARE, Scene, placed
+from .write import Scene, placed
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 FPS = 30.0

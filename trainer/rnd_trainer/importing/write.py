@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame, save_capture
+from rnd_runtime.capture_format import TRAIN_SHARE
 from rnd_runtime.errors import InputError, refuse_changed
 from rnd_runtime.files import output_folder
 from rnd_runtime.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
@@ -31,8 +32,6 @@ UPS = {
 }  # fmt: skip
 SNAP = np.cos(np.radians(30))
 """a person who stands within 30° of an axis on average stands along it; farther off the world was never levelled"""
-TRAIN_SHARE = 0.8
-"""of the training camera's frames: the paper's split"""
 MOST_FILLED = 100_000
 """poses between given ones, an hour of a video; numbers farther apart, such as times, count no frames"""
 _TO_LINEAR = srgb_to_linear(np.arange(256) / 255)

@@ -24,7 +24,7 @@ from rnd_runtime.images import linear_to_srgb
 from rnd_runtime.light import Light
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.sh import sh_basis, sphere_quadrature
-from rnd_runtime.shading import Shader
+from rnd_runtime.shading import SHADOW_RESOLUTION, Shader
 from rnd_runtime.shadow import directional_visibility
 
 from .lights import stage_lights
@@ -35,7 +35,6 @@ Floats = NDArray[np.float64]
 # In which visibility is traced for the fit of its 16 coefficients: 2 · 14² = 392 directions. Against 800, the person's
 # irradiance under a white sky differs by 0.8 % rms and 0.004 % on average; the fit takes seconds.
 QUADRATURE = 14
-SHADOW_TEXELS = 384
 DISC, THICKNESS = 0.55, 0.05  # standard deviations of a Gaussian in its plane and across, in spacings
 OPACITY = 0.99
 RIM = 2  # pixels at the silhouette that "inside" leaves out: a splat's edge is softer than a surface's
@@ -120,7 +119,7 @@ def true_gaussians(surface: Surface) -> Gaussians:
 def fitted_visibility(points: Floats, normals: Floats, radius: float) -> Floats:
     """Harmonics [N, 16] that fit traced shadows best where they count: least squares weighted by the cosine."""
     directions, areas = sphere_quadrature(QUADRATURE)
-    traced = directional_visibility(points, normals, directions, radii=radius, resolution=SHADOW_TEXELS)
+    traced = directional_visibility(points, normals, directions, radii=radius, resolution=SHADOW_RESOLUTION)
     basis = sh_basis(directions)
     weight = np.maximum(normals @ directions.T, 0) * areas * len(areas) / (4 * np.pi)
     result = np.empty((len(points), basis.shape[1]))

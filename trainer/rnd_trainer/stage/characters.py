@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import read_image, srgb_to_linear
+from rnd_runtime.light import REC709_LUMINANCE
 from rnd_runtime.npz import Npz
 from rnd_runtime.skeleton import SMPL_NAMES, bone_transforms, smpl_skeleton
 
@@ -368,7 +369,7 @@ def _roughness(character: Character, of_vertex: Ints, colour: Floats) -> Floats:
             for name in character.materials
         ]
     )
-    luminance = colour @ [0.2126, 0.7152, 0.0722]
+    luminance = colour @ REC709_LUMINANCE
     mean = np.bincount(of_vertex, luminance, len(base)) / np.maximum(
         np.bincount(of_vertex, minlength=len(base)), 1
     )

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rnd_runtime.capture_format import Frame, Split
+from rnd_runtime.capture_format import TRAIN_SHARE, Frame, Split
 from rnd_runtime.errors import InputError, flag
 
 from .lights import WHITE
 
-TRAIN_SHARE = 0.8  # of the frames, as in the paper
 TRAIN_CAMERA = "cam00"
 
 
