@@ -263,6 +263,21 @@ def test_wham_takes_the_longest_track_and_fills_its_gaps(tmp_path):
     )
 
 
+def test_of_whams_repeated_frames_the_first_counts_as_for_rnd_data_import(tmp_path):
+    file = _wham(tmp_path)
+    people = pickle.loads(file.read_bytes())
+    track = {name: np.concatenate([value[3:], value[:4] * 2]) for name, value in people[3].items()}
+    track["frame_ids"] = np.concatenate([people[3]["frame_ids"][3:], people[3]["frame_ids"][:4]])
+    motion = load_motion(_pickle(file, {3: track}), SKELETON)
+    assert_allclose(motion.rotations[3:], MATRICES[3:], atol=SINGLE)
+    assert motion.frame_count == FRAMES and not np.allclose(motion.rotations[2], MATRICES[2], atol=0.01)
+    track["frame_ids"] = track["frame_ids"][1:]
+    with pytest.raises(
+        InputError, match=rf"wham_output.pkl: poses of a track: .* got {FRAMES + 1} and {FRAMES}"
+    ):
+        load_motion(_pickle(file, {3: track}), SKELETON)
+
+
 @pytest.mark.parametrize("write", [_phalp, _wham_in_camera])
 def test_what_a_camera_saw_is_turned_upright_over_the_origin(tmp_path, write):
     motion = load_motion(write(tmp_path), SKELETON)

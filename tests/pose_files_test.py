@@ -323,6 +323,18 @@ def test_a_track_that_phalp_lost_is_left_out_there(tmp_path) -> None:
     )
 
 
+def test_of_whams_repeated_frames_the_first_counts(tmp_path) -> None:
+    track = {"pose": np.zeros((4, 72)), "trans": np.arange(12.0).reshape(4, 3), "betas": np.zeros((4, 10))}
+    layouts._pickle(tmp_path / "a.pkl", {0: track | {"frame_ids": [7, 5, 7, 6]}})
+    poses = read_poses(tmp_path / "a.pkl").poses
+    assert poses.frames.tolist() == [5, 6, 7] and poses.root(np.zeros(3))[:, 0].tolist() == [3, 9, 0]
+    layouts._pickle(tmp_path / "b.pkl", {0: track | {"frame_ids": [7, 5, 6]}})
+    with pytest.raises(
+        InputError, match=r"b\.pkl: poses of a track: expected one a frame, got 4 and 3 frame_ids"
+    ):
+        read_poses(tmp_path / "b.pkl")
+
+
 def test_files_that_are_no_poses_are_refused_by_name(tmp_path) -> None:
     (tmp_path / "a.json").write_text("{}")
     np.savez(tmp_path / "b.npz", pictures=np.zeros(3))

@@ -16,7 +16,7 @@ from .motion_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .npz import Members
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 from .unpickle import read_pickle
-from .video_fits import PHALP_FOCAL, VideoFits, is_phalp, read_easymocap_folder, read_phalp
+from .video_fits import PHALP_FOCAL, VideoFits, in_order, is_phalp, read_easymocap_folder, read_phalp
 
 Floats = NDArray[np.float64]
 
@@ -122,11 +122,8 @@ def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
     notes = [_VIDEO_NOTE, *_left_out(longest, tuple(who for who in people if who != longest))]
     person = people[longest]
     world = "pose_world" in person and "trans_world" in person
-    poses = np.asarray(person["pose_world" if world else "pose"], np.float64)
-    trans = np.asarray(person["trans_world" if world else "trans"], np.float64)
-    frames = np.asarray(person.get("frame_ids", np.arange(len(poses)))).reshape(-1)
-    if len(frames) != len(poses) or (np.diff(frames) <= 0).any():
-        raise InputError("frame_ids", expected=f"{len(poses)} that ascend", got=f"{len(frames)}", file=path)
+    poses, trans = (person[f"{name}_world" if world else name] for name in ("pose", "trans"))
+    frames, (poses, trans) = in_order(person.get("frame_ids", np.arange(len(poses))), poses, trans)
     poses, trans, filled = _without_gaps(frames, poses.reshape(len(poses), -1), trans, path)
     if not world:
         poses, trans, turned = _before_the_camera(poses, trans)

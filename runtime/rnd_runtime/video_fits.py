@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .rotations import matrix_to_axis_angle
@@ -134,6 +134,22 @@ def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tu
         raise InputError("--person", expected=" or ".join(map(str, numbers)), got=person)
     chosen = max(numbers, key=list(seen).count) if person is None else person
     return chosen, tuple(number for number in numbers if number != chosen)
+
+
+def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], list[Floats]]:
+    """A track's frame numbers [F], ascending, and its ``values`` [F, …]; of a number that repeats the first counts.
+
+    Raises:
+        InputError: there are not as many of each.
+    """
+    numbers = np.asarray(frames, np.int64).reshape(-1)
+    arrays = [np.asarray(value, np.float64) for value in values]
+    for array in arrays:
+        if array.shape[:1] != numbers.shape:
+            got = f"{len(array)} and {numbers.size} frame_ids"
+            raise InputError("poses of a track", expected="one a frame", got=got)
+    ascending, first = np.unique(numbers, return_index=True)
+    return ascending, [array[first] for array in arrays]
 
 
 def with_root(poses: Floats) -> Floats:

@@ -18,6 +18,7 @@ from rnd_runtime.video_fits import (
     PHALP_FOCAL,
     VideoFits,
     easymocap_files,
+    in_order,
     is_phalp,
     one_of,
     read_easymocap_folder,
@@ -192,10 +193,8 @@ def _wham(content: dict[Any, Any], person: int | None, path: Path) -> FoundPoses
     tracks = {int(key): entry for key, entry in content.items()}
     chosen, others = one_of([key for key, entry in tracks.items() for _ in entry["frame_ids"]], person, path)
     entry = tracks[chosen]
-    frames = np.asarray(entry["frame_ids"], np.int64)
-    order = np.unique(frames, return_index=True)[1]
-    pose, trans, betas = (np.asarray(entry[key], np.float64)[order] for key in ("pose", "trans", "betas"))
-    poses = smpl_poses(frames[order], pose, trans, betas)
+    frames, members = in_order(entry["frame_ids"], *(entry[key] for key in ("pose", "trans", "betas")))
+    poses = smpl_poses(frames, *members)
     notes = _several(chosen, others)
     return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=notes, in_camera=True)
 
