@@ -22,6 +22,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.images import to_bytes, write_image
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.skeleton import SMPL_NAMES
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing import easymocap, nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
@@ -29,6 +30,7 @@ from rnd_trainer.importing.options import ImportOptions
 from rnd_trainer.importing.pictures import listed
 from rnd_trainer.importing.pose_files import read_poses
 from rnd_trainer.importing.recording import Poses, easymocap_poses, read_as, smpl_poses
+from rnd_trainer.importing.write import _by_name
 from rnd_trainer.silhouette import overlap
 
 PLACE = 2e-5  # m: float32 in the files and in bone transforms
@@ -277,6 +279,20 @@ def test_an_npz_is_read_by_its_keys_or_as_told(tmp_path) -> None:
     assert_allclose(told.root(rest), world.places, atol=1e-9)
     assert_allclose(told.rotations[:, 0], world.roots, atol=1e-9)
     assert np.abs(read_poses(tmp_path / "em.npz").poses.root(rest) - world.places).max() > 0.1
+
+
+def test_joints_that_an_npz_names_are_told_by_name(tmp_path) -> None:
+    """In any order after the root, as rnd-play has it; 24 joints are not SMPL's where they say otherwise."""
+    world, order = layouts.World(layouts.Z_UP), [0, *range(23, 0, -1)]
+    poses = world.thetas.reshape(FRAMES, 24, 3)[:, order].reshape(FRAMES, -1)
+    names, file = np.array(SMPL_NAMES)[order], tmp_path / "p.npz"
+    for more in ({}, {"Rh": np.zeros((FRAMES, 3))}):
+        np.savez(file, poses=poses, trans=world.trans, joint_names=names, **more)
+        named = read_poses(file).poses
+        assert_allclose(_by_name(named, shaped_body()), axis_angle_to_matrix(world.thetas.reshape(-1, 24, 3)))
+    np.savez(file, poses=poses, trans=world.trans, joint_names=names[:23])
+    with pytest.raises(InputError, match=r"p\.npz: joints of the motion: expected 23 joints"):
+        read_poses(file)
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,7 @@ def _read(
 ) -> MotionRecord:
     easymocap = members.first_of("Rh", "Rh_all") is not None
     axis_angles = _axis_angles(members, notes, joint_names)
-    names = _names(members, axis_angles, joint_names)
+    names = names_of_joints(members, axis_angles.shape[1], joint_names)
     _check_angles(axis_angles, names, members.path, notes)
     rotations = axis_angle_to_matrix(axis_angles)
     named = joint_names is not None or "joint_names" in members.names
@@ -166,8 +166,12 @@ def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
     return [np.concatenate([pose.reshape(len(body), -1, 3) for pose in poses], 1)]
 
 
-def _names(archive: Members, axis_angles: Floats, given: tuple[str, ...] | None) -> tuple[str, ...]:
-    count = axis_angles.shape[1]
+def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """What ``count`` joints are called: by the file, else as ``given``, else by the SMPL family's order.
+
+    Raises:
+        InputError: nobody names them, or not as many, or not each by a name of its own.
+    """
     names = archive.strings("joint_names") if "joint_names" in archive.names else given
     if names is None:
         names = NAMES_BY_COUNT.get(count)

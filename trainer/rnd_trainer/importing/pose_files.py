@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rnd_runtime.errors import InputError
+from rnd_runtime.motion_files import names_of_joints
 from rnd_runtime.npz import Npz
 from rnd_runtime.unpickle import read_pickle
 from rnd_runtime.video_fits import (
@@ -267,9 +268,13 @@ def _npz(path: Path) -> FoundPoses:
             raise InputError(member, expected="a row of numbers a frame", got=list(poses.shape), file=path)
         poses = poses.reshape(len(poses), -1)
         root = archive.first_of("global_orient", "root_orient")
-        if member in ("body_pose", "pose_body") and root is not None:
+        names = None
+        if "joint_names" in archive.names:
+            names = names_of_joints(archive, poses.shape[1] // 3)
+        elif member in ("body_pose", "pose_body") and root is not None:
             poses = np.concatenate([threes(root, archive.numbers(root), len(poses)), poses], 1)
-        poses = with_root(poses)
+        else:
+            poses = with_root(poses)
         betas_name = archive.first_of("shapes", "betas")
         betas = None if betas_name is None else archive.numbers(betas_name)
         notes = () if betas is None else _gender(archive)
@@ -286,9 +291,12 @@ def _npz(path: Path) -> FoundPoses:
     family = "SMPL-X" if smplx else "SMPL"
     place = shift or "trans"
     if turn is not None:
-        found = easymocap_poses(frames, poses, Rh, trans, betas, family=family, members=(turn, place))
+        members = (turn, place)
+        found = easymocap_poses(
+            frames, poses, Rh, trans, betas, family=family, members=members, joint_names=names
+        )
         return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
-    found = smpl_poses(frames, poses, trans, betas, family=family, member=place)
+    found = smpl_poses(frames, poses, trans, betas, family=family, member=place, joint_names=names)
     return FoundPoses("SMPL", found, fps=fps, notes=notes)
 
 

@@ -162,15 +162,17 @@ def smpl_poses(
     *,
     family: str = "SMPL",
     member: str = "trans",
+    joint_names: tuple[str, ...] | None = None,
 ) -> Poses:
     """Poses in SMPL's own convention: the root turns about its rest place J0 and lies at J0 + trans.
 
     Args:
-        axis_angles: [F, 3J] or [F, J, 3] rad, the root first; J is 22, 24, 52 or 55.
+        axis_angles: [F, 3J] or [F, J, 3] rad, the root first.
         trans: [F, 3] m.
         member: what the file calls ``trans``.
+        joint_names: J; without them J is 22, 24, 52 or 55, in the family's order.
     """
-    rotations, names = _rotations(axis_angles)
+    rotations, names = _rotations(axis_angles, joint_names)
     offsets = threes(member, trans, len(rotations))
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
@@ -186,13 +188,14 @@ def easymocap_poses(
     *,
     family: str = "SMPL",
     members: tuple[str, str] = ("Rh", "Th"),
+    joint_names: tuple[str, ...] | None = None,
 ) -> Poses:
     """Poses in EasyMocap's convention: a body with an unturned root, then x = R(Rh) X + Th about the origin.
 
     A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first. ``members``: what the
-    file calls ``Rh`` and ``Th``.
+    file calls ``Rh`` and ``Th``; ``joint_names`` as for :func:`smpl_poses`.
     """
-    rotations, names = _rotations(axis_angles)
+    rotations, names = _rotations(axis_angles, joint_names)
     turn = axis_angle_to_matrix(threes(members[0], Rh, len(rotations)))
     offsets = threes(members[1], Th, len(rotations))
     rotations[:, 0] = turn @ rotations[:, 0]
@@ -250,13 +253,13 @@ def mean_betas(betas: ArrayLike | None) -> Floats | None:
     return array.reshape(-1, array.shape[-1]).mean(0)
 
 
-def _rotations(axis_angles: ArrayLike) -> tuple[Floats, tuple[str, ...]]:
+def _rotations(axis_angles: ArrayLike, names: tuple[str, ...] | None) -> tuple[Floats, tuple[str, ...]]:
     angles = np.asarray(axis_angles, np.float64)
     if not angles.size:
         raise InputError("body poses", expected="at least one frame", got="none")
     joints, over = divmod(angles.size, 3 * len(angles))
-    names = None if over else NAMES_BY_COUNT.get(joints)
-    if names is None:
+    names = names or NAMES_BY_COUNT.get(joints)
+    if over or names is None:
         known = ", ".join(map(str, NAMES_BY_COUNT))
         raise InputError("joints of the body poses", expected=known, got=_shape(angles) if over else joints)
     return axis_angle_to_matrix(angles.reshape(-1, joints, 3)), names
