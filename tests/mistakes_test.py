@@ -89,6 +89,8 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ),
         (f"{IMPORT} --every 0", "--every: expected at least 1, got 0"),
         (f"{IMPORT} --held-out-every 0", "--held-out-every: expected at least 1, got 0"),
+        (f"{IMPORT} --count 0", "--count: expected at least 1, got 0"),
+        (f"{IMPORT} --start 9 --stop 3", "--stop: expected more than --start 9, got 3"),
         (f"{IMPORT} --fps 0", "--fps: expected more than 0, got 0"),
         ("rnd-stage OUT --estimate-seed -1", "--estimate-seed: expected at least 0, got -1"),
     ],

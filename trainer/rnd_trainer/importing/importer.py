@@ -160,6 +160,9 @@ def _check_numbers(options: ImportOptions) -> None:
     choice = options.choice
     check_option(choice.every >= 1, "--every", "at least 1", choice.every)
     check_option(choice.held_out_every >= 1, "--held-out-every", "at least 1", choice.held_out_every)
+    check_option(options.count >= 1, "--count", "at least 1", options.count)
+    stop = math.inf if choice.stop is None else choice.stop
+    check_option(stop > choice.start, "--stop", f"more than --start {choice.start}", choice.stop)
     check_option(
         len(options.distortion) in _COEFFICIENTS and all(map(math.isfinite, options.distortion)),
         "--distortion", "k1 k2 p1 p2 [k3 …], as OpenCV has them", " ".join(map(str, options.distortion)),
