@@ -30,6 +30,7 @@ COMMANDS = {
     "rnd-stage": rnd_trainer.stage.cli.main,
 }
 BODY, AVATAR = ASSETS / "body.npz", ASSETS / "avatar.onnx"
+MOTION = f"rnd-data motion {ASSETS / 'walk.npz'} OUT/w.npz"
 IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 
 
@@ -92,6 +93,10 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         (f"{IMPORT} --count 0", "--count: expected at least 1, got 0"),
         (f"{IMPORT} --start 9 --stop 3", "--stop: expected more than --start 9, got 3"),
         (f"{IMPORT} --fps 0", "--fps: expected more than 0, got 0"),
+        (f"{MOTION} --fps 20000", "--fps: expected 0.001 to 10000, got 20000"),
+        (f"{MOTION} --source-fps 0", "--source-fps: expected 0.001 to 10000, got 0"),
+        (f"{MOTION} --speed 1e-7", "--speed: expected 0.01 to 100, got 1e-07"),
+        (f"{MOTION} --smooth 1e4", "--smooth: expected 0.01 to 1000, got 10000"),
         ("rnd-stage OUT --estimate-seed -1", "--estimate-seed: expected at least 0, got -1"),
     ],
 )

@@ -78,6 +78,14 @@ def refuse_changed(options: object, names: Iterable[str], hint: str) -> None:
             raise InputError(flag(name), expected="the default", got=value, hint=hint)
 
 
+def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:
+    """Raise :class:`InputError` for a number, where there is one, beyond its ``limits`` (least, most), by field."""
+    for name, (low, high) in limits.items():
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:  # false for NaN
+            raise InputError(flag(name), expected=f"{low:g} to {high:g}", got=value)
+
+
 def flag(name: str) -> str:
     """How an option is written on the command line."""
     return "--" + name.replace("_", "-")

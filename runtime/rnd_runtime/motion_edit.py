@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError, flag
+from .errors import InputError, flag, refuse_outside
 from .motion import Motion
 from .rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 
@@ -22,6 +22,9 @@ _SEAM_SECONDS = 0.5
 _LEAST_LOOP = 4  # frames
 
 
+EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # least and most; beyond are mistakes
+
+
 @dataclass(frozen=True)
 class MotionEdits:
     """Changes to a motion, made in this order; the defaults change nothing.
@@ -31,6 +34,9 @@ class MotionEdits:
         speed: playback speed; the frame rate stays.
         in_place: hold the root over the place where it begins.
         loop: blend the end into the beginning, so that the clip can be repeated.
+
+    Raises:
+        InputError: for a number beyond :data:`EDIT_LIMITS`.
     """
 
     smooth: float | None = None
@@ -38,12 +44,15 @@ class MotionEdits:
     in_place: bool = False
     loop: bool = False
 
+    def __post_init__(self) -> None:
+        refuse_outside(self, EDIT_LIMITS)
+
 
 def edit_motion(motion: Motion, edits: MotionEdits) -> Motion:
     """``motion`` with ``edits`` made; notes say what they cost.
 
     Raises:
-        InputError: for a speed or cutoff that is not positive, or a motion too short to loop.
+        InputError: for a motion too short to loop.
     """
     if edits.smooth is not None:
         motion = smoothed(motion, edits.smooth)

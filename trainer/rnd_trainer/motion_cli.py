@@ -13,10 +13,11 @@ from rich.console import Console
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import existing_file
 from rnd_runtime.motion import load_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
+from rnd_runtime.motion_files import FPS_LIMITS
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
 
 # Joints of an adult in cm, SMPL's order, standing about SMPL's origin: what matters are the proportions of the legs.
@@ -54,6 +55,9 @@ def motion(
     """
     if out.suffix.lower() != ".npz":
         raise InputError("output", expected="a name that ends in .npz", got=out.name)
+    low, high = FPS_LIMITS
+    for name, rate in (("--source-fps", source_fps), ("--fps", fps)):
+        check_option(rate is None or low <= rate <= high, name, f"{low:g} to {high:g}", rate)
     skeleton = _skeleton(body)
     made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
     if fps is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body, posed_vertices
-from rnd_runtime.errors import InputError, check_option
+from rnd_runtime.errors import InputError, check_option, refuse_outside
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light
@@ -24,7 +24,7 @@ from .cameras import CameraOptions, CameraPath, file_path, frame_motion, front_p
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
 from .lights import chosen_light, light_notes
 from .mesh_files import write_obj, write_rigged_glb
-from .options import parse_frames, refuse_outside
+from .options import parse_frames
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
 from .splats import (
     Splats,

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, flag, refuse_changed
+from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.motion import Motion, load_motion
-from rnd_runtime.motion_edit import MotionEdits, edit_motion
+from rnd_runtime.motion_edit import EDIT_LIMITS, MotionEdits, edit_motion
 from rnd_runtime.motion_files import FPS_LIMITS
 from rnd_runtime.skeleton import Skeleton
 
@@ -69,7 +69,7 @@ class MotionOptions:
         refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 
     def __post_init__(self) -> None:
-        refuse_outside(self, {"motion_fps": FPS_LIMITS, "smooth": (1e-2, 1e3), "speed": (1e-2, 100)})
+        refuse_outside(self, {"motion_fps": FPS_LIMITS, **EDIT_LIMITS})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,14 +83,6 @@ class LitOptions(MotionOptions):
         super().__post_init__()
         if not vars(self)["hdr"]:
             refuse_changed(self, ["hdr_up"], "needs --hdr")
-
-
-def refuse_outside(options: object, limits: dict[str, tuple[float, float]]) -> None:
-    """Refuse numbers that no later step could explain: ``limits`` by field."""
-    for name, (low, high) in limits.items():
-        value = getattr(options, name)
-        if value is not None and not low <= value <= high:  # false for NaN
-            raise InputError(flag(name), expected=f"{low:g} to {high:g}", got=value)
 
 
 @dataclass(frozen=True)
