@@ -621,6 +621,17 @@ def test_a_table_may_have_sides_and_only_what_is_missing(tmp_path):
             match_joints(theirs, SMPL_NAMES, load_joint_map(tmp_path / "w.toml"))
 
 
+@pytest.mark.parametrize(("line", "said"), [('tail = "Hips"', "avatar"), ('head = "Snout"', "motion")])
+def test_a_mistake_in_a_joint_map_is_blamed_on_it(tmp_path, line, said):
+    """Whether the motion has a skeleton of its own or names its columns."""
+    table = tmp_path / "t.toml"
+    table.write_text(line)
+    named = _npz(tmp_path / "a.npz", poses=POSES, trans=PELVIS, fps=30, joint_names=SMPL_NAMES)
+    for file in (_bvh(tmp_path / "a.bvh", NAMINGS["mixamo"]), named):
+        with pytest.raises(InputError, match=f"t.toml: joint map: expected joints of the {said}"):
+            load_motion(file, SKELETON, joint_map=table)
+
+
 def test_a_joint_map_renames_named_arrays_too(tmp_path):
     names = [f"B{joint}" for joint in range(24)]
     file = _npz(tmp_path / "a.npz", poses=POSES, trans=PELVIS, fps=30, joint_names=names)

@@ -47,12 +47,15 @@ def load_joint_map(path: str | Path) -> JointTable:
 
 
 def match_joints(
-    theirs: Sequence[str], ours: Sequence[str], extra: Mapping[str, tuple[str, ...]] | None = None
+    theirs: Sequence[str],
+    ours: Sequence[str],
+    extra: Mapping[str, tuple[str, ...]] | None = None,
+    file: str | Path | None = None,
 ) -> dict[str, int]:
     """For each of the joints ``ours`` that can be told among ``theirs``, its index there.
 
     The naming of ``joint_names.toml`` that explains the most joints is taken whole, so that "LeftShoulder" is a
-    collar bone in one file and a shoulder in another. Lines of ``extra`` come before it.
+    collar bone in one file and a shoulder in another. Lines of ``extra``, read from ``file``, come before it.
 
     Raises:
         InputError: when ``extra`` names joints that nobody has, or no naming explains enough of them.
@@ -71,12 +74,17 @@ def match_joints(
     strangers = [joint for joint in extra if joint not in ours]
     if strangers:
         raise InputError(
-            "joint map", expected=f"joints of the avatar ({', '.join(ours)})", got=", ".join(strangers)
+            "joint map",
+            expected=f"joints of the avatar ({', '.join(ours)})",
+            got=", ".join(strangers),
+            file=file,
         )
     given = found(extra)
     if len(given) < len(extra):
         absent = ", ".join(" or ".join(names) for joint, names in extra.items() if joint not in given)
-        raise InputError("joint map", expected=f"joints of the motion ({', '.join(theirs)})", got=absent)
+        raise InputError(
+            "joint map", expected=f"joints of the motion ({', '.join(theirs)})", got=absent, file=file
+        )
     best = max((found(table) for table in _known_tables()), key=len)
     matched = {**{joint: place for joint, place in best.items() if place not in given.values()}, **given}
     if len(matched) < min(_FEWEST, len(ours)):

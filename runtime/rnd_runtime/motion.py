@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from .errors import InputError
 from .files import is_folder
 from .interpolation import interpolate_points, interpolate_rotations
-from .joint_names import JointTable, load_joint_map, match_joints
+from .joint_names import load_joint_map, match_joints
 from .mocap import asf_beside, read_acclaim, read_bvh
 from .motion_files import SMPL_REST_ROOT, read_motion_file
 from .npz import save_npz
@@ -146,12 +147,11 @@ def load_motion(
     """
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise InputError("fps", expected="a positive number", got=fps)
-    table = None if joint_map is None else load_joint_map(joint_map)
     try:
         if Path(path).suffix.lower() in _MOCAP_READERS:
-            motion = _load_mocap(path, skeleton, up, table)
+            motion = _load_mocap(path, skeleton, up, joint_map)
         else:
-            motion = _load_arrays(path, skeleton, up, joint_names, table)
+            motion = _load_arrays(path, skeleton, up, joint_names, joint_map)
     except InputError as error:
         raise error.at(file=path) from error
     if fps is None:
@@ -172,9 +172,14 @@ def motion_inputs(path: str | Path) -> list[Path]:
     return [path, asf_beside(path)] if path.suffix.lower() == ".amc" else [path]
 
 
-def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, table: JointTable | None) -> Motion:
+def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | None) -> dict[str, int]:
+    table = None if joint_map is None else load_joint_map(joint_map)
+    return match_joints(names, skeleton.names, table, joint_map)
+
+
+def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
     tree = _MOCAP_READERS[Path(path).suffix.lower()](path)
-    moved = retarget(tree, skeleton, match_joints(tree.names, skeleton.names, table), up)
+    moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
     return Motion(moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes)
 
 
@@ -183,12 +188,12 @@ def _load_arrays(
     skeleton: Skeleton,
     up: str,
     joint_names: tuple[str, ...] | None,
-    table: JointTable | None,
+    joint_map: str | Path | None,
 ) -> Motion:
     record = read_motion_file(path, joint_names)
     names = list(record.joint_names)
-    if table is not None:
-        matched = match_joints(names, skeleton.names, table)
+    if joint_map is not None:
+        matched = _matched(names, skeleton, joint_map)
         names = ["" if name in matched else name for name in names]  # the table's word counts
         for ours, place in matched.items():
             names[place] = ours
