@@ -234,13 +234,14 @@ def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> Non
         out, err = capsys.readouterr()
         return int(ended.value.code or 0), (out + err).splitlines()
 
-    files = ["--json", str(tmp_path / "grid.json"), "--chart", str(tmp_path / "grid.svg")]
+    files = ["--json", str(tmp_path / "grid[a].json"), "--chart", str(tmp_path / "grid[/a].svg")]
     code, lines = said(*files)
     assert code == 0 and [line.strip() for line in lines[:10:4]] == [
         "(9 left, about 9 min)", "(5 left, about 5 min)", "(1 left, about 1 min)"
     ]  # fmt: skip
-    rows = json.loads((tmp_path / "grid.json").read_text())
-    (tmp_path / "grid.json").write_text(json.dumps(rows[:7]))
+    assert lines[-1] == f"{files[1]}, {files[3]}"
+    rows = json.loads((tmp_path / "grid[a].json").read_text())
+    (tmp_path / "grid[a].json").write_text(json.dumps(rows[:7]))
     lines = said(*files)[1]
     assert [line.strip() for line in lines[5:10]] == [
         "(kept)", "(kept)", "(2 left, about 16 min)", "(1 left, about 4 min)", "(0 left, about 0 min)"

@@ -16,6 +16,7 @@ import torch
 from msgspec import structs
 
 import rnd_trainer.ablate
+import rnd_trainer.eval_cli
 import rnd_trainer.evaluate
 import rnd_trainer.held_out
 from rnd_runtime.capture import Capture, load_capture
@@ -268,6 +269,26 @@ def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp
     (run / "refined_motion.npz").unlink()
     evaluate_run(EvalOptions(run, tiny_capture.folder))
     assert str(scored[-1].motion.source) == str(tiny_capture.motion.source)
+
+
+def test_rows_are_written_before_the_table_whose_title_is_the_runs_name(
+    tiny_checkpoint, tiny_capture, tmp_path, monkeypatch, capsys
+) -> None:
+    rows = [{"split": "novel_view", "frames": 1}]
+    monkeypatch.setattr(rnd_trainer.held_out, "score", lambda *_, **__: rows)
+    monkeypatch.chdir(tmp_path)
+    Path("r[x]").mkdir()
+    shutil.copy(tiny_checkpoint, "r[x]/avatar.ckpt")
+    evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder))
+    assert "r[x]/avatar.ckpt" in capsys.readouterr().out
+
+    def closed() -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(rnd_trainer.eval_cli, "wide_console", closed)
+    with pytest.raises(BrokenPipeError):
+        evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder, json=Path("rows.json")))
+    assert json.loads(Path("rows.json").read_text()) == rows
 
 
 def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:

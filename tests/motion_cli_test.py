@@ -65,6 +65,13 @@ def test_fits_of_a_video_go_out_as_amass(tmp_path, monkeypatch, capsys, write):
     assert_allclose(load_motion(out, skeleton).rotations, MATRICES, atol=2e-6)
 
 
+@pytest.mark.parametrize("name", ["walk[final].npz", "out[/x].npz"])
+def test_a_files_name_is_printed_as_it_is(tmp_path, monkeypatch, capsys, name):
+    monkeypatch.chdir(tmp_path)
+    assert _run(monkeypatch, ASSETS / "walk.npz", name) == 0
+    assert f"{name}: 132 frames" in capsys.readouterr().out
+
+
 def test_bad_use_is_one_line_and_exit_2(tmp_path, monkeypatch, capsys):
     assert _run(monkeypatch, ASSETS / "walk.npz", tmp_path / "w.bvh") == 2
     assert "ends in .npz" in capsys.readouterr().err

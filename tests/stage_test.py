@@ -243,6 +243,14 @@ def test_impossible_recipes_are_refused(change: dict) -> None:
         replace(RECIPE, **change).check()
 
 
+def test_the_captures_name_is_printed_as_it_is(production, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(film, "prepare", lambda recipe, out: production)
+    monkeypatch.setattr(manifest, "finish", lambda *_: True)
+    monkeypatch.setattr(cli, "_film_with_progress", lambda *_: None)
+    cli._stage(cli.StageOptions(Path("out[x]"), variant="scalar_rgb"))
+    assert "out[x]/capture.json: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["1", "2/2", "a/b", "-1/2", "1/0", f"1/{'9' * 5000}"])
 def test_bad_shards_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="--shard"):

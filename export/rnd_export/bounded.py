@@ -75,7 +75,7 @@ def export_bounded(
         f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen "
         f"(in this machine's calm moments; just now {median:.1f} ms, 95 frames of a hundred within {p95:.1f}). "
         f"Given up: {lost}",
-        highlight=False, soft_wrap=True,
+        markup=False, highlight=False, soft_wrap=True,
     )  # fmt: skip
     if options.json is not None:
         row = {

@@ -112,6 +112,7 @@ def need_extra() -> None:
 def evaluate_run(options: EvalOptions) -> None:
     """Score every held-out split that the capture has; print a table, write rows and pictures as asked."""
     need_extra()
+    from rich.markup import escape
     from rich.table import Table
 
     from rnd_runtime.capture import load_capture
@@ -139,8 +140,10 @@ def evaluate_run(options: EvalOptions) -> None:
         perceptual=load_lpips(options.perceptual_weights),
         avatar=exported if _is_of(exported, checkpoint.sha256) else None,
     )
+    if options.json is not None:
+        write_json(options.json, rows)
     names = [name for name in COLUMNS if any(name in row for row in rows)]
-    table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=str(path))
+    table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=escape(str(path)))
     for row in rows:
         cells = [COLUMNS[name][1].format(row[name]) if name in row else "" for name in names]
         table.add_row(row["split"], str(row["frames"]), *cells)
@@ -149,9 +152,8 @@ def evaluate_run(options: EvalOptions) -> None:
     if rows[0].get("flicker") is not None:
         console.print(f"flicker on the held-out motion: {rows[0]['flicker']:.2f} of 255 levels")
     if "fps" in rows[0]:
-        console.print(f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second")
-    if options.json is not None:
-        write_json(options.json, rows)
+        line = f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second"
+        console.print(line, markup=False)
 
 
 def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:

@@ -107,10 +107,10 @@ def _stage(options: StageOptions) -> None:
     with console.status("dressing"):
         production = prepare(options.recipe, options.out)
     for note in production.motion.notes:
-        console.print(f"rnd-stage: {note}")
+        console.print(f"rnd-stage: {note}", markup=False, soft_wrap=True)
     seconds = _film_with_progress(production, options, shard, console)
     if finish(production, options.out, variant, seconds):
-        console.print(f"{options.out / 'capture.json'}: {production.title}")
+        console.print(f"{options.out / 'capture.json'}: {production.title}", markup=False, soft_wrap=True)
     else:
         console.print("rnd-stage: this shard is filmed; others are missing, so there is no capture.json yet")
 
