@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,8 +19,9 @@ from rnd_runtime.body import Body  # noqa: E402
 from rnd_runtime.camera import Camera  # noqa: E402
 from rnd_runtime.capture import load_capture  # noqa: E402
 from rnd_runtime.errors import InputError  # noqa: E402
+from rnd_runtime.files import write_json  # noqa: E402
 from rnd_runtime.gaussians import Gaussians  # noqa: E402
-from rnd_runtime.images import read_image, srgb_to_linear  # noqa: E402
+from rnd_runtime.images import read_image, srgb_to_linear, write_image  # noqa: E402
 from rnd_runtime.light import Light, texel_directions  # noqa: E402
 from rnd_runtime.motion import Motion, save_motion  # noqa: E402
 from rnd_runtime.rotations import axis_angle_to_matrix, matrix_to_axis_angle  # noqa: E402
@@ -233,6 +235,35 @@ def test_another_recipe_is_refused_and_one_that_cannot_be_filmed_leaves_nothing(
     assert json.loads((tmp_path / "out" / film.RECIPE_FILE).read_text())["samples"] == 9
     with pytest.raises(InputError, match="samples"):
         film.prepare(replace(RECIPE, samples=10), tmp_path / "out", template)
+
+
+def test_a_replaced_file_is_refused(tmp_path: Path) -> None:
+    """By its digest, or, where an older recipe has none, by the map of its light that pictures were lit by."""
+    sky, out, texels = tmp_path / "sky.exr", tmp_path / "out", np.ones((8, 16, 3), np.float32)
+    shutil.copy(ASSETS / "walk.npz", tmp_path / "walk.npz")
+    recipe = replace(RECIPE, motion=str(tmp_path / "walk.npz"), hdr=(str(sky),))
+    write_image(sky, texels)
+    write_json(out / film.RECIPE_FILE, film.recipe_for(recipe, out))
+    write_image(out / "lights/sky.exr", texels)
+    written = film.recipe_for(recipe, out)
+    film._refuse_other_lights(film._chosen(recipe), out)
+    texels[:2] = 9
+    write_image(sky, texels)
+    shutil.copy(ASSETS / "avatar.onnx", tmp_path / "walk.npz")
+    with pytest.raises(InputError, match=r"stage.json: .*content of \S*walk.npz, content of \S*sky.exr \(or"):
+        film.prepare(recipe, out)
+    del written["sha256"]
+    write_json(out / film.RECIPE_FILE, written)
+    with pytest.raises(InputError, match=r"lights/sky.exr: holds another light"):
+        film.prepare(recipe, out)
+    assert json.loads((out / film.RECIPE_FILE).read_text()) == written
+
+
+@pytest.mark.parametrize("text", ["[]", "3", '{"sha256": 1}', "{"])
+def test_a_recipe_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / film.RECIPE_FILE).write_text(text)
+    with pytest.raises(InputError, match=r"stage.json: not a recipe"):
+        film.recipe_for(RECIPE, tmp_path)
 
 
 @pytest.mark.parametrize(

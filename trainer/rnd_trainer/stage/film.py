@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import existing_file, output_folder, write_json
-from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
-from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.files import existing_file, output_folder, sha256_of, write_json
+from rnd_runtime.images import linear_to_srgb, read_image, to_bytes, write_image
+from rnd_runtime.motion import Motion, load_motion, motion_inputs
 from rnd_runtime.npz import save_npz
 
 from . import plan as plans
@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 RECIPE_FILE = "stage.json"
 TRUTH_SAMPLES = 16  # a truth has no noise but at edges
 VISIBILITY_SAMPLES = 16
+SAME_MAP = 1e-4  # relative: machines round a light's float32 texels differently
 FINEST, COARSEST = 0.003, 0.007  # m between a dressed surface's vertices
 
 
@@ -73,6 +74,7 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
         if file is not None:
             existing_file(Path(file), what=what)
     mine = recipe_for(recipe, folder)
+    _refuse_other_lights(lights, folder)
     dressed, title = _cast(recipe, template)
     motion = dance(dressed.body.skeleton)
     if recipe.motion is not None:
@@ -160,18 +162,22 @@ def _write_truth(folder: Path, shot: Shot, truth: Truth, recipe: Recipe) -> None
 
 
 def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
-    """The recipe as JSON has it.
+    """The recipe as JSON has it, with the digests of the files that it names.
 
-    Raises :class:`InputError` where ``folder`` holds another one's pictures.
+    Raises :class:`InputError` where ``folder`` holds another one's pictures, or such of files that were replaced.
     """
     file = output_folder(folder) / RECIPE_FILE
     mine = json.loads(json.dumps(asdict(recipe)))
+    motion = [] if recipe.motion is None else map(str, motion_inputs(recipe.motion))
+    named = [*motion, *recipe.hdr, *([] if recipe.character is None else [recipe.character])]
+    digests = {name: sha256_of(name) for name in named}
     if file.exists():
-        try:
-            theirs = json.loads(file.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise InputError("not a recipe", got=str(error), file=file) from error
+        theirs = _recipe_in(file)
+        earlier = theirs.get("sha256", {})  # older recipes have none
         different = sorted(key for key in mine if theirs.get(key) != mine[key])
+        different += [
+            f"content of {name}" for name in digests if earlier.get(name, digests[name]) != digests[name]
+        ]
         if different:
             raise InputError(
                 "holds another recipe",
@@ -179,7 +185,30 @@ def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
                 file=file,
                 hint="or another OUT",
             )
-    return mine
+    return mine | {"sha256": digests}
+
+
+def _recipe_in(file: Path) -> dict[str, Any]:
+    try:
+        recipe = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError("not a recipe", got=str(error), file=file) from error
+    if not (isinstance(recipe, dict) and isinstance(recipe.get("sha256", {}), dict)):
+        raise InputError("not a recipe", expected="an object as rnd-stage writes it", file=file)
+    return recipe
+
+
+def _refuse_other_lights(lights: list[StageLight], folder: Path) -> None:
+    """Raise :class:`InputError` where ``folder`` holds a map that is not its light's: pictures were lit by it."""
+    for light in lights:
+        file = folder / _light_file(light.name)
+        if file.exists():
+            theirs = read_image(file)
+            same = theirs.shape == light.file_radiance.shape
+            if not (same and np.allclose(theirs, light.file_radiance, rtol=SAME_MAP, atol=0)):
+                raise InputError(
+                    "holds another light", expected="its map as it is now", file=file, hint="or another OUT"
+                )
 
 
 def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:
