@@ -1,12 +1,28 @@
 """The benchmark's means: seeds of one subject count as one, and no figure is invented."""
 
+import json
+from pathlib import Path
+
 import pytest
 
-from rnd_trainer.stage.benchmark import means
+from rnd_trainer.stage.benchmark import COST_FILE, _cost, means
+from rnd_trainer.stage.plan import BenchmarkOptions
 
 
 def _row(method: str, subject: int, seed: int, psnr: float, **more: float) -> dict[str, object]:
     return {"method": method, "split": "novel_view", "subject": subject, "seed": seed, "psnr": psnr, **more}
+
+
+def test_subjects_that_rnd_stage_filmed_have_no_cost(tmp_path: Path):
+    options, row = BenchmarkOptions(subjects=2), _row("ours", 0, 0, 30.0, minutes=6)
+    nothing = _cost(tmp_path, options, [row], 60)
+    assert nothing["pictures"] == 0 and nothing["seconds_per_picture"] is None and nothing["variant"] is None
+    (tmp_path / "subject1").mkdir()
+    spent = {"pictures": 4, "seconds": 8.0, "cpu_seconds": 12.0, "variant": "llvm_ad_rgb"}
+    (tmp_path / "subject1" / COST_FILE).write_text(json.dumps(spent))
+    one = _cost(tmp_path, options, [row], 60)
+    assert (one["pictures"], one["seconds_per_picture"], one["cpu_seconds_per_picture"]) == (4, 2, 3)
+    assert one["variant"] == "llvm_ad_rgb" and one["hours_training"] == pytest.approx(0.1)
 
 
 def test_every_subject_counts_once():

@@ -144,18 +144,21 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _cost(
     folder: Path, options: BenchmarkOptions, rows: list[dict[str, Any]], seconds: float
 ) -> dict[str, Any]:
-    """Seconds a picture with its truth, and hours of filming and training, as measured when it was done."""
+    """Seconds a picture with its truth, and hours of filming and training, as measured when it was done.
+
+    Subjects that rnd-stage filmed without the benchmark left no figures; where none did, those of pictures are None.
+    """
     files = [folder / f"subject{subject}" / COST_FILE for subject in range(options.subjects)]
-    filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
     pictures, filming, cpu = (sum(f[key] for f in filmed) for key in ("pictures", "seconds", "cpu_seconds"))
     trainings = {(row["subject"], row["method"], row["seed"]): row["minutes"] for row in rows}
     return {
-        "seconds_per_picture": filming / max(pictures, 1),
-        "cpu_seconds_per_picture": cpu / max(pictures, 1),
+        "seconds_per_picture": filming / pictures if pictures else None,
+        "cpu_seconds_per_picture": cpu / pictures if pictures else None,
         "pictures": pictures,
         "hours_filming": filming / 3600,
         "hours_training": sum(minutes or 0 for minutes in trainings.values()) / 60,
         "hours_this_call": seconds / 3600,
-        "variant": filmed[0]["variant"],
+        "variant": filmed[0]["variant"] if filmed else None,
         "machine": machine(),
     }
