@@ -36,7 +36,8 @@ def tiny_config():
 @pytest.fixture(scope="session")
 def tiny_run(tiny_capture, tiny_config, tmp_path_factory) -> Path:
     """The folder of a finished tiny training."""
-    from rnd_trainer.train import Training, run
+    from rnd_trainer.train import Training
+    from rnd_trainer.training_run import run
 
     folder = tmp_path_factory.mktemp("run")
     run(Training(tiny_capture, tiny_config), folder, on_step=lambda step: None, on_preview=lambda: None)

@@ -29,7 +29,8 @@ from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
 from rnd_trainer.perceptual import load_features
 from rnd_trainer.perceptual_nets import BACKBONES
-from rnd_trainer.train import MAX_BAD_STEPS, Training, run
+from rnd_trainer.train import MAX_BAD_STEPS, Training
+from rnd_trainer.training_run import run
 from rnd_trainer.training_state import STATE_SCHEMA
 
 

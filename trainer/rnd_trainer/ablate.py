@@ -28,7 +28,8 @@ from .held_out import score
 from .model import AvatarModel
 from .perceptual import Perceptual, networks_sha256
 from .pose_refinement import joint_error_degrees
-from .train import Step, Training, run
+from .train import Step, Training
+from .training_run import run
 from .training_state import STATE_FILE, read_state
 
 ROWS = "rows.json"

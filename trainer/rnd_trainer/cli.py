@@ -205,7 +205,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
     )
 
     from .preview import save_preview
-    from .train import run
+    from .training_run import run
 
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
     shown = [(training.views[k], training.poses[k]) for k in dict.fromkeys(chosen)]

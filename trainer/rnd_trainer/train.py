@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import gc
-import hashlib
-import json
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, sha256_of
+from rnd_runtime.files import sha256_of
 from rnd_runtime.light import texel_directions
 from rnd_runtime.motion import Motion, save_motion
 
@@ -33,13 +26,12 @@ from .checkpoint import save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
 from .data import TrainingView, load_views, pose_input, training_light, training_light_name
 from .light import PROBE_SHAPE, LightProbe, as_probe
-from .metrics_log import row_of
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
 from .perceptual import Perceptual, networks_sha256
 from .pose_refinement import PoseRefinement
 from .template import sample_template
-from .training_state import STATE_FILE, STATE_SCHEMA, read_state
+from .training_state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
 from .unseen import UnseenPoses
 
 REFINED_MOTION = "refined_motion.npz"
@@ -364,29 +356,8 @@ class Training:
 
     @cached_property
     def _learned_from_sha256(self) -> str:
-        """Of all that the capture teaches: pictures, cameras, which pose is whose, poses, body, and light if given.
-
-        The same on every CPU: what was computed is rounded, since a sine may differ in its last bit.
-        """
-        digest = hashlib.sha256()
-
-        def add(*arrays: NDArray[Any] | None) -> None:
-            for array in arrays:
-                if array is not None:
-                    digest.update(np.ascontiguousarray(array).data)
-
-        for view in self.views:
-            add(np.array(view.frame.frame), view.image, view.mask, view.normal)
-            add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
-        motion, body = self.capture.motion, self.capture.body
-        add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))
-        add(_rounded(body.vertices), body.faces, _rounded(body.skinning_weights))
-        add(_rounded(body.skeleton.rest_joints))
-        if self.config.light == "capture":
-            name, light = training_light(self.capture)
-            digest.update(name.encode())
-            add(light.radiance, _rounded(light.rotation))
-        return digest.hexdigest()
+        light = training_light(self.capture) if self.config.light == "capture" else None
+        return learned_sha256(self.views, self.capture, light)
 
     def _lights(self) -> list[str]:
         """Names of the lights that its pictures were taken under."""
@@ -411,74 +382,3 @@ class Training:
             "consistency": None if self.consistency is None else self.consistency.backbone,
             "consistency_sha256": networks_sha256(self.consistency),
         }
-
-
-def run(
-    training: Training, folder: Path, *, on_step: Callable[[Step], None], on_preview: Callable[[], None]
-) -> bool:
-    """Train to the last step after a rehearsal, saving every ``save_every`` steps and at the end.
-
-    Ctrl-C finishes the step in hand, saves, and returns True where steps are left: resuming continues the very same
-    curve.
-    """
-    config = training.config
-    if training.step_index < config.steps:
-        training.rehearse()
-    with (
-        _keep_until(folder / "metrics.jsonl", training.step_index) as log,
-        _deferred_interrupt() as interrupted,
-    ):
-        while training.step_index < training.total_steps and not interrupted():
-            step = training.step()
-            row = {
-                "step": step.index,
-                "stage": step.stage,
-                "seconds": round(training.seconds, 3),
-                **step.terms,
-            }
-            log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
-            on_step(step)
-            if training.step_index % config.save_every == 0:
-                log.flush()
-                training.save(folder)
-            if training.step_index % config.preview_every == 0 or training.step_index == training.total_steps:
-                on_preview()
-        training.save(folder)
-        return interrupted() and training.step_index < training.total_steps
-
-
-def _keep_until(path: Path, step: int) -> TextIO:
-    """The metrics log, without rows at or after ``step``: those steps will be done again. Damaged rows go too."""
-    kept = []
-    if path.exists():
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        kept = [line for line in lines if (row := row_of(line)) is not None and row["step"] < step]
-    with atomic_path(path) as temporary:
-        temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-    return path.open("a", encoding="utf-8", buffering=1)  # line by line: --view reads along
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C into a flag; a second one interrupts at once."""
-    pressed = False
-
-    def handle(number: int, frame: object) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
-
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield lambda: False
-        return
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def _rounded(values: ArrayLike) -> NDArray[np.float32]:
-    """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
-    return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
+from rnd_runtime.light import Light
 
 from .checkpoint import read_tensors
 from .config import TrainConfig, from_dict, to_dict
+from .data import TrainingView
 
 STATE_SCHEMA = "rnd-training/1"
 STATE_FILE = "training.state"
@@ -64,3 +70,34 @@ class TrainingState:
 def read_state(path: Path) -> TrainingState:
     """The state in ``path``. Raises :class:`InputError` where it is none."""
     return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
+
+
+def learned_sha256(views: list[TrainingView], capture: Capture, light: tuple[str, Light] | None) -> str:
+    """Of all that a capture teaches: pictures, cameras, which pose is whose, poses, body, and a ``light`` if given.
+
+    The same on every CPU: what was computed is rounded, since a sine may differ in its last bit.
+    """
+    digest = hashlib.sha256()
+
+    def add(*arrays: NDArray[Any] | None) -> None:
+        for array in arrays:
+            if array is not None:
+                digest.update(np.ascontiguousarray(array).data)
+
+    for view in views:
+        add(np.array(view.frame.frame), view.image, view.mask, view.normal)
+        add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
+    motion, body = capture.motion, capture.body
+    add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))
+    add(_rounded(body.vertices), body.faces, _rounded(body.skinning_weights))
+    add(_rounded(body.skeleton.rest_joints))
+    if light is not None:
+        name, radiance = light
+        digest.update(name.encode())
+        add(radiance.radiance, _rounded(radiance.rotation))
+    return digest.hexdigest()
+
+
+def _rounded(values: ArrayLike) -> NDArray[np.float32]:
+    """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
+    return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)

@@ -14,7 +14,8 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig, TrainConfig
-from rnd_trainer.train import MAX_BAD_STEPS, Training, run
+from rnd_trainer.train import MAX_BAD_STEPS, Training
+from rnd_trainer.training_run import run
 
 from .figures import Result, at_most, holds, stated
 from .studio import write_studio
