@@ -120,7 +120,7 @@ def test_the_hardest_scenes_are_what_they_say(tiny_avatar, tmp_path) -> None:
     assert (low < inside).all() and (inside < high).all() and outside[2] > high[2] + 1
     for hard in scenes.values():
         truth = reference(tiny_avatar, hard, 32, tmp_path)
-        assert np.isfinite(truth.radiance).all() and truth.radiance.max() > 0
+        assert np.isfinite(truth.radiance).all() and (truth.radiance > 0.01).mean() > 0.05
 
 
 def test_one_compiled_function_draws_what_three_kernels_draw() -> None:

@@ -1,6 +1,7 @@
 """What the points of the grid film: a walk under a sky, or what is hardest for speed and accuracy.
 
-The hardest are the worst camera, inside the chest, the worst pose, a squat, and the worst light, a sun of 10⁶.
+The hardest are the worst camera, in the neck and looking down into the body, the worst pose, a squat, and the worst
+light, a sun of 10⁶.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from .bench_options import SceneName
 USUAL, INSIDE, SQUAT, SUN = get_args(SceneName)
 HARDEST = (INSIDE, SQUAT, SUN)
 SUN_RADIANCE = 1e6
-CHEST = np.array([0.0, 1.2, 0.0])
-"""m, in the body that stands at the origin"""
+NECK, FEET = (0.0, 1.5, 0.0), (0.0, 0.3, 0.1)
+"""m, of the body that stands at the origin; across it all would lie before the near plane"""
 
 
 class Scene(NamedTuple):
@@ -49,7 +50,7 @@ def bench_camera(size: int, view: str = USUAL) -> Camera:
     distance, angle = 3.4, np.radians(20)
     fov = 2 * np.arctan(0.5 * 1.75 / 0.7 / distance)
     if view == INSIDE:
-        return Camera.look_at(CHEST, CHEST - [0.0, 0.0, 1.0], width=size, height=size, fov_y=fov)
+        return Camera.look_at(list(NECK), list(FEET), width=size, height=size, fov_y=fov)
     eye = [distance * np.sin(angle), 0.9, distance * np.cos(angle)]
     return Camera.look_at(eye, [0, 0.875, 0], width=size, height=size, fov_y=fov)
 

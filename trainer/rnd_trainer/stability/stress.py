@@ -24,8 +24,9 @@ def worst_cases(subject: Subject) -> Result:
     Frames in memory without the tone map, and by how much they differ from the full reference: everything after the
     networks in float64, the sum over all 2 048 texels, the oracle rasteriser. The grid has the same scenes in motion.
     """
-    chest = np.median(subject.rest.means, axis=0).astype(np.float64)
-    inside = Camera.look_at(chest, chest - [0, 0, 1.0], width=subject.size, height=subject.size, fov_y=0.6)
+    low, high = (share(subject.rest.means[:, 1]) for share in (np.min, np.max))
+    neck, feet = ([0.0, low + share * (high - low), z] for share, z in ((0.85, 0.0), (0.15, 0.1)))
+    inside = Camera.look_at(neck, feet, width=subject.size, height=subject.size, fov_y=0.6)
     fierce = Shader(sun_and_sky(128, radiance=1e6), "table+sun")
     still = subject.motion({})
     cases = {
