@@ -24,8 +24,9 @@ def worst_cases(subject: Subject) -> Result:
     Frames in memory without the tone map, and by how much they differ from the full reference: everything after the
     networks in float64, the sum over all 2 048 texels, the oracle rasteriser. The grid has the same scenes in motion.
     """
-    low, high = (share(subject.rest.means[:, 1]) for share in (np.min, np.max))
-    neck, feet = ([0.0, low + share * (high - low), z] for share, z in ((0.85, 0.0), (0.15, 0.1)))
+    heights = subject.rest.means[:, 1]
+    low, high = float(heights.min()), float(heights.max())
+    neck, feet = [0.0, low + 0.85 * (high - low), 0.0], [0.0, low + 0.15 * (high - low), 0.1]
     inside = Camera.look_at(neck, feet, width=subject.size, height=subject.size, fov_y=0.6)
     fierce = Shader(sun_and_sky(128, radiance=1e6), "table+sun")
     still = subject.motion({})
