@@ -370,6 +370,12 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
     monkeypatch.setattr(bench_reference, "sources", lambda package: [code])
     reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path)
     assert len(lit) == 3  # by another formula
+    near = bench_camera(8, INSIDE)
+    monkeypatch.setattr(bench_reference, "bench_camera", lambda size, view: near)
+    reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path)
+    monkeypatch.setattr(bench_reference, "TURN", 0.5)
+    reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path)
+    assert len(lit) == 5  # from another place, and under a light that turns otherwise
 
 
 def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:

@@ -45,9 +45,10 @@ class Reference(NamedTuple):
 def reference(avatar_file: Path, scene: Scene, size: int, folder: Path) -> Reference:
     """The reference of a whole avatar in ``scene``; what is slow of it is kept in ``folder``, by what the files hold.
 
-    And by the sources of the runtime: another formula is another reference.
+    And by the camera, the frames and the sources of the runtime: another formula is another reference.
     """
-    inputs = (avatar_file, scene.motion, scene.hdr, scene.view)
+    asked = f"{bench_camera(size, scene.view).world_to_camera.tolist()} {COMPARED} {STEP_S} {TURN}"
+    inputs = (avatar_file, scene.motion, scene.hdr, asked)
     stem = f"reference_{content_key(*inputs, *sources('rnd_runtime'))}"
     lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, scene))
 
