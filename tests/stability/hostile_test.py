@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rnd_trainer.stability.commands import environment
-from rnd_trainer.stability.determinism import backends_agree
+from rnd_trainer.stability.determinism import backends_agree, frames_agree
 from rnd_trainer.stability.fuzz import READERS, fuzz, prepare
 from rnd_trainer.stability.kill import half_files
 
@@ -87,4 +87,4 @@ def test_half_a_file_is_told_from_a_whole_one(tmp_path):
 
 
 def test_both_openglbackends_agree_draw_the_same_bits(subject):
-    assert backends_agree(subject).passes
+    assert backends_agree(subject).passes and frames_agree(subject).passes
