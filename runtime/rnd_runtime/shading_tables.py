@@ -19,7 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ._lanes import WIDTH, lanes, load, total
+from ._lanes import WIDTH, lanes, load, store, total
 from ._raster_input import floats, mask
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
@@ -52,8 +52,9 @@ class SkyTables:
         solid_angles = texel_solid_angles(*texels).reshape(-1, 1).astype(np.float32)
         radiance = light.resized(*texels).radiance.reshape(-1, 3)
         weighted = (radiance * solid_angles)[:, :, None] * sh_basis(directions)[:, None, :]  # [K, 3, 16]
-        cosines = np.maximum(octahedral_nodes(DIFFUSE_SIZE) @ directions.T, 0)
-        diffuse = cosines @ weighted.reshape(len(directions), 3 * SH_COUNT)
+        diffuse = np.empty((DIFFUSE_SIZE * DIFFUSE_SIZE, 3 * SH_COUNT), np.float32)
+        weighted = weighted.reshape(len(directions), 3 * SH_COUNT).astype(np.float32)
+        _gather(octahedral_nodes(DIFFUSE_SIZE), directions, weighted, diffuse)
         nodes = octahedral_nodes(SPECULAR_SIZE)
         specular = np.empty((len(LOBE_WIDTHS), len(nodes), 3), np.float32)
         whole = -(-len(directions) // WIDTH) * WIDTH
@@ -113,6 +114,25 @@ def octahedral_nodes(size: int) -> Floats32:
     fold = np.maximum(-c, 0)
     nodes = np.stack([a - np.copysign(fold, a), b - np.copysign(fold, b), c], axis=-1)
     return np.asarray((nodes / np.linalg.norm(nodes, axis=-1, keepdims=True)).reshape(-1, 3), np.float32)
+
+
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _gather(nodes, directions, weighted, sums):  # type: ignore[no-untyped-def]
+    """Σ_k weighted [K, 48] max(n·ω_k, 0) at every node, texel by texel: a product of matrices would add in an order of
+    its threads."""
+    for i in numba.prange(len(nodes)):
+        x, y, z = nodes[i, 0], nodes[i, 1], nodes[i, 2]
+        first, second, third = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
+        for k in range(len(directions)):
+            cosine = x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]
+            if cosine > 0:
+                row = 3 * WIDTH * k
+                first += cosine * load(weighted, row)
+                second += cosine * load(weighted, row + WIDTH)
+                third += cosine * load(weighted, row + 2 * WIDTH)
+        store(sums, 3 * WIDTH * i, first)
+        store(sums, 3 * WIDTH * i + WIDTH, second)
+        store(sums, 3 * WIDTH * i + 2 * WIDTH, third)
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
