@@ -28,6 +28,8 @@ CEILING_DB = 60.0
 LEAST_SPAN = 5.0
 """a panel's greatest milliseconds over its least, at least: equal times should look equal, and two of the ticks
 1, 2, 5, 10 … have room"""
+CROWDED = 500.0
+"""that ratio in a panel, from which on only 0.1, 1, 10 … have room"""
 COLUMNS, WIDE = 5, 3
 """panels side by side, and how many of them the overview is as wide as"""
 
@@ -104,6 +106,8 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
 
 
 def _stage(axes: Any, rows: list[Row], stage: str) -> None:
+    import matplotlib.ticker
+
     had = [{**row, "stage_ms": row["stages"][stage]} for row in rows if row["stages"].get(stage, 0) > 0]
     _points(axes, had, "stage_ms")
     axes.set_title(stage, loc="left", fontsize=9)
@@ -111,6 +115,8 @@ def _stage(axes: Any, rows: list[Row], stage: str) -> None:
     least, most = axes.get_xlim()
     short = max(0.5 * (math.log(LEAST_SPAN) - math.log(most / least)), 0)
     axes.set_xlim(least * math.exp(-short), most * math.exp(short))
+    if most > CROWDED * least:
+        axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1,)))
 
 
 def _hard(row: Row) -> bool:
