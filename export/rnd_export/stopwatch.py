@@ -18,12 +18,13 @@ def milliseconds(
     draw: Callable[[int], object], count: int, clock: Callable[[], float] = perf_counter
 ) -> NDArray[np.float64]:
     """What each of ``count`` frames of ``draw`` takes [count], after ``UNTIMED`` that warm up."""
-    taken = []
-    for frame in range(UNTIMED + count):
-        started = clock()
-        draw(frame)
-        taken.append(1e3 * (clock() - started))
-    return np.array(taken[UNTIMED:])
+    return np.array([_timed(draw, frame, clock) for frame in range(UNTIMED + count)][UNTIMED:])
+
+
+def _timed(draw: Callable[[int], object], frame: int, clock: Callable[[], float]) -> float:
+    started = clock()
+    draw(frame)
+    return 1e3 * (clock() - started)
 
 
 class Stopwatch:
@@ -44,11 +45,7 @@ class Stopwatch:
 
     def ms(self, draw: Callable[[int], object]) -> float:
         """What a frame of ``draw`` takes where the reference takes as little as in its calmest moments."""
-        rounds = [(self._timed(draw, k), self._timed(self._reference, k)) for k in range(UNTIMED + TIMED)]
+        both = (draw, self._reference)
+        rounds = [[_timed(drawn, k, self._clock) for drawn in both] for k in range(UNTIMED + TIMED)]
         ours, reference = np.array(rounds[UNTIMED:]).T
         return float(np.median(ours / reference)) * self._calm
-
-    def _timed(self, draw: Callable[[int], object], frame: int) -> float:
-        started = self._clock()
-        draw(frame)
-        return 1e3 * (self._clock() - started)

@@ -61,7 +61,7 @@ class Checkpoint:
         lights = self.info.get("lights")
         if (
             lights is None
-        ):  # checkpoints of before have none: a capture whose folder has the name is taken for theirs
+        ):  # in checkpoints of before: a capture whose folder has the name is taken for theirs
             return {f.light for f in capture.split("train")} if self._learned_in(capture.folder) else set()
         return {name for name, digest in lights.items() if capture.light_sha256(name) == digest}
 
