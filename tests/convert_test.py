@@ -21,7 +21,7 @@ from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError
-from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
+from rnd_runtime.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.motion_files import SMPLH_NAMES
@@ -338,6 +338,17 @@ def test_a_clip_of_ever_other_numbers_of_gaussians_is_refused(tmp_path):
     clip = [make_splats(part, fixed_colour(part.albedo)) for part in parts]
     with pytest.raises(InputError, match="as many finite Gaussians in every frame, got 7 to 9"):
         write_visionary(tmp_path / "clip.onnx", clip, 30.0)
+
+
+def test_viewers_without_the_extension_get_linear_colours(tmp_path):
+    """COLOR_0 is linear in glTF, however the harmonics are coded."""
+    for coding, decoded in (("linear", np.asarray), ("srgb", srgb_to_linear)):
+        _splats(tmp_path, "--format", "glb", "--coding", coding)
+        document, arrays = _glb(tmp_path / f"{FRAME:06d}.glb")
+        attributes = document["meshes"][0]["primitives"][0]["attributes"]
+        harmonics = arrays[attributes["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"]]
+        colour = decoded((0.5 + 0.28209479177387814 * harmonics).clip(0, 1))
+        np.testing.assert_allclose(arrays[attributes["COLOR_0"]][:, :3], colour, atol=1e-6)
 
 
 @pytest.mark.skipif(shutil.which(TRANSFORM) is None, reason="splat-transform is not installed")

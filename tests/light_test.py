@@ -315,11 +315,33 @@ def test_other_primaries_than_rec709s_are_noted(tmp_path):
     assert "red (0.7347, 0.2653)" in note and note.startswith("the light is taken as Rec.709")
 
 
-def _write_rgbe(path: Path, bytes_rgbe: np.ndarray) -> None:
+def _write_rgbe(path: Path, bytes_rgbe: np.ndarray, more: str = "") -> None:
     """A flat Radiance file by hand (Ward 1991): a pixel is mantissa/256 · 2^(exponent − 128) per channel."""
     height, width = bytes_rgbe.shape[:2]
-    header = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
+    header = f"#?RADIANCE\n{more}FORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
     path.write_bytes(header + bytes_rgbe.astype(np.uint8).tobytes())
+
+
+def test_what_a_radiance_file_states_of_its_exposure_and_colours(tmp_path):
+    """Each EXPOSURE multiplied the pixels when it was written (Radiance's refer/filefmts.pdf)."""
+    rgbe = np.full((2, 4, 4), [128, 64, 32, 129], np.uint8)  # 1, 0.5, 0.25
+    _write_rgbe(
+        tmp_path / "a.hdr",
+        rgbe,
+        "EXPOSURE= 2.0\npfilt -e 4\nEXPOSURE=4\nPRIMARIES=.7 .3 .2 .7 .1 .1 .33 .33\n",
+    )
+    light = load_light(tmp_path / "a.hdr", exposure=1.0)
+    assert_allclose(light.radiance[0, 0], np.array([1, 0.5, 0.25]) / 4)
+    assert "divided by the exposure that its file states, 8" in light.notes[0]
+    assert "red (0.7, 0.3)" in light.notes[1]
+    _write_rgbe(
+        tmp_path / "b.hdr", rgbe, "EXPOSURE=1.000000\nPRIMARIES=0.64 0.33 0.3 0.6 0.15 0.06 0.3127 0.329\n"
+    )
+    assert load_light(tmp_path / "b.hdr").notes == ()
+    for broken in ("0", "-1", "nan", "1e99", "1 2", ""):
+        _write_rgbe(tmp_path / "c.hdr", rgbe, f"EXPOSURE={broken}\n")
+        with pytest.raises(InputError, match=r"c\.hdr: EXPOSURE of the light probe: expected numbers"):
+            load_light(tmp_path / "c.hdr")
 
 
 def test_radiance_hdr(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -211,6 +212,19 @@ def test_stage_times_summary():
     for seconds in (0.001, 0.002, 0.009):
         times.add("a", seconds)
     assert times.summary() == {"a": {"runs": 3, "median_ms": 2.0, "p95_ms": 8.3, "total_s": 0.012}}
+
+
+def test_the_same_inputs_elsewhere_are_the_same_run(tmp_path) -> None:
+    """As on two machines that share the folder for pictures alone, each with a clone of its own."""
+    out, frame = tmp_path / "out", tmp_path / "out" / "frames" / "000001.png"
+    frame.parent.mkdir(parents=True)
+    for place, content in (("one", b"walk"), ("other", b"walk"), ("third", b"jump")):
+        (tmp_path / place).write_bytes(content)
+    claim(out, {}, [tmp_path / "one"])
+    frame.write_bytes(b"one's")
+    os.utime(frame, (0, 0))  # long before what comes
+    assert claim(out, {}, [tmp_path / "other"]) == 0 and frame.exists()
+    assert claim(out, {}, [tmp_path / "third"]) == 1 and not frame.exists()
 
 
 def test_pictures_that_no_run_left_stay(tmp_path) -> None:

@@ -11,6 +11,7 @@ from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import bone_transforms
 from rnd_trainer.pose_refinement import (
+    FADE_SECONDS,
     ROTATION_BOUND,
     TRANSLATION_BOUND,
     PoseRefinement,
@@ -41,7 +42,24 @@ def test_the_corrected_motion_has_the_corrected_bones_and_stays_within_bounds() 
     corrected = refinement.apply_to(moves)
     expected = bone_transforms(skeleton, corrected.rotations[4], corrected.translations[4])
     assert np.abs(refinement.bones(4).detach().numpy() - expected).max() < FLOAT32
-    assert np.array_equal(corrected.rotations[2], moves.rotations[2])
+
+
+def test_between_training_frames_and_beyond_them_corrections_are_as_smooth_as_the_motion() -> None:
+    """Else they would alternate, and what a window and a velocity tell the networks would be noise."""
+    skeleton, moves = body().skeleton, motion(body())
+    refinement = PoseRefinement(moves, skeleton, [1, 4])
+    with torch.no_grad():
+        for raw, turn in zip(refinement.raw, (0.03, 0.06)):
+            raw[:, 0] = turn
+    corrected = refinement.apply_to(moves)
+    first, last = (float(refinement.bounded(frame)[0][0, 0].detach()) for frame in (1, 4))
+    fade = 1 / (moves.fps * FADE_SECONDS)
+    expected = np.array([first * (1 - fade), first, (2 * first + last) / 3, (first + 2 * last) / 3, last])
+    turned = np.swapaxes(moves.rotations, -1, -2) @ corrected.rotations
+    angles = np.arccos((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2)
+    np.testing.assert_allclose(angles[:5], expected[:, None].repeat(angles.shape[1], 1), atol=1e-6)
+    shifts = (corrected.translations - moves.translations)[:, 0]
+    assert shifts[4] == np.abs(shifts).max() and 0 < shifts[2] < shifts[3] < shifts[4]
 
 
 def test_refinement_does_not_make_noisy_poses_worse(tiny_capture, tiny_config) -> None:

@@ -181,6 +181,7 @@ ATTACKS = {
     "far offset": lambda: _torch_file((5, (1,), (1,))),
     "negative stride": lambda: _torch_file((2, (2,), (-1,))),
     "huge size": lambda: _torch_file((0, (2**40,), (1,))),
+    "one number said too often": lambda: _torch_file((0, (50_000, 50_000), (0, 0))),
     "deep nest": lambda: b"(" * 5000 + b"l" * 5000 + b".",
     "nothing": lambda: b"",
     "text": lambda: b"hello",

@@ -14,8 +14,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.light import REC709, load_light
-from rnd_viewer.lights import light_notes
+from rnd_runtime.light import REC709, light_notes, load_light
 
 WEB = Path(__file__).parent.parent / "viewer/web"
 NODE = shutil.which("node")
@@ -223,3 +222,27 @@ def test_an_attribute_of_negative_size_ends(tmp_path):
     size = (-10).to_bytes(4, "little", signed=True)
     file.write_bytes(b"\x76\x2f\x31\x01\x02\x00\x00\x00" + b"a\x00int\x00" + size + bytes(8))
     assert "the .exr file is damaged" in _page(file)["refused"]
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "EXPOSURE= 3\nEXPOSURE=7.5\n",
+        "EXPOSURE=1.0\nPRIMARIES=0.7 0.3 0.2 0.7 0.1 0.1 0.33 0.33\n",
+        "PRIMARIES=1 2 3\n",
+        "EXPOSURE=0\n",
+        "EXPOSURE=fast\n",
+        "EXPOSURE=1e31\n",
+    ],
+)
+def test_what_a_radiance_file_states_is_taken_alike(tmp_path, stated):
+    file = tmp_path / "sky.hdr"
+    file.write_bytes(_hdr(file).replace(b"\n", b"\n" + stated.encode(), 1))
+    page = _page(file)
+    try:
+        light = load_light(file)
+    except InputError as error:
+        assert page["refused"] in str(error) and "EXPOSURE" in page["refused"]
+    else:
+        assert_array_equal(np.float32(page["radiance"]).reshape(light.radiance.shape), light.radiance)
+        assert page["notes"] == light_notes(light)

@@ -450,6 +450,35 @@ def test_without_webgl_the_reason_stays(address, site, tmp_path):
         assert "WebGL2" in said and _is_refusal(browser)
 
 
+def test_a_lost_context_is_asked_for_again(address, site, tmp_path):
+    """As after a reset of the driver: a canvas whose context is lost gives blank pictures."""
+    (site / "lost").mkdir()
+    for entry in DIST.iterdir():
+        if entry.name != "worker.js":
+            (site / "lost" / entry.name).symlink_to(entry)
+    told = """{
+        const { getContext } = OffscreenCanvas.prototype;
+        OffscreenCanvas.prototype.getContext = function (...words) {
+            return self.context = getContext.apply(this, words);
+        };
+        new BroadcastChannel("lose").onmessage = () => {
+            self.context.getExtension("WEBGL_lose_context").loseContext();
+            new BroadcastChannel("gone").postMessage(self.context.isContextLost());
+        };
+    }"""
+    (site / "lost/worker.js").write_text(told + (DIST / "worker.js").read_text())
+    with chromium(tmp_path, webgl=True) as browser:
+        _open(browser, address + "lost/")
+        assert _drop(browser, "avatar.onnx", "walk.npz", "window.hdr") == ""
+        asked = {"width": 96, "height": 96, "background": "hdr"}
+        before = _picture(browser, **asked)
+        assert browser.run("""new Promise((done) => {
+            new BroadcastChannel("gone").onmessage = ({ data }) => done(data);
+            new BroadcastChannel("lose").postMessage(1);
+        })""")
+        assert before.any() and (_picture(browser, **asked) == before).all()
+
+
 def _clip(page: Page, folder: Path, size: int) -> Path:
     """The clip of ``size``² pixels that the page offers as a download to ``folder``."""
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(folder))

@@ -14,9 +14,10 @@ from rnd_runtime.capture import load_capture
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, flag
 from rnd_runtime.files import atomic_path, earlier_rows, write_json
-from rnd_runtime.light import Light, load_light
+from rnd_runtime.light import Light, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_trainer.checkpoint import Checkpoint
+from rnd_trainer.notes import say_notes
 
 from .budget import Bound, Found, given_up, search
 from .candidates import Scene, Workbench
@@ -49,11 +50,14 @@ def export_bounded(
     light = (
         Light(checkpoint.probe.numpy()) if options.hdr is None else load_light(options.hdr, up=options.hdr_up)
     )
+    if options.hdr is not None:
+        say_notes("rnd-export", light_notes(light))
     if options.capture is None:
         scene = Scene(motion, light, options.size)
     else:
         capture = load_capture(options.capture)
         moves = capture.motion_for(checkpoint.skeleton)
+        say_notes("rnd-export", moves.notes)
         scene = Scene(moves, light, options.size, shots=shots_of(capture, options.size))
     bench = Workbench(checkpoint, scene)
     console, steps = Console(), []

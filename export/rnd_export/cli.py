@@ -93,6 +93,7 @@ def _export(options: Options) -> None:
     from rnd_runtime.files import existing_file
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
+    from rnd_trainer.notes import say_notes
 
     check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
     check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
@@ -112,6 +113,7 @@ def _export(options: Options) -> None:
         print(f"rnd-export: {note}", file=sys.stderr)  # noqa: T201
     if options.motion is not None:
         motion = load_motion(options.motion, checkpoint.skeleton)
+        say_notes("rnd-export", motion.notes)
     else:
         motion = random_motion(checkpoint.skeleton, frames=options.frames, seed=0)
     if given:

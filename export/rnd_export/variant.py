@@ -82,10 +82,9 @@ class Variant:
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
         if self.skinning_nodes is not None and (self.encoder == "static" or not config.dynamic_skinning):
             raise InputError("--skinning-nodes", expected="dynamic skinning", got="the template's weights")
-        if self.window_poses is not None and self.encoder == "static":
-            raise InputError(
-                "--window-poses", expected="dynamic skinning", got="--encoder static, which has no window"
-            )
+        if self.window_poses is not None and (self.encoder == "static" or not config.dynamic_skinning):
+            got = "the template's weights, which have no window"
+            raise InputError("--window-poses", expected="dynamic skinning", got=got)
 
 
 def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:

@@ -12,6 +12,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _KEPT = 4  # states of the sources
@@ -27,13 +28,19 @@ def keep_kernels_by_source() -> None:
         for file in _sources(root):
             digest.update(file.name.encode() + file.read_bytes())
         folder = root / ".cache" / "kernels" / digest.hexdigest()[:16]
-        if not folder.is_dir():
-            folder.mkdir(parents=True)
-            for old in sorted(folder.parent.iterdir(), key=lambda path: path.stat().st_mtime)[:-_KEPT]:
-                shutil.rmtree(old, ignore_errors=True)
+        new = not folder.is_dir()
+        folder.mkdir(parents=True, exist_ok=True)  # another process may have been faster
     except OSError:  # not ours to write: numba finds a place of its own
         return
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if new:
+        _remove_oldest(folder.parent)
+
+
+def _remove_oldest(kept: Path) -> None:
+    with suppress(OSError):  # another process removes them too
+        for old in sorted(kept.iterdir(), key=lambda path: path.stat().st_mtime)[:-_KEPT]:
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def _sources(root: Path) -> Iterator[Path]:

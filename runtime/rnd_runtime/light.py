@@ -22,6 +22,9 @@ REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 _SAME_COLOUR = 2e-3  # by which x and y may miss them: D65 has more digits
 
 _MAX_STOPS = 64  # beyond it radiance leaves float32
+_MOST_EXPOSED = 1e30  # a .hdr file's EXPOSURE, or one over it
+_LONGEST_LINE = 4096  # bytes of its header
+_DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 _TO_Y_UP: dict[str, Floats] = {
     "y": np.eye(3),
@@ -125,7 +128,8 @@ def _check_yaw(yaw: float) -> None:
 def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: float = 0.0) -> Light:
     """Read a lat-long .exr or .hdr as a :class:`Light`.
 
-    NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them.
+    NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them. Pixels of a
+    Radiance file are divided by each EXPOSURE that its header states ("Radiance picture format", Ward).
 
     Args:
         up: the axis that points up in the world the map was made for: "y"; "z" for a Z-up world; "-y" for
@@ -150,8 +154,55 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         radiance, repaired = repair(radiance)
     except InputError as error:
         raise error.at(file=path) from error
-    radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure))
-    return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=_colour_notes(header.chromaticities))
+    stated, chromaticities = 1.0, header.chromaticities
+    if Path(path).suffix.lower() == ".hdr":
+        stated, chromaticities = _radiance_header(path)
+    radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure) / stated)
+    notes = _exposure_notes(stated) + _colour_notes(chromaticities)
+    return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=notes)
+
+
+def light_notes(light: Light) -> list[str]:
+    """What the user should know of ``light``, one sentence each."""
+    notes = list(light.notes)
+    if light.repaired:
+        notes.append(
+            f"{light.repaired} texels of the light were NaN, infinite or negative and were filled in"
+        )
+    if light.maximum < _DIM:
+        notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
+    return notes
+
+
+def _radiance_header(path: str | Path) -> tuple[float, tuple[float, ...] | None]:
+    """The product of a .hdr file's EXPOSUREs, and its PRIMARIES: x and y of red, green, blue and white.
+
+    OpenImageIO reads the last EXPOSURE alone, and no PRIMARIES.
+    """
+    exposure, primaries = 1.0, None
+    with Path(path).open("rb") as file:
+        while (line := file.readline(_LONGEST_LINE)).strip():
+            name, _, text = line.partition(b"=")
+            if name not in (b"EXPOSURE", b"PRIMARIES"):
+                continue
+            try:
+                numbers = tuple(float(word) for word in text.split())
+            except ValueError:
+                numbers = ()
+            if name == b"EXPOSURE":
+                exposure *= numbers[0] if len(numbers) == 1 else np.nan
+            elif len(numbers) == 8 and np.isfinite(numbers).all():
+                primaries = numbers
+    if not 1 / _MOST_EXPOSED <= exposure <= _MOST_EXPOSED:
+        expected = f"numbers whose product is {1 / _MOST_EXPOSED:g} to {_MOST_EXPOSED:g}"
+        raise InputError("EXPOSURE of the light probe", expected=expected, got=f"{exposure:g}", file=path)
+    return exposure, primaries
+
+
+def _exposure_notes(stated: float) -> tuple[str, ...]:
+    if stated == 1:
+        return ()
+    return (f"the light's pixels are divided by the exposure that its file states, {stated:.4g}",)
 
 
 def _colour_channels(names: tuple[str, ...], path: str | Path) -> list[int]:

@@ -12,6 +12,7 @@ import bz2
 import gzip
 import io
 import lzma
+import math
 import pickle  # noqa: TID251  # only its stack machine, with every call taken out
 import struct
 import tokenize
@@ -40,6 +41,9 @@ _TORCH_DTYPES = {
 _STORAGE = "torch.storage"  # our note for a storage whose bytes come later
 _TORCH_MAGIC = 0x1950A86A20F9469CFC6C
 _ARRAY_KINDS = "biufcSUO"
+_MOST_REPEATED = (
+    10_000_000  # numbers of a tensor that says its storage many times over, as one shape for all frames
+)
 
 
 def read_pickle(path: str | Path, *, what: str = "pickle") -> Any:
@@ -339,6 +343,9 @@ def _torch(name: str, leaf: str, args: Any) -> Any:
             return np.zeros(size, storage.dtype)
         if len(size) != len(stride) or last >= len(storage):
             raise InputError("torch tensor", expected=f"{len(storage)} numbers at most", got=last + 1)
+        if math.prod(size) > max(len(storage), _MOST_REPEATED):
+            expected = f"at most {_MOST_REPEATED} numbers made of {len(storage)}"
+            raise InputError("torch tensor", expected=expected, got=math.prod(size))
         steps = [step * storage.itemsize for step in stride]
         return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()
     if leaf == "_load_from_bytes":

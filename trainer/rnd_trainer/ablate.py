@@ -22,11 +22,11 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import earlier_rows, sha256_of, write_json
 
 from .checkpoint import load_checkpoint
-from .config import TrainConfig
+from .config import NODE_SHARE, TrainConfig
 from .data import check_true_normals, training_light
 from .held_out import score
 from .model import AvatarModel
-from .perceptual import Perceptual, networks_sha256
+from .perceptual import Perceptual, networks_by_role, networks_sha256
 from .pose_refinement import joint_error_degrees
 from .train import Step, Training
 from .training_run import run
@@ -100,7 +100,7 @@ VARIANTS = (
 
 
 def _gaussians(count: int) -> StudyRow:
-    model = {"gaussians": count, "nodes": count // 4}
+    model = {"gaussians": count, "nodes": count // NODE_SHARE}
     return StudyRow(f"N = {count}", f"{count} Gaussians", "ours", model)
 
 
@@ -172,8 +172,10 @@ def ablate(
             found = _done_before(place, same(config))
             if not found and (place / STATE_FILE).exists():
                 begun = read_state(place / STATE_FILE)
-                weights = networks_sha256(perceptual, consistency)
-                begun.refuse_other(config, weights, what="a run begun before", hint=ELSEWHERE)
+                networks = networks_by_role(perceptual, consistency or perceptual)
+                begun.refuse_other(config, networks, what="a run begun before", hint=ELSEWHERE)
+                learned = told | ({MOTION: NOISY_MOTION} if variant.noisy else {})
+                _refuse_others(begun.header, learned, "begun", place / STATE_FILE)
             jobs.append((variant, seed, config, found))
     for done, (variant, seed, config, found) in enumerate(jobs):
 
@@ -207,7 +209,7 @@ def check_needs(variants: Iterable[StudyRow], capture: Capture) -> None:
 
 def _config(base: TrainConfig, variant: StudyRow, seed: int) -> TrainConfig:
     model = dataclasses.replace(base.model, **variant.model)
-    steps = round(base.steps * variant.length)
+    steps = max(round(base.steps * variant.length), 1)
     changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
     return dataclasses.replace(base, model=model, seed=seed, **changed)
 
@@ -222,12 +224,19 @@ def _done_before(place: Path, same: dict[str, Any]) -> list[dict[str, Any]]:
     Raises :class:`InputError` where they do not say ``same``: they would be compared as if they were of this study.
     """
     rows = _rows(place)
-    for name, value in same.items() if rows else ():
-        got = rows[0].get(name, value if name in OLDER_LACK else None)
-        if got != value:
-            what = f"{name} of a run done before"
-            raise InputError(what, expected=value, got=got, file=place / ROWS, hint=ELSEWHERE)
+    if rows:
+        _refuse_others(rows[0], same, "done", place / ROWS)
     return rows
+
+
+def _refuse_others(before: dict[str, Any], same: dict[str, Any], stage: str, file: Path) -> None:
+    """Raise :class:`InputError` where a run that was begun or done does not say ``same``."""
+    for name, value in same.items():
+        got = before.get(name, value if name in OLDER_LACK else None)
+        if got != value:
+            raise InputError(
+                f"{name} of a run {stage} before", expected=value, got=got, file=file, hint=ELSEWHERE
+            )
 
 
 def _rows(place: Path) -> list[dict[str, Any]]:

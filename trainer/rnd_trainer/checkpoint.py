@@ -19,7 +19,6 @@ from rnd_runtime.files import atomic_path, existing_file, sha256_of
 from rnd_runtime.skeleton import Skeleton
 
 from .config import TrainConfig, from_dict, to_dict
-from .light import LightProbe
 from .model import AvatarModel
 from .template import Template
 from .twist import twist_frames
@@ -79,15 +78,14 @@ class Checkpoint:
 def save_checkpoint(
     path: Path,
     model: AvatarModel,
-    probe: LightProbe | Tensor,
+    probe: Tensor,
     skeleton: Skeleton,
     config: TrainConfig,
     info: dict[str, Any],
 ) -> None:
-    """Write ``avatar.ckpt`` atomically. ``info``: step, capture, body licence and such, JSON values."""
-    radiance = probe.radiance() if isinstance(probe, LightProbe) else probe
+    """Write ``avatar.ckpt`` atomically: ``probe`` [32, 64, 3]; ``info``: step, capture and such, JSON values."""
     tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-    tensors["probe"] = radiance.detach().cpu().contiguous()
+    tensors["probe"] = probe.detach().cpu().contiguous()
     tensors["skeleton.rest_joints"] = torch.as_tensor(np.asarray(skeleton.rest_joints), dtype=torch.float64)
     header = {
         "schema": SCHEMA,

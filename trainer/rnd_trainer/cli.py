@@ -42,7 +42,7 @@ class TrainOptions:
     steps: int | None = None
     """with pictures, instead of the preset's 4500 (quick: 2000); the third stage, of unseen poses, adds 30 % to them"""
     gaussians: int | None = None
-    """instead of the preset's; a quarter of them are nodes"""
+    """instead of the preset's; an eighth of them are nodes"""
     save_every: int | None = None
     """steps between saved states, instead of the preset's; --resume goes on from the last one"""
     image_scale: float | None = None
@@ -90,12 +90,14 @@ def _train(options: TrainOptions) -> None:
 
     from .config import to_dict
     from .live_view import live_view
+    from .notes import capture_notes, say_notes
     from .perceptual import load_features, load_lpips
     from .train import Training
     from .training_state import STATE_FILE
 
     config, device = _config(options), _device(options.device)
     capture = load_capture(options.capture, motion_file=options.motion)
+    say_notes("rnd-train", capture_notes(capture, ["train"] if options.light == "capture" else []))
     folder = options.out
     state = folder / STATE_FILE
     if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
@@ -208,7 +210,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
     from .training_run import run
 
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
-    shown = [(training.views[k], training.poses[k]) for k in dict.fromkeys(chosen)]
+    shown = [training.views[k] for k in dict.fromkeys(chosen)]
     columns = (
         TextColumn("stage {task.fields[stage]}"), BarColumn(), MofNCompleteColumn(),
         TextColumn("image loss {task.fields[loss]:.4f}"), TimeElapsedColumn(), TextColumn("gone,"),
@@ -221,6 +223,12 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
         smooth = [float("nan")]
 
         def on_step(step: Any) -> None:
+            if training.light_found is False:
+                training.light_found = None
+                progress.console.print(
+                    "no sky and sun could be told from these pictures (too little is seen of the person, or always "
+                    "from one side): the light is learned from white, which costs several dB"
+                )
             loss = step.terms.get("image", smooth[0])  # the third stage has no pictures
             smooth[0] = loss if smooth[0] != smooth[0] else 0.98 * smooth[0] + 0.02 * loss
             progress.update(task, completed=step.index + 1, stage=step.stage, loss=smooth[0])
@@ -231,7 +239,9 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
             name = f"step_{training.step_index:06d}.png"
             lit = training.stage > 1 and training.config.light != "none"
             light = training.light() if lit else None
-            save_preview(folder / "previews" / name, training.model, light, shown)
+            motion = training.motion()  # as it is corrected by now
+            posed = [(view, training.pose(view, motion)) for view in shown]
+            save_preview(folder / "previews" / name, training.model, light, posed)
 
         return run(training, folder, on_step=on_step, on_preview=on_preview)
 

@@ -59,7 +59,7 @@ class EvalOptions:
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
     motion: str | None = None
     """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones. Default: the
-    poses that the training corrected (--refine-poses), else the capture's own"""
+    poses that the training corrected (--refine-poses), else the capture's own. A study trains with it too"""
     method: str | None = None
     """name of the rows in the JSON; the run folder's unless given"""
     ablate: bool = False
@@ -119,7 +119,9 @@ def evaluate_run(options: EvalOptions) -> None:
     from rnd_runtime.shading import check_mode
 
     from .checkpoint import load_checkpoint
+    from .evaluate import HELD_OUT
     from .held_out import score
+    from .notes import capture_notes, say_notes
     from .perceptual import load_lpips
 
     check_mode(options.shade)
@@ -130,6 +132,7 @@ def evaluate_run(options: EvalOptions) -> None:
     capture = load_capture(
         options.capture, motion_file=options.motion or _corrected(path, checkpoint, options)
     )
+    say_notes("rnd-eval", capture_notes(capture, HELD_OUT))
     exported = path.with_suffix(".onnx")
     rows = score(
         checkpoint,
@@ -176,7 +179,12 @@ def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
 
     if not exported.is_file():
         return False
-    if checkpoint_of(exported) == checkpoint_sha256:
+    try:
+        made_of = checkpoint_of(exported)
+    except InputError as error:
+        print(f"{error}: its size and speed are left out", file=sys.stderr)  # noqa: T201
+        return False
+    if made_of == checkpoint_sha256:
         return True
     print(f"{exported}: of another checkpoint: its size and speed are left out", file=sys.stderr)  # noqa: T201
     return False

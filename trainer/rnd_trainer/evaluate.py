@@ -55,13 +55,17 @@ class Judge:
         self, checkpoint: Checkpoint, capture: Capture, mode: str = "table+sun", motion: Motion | None = None
     ) -> None:
         self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
-        self.motion = capture.motion if motion is None else motion
+        self.motion = capture.motion_for(checkpoint.skeleton) if motion is None else motion
         self._trained = checkpoint.learned_under(capture)
         self._shaders: dict[str | None, Shader | None] = {}
 
     def render(self, frame: Frame, albedo_scale: Tensor | None = None, index: int | None = None) -> Rendered:
         """``frame``'s camera and light; ``index`` shows another motion frame instead of its own."""
         index = frame.frame if index is None else index
+        if frame.split == "relight" and frame.light is None:
+            expected = "the name of the light it was taken under"
+            raise InputError("light of a relight picture", expected=expected, got="none", frame=frame.frame,
+                             file=self.capture.file)  # fmt: skip
         model = self.checkpoint.config.model
         pose = pose_input(self.motion, self.checkpoint.skeleton, index / self.motion.fps, model)
         camera = self.capture.cameras[frame.camera]
@@ -116,10 +120,11 @@ def evaluate(
 
 
 def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
-    """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive held-out frames.
+    """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive frames of the motion.
 
-    Motion at constant speed cancels in the second difference to first order; what jumps does not. None where
-    the motion has fewer than three frames after the split's first.
+    From the split's first frame on, whether all of them are held out or not: nothing is compared with a picture.
+    Motion at constant speed cancels in the second difference to first order; what jumps does not. None where the
+    motion has fewer than three frames from there on, or nobody is seen.
     """
     frames = sorted(judge.capture.split(split), key=lambda frame: (frame.camera, frame.frame))
     if not frames:
@@ -131,6 +136,8 @@ def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
     shown = [judge.render(first, index=k) for k in range(first.frame, last)]
     images = torch.stack([to_srgb8(r.image) for r in shown])
     covered = torch.stack([r.alpha for r in shown])[1:-1] > 0.5
+    if not covered.any():
+        return None
     second = (images[:-2] - 2 * images[1:-1] + images[2:]).abs().mean(-1) / 2
     return float(255 * second[covered].mean())
 
@@ -139,7 +146,7 @@ def albedo_scale(judge: Judge) -> Tensor | None:
     """Per-channel least-squares factor [3] from the learned to the true albedo, over training frames that have it.
 
     Albedo and light are known up to this factor; IntrinsicAvatar's protocol fits it before relighting.
-    None where the capture has no albedo.
+    None where the capture has no albedo, or nothing there is covered by both.
     """
     ours, theirs = [], []
     for frame in judge.capture.split("train"):
@@ -154,4 +161,5 @@ def albedo_scale(judge: Judge) -> Tensor | None:
     if not ours:
         return None
     x, y = torch.cat(ours), torch.cat(theirs)
-    return (x * y).sum(0) / (x * x).sum(0)
+    scale = (x * y).sum(0) / (x * x).sum(0)
+    return scale if bool(torch.isfinite(scale).all()) else None

@@ -53,9 +53,10 @@ def score(
         InputError: the capture has no held-out split.
     """
     judge = Judge(checkpoint, capture, mode)
-    scale = albedo_scale(judge)
+    lit = checkpoint.config.light != "none"  # else there is no albedo: colours that no light changes
+    scale = albedo_scale(judge) if lit else None
     jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
-    if scale is not None and capture.split("relight") and checkpoint.config.light != "none":
+    if scale is not None and capture.split("relight"):
         jobs.append(("relight", scale))
     if not jobs:
         raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)

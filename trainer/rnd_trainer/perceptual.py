@@ -120,6 +120,11 @@ def networks_sha256(*networks: Perceptual | None) -> str | None:
     return " ".join(dict.fromkeys(network.sha256 for network in networks if network is not None)) or None
 
 
+def networks_by_role(perceptual: Perceptual | None, features: Perceptual | None) -> dict[str, str | None]:
+    """Which network LPIPS is of and whose features L_gc compares: what else they could be is another training."""
+    return {"lpips": networks_sha256(perceptual), "consistency": networks_sha256(features)}
+
+
 def load_features(path: Path | None) -> Perceptual | None:
     """The network of ``--consistency-weights``, whole or its first few blocks; None where none is named."""
     return None if path is None else load_perceptual(path)

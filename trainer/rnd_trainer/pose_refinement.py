@@ -1,13 +1,14 @@
 """Corrections of estimated body poses, learned with the avatar: bounded, delayed, one row a picture.
 
 What is corrected in training is where the bones are; windows and velocities are those of the estimate there, and in
-playback those of the motion that is played, corrected or not. Poses between the training frames are nobody's to
-correct, and keep what they had.
+playback those of the motion that is played, corrected or not. Poses between the training frames are corrected as their
+neighbours are, so that the motion stays as smooth as it was.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,6 +22,8 @@ ROTATION_BOUND = 0.12
 """radians that a joint may be corrected by about each axis, 7°: estimators err by one to three"""
 TRANSLATION_BOUND = 0.05
 """metres that the root may be moved along each axis"""
+FADE_SECONDS = 0.5
+"""time in which the correction of the first and of the last training frame fades out beyond them"""
 
 
 class PoseRefinement(nn.Module):
@@ -84,13 +87,20 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def apply_to(self, motion: Motion) -> Motion:
-        """``motion`` with its training frames corrected; frames in between keep what they had."""
-        rotations, translations = motion.rotations.copy(), motion.translations.copy()
-        for frame in self.frames:
-            turn, shift = (x.double().cpu().numpy() for x in self.bounded(frame))
-            rotations[frame] = rotations[frame] @ axis_angle_to_matrix(turn)
-            translations[frame] += shift
-        return Motion(rotations, translations, motion.fps, motion.joint_names)
+        """``motion`` with its training frames corrected.
+
+        Frames in between get what lies between the corrections of their neighbours, linear in time; what was learned
+        at the first and at the last training frame fades out beyond them.
+        """
+        learned = np.stack([torch.cat([turn.flatten(), shift]).double().cpu().numpy()
+                            for turn, shift in map(self.bounded, self.frames)])  # fmt: skip
+        every = np.arange(motion.frame_count)
+        between = np.stack([np.interp(every, self.frames, column) for column in learned.T], axis=1)
+        beyond = np.maximum(np.maximum(self.frames[0] - every, every - self.frames[-1]), 0) / motion.fps
+        between *= np.maximum(1 - beyond / FADE_SECONDS, 0)[:, None]
+        turns = between[:, :-3].reshape(len(every), -1, 3)
+        rotations = motion.rotations @ axis_angle_to_matrix(turns)
+        return replace(motion, rotations=rotations, translations=motion.translations + between[:, -3:])
 
 
 def joint_error_degrees(motion: Motion, truth: Motion, frames: Sequence[int]) -> float:

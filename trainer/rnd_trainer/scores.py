@@ -45,7 +45,7 @@ def frame_scores(
     length = outline_length(mask)
     if length > 0:
         scores["outline_px"] = float((rendered.alpha - mask).abs().sum()) / length
-    if perceptual is not None:
+    if perceptual is not None and min(image.shape[:2]) >= perceptual.smallest:
         scores["lpips"] = float(perceptual(image, target))
         scores["lpips_inner"] = float(perceptual(torch.where(silhouette(mask), target, image), target))
         if min(image[box].shape[:2]) >= perceptual.smallest:

@@ -59,10 +59,13 @@ def _trained(options: EvalOptions, config: TrainConfig, variants: Sequence[Study
     from rnd_runtime.capture import load_capture
 
     from .ablate import ablate, check_needs
+    from .evaluate import HELD_OUT
+    from .notes import capture_notes, say_notes
     from .perceptual import load_features, load_lpips
 
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)
+    say_notes("rnd-eval", capture_notes(capture, HELD_OUT))
     perceptual = load_lpips(options.perceptual_weights)
     console = Console(stderr=True)
     if perceptual is None:

@@ -28,7 +28,7 @@ from .data import TrainingView, load_views, pose_input, training_light, training
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
-from .perceptual import Perceptual, networks_sha256
+from .perceptual import Perceptual, networks_by_role, networks_sha256
 from .pose_refinement import PoseRefinement
 from .template import sample_template
 from .training_state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
@@ -86,13 +86,14 @@ class Training:
         fixed_light = self._capture_light() if config.light == "capture" else None
         networks = (self.perceptual, self.consistency)
         self.objective = Objective(config, self.probe, fixed_light, *networks, self.generator)
-        self.poses = [self._pose(view) for view in self.views]
+        self.poses = [self.pose(view) for view in self.views]
         self.refinement = self._refinement() if config.refine_poses else None
         self.unseen: UnseenPoses | None = None  # from the third stage on
         self.optimizer = self._optimizer()
         self.step_index = 0
         self.bad_steps = 0
         self.lit = False  # whether the second stage has begun
+        self.light_found: bool | None = None  # in the search that it begins with, once that is done
         self.seconds = 0.0
 
     # -- one step ------------------------------------------------------------------------------------------
@@ -243,8 +244,9 @@ class Training:
         if self._searches_light:
             motion = self.motion()
             found = light_start.start_light(
-                self.model, self.views, [self._pose(view, motion) for view in self.views]
+                self.model, self.views, [self.pose(view, motion) for view in self.views]
             )
+            self.light_found = found is not None
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
 
@@ -269,7 +271,8 @@ class Training:
         groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in parts]
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
-    def _pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
+    def pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
+        """What the networks need to know of ``view``, in the capture's motion or another."""
         motion = self.capture.motion if motion is None else motion
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
@@ -306,7 +309,9 @@ class Training:
             "seconds": self.seconds,
             "bad_steps": self.bad_steps,
             "lit": self.lit,
-            "perceptual_sha256": networks_sha256(self.perceptual, self.consistency),
+            "networks": networks_by_role(self.perceptual, self.consistency),
+            "capture_sha256": sha256_of(self.capture.file),
+            "motion": Path(self.capture.motion.source).name,
             "learned_from_sha256": self._learned_from_sha256,
         }
         write_tensors(folder / STATE_FILE, tensors, header)
@@ -327,7 +332,7 @@ class Training:
         The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
         """
         saved = read_state(path)
-        saved.refuse_other(self.config, networks_sha256(self.perceptual, self.consistency))
+        saved.refuse_other(self.config, networks_by_role(self.perceptual, self.consistency))
         header, taught = saved.header, saved.part("taught")
         if header.get("learned_from_sha256", self._learned_from_sha256) != self._learned_from_sha256:
             raise InputError(

@@ -41,14 +41,15 @@ class TrainingState:
     def refuse_other(
         self,
         config: TrainConfig,
-        perceptual_sha256: str | None,
+        networks: dict[str, str | None],
         *,
         what: str = "--resume",
         hint: str | None = None,
     ) -> None:
         """Raise :class:`InputError` where another configuration, or other perceptual weights, began this training.
 
-        What concerns the third stage alone may differ before that has begun. ``what`` and ``hint`` as of the error.
+        What concerns the third stage alone may differ before that has begun. ``networks`` as of
+        :func:`rnd_trainer.perceptual.networks_by_role`; ``what`` and ``hint`` as of the error.
         """
         try:
             before = to_dict(from_dict(self.header["config"]))
@@ -61,10 +62,18 @@ class TrainingState:
         if wrong:
             expected = "the configuration it was started with"
             raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
-        weights = self.header.get("perceptual_sha256")
-        if weights != perceptual_sha256:
-            expected = f"the perceptual weights {weights}"
-            raise InputError(what, expected=expected, got=perceptual_sha256, file=self.path, hint=hint)
+        if "networks" in self.header:
+            begun, given = _in_words(self.header["networks"]), _in_words(networks)
+        else:  # states of before: all networks in one line, each once
+            begun = self.header.get("perceptual_sha256") or "none"
+            given = " ".join(dict.fromkeys(filter(None, networks.values()))) or "none"
+        if begun != given:
+            expected = f"the perceptual weights {begun}"
+            raise InputError(what, expected=expected, got=given, file=self.path, hint=hint)
+
+
+def _in_words(networks: dict[str, str | None]) -> str:
+    return ", ".join(f"{digest} for {role}" for role, digest in networks.items() if digest) or "none"
 
 
 def read_state(path: Path) -> TrainingState:

@@ -15,14 +15,14 @@ from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError, check_option, refuse_outside
 from rnd_runtime.files import existing_file, output_folder
 from rnd_runtime.gaussians import Gaussians
-from rnd_runtime.light import Light
+from rnd_runtime.light import Light, light_notes
 from rnd_runtime.motion import Motion
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
 from .cameras import CameraOptions, CameraPath, file_path, frame_motion, front_path
 from .convert_cli import AmassOptions, MeshOptions, Options, SplatOptions
-from .lights import chosen_light, light_notes
+from .lights import chosen_light
 from .mesh_files import write_obj, write_rigged_glb
 from .options import parse_frames
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb

@@ -8,8 +8,6 @@ from pathlib import Path
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.light import Light, Up, load_light
 
-DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
-
 
 def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, exposure: float) -> Light:
     """The light in ``probe``, or the one that was learnt with ``avatar``.
@@ -23,15 +21,3 @@ def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, expo
     if probe is None:
         return Light(avatar.trained_light).scaled(2.0**exposure).turned(turn)
     return load_light(probe, up=up, yaw=turn, exposure=exposure)
-
-
-def light_notes(light: Light) -> list[str]:
-    """What the user should know of ``light``, one sentence each."""
-    notes = list(light.notes)
-    if light.repaired:
-        notes.append(
-            f"{light.repaired} texels of the light were NaN, infinite or negative and were filled in"
-        )
-    if light.maximum < DIM:
-        notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
-    return notes

@@ -95,8 +95,8 @@ class PlayOptions(LitOptions):
     avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
     """The avatar, a file that rnd-export wrote."""
     motion: Annotated[Path | None, option("FILE")] = None
-    """Body poses over time: .npz of AMASS, SMPL or EasyMocap, .pkl of AIST++ or WHAM, .pt of GVHMR, .npy of MDM,
-    .bvh, or .amc with its .asf beside it."""
+    """Body poses over time: .npz of AMASS, SMPL or EasyMocap (or its folder), .pkl of AIST++, WHAM or 4D-Humans, .pt of
+    GVHMR, .npy of MDM, .bvh, or .amc with its .asf beside it."""
     hdr: Annotated[Path | None, option("FILE")] = None
     """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
     out: Annotated[Path | None, option("FOLDER")] = None

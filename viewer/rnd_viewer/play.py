@@ -16,6 +16,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
+from rnd_runtime.light import light_notes
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
@@ -34,7 +35,7 @@ from .cameras import (
     split_camera,
 )
 from .governor import FULL, Governor, Quality
-from .lights import chosen_light, light_notes
+from .lights import chosen_light
 from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.light import Light, Up, load_light
+from rnd_runtime.light import Light, Up, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
@@ -19,7 +19,6 @@ from rnd_runtime.skeleton import Skeleton
 
 from .aov import aov_picture
 from .cameras import CameraOptions, frame_motion, front_path, orbit_path
-from .lights import light_notes
 from .player import Player
 from .video import clip_writer
 

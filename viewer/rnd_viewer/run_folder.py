@@ -13,6 +13,8 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from rnd_runtime.files import sha256_of
+
 _MARK = ".run-"
 _FRAME = re.compile(
     r"\d{6,}\.(png|exr)"
@@ -55,11 +57,7 @@ def part_name(stem: str, frames: range, count: int) -> str:
 
 
 def _identity(settings: Mapping[str, object], inputs: Iterable[Path]) -> str:
-    """What two processes of one run agree on: settings, and name, size and time of every input."""
-    files = []
-    for path in inputs:
-        if path.is_file():
-            status = path.stat()
-            files.append((str(path.resolve()), status.st_size, status.st_mtime_ns))
-    text = json.dumps([settings, files], sort_keys=True, default=str)
+    """What two processes of one run agree on, on several machines too: settings, and the content of every input."""
+    contents = [sha256_of(path) for path in inputs if path.is_file()]
+    text = json.dumps([settings, contents], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -10,6 +10,7 @@ import numpy as np
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path
+from rnd_runtime.images import srgb_to_linear
 
 from .glb import FLOAT, GlbBuilder
 from .splats import SH_0, Coding, Splats
@@ -53,13 +54,15 @@ def write_ply(path: Path, splats: Splats) -> None:
 def write_splat_glb(path: Path, splats: Splats, coding: Coding) -> None:
     """glTF binary of one KHR_gaussian_splatting primitive: Y up, scales and opacities as they are, xyzw.
 
-    Points with COLOR_0 for viewers that do not know the extension. Degrees that are all zero are left out.
+    Points with COLOR_0, linear as glTF 2.0 (3.7.2.1) has it, for viewers that do not know the extension. Degrees that
+    are all zero are left out.
     """
     glb = GlbBuilder()
-    colour = 0.5 + splats.harmonics[:, 0] * SH_0
+    stored = np.clip(0.5 + splats.harmonics[:, 0] * SH_0, 0, 1)
+    colour = srgb_to_linear(stored) if coding == "srgb" else stored
     attributes = {
         "POSITION": glb.accessor(splats.means, "VEC3", FLOAT, bounds=True),
-        "COLOR_0": glb.accessor(np.clip(np.c_[colour, splats.opacities], 0, 1), "VEC4", FLOAT),
+        "COLOR_0": glb.accessor(np.c_[colour, splats.opacities], "VEC4", FLOAT),
         f"{KHR}:ROTATION": glb.accessor(splats.quaternions[:, [1, 2, 3, 0]], "VEC4", FLOAT),
         f"{KHR}:SCALE": glb.accessor(splats.scales, "VEC3", FLOAT),
         f"{KHR}:OPACITY": glb.accessor(splats.opacities, "SCALAR", FLOAT),

@@ -19,7 +19,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
 from rnd_runtime.frame import as_seen_from, draw
 from rnd_runtime.gaussians import Gaussians, Raster
-from rnd_runtime.light import Light, downsize, load_light
+from rnd_runtime.light import Light, downsize, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.motion_edit import edit_motion
 from rnd_runtime.raster import make_rasterizer
@@ -29,7 +29,6 @@ from rnd_runtime.tone import tone_map
 from .aov import aov_picture, aov_values, splat_features
 from .background import Background
 from .cameras import CameraOptions, frame_motion, front_path
-from .lights import light_notes
 from .view_options import SIZES, ViewOptions
 from .view_state import ViewState
 
@@ -222,7 +221,8 @@ class Scene:
 
     def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
         shader = Shader(self._light(name), shade)
-        shader.light = self._sky(name)  # from here on it is only turned
+        # from here on it is only turned: its texels need not stay
+        shader.light = replace(shader.light, radiance=np.zeros((1, 2, 3), np.float32))
         self._light.cache_clear()
         return shader
 

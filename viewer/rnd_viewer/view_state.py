@@ -96,5 +96,5 @@ def parse_request(message: str | bytes) -> Request:
     """Decode one message of a page, or raise InputError."""
     try:
         return _decoder.decode(message)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError("request", got=str(error)) from error

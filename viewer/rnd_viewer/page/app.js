@@ -45,7 +45,7 @@ function ask(exact) {
 function show(picture) {
   if (picture.number < shown) return picture.image.close?.();  // it took longer to decode than the one after it
   shown = picture.number;
-  const sent = flying.get(picture.number);
+  const sent = flying.get(picture.number) ?? performance.now();  // forgotten where the one before it failed
   for (const old of [...flying.keys()]) if (old <= picture.number) flying.delete(old);
   const canvas = $("picture"), context = canvas.getContext("2d");
   if (canvas.width !== picture.width || canvas.height !== picture.height) {
@@ -297,9 +297,10 @@ function bindFiles() {
   const load = async (files) => {
     const list = [...files];  // the browser takes its own list away when this function waits
     if (!list.length) return say("expected files, got something else", { wrong: true });
-    if (clipMade) await clipMade.promise;  // which is of one scene
+    const idle = async () => { while (clipMade) await clipMade.promise; };  // a clip is of one scene
+    if (clipMade) await idle();
     say(`reading ${list.map((file) => file.name).join(", ")} …`);
-    await engine.load(list);
+    await engine.load(list, idle);  // another clip may begin while it reads
   };
   $("choose").addEventListener("change", () => {
     load($("choose").files);

@@ -3,11 +3,12 @@
 const MOST_CLIP_FRAMES = 900;
 const MOST_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
 const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder; it halves the chroma as well
-const CLIP_TYPES = ["video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
+// H.264 of level 4.0, which 1024² at 30 fps need, before 3.0; then what has none
+const CLIP_TYPES = ["video/mp4;codecs=avc1.42E028", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
  * Start the worker. `on` gets: scene, picture, progress, clip, error as from rnd-view, message(text), and refused(text) of
- * files that cannot be used.
+ * files that cannot be used. `load` takes files in once they are read and `idle()`, a promise, is kept.
  * Files named in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
  */
 export async function connect(on) {
@@ -30,8 +31,9 @@ export async function connect(on) {
     else on.picture(data);
   };
   const render = (number, state) => worker.postMessage({ ask: "render", number, state });
-  const load = async (files) => {
+  const load = async (files, idle) => {
     const contents = await Promise.all(files.map(read)).catch((error) => on.refused(error.message));
+    await idle?.();
     if (contents && dead) on.refused(dead);
     else if (contents) worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
   };

@@ -8,6 +8,7 @@ const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];  // x and y of
 const SAME_COLOUR = 2e-3;  // by which x and y may miss them: D65 has more digits
 const DIM = 1e-3;  // largest radiance below which every 8-bit pixel of a body would be black or next to it
 const RGBE = "FORMAT=32-bit_rle_rgbe";
+const MOST_EXPOSED = 1e30;
 
 /** Rec.709. */
 export const luminance = (r, g, b) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
@@ -20,8 +21,9 @@ export function readLight(bytes, name) {
 }
 
 /** What the user should know of a light, one sentence each (rnd_viewer/lights.py). */
-export function lightNotes({ radiance, repaired, chromaticities }) {
+export function lightNotes({ radiance, repaired, chromaticities, exposure = 1 }) {
   const notes = [];
+  if (exposure !== 1) notes.push(`the light's pixels are divided by the exposure that its file states, ${short(exposure, 4)}`);
   if (chromaticities?.some((value, k) => !(Math.abs(value - REC709[k]) <= SAME_COLOUR))) {
     const [red, green, blue, white] = [0, 2, 4, 6].map((k) => `(${short(chromaticities[k], 4)}, ${short(chromaticities[k + 1], 4)})`);
     notes.push(`the light is taken as Rec.709, but its file states red ${red}, green ${green}, blue ${blue} and white ${white}`);
@@ -45,8 +47,17 @@ function readHdr(bytes) {
     return text.replace(/\r$/, "");
   };
   if (!line().startsWith("#?")) throw new Error("not a Radiance .hdr file");
-  for (let text = line(); text !== ""; text = line())
+  let exposure = 1, chromaticities;
+  for (let text = line(); text !== ""; text = line()) {
     if (/^FORMAT=/.test(text) && text !== RGBE) throw refusal("the .hdr file", { expected: RGBE, got: text });
+    const [name, value = ""] = text.split("="), numbers = value.trim().split(/\s+/).map((word) => Number(word || NaN));
+    if (name === "EXPOSURE") exposure *= numbers.length === 1 ? numbers[0] : NaN;
+    if (name === "PRIMARIES" && numbers.length === 8 && numbers.every(Number.isFinite)) chromaticities = numbers;
+  }
+  if (!(exposure >= 1 / MOST_EXPOSED && exposure <= MOST_EXPOSED)) {
+    const expected = `numbers whose product is ${short(1 / MOST_EXPOSED, 6)} to ${short(MOST_EXPOSED, 6)}`;
+    throw refusal("EXPOSURE of the light probe", { expected, got: short(exposure, 6) });
+  }
   const size = /^-Y (\d+) \+X (\d+)/.exec(line());
   if (!size) throw new Error("the .hdr file must be stored top to bottom, left to right");
   const height = Number(size[1]), width = Number(size[2]);
@@ -56,10 +67,10 @@ function readHdr(bytes) {
     for (let x = 0; x < width; x++) {
       const exponent = row[3 * width + x];
       const scale = exponent ? 2 ** (exponent - 136) : 0;  // mantissas are 0.x in 256ths, exponents start at 128
-      for (let c = 0; c < 3; c++) radiance[3 * (y * width + x) + c] = row[c * width + x] * scale;
+      for (let c = 0; c < 3; c++) radiance[3 * (y * width + x) + c] = row[c * width + x] * scale / exposure;
     }
   }
-  return { width, height, radiance };
+  return { width, height, radiance, chromaticities, exposure };
 }
 
 /** One scanline into `row`, plane by plane; where the next one starts. */

@@ -29,6 +29,9 @@ export class Splatter {
     this.setSky({ width: 1, height: 1, radiance: new Float32Array(3) });
   }
 
+  /** Whether the browser has taken the context away, as after a driver's reset: nothing is drawn any more. */
+  isLost() { return this.gl.isContextLost(); }
+
   /** The map that may stand behind. */
   setSky({ width, height, radiance }) {
     const texels = new Float32Array(4 * width * height);

@@ -17,7 +17,7 @@ const LARGEST_SKY = 1024;  // rows behind the avatar
 const SIZE = 512, SIZES = [64, 1024];  // px: to begin with, the least and the largest
 const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
 
-const splatter = new Splatter();
+let splatter = new Splatter();
 // What is shown: the motion as its file has it (null: at rest) and for the avatar, and
 // lights {name, light, notes, shaders: Map of shade → function}
 let scene = { avatar: null, record: null, motion: null, lights: [] };
@@ -82,7 +82,12 @@ async function render({ number, state }) {
   clock("shading");
   const records = project(gaussians, count, features, beside, grown);
   clock("sorting");
+  if (splatter.isLost()) {  // the driver was reset; what a canvas without its context shows is blank
+    splatter = new Splatter();
+    shownSky = null;
+  }
   splatter.draw(records, state.width, state.height, look(state, camera));
+  if (splatter.isLost()) throw new Error("the browser took WebGL2 away while it drew; it is asked for again with the next picture");
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
