@@ -35,6 +35,9 @@ from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.config import ModelConfig
 from tiny import ASSETS
 
+CONFIG = ModelConfig(nodes=7_500)
+"""whose formulas below have as many nodes to give up"""
+
 
 def _clock(avatar: Avatar) -> float:
     """Costs as a machine would have them, but the same every time: by Gaussians and by nodes with attention."""
@@ -125,7 +128,7 @@ class _Formula:
     seen, held_out = "seen", "held out"
 
     def __init__(self, harder: float = 0.0) -> None:
-        self.config, self._harder = ModelConfig(), harder
+        self.config, self._harder = CONFIG, harder
 
     def model(self, recipe: Recipe) -> Recipe:
         return recipe
@@ -227,7 +230,7 @@ def test_what_no_step_reaches_is_refused_at_the_last() -> None:
     with pytest.raises(InputError, match="no file keeps the bound of ms"):
         search(_Formula(), Bound("ms", 1.0), steps.append)
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
-    assert steps[-1].plan.recipe(ModelConfig()) == deepest.recipe(ModelConfig())
+    assert steps[-1].plan.recipe(CONFIG) == deepest.recipe(CONFIG)
 
 
 def test_what_cannot_be_kept_is_refused() -> None:
@@ -352,7 +355,7 @@ class _NodesFirst(_OwnRates):
 
 def test_nodes_of_its_own_are_looked_for_below_those_of_all() -> None:
     found = search(_NodesFirst(), Bound("psnr", 45.0), lambda found: None)
-    variant = found.plan.recipe(ModelConfig()).variant
+    variant = found.plan.recipe(CONFIG).variant
     assert variant.nodes == 3750 and variant.offset_nodes < 3750 > variant.visibility_nodes
 
 
@@ -361,7 +364,7 @@ def test_a_step_that_makes_the_same_file_is_none() -> None:
     steps: list[Found] = []
     with pytest.raises(InputError, match="no file keeps the bound of ms"):
         search(_Formula(), Bound("ms", 1.0), steps.append)
-    recipes = [step.plan.recipe(ModelConfig()) for step in steps]
+    recipes = [step.plan.recipe(CONFIG) for step in steps]
     assert all(before != after for before, after in itertools.pairwise(recipes))
 
 

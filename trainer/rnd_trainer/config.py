@@ -9,13 +9,17 @@ from typing import Any, Literal
 from rnd_runtime.errors import InputError, check_option
 
 
+NODE_SHARE = 8
+"""Gaussians to each node: at four, every figure is the same and a step takes a fifth longer (docs/tried.md)"""
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """What the avatar is made of; stored in the checkpoint, since it says how to rebuild the networks."""
 
     gaussians: int = 30_000
     """Gaussians on the template's surface; fixed, nothing is densified or pruned"""
-    nodes: int = 7_500
+    nodes: int = 3_750
     """points at which the networks are evaluated; the Gaussians interpolate between them (smooth quantities)"""
     window_poses: int = 10
     """d: poses in the motion window (the paper's ablation: 20 gains little over 10)"""
@@ -155,16 +159,16 @@ def preset(name: str) -> TrainConfig:
     if name == "full":
         return dataclasses.replace(standard, steps=5 * standard.steps)
     if name == "quick":
-        small = dataclasses.replace(standard.model, gaussians=12_000, nodes=3_000)
+        small = dataclasses.replace(standard.model, gaussians=12_000, nodes=1_500)
         return dataclasses.replace(standard, model=small, steps=2_000, preview_every=250, save_every=250)
     raise InputError("preset", expected="quick, standard or full", got=name)
 
 
 def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> TrainConfig:
-    """``config`` with another number of Gaussians (a quarter of them nodes) and of steps, where given."""
+    """``config`` with another number of Gaussians (an eighth of them nodes) and of steps, where given."""
     model = config.model
     if gaussians is not None:
-        model = dataclasses.replace(model, gaussians=gaussians, nodes=max(16, gaussians // 4))
+        model = dataclasses.replace(model, gaussians=gaussians, nodes=max(16, gaussians // NODE_SHARE))
     return dataclasses.replace(config, model=model, steps=config.steps if steps is None else steps)
 
 
