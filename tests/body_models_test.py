@@ -213,6 +213,17 @@ def test_a_converted_body_is_the_shaped_one(tmp_path) -> None:
     assert body.license == "mine"
 
 
+def test_a_body_is_converted_into_another_npz(tmp_path) -> None:
+    coarse_body().save(tmp_path / "body.npz")
+    before = (tmp_path / "body.npz").read_bytes()
+    with pytest.raises(InputError, match="output: expected another file than what is read"):
+        convert_body_model(tmp_path / "body.npz", tmp_path / "body.npz")
+    assert (tmp_path / "body.npz").read_bytes() == before
+    with pytest.raises(InputError, match=r"output: expected a name that ends in \.npz, got body\.txt"):
+        convert_body_model(tmp_path / "body.npz", tmp_path / "body.txt")
+    assert len(list(tmp_path.iterdir())) == 1
+
+
 def test_betas_that_would_change_nothing_are_refused(tmp_path, monkeypatch) -> None:
     coarse_body().save(tmp_path / "body.npz")
     out = tmp_path / "out.npz"

@@ -106,6 +106,7 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
             ["--max-mb", "4", "--precision", "int8"],
             "--precision: expected the default, got int8 (a bound finds",
         ),
+        (["--target-ms", "0"], "--target-ms: expected more than 0, got 0"),
         (
             ["--max-mb", "4", "--window-poses", "5"],
             "--window-poses: expected the default, got 5 (a bound finds",

@@ -226,6 +226,19 @@ def test_bad_masks_and_backgrounds_are_counted(folder) -> None:
     assert findings["background"].level == "note" and bright.name in findings["background"].sentence
 
 
+def test_what_would_not_train_is_named(folder) -> None:
+    def relit(record) -> None:
+        record["lights"] = {"noon": {"file": "body.npz"}, "dusk": {"file": "body.npz"}}
+        for number, frame in enumerate(record["frames"]):
+            frame.update(split="train", light=["noon", "dusk"][number % 2])
+
+    _edit(folder, relit)
+    wrong = _wrong(folder)
+    assert "2 lights (dusk, noon)" in wrong["training"] and "an .exr or .hdr file" in wrong["lights"]
+    _edit(folder, lambda record: [frame.update(split="relight") for frame in record["frames"]])
+    assert _wrong(folder)["training"].startswith("no picture trains: none of 8")
+
+
 def test_the_command_prints_writes_and_exits(folder, capsys) -> None:
     assert check_and_report(folder, folder / "out") == 0
     printed = capsys.readouterr().out
@@ -238,6 +251,13 @@ def test_the_command_prints_writes_and_exits(folder, capsys) -> None:
     (folder / "capture.json").unlink()
     with pytest.raises(InputError, match="capture not found"):
         check_and_report(folder, folder / "out")
+
+
+def test_findings_that_cannot_be_saved_are_shown(folder, capsys) -> None:
+    (folder / "out").write_text("")
+    with pytest.raises(InputError, match="output folder cannot be made"):
+        check_and_report(folder, folder / "out")
+    assert "silhouette: mean IoU" in capsys.readouterr().out
 
 
 def test_the_overlay_looks_at_the_person(folder) -> None:

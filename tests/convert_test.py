@@ -517,6 +517,14 @@ def test_a_body_is_known_by_its_suffix_in_capitals_too(tmp_path):
     assert main(line) == 0
 
 
+def test_a_body_is_not_written_over_by_its_motion(tmp_path, capsys):
+    body_file = Path(shutil.copy(ASSETS / "body.npz", tmp_path))
+    before = body_file.read_bytes()
+    assert main(["motion", str(body_file), "--motion", str(WALK), "--out", str(body_file)]) == 2
+    assert "output: expected another file than what is read" in capsys.readouterr().err
+    assert body_file.read_bytes() == before
+
+
 def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):
     """The options that the reader's own errors name, and its notes."""
     with np.load(WALK) as archive:

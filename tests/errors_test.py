@@ -101,6 +101,24 @@ def test_what_is_missing_is_told_with_what_it_is(capsys):
 
 
 @dataclass
+class Files:
+    file: tyro.conf.Positional[Path]
+    out: Path | None = None
+    lights: tuple[Path, ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [(["", "--out", "b"], "PATH"), (["a", "--out", ""], "--out"), (["a", "--lights", "b", ""], "--lights")],
+)
+def test_an_empty_path_is_refused(words, name, capsys):
+    """To Path it would be the folder that we are in."""
+    assert run_command("rnd-x", lambda: parse_options(lambda: tyro.cli(Files, prog="rnd-x", args=words))) == 2
+    line = f"rnd-x: {name}: expected a path, got nothing (see rnd-x --help)\n"
+    assert capsys.readouterr().err == line
+
+
+@dataclass
 class Named(Options):
     name: str = "a"
 

@@ -10,7 +10,15 @@ import sys
 import pytest
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path, earlier_rows, existing_file, output_folder, write_json
+from rnd_runtime.files import (
+    atomic_path,
+    earlier_rows,
+    existing_file,
+    output_file,
+    output_folder,
+    refuse_input,
+    write_json,
+)
 
 
 def _names(folder):
@@ -102,6 +110,25 @@ def test_output_folder_where_nothing_can_be_made_is_refused():
     with pytest.raises(InputError) as caught:
         output_folder("/proc/nothing/can/be/made/here")
     assert "output folder cannot be made" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_an_output_is_looked_at_before_what_takes_long(tmp_path):
+    assert output_file(tmp_path / "new" / "a.json") == tmp_path / "new" / "a.json"
+    assert not _names(tmp_path / "new")
+    with pytest.raises(InputError, match="new: cannot be written: it is a folder"):
+        output_file(tmp_path / "new")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="output folder cannot be made"):
+        output_file(tmp_path / "file" / "a.json")
+
+
+def test_an_input_is_no_output_under_any_name(tmp_path):
+    (tmp_path / "a").write_text("")
+    (tmp_path / "link").symlink_to("a")
+    refuse_input(tmp_path / "b", tmp_path / "a", None, tmp_path / "none")
+    for out in (tmp_path / "a", tmp_path / "link", tmp_path / "new" / ".." / "a", tmp_path / "none"):
+        with pytest.raises(InputError, match="output: expected another file than what is read, got"):
+            refuse_input(out, None, tmp_path / "a", tmp_path / "none")
 
 
 def test_existing_file(tmp_path):

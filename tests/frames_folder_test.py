@@ -131,7 +131,7 @@ def test_masks_of_another_size_are_refused_whatever_the_lens(tmp_path, distortio
     for k, mask in enumerate(_masks()):
         write_image(tmp_path / "masks" / f"{k:05d}.png", mask[::2, ::2])
     expected = f"size of mask: expected {WIDTH} x {HEIGHT} as the camera, got {WIDTH // 2} x {HEIGHT // 2}"
-    with pytest.raises(InputError, match=expected):
+    with pytest.raises(InputError, match=rf"masks/0000\d\.png: frame \d: {expected}"):
         _imported(tmp_path, distortion=distortion)
 
 

@@ -167,6 +167,18 @@ def test_a_layout_can_be_named_and_not_another(tmp_path, name) -> None:
         find_layout(tmp_path, other)
 
 
+def test_a_picture_beside_folders_is_no_video_and_a_capture_no_source(tmp_path) -> None:
+    (tmp_path / "00000.png").touch()
+    (tmp_path / ".hidden").mkdir()
+    assert find_layout(tmp_path)[1] == "a folder of frames"
+    (tmp_path / "images").mkdir()
+    with pytest.raises(InputError, match="source: expected a known layout"):
+        find_layout(tmp_path)
+    (tmp_path / "capture.json").touch()
+    with pytest.raises(InputError, match="a capture already"):
+        find_layout(tmp_path)
+
+
 def test_a_layout_and_a_root_may_both_be_said(tmp_path) -> None:
     """EasyMocap's Rh and Th under SMPL's names, in a folder that could be frames of a video as well."""
     source = tmp_path / "source"

@@ -370,6 +370,18 @@ def test_what_is_no_probe_is_refused(tmp_path, name, pixels, words):
     assert words in str(caught.value) and str(tmp_path / name) in str(caught.value)
 
 
+def test_a_folder_and_a_file_without_a_suffix_are_told_apart(tmp_path):
+    (tmp_path / "sky").write_bytes(b"")
+    for name, words in (
+        ("", "light probe not found: got a folder"),
+        ("none", "light probe not found"),
+        ("sky", "light probe: expected an .exr or .hdr file, got no suffix"),
+    ):
+        with pytest.raises(InputError) as caught:
+            load_light(tmp_path / name)
+        assert str(caught.value) == f"{tmp_path / name}: {words}"
+
+
 def test_bad_arguments_are_refused(tmp_path):
     write_image(tmp_path / "a.exr", np.ones((4, 8, 3), np.float32))
     for arguments in ({"exposure": np.nan}, {"exposure": 1000.0}, {"yaw": np.inf}, {"up": "x"}):

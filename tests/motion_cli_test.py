@@ -1,5 +1,6 @@
 """rnd-data motion, as a user types it."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -77,3 +78,12 @@ def test_bad_use_is_one_line_and_exit_2(tmp_path, monkeypatch, capsys):
     assert "ends in .npz" in capsys.readouterr().err
     assert _run(monkeypatch, tmp_path / "none.bvh", tmp_path / "w.npz") == 2
     assert "none.bvh" in capsys.readouterr().err
+
+
+def test_what_is_read_is_not_written_over(tmp_path, monkeypatch, capsys):
+    walk, body = (Path(shutil.copy(ASSETS / name, tmp_path)) for name in ("walk.npz", "body.npz"))
+    before = [file.read_bytes() for file in (walk, body)]
+    for out in (walk, body):
+        assert _run(monkeypatch, walk, out, "--body", body) == 2
+        assert "output: expected another file than what is read" in capsys.readouterr().err
+    assert [file.read_bytes() for file in (walk, body)] == before

@@ -96,6 +96,13 @@ def test_resampling_keeps_the_time():
     assert_allclose(_angles(after), np.linspace(0, 1.2, 51), atol=ROUND_OFF)
 
 
+def test_more_frames_than_memory_holds_are_refused():
+    motion = replace(_motion(np.zeros(3)), fps=1e-3)
+    words = r"frames of the motion: expected at most 2000000, got 20000001 in 2000 s at 10000 per second"
+    with pytest.raises(InputError, match=words):
+        resampled(motion, 1e4)
+
+
 def test_a_loop_stays_one_at_another_rate_and_speed():
     """Half or twice its frames go round, and none of them twice."""
     once = looped(_motion(0.8 * np.sin(np.arange(72) / 7)))

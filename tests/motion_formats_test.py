@@ -16,6 +16,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.joint_names import load_joint_map, match_joints
 from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
+from rnd_runtime.retarget import Retargeted, retarget
 from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS
 
 SKELETON = Body.load(Path(__file__).parents[1] / "assets" / "body.npz").skeleton
@@ -354,6 +355,23 @@ def test_other_pickles_are_refused_in_one_line(tmp_path, content):
     assert "a.pkl" in str(caught.value)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scaling", [0.0, -1.0, np.nan])
+def test_an_aist_scaling_that_is_none_is_refused(tmp_path, scaling):
+    content = {"smpl_poses": _flat(POSES), "smpl_trans": PELVIS, "smpl_scaling": np.array([scaling])}
+    with pytest.raises(InputError, match=r"a\.pkl: smpl_scaling: expected 1e-06 to 1e\+06, got"):
+        load_motion(_pickle(tmp_path / "a.pkl", content), SKELETON)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("second", [[0, 0, 0], [2, 0, 0]], ids=["zero", "parallel"])
+def test_two_rows_that_are_no_rotation_are_refused(tmp_path, second):
+    thetas = MATRICES[..., :2, :].reshape(FRAMES, 24, 6).transpose(1, 2, 0).copy()
+    thetas[5, :, 2] = [1, 0, 0, *second]
+    with pytest.raises(InputError, match=r"a\.pkl: frame 2: thetas: expected two rows of a rotation"):
+        load_motion(_pickle(tmp_path / "a.pkl", {"thetas": thetas, "root_translation": PELVIS.T}), SKELETON)
+
+
 # Skeletons of their own
 
 
@@ -668,6 +686,9 @@ BROKEN_BVH = {
     "short": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 3 Frame Time: 0.03 1 2",
     "time": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 1 Frame Time: 0 1",
     "channel": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Wrotation } MOTION Frames: 1 Frame Time: 0.1 1",
+    "no channels": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 0 } MOTION Frames: 1000000000000 Frame Time: 0.1",
+    "far offset": "HIERARCHY ROOT a { OFFSET 0 1e200 0 CHANNELS 1 Xrotation } MOTION Frames: 1 Frame Time: 0.1 1",
+    "huge turn": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 2 Frame Time: 0.1 1 1e300",
     "nan": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 2 Frame Time: 0.1 1 nan",
 }  # fmt: skip
 
@@ -677,7 +698,32 @@ def test_broken_bvh_is_refused_in_one_line(tmp_path, broken):
     (tmp_path / "a.bvh").write_text(BROKEN_BVH[broken])
     with pytest.raises(InputError) as caught:
         load_motion(tmp_path / "a.bvh", SKELETON)
-    assert "a.bvh" in str(caught.value) and ("frame 1" in str(caught.value)) == (broken == "nan")
+    assert "a.bvh" in str(caught.value)
+    assert ("frame 1" in str(caught.value)) == (broken in ("nan", "huge turn"))
+    assert ("OFFSET: expected" in str(caught.value)) == (broken in ("offset", "far offset"))
+
+
+def test_what_retargeting_makes_no_numbers_of_is_refused(tmp_path, monkeypatch):
+    def torn(*arguments: object) -> Retargeted:
+        moved = retarget(*arguments)
+        moved.rotations[3, 0] = np.nan
+        return moved
+
+    monkeypatch.setattr("rnd_runtime.motion.retarget", torn)
+    with pytest.raises(InputError, match=r"a\.bvh: frame 3: motion: expected finite numbers"):
+        load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), SKELETON)
+
+
+@pytest.mark.parametrize("t_pose", [False, True])
+def test_a_recorded_root_too_far_away_is_named_by_its_frame(tmp_path, t_pose):
+    file = _bvh(tmp_path / "a.bvh", NAMINGS["smpl"], t_pose=t_pose)
+    lines = file.read_text().splitlines()
+    lines[-1] = " ".join(["90000", *lines[-1].split()[1:]])
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        InputError, match=rf"frame {FRAMES - 1 + t_pose}: trans: expected metres, at most 1000"
+    ):
+        load_motion(file, SKELETON)
 
 
 def _acclaim(folder: Path) -> Path:
@@ -798,6 +844,34 @@ def test_acclaim_bones_keep_their_lengths(tmp_path):
         )
         with pytest.raises(InputError, match=r"02\.asf: skeleton: .*" + reason):
             load_motion(file, SKELETON)
+
+
+def test_acclaims_numbers_beyond_any_use_are_refused(tmp_path):
+    file = _acclaim(tmp_path)
+    skeleton, text = tmp_path / "02.asf", file.read_text()
+    bone = next(line for line in text.splitlines() if line.startswith("lfemur"))
+    file.write_text(text.replace(bone, "lfemur 1e300 0 0", 1))
+    with pytest.raises(
+        InputError, match=r"02_01\.amc: frame 0: lfemur: expected numbers of at most 1e\+06, got 1e"
+    ):
+        load_motion(file, SKELETON)
+    file.write_text(text)
+    skeleton.write_text(skeleton.read_text().replace("length 0\n", "length 1e300\n", 1))
+    with pytest.raises(InputError, match=r"02\.asf: skeleton: expected numbers of at most 1e\+06, got 1e"):
+        load_motion(file, SKELETON)
+
+
+def test_an_acclaim_frame_without_a_bone_of_the_others_is_refused(tmp_path):
+    file = _acclaim(tmp_path)
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(lines[:-3]) + "\n")
+    with pytest.raises(
+        InputError, match=rf"frame {FRAMES - 1}: \w+: expected numbers, as other frames have, got none"
+    ):
+        load_motion(file, SKELETON)
+    file.write_text("\n".join(line for line in lines if not line.startswith(("root", "lhand"))) + "\n")
+    notes = load_motion(file, SKELETON).notes
+    assert "bones that no frame has stay as the skeleton has them: root, lhand" in notes
 
 
 def test_acclaim_needs_its_skeleton_and_fitting_bones(tmp_path):

@@ -336,6 +336,7 @@ POSES = _flat(_axis_angles(24))
         ({"poses": np.zeros((5, 75)), "trans": TRANS}, ["22, 24, 52 or 55", "25 joints (75 columns)"]),
         ({"poses": np.zeros((5, 168)), "trans": TRANS}, ["22, 24, 52 or 55", "56 joints (168 columns)"]),
         ({"poses": np.zeros((5, 0)), "trans": TRANS}, ["0 joints"]),
+        ({"poses": np.zeros((5, 0)), "joint_names": np.array([], "<U1")}, ["at least one, got none"]),
         ({"poses": POSES, "joint_names": ["a", "b"]}, ["2 joints (6 columns)", "24 joints (72 columns)"]),
         ({"poses": POSES, "joint_names": ["a"] * 24}, ["joint_names", "each name once"]),
         ({"trans": TRANS}, ["poses, poses_all, pose_body or body_pose", "got trans"]),

@@ -380,6 +380,54 @@ def test_a_run_that_fails_at_once_leaves_the_frames_of_the_last(files, tmp_path)
     assert _tree(out) == before and len(before) == FRAMES + 1
 
 
+def test_a_size_that_an_encoder_refuses_leaves_the_frames_of_the_last(files, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(_arguments(files, out, frames="0:2", format="png,mp4")) == 0
+    before = _tree(out)
+    for format in ("webp", "png,webp"):
+        assert main(_arguments(files, out, frames="0:2", format=format, size="1x16384")) == 2
+        assert "webp encoder refuses 1x16384" in capsys.readouterr().err
+    assert _tree(out) == before and len(list(out.glob(".run-*"))) == 1
+
+
+def test_what_a_run_took_away_is_said_where_it_fails_later_too(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", frames="0:2")) == 0
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    document = json.loads(walking.read_text())
+    document["cameras"][2] |= {"width": 64, "height": 64}
+    walking.write_text(json.dumps(document))
+    assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
+    assert f"3 files that another run had left in {tmp_path / 'out'} were removed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("hdr", "frames_exr/000000.exr"),
+        ("hdr", "aov/normal/000003.exr"),
+        ("camera", "play_000000-000001.json"),
+    ],
+)
+def test_a_file_that_runs_write_is_no_input_of_one_beside_it(files, tmp_path, capsys, option, name):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    file = tmp_path / "out" / name
+    file.parent.mkdir(parents=True)
+    shutil.copy(files["sky.exr"] if option == "hdr" else walking, file)
+    before = file.read_bytes()
+    changes = {option: file} | ({"size": None} if option == "camera" else {})
+    assert main(_arguments(files, tmp_path / "out", frames="0:1", **changes)) == 2
+    assert f"{file}: cannot be an input: runs write such files into --out" in capsys.readouterr().err
+    assert _tree(tmp_path / "out") == {name: before}
+    assert main(_arguments(files, tmp_path / "other", frames="0:1", **changes)) == 0
+
+
+def test_an_empty_out_is_no_folder(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(_arguments(files, "", frames="0:1")) == 2
+    assert "--out: expected a path, got nothing" in capsys.readouterr().err
+    assert not (tmp_path / "frames").exists()
+
+
 def test_a_part_without_the_body_is_no_mistake(files, tmp_path, capsys):
     walking = _cameras_that_lose_the_body(tmp_path, seen=2)
     out = tmp_path / "out"

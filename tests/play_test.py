@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,7 +151,9 @@ def test_number_colours_are_linear():
     assert Background.parse("0.1,0.2,3").colour == (0.1, 0.2, 3.0)
 
 
-@pytest.mark.parametrize("text", ["", "red", "#12345", "1,2", "1,2,3,4", "nan,0,0", "-1,0,0", "inf,0,0"])
+@pytest.mark.parametrize(
+    "text", ["", "red", "#12345", "1,2", "1,2,3,4", "nan,0,0", "-1,0,0", "inf,0,0", "1e39,0,0"]
+)
 def test_other_backgrounds_are_refused(text):
     with pytest.raises(InputError, match="none, hdr, #rrggbb or r,g,b"):
         Background.parse(text)
@@ -221,20 +224,29 @@ def test_the_same_inputs_elsewhere_are_the_same_run(tmp_path) -> None:
     for place, content in (("one", b"walk"), ("other", b"walk"), ("third", b"jump")):
         (tmp_path / place).write_bytes(content)
     claim(out, {}, [tmp_path / "one"])
+    _date(next(out.glob(".run-*")), 1)
     frame.write_bytes(b"one's")
-    os.utime(frame, (0, 0))  # long before what comes
+    _date(frame, 1)  # long before what comes
     assert claim(out, {}, [tmp_path / "other"]) == 0 and frame.exists()
     assert claim(out, {}, [tmp_path / "third"]) == 1 and not frame.exists()
 
 
 def test_pictures_that_no_run_left_stay(tmp_path) -> None:
     """Names such as 000001.png are ffmpeg's, too; those of another run are taken away."""
-    own, inner = tmp_path / "frames" / "000001.png", tmp_path / "frames" / "cam01" / "000001.png"
+    inner = tmp_path / "frames" / "cam01" / "000001.png"
+    mine, other = tmp_path / "frames" / "000001.png", tmp_path / "frames" / "000002.png"
     inner.parent.mkdir(parents=True)
-    for file in (own, inner, tmp_path / "play.mp4"):
+    for file in (mine, inner, other, tmp_path / "play.mp4"):
         file.write_bytes(b"mine")
-    claim(tmp_path, {"size": 1}, [])
-    assert own.exists() and inner.exists() and (tmp_path / "play.mp4").exists()
-    claim(tmp_path, {"size": 2}, [])
-    assert not own.exists() and len(list(tmp_path.glob(".run-*"))) == 1
+        _date(file, 1)
+    assert claim(tmp_path, {"size": 1}, []) == 0
+    _date(next(tmp_path.glob(".run-*")), 2)
+    for file in (other, inner):
+        _date(file, 3)
+    assert claim(tmp_path, {"size": 2}, []) == 1 and len(list(tmp_path.glob(".run-*"))) == 1
+    assert mine.exists() and (tmp_path / "play.mp4").exists() and not other.exists()
     assert inner.exists()  # no run writes there
+
+
+def _date(file: Path, seconds: int) -> None:
+    os.utime(file, (seconds, seconds))

@@ -297,11 +297,33 @@ def test_options_of_a_motion_that_is_not_there_are_refused(run, words, message, 
 
 
 @pytest.mark.parametrize("option", ["--hdr", "--motion"])
-def test_what_only_an_avatar_can_show_needs_one(run, option, capsys):
-    (run / "avatar.onnx").unlink()
+@pytest.mark.parametrize("why", ["no avatar.onnx in the run", "avatar.onnx is of another checkpoint"])
+def test_what_only_an_avatar_can_show_needs_one(run, option, why, capsys):
+    if why.startswith("no "):
+        (run / "avatar.onnx").unlink()
+    else:
+        (run / "avatar.ckpt").write_bytes(b"trained since")
     assert main([str(run), option, str(ASSETS / "sky.exr")]) == 2
-    assert f"{option}: expected an avatar.onnx in RUN, got none" in capsys.readouterr().err
+    assert f"{option}: expected an avatar that can be shown ({why}" in capsys.readouterr().err
     assert not (run / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("config.json", "--out: expected a name in .html, got"),
+        ("a.html", "a.html: cannot be written: it is a folder"),
+        ("config.json/a.html", "config.json: output folder cannot be made"),
+    ],
+)
+def test_a_page_that_cannot_be_written_is_refused_before_anything_is_filmed(
+    run, out, message, monkeypatch, capsys
+):
+    (run / "a.html").mkdir()
+    monkeypatch.setattr(report_shots.Avatar, "load", None)
+    before = (run / "config.json").read_bytes()
+    assert main([str(run), "--out", str(run / out)]) == 2
+    assert message in capsys.readouterr().err and (run / "config.json").read_bytes() == before
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")

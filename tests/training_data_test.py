@@ -95,6 +95,12 @@ def test_a_split_that_is_not_there_is_refused(tiny_capture) -> None:
         load_views(tiny_capture, "relight")
 
 
+def test_a_capture_of_which_nothing_trains_says_so(tiny_capture) -> None:
+    frames = tuple(replace(frame, split="relight") for frame in tiny_capture.frames)
+    with pytest.raises(InputError, match="split 'train': expected at least one frame, got none"):
+        Training(dataclasses.replace(tiny_capture, frames=frames), TrainConfig())
+
+
 def test_a_light_that_changes_is_not_learned(tiny_capture) -> None:
     lights = itertools.cycle(["noon", "evening"])
     frames = tuple(replace(frame, light=next(lights)) for frame in tiny_capture.frames)

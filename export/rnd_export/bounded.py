@@ -40,7 +40,7 @@ def export_bounded(
         )
     ((kind, value),) = given.items()
     if not value > 0:
-        raise InputError("bound", expected="more than 0", got=value)
+        raise InputError(flag(BOUNDS[kind]), expected="more than 0", got=value)
     rows = (
         []
         if options.json is None

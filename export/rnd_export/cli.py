@@ -90,7 +90,7 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
-    from rnd_runtime.files import existing_file
+    from rnd_runtime.files import existing_file, output_file
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
     from rnd_trainer.notes import say_notes
@@ -108,6 +108,8 @@ def _export(options: Options) -> None:
     out = options.out or file.with_suffix(".onnx")
     check_option(out.resolve() != file.resolve(), "--out", "another file than the checkpoint", out)
     check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
+    for written in filter(None, (out, options.json)):
+        output_file(written)
     checkpoint = load_checkpoint(file)
     if note := checkpoint.note():
         print(f"rnd-export: {note}", file=sys.stderr)  # noqa: T201

@@ -13,7 +13,10 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 Parsed = TypeVar("Parsed")
 # By which queues, systems and terminals that are closed end a program.
@@ -157,14 +160,14 @@ def _ended_as_interrupted() -> Iterator[None]:
 
 
 def parse_options(parse: Callable[[], Parsed]) -> Parsed:
-    """What ``parse``, a call of tyro's, makes of the command line.
+    """What ``parse``, a call of tyro's, makes of the command line, where no path is empty.
 
     Raises:
         InputError: what tyro has against it, a page with a frame around it, in one line.
     """
     page = io.StringIO()
     try:
-        with contextlib.redirect_stderr(page):
+        with contextlib.redirect_stderr(page), _paths():
             options = parse()
     except SystemExit as leaving:
         if not leaving.code:  # --help
@@ -174,6 +177,34 @@ def parse_options(parse: Callable[[], Parsed]) -> Parsed:
     return options
 
 
+def _paths() -> ConstructorRegistry:
+    """By which tyro takes paths as it does by itself, but no empty ones."""
+    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec
+
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+        if info.type is not Path:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="PATH",
+            instance_from_str=_path_of,
+            is_instance=lambda value: isinstance(value, Path),
+            str_from_instance=lambda path: [str(path)],
+        )
+
+    return registry
+
+
+def _path_of(words: list[str]) -> Path:
+    if not words[0]:
+        raise ValueError("no path")  # Path("") is the folder that we are in
+    return Path(words[0])
+
+
+_NO_PATH = re.compile(r"^Error parsing (\S+): .*(no path|''\])$")
 _NOT_A_NUMBER = re.compile(r"^Error parsing (\S+): .*?\b(int|float)\b.*?'(.*)'\]?$", re.IGNORECASE)
 
 
@@ -189,7 +220,10 @@ def _refusal(page: str) -> InputError:
     parts = [part.strip() for part in parts if part.strip()] or [page]
     what = parts[0].split("\n\n")[0].removesuffix(".").replace(" (required)", ";").rstrip(";")
     what = _NOT_A_NUMBER.sub(_no_number, " ".join(what.split()))
+    what = _NO_PATH.sub(r"\1: expected a path, got nothing", what)
     meant = next((part.splitlines()[1].split()[0] for part in parts if part.startswith("Perhaps")), None)
     hint = [f"perhaps {meant.rstrip(',')}"] if meant else []
     hint += [f"see {command}" for command in re.findall(r"[\w-]+(?: \w+)* --help", parts[-1])]
-    return InputError(what[:1].lower() + what[1:], hint="; ".join(hint) or None)
+    if not what[:2].isupper():  # as a metavar is
+        what = what[:1].lower() + what[1:]
+    return InputError(what, hint="; ".join(hint) or None)

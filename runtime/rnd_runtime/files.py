@@ -26,10 +26,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     The temporary keeps the suffix (writers choose a format by it) and starts with a dot. When the block
     raises, the temporary is removed and what stood under ``path`` before stays.
     """
-    path = Path(path)
-    output_folder(path.parent)
-    if path.is_dir():
-        raise InputError("cannot be written: it is a folder", file=path)
+    path = output_file(path)
     begin = path.stem[:_NAMED]
     handle, name = tempfile.mkstemp(prefix=f".{begin}.", suffix=path.suffix, dir=path.parent)
     os.close(handle)
@@ -97,6 +94,35 @@ def output_folder(path: str | Path) -> Path:
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError("output folder cannot be written", file=path)
     return path
+
+
+def output_file(path: str | Path) -> Path:
+    """``path``, its folder made, if a file can be put there; else :class:`InputError`. Ask before what takes long."""
+    path = Path(path)
+    output_folder(path.parent)
+    if path.is_dir():
+        raise InputError("cannot be written: it is a folder", file=path)
+    return path
+
+
+def npz_output(path: Path) -> Path:
+    """``path`` if its name ends in .npz; else :class:`InputError`."""
+    if path.suffix.lower() != ".npz":
+        raise InputError("output", expected="a name that ends in .npz", got=path.name)
+    return path
+
+
+def refuse_input(out: str | Path, *inputs: str | Path | None) -> None:
+    """Raise :class:`InputError` where ``out`` is one of ``inputs``, those that there are: it would be lost."""
+    if any(_is_same(Path(path), Path(out)) for path in inputs if path is not None):
+        raise InputError("output", expected="another file than what is read", got=out)
+
+
+def _is_same(one: Path, other: Path) -> bool:
+    try:
+        return one.samefile(other)
+    except OSError:  # one is not there
+        return one.resolve() == other.resolve()
 
 
 def is_folder(path: str | Path) -> bool:

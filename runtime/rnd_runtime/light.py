@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
+from .files import existing_file
 from .images import read_header, read_image
 
 Floats = NDArray[np.float64]
@@ -140,8 +141,10 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     Raises:
         InputError: unreadable, not 2:1, without channels R, G, B of one layer, or without one valid texel.
     """
-    if Path(path).suffix.lower() not in (".exr", ".hdr"):
-        raise InputError("light probe", expected="an .exr or .hdr file", got=Path(path).suffix, file=path)
+    suffix = existing_file(path, what="light probe").suffix.lower()
+    if suffix not in (".exr", ".hdr"):
+        got = suffix or "no suffix"
+        raise InputError("light probe", expected="an .exr or .hdr file", got=got, file=path)
     if not abs(exposure) <= _MAX_STOPS:
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
     header = read_header(path)
@@ -155,7 +158,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     except InputError as error:
         raise error.at(file=path) from error
     stated, chromaticities = 1.0, header.chromaticities
-    if Path(path).suffix.lower() == ".hdr":
+    if suffix == ".hdr":
         stated, chromaticities = _radiance_header(path)
     radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure) / stated)
     notes = _exposure_notes(stated) + _colour_notes(chromaticities)

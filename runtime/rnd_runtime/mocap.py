@@ -16,6 +16,7 @@ from .rotations import axis_angle_to_matrix
 Floats = NDArray[np.float64]
 
 _ACCLAIM_FPS = 120.0  # CMU's; the format has no place for it
+_MOST = 1e6  # degrees, or lengths in whatever unit: what is larger overflows further on
 _WHOLE_FPS = 2e-4  # share by which 1 / 0.0083333 may miss a whole number: less than 29.97 misses 30
 
 
@@ -80,7 +81,7 @@ def read_bvh(path: str | Path) -> MocapTree:
     """Read a Biovision file: rotations in degrees, multiplied in the order of their channels.
 
     Raises:
-        InputError: when it is not one, is cut short, or holds numbers that are not finite.
+        InputError: when it is not one, is cut short, or holds numbers that are not finite or beyond any use.
     """
     path = existing_file(path, what="motion")
     try:
@@ -95,9 +96,6 @@ def read_bvh(path: str | Path) -> MocapTree:
         raise InputError("BVH file", expected="numbers", got=str(error), file=path) from error
     except InputError as error:
         raise error.at(file=path) from error
-    finite = np.isfinite(values).all(1)
-    if not finite.all():
-        raise InputError("BVH motion", expected="finite numbers", file=path, frame=int(np.argmin(finite)))
     rotations = np.tile(np.eye(3), (frames, len(joints), 1, 1))
     positions = np.tile([joint.offset for joint in joints], (frames, 1, 1))
     positions[:, 0] = 0
@@ -157,6 +155,7 @@ def _bvh_hierarchy(words: Iterator[str]) -> list[_Joint]:
             offset = np.array([float(next(words)) for _ in range(3)])
             if not np.isfinite(offset).all():
                 raise InputError("OFFSET", expected="finite numbers", got=offset.tolist())
+            _check_size("OFFSET", offset.tolist())
             if open_joints[-1] >= 0:  # else of an end site, which is no joint
                 joints[open_joints[-1]].offset = offset
         elif word == "CHANNELS" and open_joints:
@@ -180,11 +179,19 @@ def _bvh_motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats
         raise InputError("BVH motion", expected="Frames: … Frame Time: …", got=" ".join(header))
     frames, seconds = int(header[1]), float(header[4])
     values = np.array([float(word) for word in words])
+    if channels == 0:
+        raise InputError("channels", expected="at least one", got="none")
     if frames < 1 or values.size != frames * channels:
         raise InputError("BVH motion", expected=f"{frames} frames of {channels} numbers", got=values.size)
     if not 1e-4 <= seconds <= 10:
         raise InputError("Frame Time", expected="seconds, 0.0001 to 10", got=seconds)
-    return frames, seconds, values.reshape(frames, channels)
+    values = values.reshape(frames, channels)
+    finite = np.isfinite(values).all(1)
+    if not finite.all():
+        raise InputError("BVH motion", expected="finite numbers", frame=int(np.argmin(finite)))
+    frame = int(np.abs(values).max(1).argmax())
+    _check_size("BVH motion", values[frame].tolist(), frame)
+    return frames, seconds, values
 
 
 # Acclaim
@@ -205,6 +212,8 @@ def read_acclaim(path: str | Path) -> MocapTree:
     except (ValueError, IndexError, KeyError, StopIteration) as error:
         got = f"{type(error).__name__} {error}"
         raise InputError("skeleton", expected="an Acclaim skeleton", got=got, file=skeleton) from error
+    except InputError as error:
+        raise error.at(file=skeleton) from error
     frames = _read_amc(path, bones)
     rotations = np.tile(np.eye(3), (len(frames), len(bones), 1, 1))
     positions = np.zeros((len(frames), 3))
@@ -226,8 +235,10 @@ def read_acclaim(path: str | Path) -> MocapTree:
     for joint in joints:
         if joint.parent >= 0:
             joint.offset = bones[joint.parent].reach
-    note = f"no frame rate in the file: {_ACCLAIM_FPS:g} frames per second assumed, as CMU records"
-    return _tree(joints, rotations, positions, _ACCLAIM_FPS, (note,), path)
+    notes = [f"no frame rate in the file: {_ACCLAIM_FPS:g} frames per second assumed, as CMU records"]
+    if silent := [bone.name for bone in bones if bone.freedoms and bone.name not in frames[0]]:
+        notes.append(f"bones that no frame has stay as the skeleton has them: {', '.join(silent)}")
+    return _tree(joints, rotations, positions, _ACCLAIM_FPS, tuple(notes), path)
 
 
 @dataclass
@@ -308,10 +319,11 @@ def _three(words: Sequence[str]) -> list[float]:
     return _finite(words[:3])
 
 
-def _finite(words: Sequence[str]) -> list[float]:
+def _finite(words: Sequence[str], what: str = "skeleton") -> list[float]:
     numbers = [float(word) for word in words]
     if not np.isfinite(numbers).all():
         raise ValueError(f"not finite: {' '.join(words)}")
+    _check_size(what, numbers)
     return numbers
 
 
@@ -339,21 +351,39 @@ def _read_amc(path: Path, bones: list[_Bone]) -> list[dict[str, list[float]]]:
             )
         bone, number = words[0], len(frames) - 1
         try:
-            values = _finite(words[1:])
+            values = _finite(words[1:], bone)
         except ValueError as error:
             raise InputError(
                 bone, expected="finite numbers", got=str(error), file=path, frame=number
             ) from error
+        except InputError as error:
+            raise error.at(file=path, frame=number) from error
         if counts.get(bone) != len(values):
             expected = f"{counts[bone]} numbers" if bone in counts else "a bone of the skeleton"
             raise InputError(bone, expected=expected, got=len(values), file=path, frame=number)
         frames[-1][bone] = values
     if not frames:
         raise InputError("AMC motion", expected="at least one frame", got="none", file=path)
+    _check_whole(frames, path)
     return frames
 
 
+def _check_whole(frames: list[dict[str, list[float]]], path: Path) -> None:
+    """Refuse a frame without a bone that others have: a file that was cut short."""
+    named = dict.fromkeys(bone for frame in frames for bone in frame)
+    for number, frame in enumerate(frames):
+        if lacking := [bone for bone in named if bone not in frame]:
+            expected = "numbers, as other frames have"
+            raise InputError(lacking[0], expected=expected, got="none", file=path, frame=number)
+
+
 # Both
+
+
+def _check_size(what: str, numbers: Sequence[float], frame: int | None = None) -> None:
+    largest = max(map(abs, numbers), default=0.0)
+    if largest > _MOST:
+        raise InputError(what, expected=f"numbers of at most {_MOST:g}", got=f"{largest:g}", frame=frame)
 
 
 def _about_axis(axis: int, angles: Floats) -> Floats:

@@ -17,7 +17,7 @@ from .files import is_folder
 from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import load_joint_map, match_joints
 from .mocap import asf_beside, read_acclaim, read_bvh
-from .motion_files import SMPL_REST_ROOT, read_motion_file
+from .motion_files import SMPL_REST_ROOT, check_translations, read_motion_file
 from .npz import save_npz
 from .retarget import retarget
 from .rotations import matrix_to_axis_angle
@@ -180,6 +180,12 @@ def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | N
 def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
     tree = _MOCAP_READERS[Path(path).suffix.lower()](path)
     moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
+    first = len(tree.rotations) - len(moved.rotations)
+    finite = np.isfinite(moved.rotations).all((1, 2, 3)) & np.isfinite(moved.translations).all(1)
+    if not finite.all():
+        got = "others after retargeting"
+        raise InputError("motion", expected="finite numbers", got=got, frame=first + int(np.argmin(finite)))
+    check_translations(moved.translations, path, first)
     return Motion(moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes)
 
 

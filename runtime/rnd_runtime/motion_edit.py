@@ -20,6 +20,7 @@ _TRANSLATION_BETA = 5.0
 _SPEED_CUTOFF = 1.0  # Hz, of the speed itself, as in the paper
 _SEAM_SECONDS = 0.5
 _LEAST_LOOP = 4  # frames
+_MOST_FRAMES = 2_000_000  # nine hours at 60 per second: gigabytes
 
 
 EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # least and most; beyond are mistakes
@@ -84,9 +85,17 @@ def sped_up(motion: Motion, speed: float) -> Motion:
 
 
 def resampled(motion: Motion, fps: float) -> Motion:
-    """``motion`` at ``fps`` frames per second; a closed one stays so where a whole number of frames goes round."""
+    """``motion`` at ``fps`` frames per second; a closed one stays so where a whole number of frames goes round.
+
+    Raises:
+        InputError: for more frames than a motion may have.
+    """
     _check("fps", fps, "frames per second")
-    frames = motion.at(np.arange(motion.frames_at(fps)) / fps)
+    count = motion.frames_at(fps)
+    if count > _MOST_FRAMES:
+        got = f"{count} in {motion.duration:.6g} s at {fps:g} per second"
+        raise InputError("frames of the motion", expected=f"at most {_MOST_FRAMES}", got=got)
+    frames = motion.at(np.arange(count) / fps)
     return replace(frames, fps=fps, closed=motion.goes_round_at(fps))
 
 

@@ -113,7 +113,7 @@ def _read(
     else:
         notes.append("no trans in the file: the root stays in place")
         translations = np.zeros((len(rotations), 3))
-    _check_translations(translations, members.path)
+    check_translations(translations, members.path)
     if "betas" in members.names:
         notes.append("the file's betas are ignored: the avatar keeps its own shape")
     fps = _frame_rate(members, notes)
@@ -170,7 +170,7 @@ def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None 
     """What ``count`` joints are called: by the file, else as ``given``, else by the SMPL family's order.
 
     Raises:
-        InputError: nobody names them, or not as many, or not each by a name of its own.
+        InputError: there are none, nobody names them, or not as many, or not each by a name of its own.
     """
     names = archive.strings("joint_names") if "joint_names" in archive.names else given
     if names is None:
@@ -185,6 +185,8 @@ def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None 
             got=f"{count} joints ({3 * count} columns)",
             file=archive.path,
         )
+    if count == 0:
+        raise InputError("joints of the motion", expected="at least one", got="none", file=archive.path)
     if len(set(names)) != count:
         raise InputError("joint_names", expected="each name once", got=", ".join(names), file=archive.path)
     return names
@@ -225,7 +227,8 @@ def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path,
         )
 
 
-def _check_translations(translations: Floats, path: str | Path) -> None:
+def check_translations(translations: Floats, path: str | Path, first: int = 0) -> None:
+    """Raise :class:`InputError` for a root too far away; ``first``: the file's frame of ``translations[0]``."""
     distances = np.abs(translations).max(-1)
     if distances.max() > _MAX_DISTANCE:
         frame = int(np.argmax(distances > _MAX_DISTANCE))
@@ -234,7 +237,7 @@ def _check_translations(translations: Floats, path: str | Path) -> None:
             expected=f"metres, at most {_MAX_DISTANCE:g} from the origin",
             got=f"{distances[frame]:g}",
             file=path,
-            frame=frame,
+            frame=first + frame,
             hint="are these millimetres?",
         )
 

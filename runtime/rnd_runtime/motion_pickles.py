@@ -25,6 +25,8 @@ PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
 _PHONE_FOCAL = 1.2  # of the picture's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
 _MOST_FILLED = 18_000  # frames, ten minutes: more of a person who is away are a mistake in the numbers
+_SCALINGS = (1e-6, 1e6)  # AIST++'s are near 94; 0 and below are no size
+_LEAST_ROW = 1e-6  # length of a rotation's row, or of what the first leaves of the second
 _LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
@@ -83,8 +85,7 @@ def _track(content: Mapping[Any, Any], path: str | Path) -> Track:
     if "smpl_poses" in content:
         arrays: dict[str, Any] = {
             "poses": content["smpl_poses"],
-            "trans": np.asarray(content["smpl_trans"])
-            / np.asarray(content.get("smpl_scaling", 1.0)).reshape(-1)[0],
+            "trans": np.asarray(content["smpl_trans"]) / _scaling(content, path),
             "fps": _AIST_FPS,
         }
         return Track(Members(arrays, path), SMPL_REST_ROOT)
@@ -100,6 +101,14 @@ def _track(content: Mapping[Any, Any], path: str | Path) -> Track:
     return Track(Members({str(name): value for name, value in content.items()}, path), None)
 
 
+def _scaling(content: Mapping[Any, Any], path: str | Path) -> Any:
+    scaling = np.asarray(content.get("smpl_scaling", 1.0)).reshape(-1)[0]
+    low, high = _SCALINGS
+    if not low <= scaling <= high:
+        raise InputError("smpl_scaling", expected=f"{low:g} to {high:g}", got=scaling, file=path)
+    return scaling
+
+
 def _with_fps(arrays: Mapping[str, Any]) -> dict[str, Any]:
     return {"fps": _VIDEO_FPS, **arrays}
 
@@ -109,12 +118,23 @@ def _mdm(content: Mapping[Any, Any], path: str | Path) -> Track:
         poses = np.asarray(content["thetas_ori"], np.float64).transpose(2, 0, 1)
     else:
         rows = np.asarray(content["thetas"], np.float64).transpose(2, 0, 1)
-        x = rows[..., :3] / np.linalg.norm(rows[..., :3], axis=-1, keepdims=True)
-        y = rows[..., 3:] - (x * rows[..., 3:]).sum(-1, keepdims=True) * x
-        y /= np.linalg.norm(y, axis=-1, keepdims=True)
+        x = _unit_rows(rows[..., :3], path)
+        y = _unit_rows(rows[..., 3:] - (x * rows[..., 3:]).sum(-1, keepdims=True) * x, path)
         poses = matrix_to_axis_angle(np.stack([x, y, np.cross(x, y)], -2))
     trans = np.asarray(content["root_translation"], np.float64).T
     return Track(Members({"poses": poses, "trans": trans, "fps": _MDM_FPS}, path), np.zeros(3))
+
+
+def _unit_rows(rows: Floats, path: str | Path) -> Floats:
+    """``rows`` [F, J, 3] of length 1."""
+    lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
+    good = (np.isfinite(lengths) & (lengths > _LEAST_ROW)).all((1, 2))
+    if not good.all():
+        expected, frame = "two rows of a rotation", int(np.argmin(good))
+        got = "zeros, parallel rows or no numbers"
+        raise InputError("thetas", expected=expected, got=got, file=path, frame=frame)
+    unit: Floats = rows / lengths
+    return unit
 
 
 def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:

@@ -51,6 +51,8 @@ def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
     A point is a training of its own, with its own schedule; the mean over seeds, with their range.
     """
     with chart(files, (7.5, 4.2)) as figure:
+        from matplotlib.ticker import LogLocator, NullFormatter  # here, as of an extra
+
         axes = figure.add_subplot()
         for split in dict.fromkeys(row["split"] for row in rows):
             points = []
@@ -66,7 +68,9 @@ def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
         what = f"{first['gaussians']:,} Gaussians".replace(",", " ")
         axes.set_title(f"Held-out PSNR against training time: {what}, {first['machine']}", loc="left")
         axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("minutes of training")
         axes.set_ylabel("dB")
         axes.grid(True, color="#eee", lw=0.6)

@@ -74,9 +74,7 @@ def load_views(
 
     Raises :class:`InputError` when the split is empty or more than a fifth of its masks are unusable.
     """
-    frames = [frame for frame in capture.frames if frame.split == split]
-    if not frames:
-        raise InputError(f"split {split!r}", expected="at least one frame", got="none", file=capture.folder)
+    frames = _frames(capture, split)
     if true_normals:
         check_true_normals(capture, frames)
     views, bad = [], []
@@ -101,6 +99,13 @@ def load_views(
     return views, bad
 
 
+def _frames(capture: Capture, split: str) -> list[Frame]:
+    frames = [frame for frame in capture.frames if frame.split == split]
+    if not frames:
+        raise InputError(f"split {split!r}", expected="at least one frame", got="none", file=capture.folder)
+    return frames
+
+
 def check_true_normals(capture: Capture, frames: Iterable[Frame], what: str = "--normals true") -> None:
     """Raise :class:`InputError` where one of ``frames`` has no exact normals, which ``what`` asks for."""
     for frame in frames:
@@ -121,9 +126,9 @@ def training_light(capture: Capture, what: str = "--light capture") -> tuple[str
 def training_light_name(capture: Capture, what: str) -> str:
     """The name of the one light that all training pictures were taken under, "unknown" where it has none.
 
-    Raises :class:`InputError` where there are several.
+    Raises :class:`InputError` where there are several, or no training pictures.
     """
-    names = {frame.light or "unknown" for frame in capture.split("train")}
+    names = {frame.light or "unknown" for frame in _frames(capture, "train")}
     if len(names) != 1:
         got = ", ".join(sorted(names))
         raise InputError(what, expected="one light in the train split", got=got, file=capture.folder)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
-from rnd_runtime.files import is_folder, write_json
+from rnd_runtime.files import is_folder, output_file, output_folder, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -125,6 +125,7 @@ def evaluate_run(options: EvalOptions) -> None:
     from .perceptual import load_lpips
 
     check_mode(options.shade)
+    check_outputs(options)
     path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
     checkpoint = load_checkpoint(path)
     if note := checkpoint.note():
@@ -157,6 +158,14 @@ def evaluate_run(options: EvalOptions) -> None:
     if "fps" in rows[0]:
         line = f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second"
         console.print(line, markup=False)
+
+
+def check_outputs(options: EvalOptions) -> None:
+    """Raise :class:`InputError` for a file or folder that could not be written once everything is scored."""
+    for file in filter(None, (options.json, options.chart)):
+        output_file(file)
+    if options.pictures is not None:
+        output_folder(options.pictures)
 
 
 def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:

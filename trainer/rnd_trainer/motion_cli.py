@@ -13,9 +13,9 @@ from rich.console import Console
 from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
-from rnd_runtime.errors import InputError, check_option
-from rnd_runtime.files import existing_file
-from rnd_runtime.motion import load_motion
+from rnd_runtime.errors import check_option
+from rnd_runtime.files import existing_file, npz_output, refuse_input
+from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
 from rnd_runtime.motion_files import FPS_LIMITS
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
@@ -53,8 +53,7 @@ def motion(
         joint_map: TOML or JSON file with SMPL's joints and what the source calls them
         edits: what to do to the motion
     """
-    if out.suffix.lower() != ".npz":
-        raise InputError("output", expected="a name that ends in .npz", got=out.name)
+    refuse_input(npz_output(out), *motion_inputs(source), body, joint_map)
     low, high = FPS_LIMITS
     for name, rate in (("--source-fps", source_fps), ("--fps", fps)):
         check_option(rate is None or low <= rate <= high, name, f"{low:g} to {high:g}", rate)

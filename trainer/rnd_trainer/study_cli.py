@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rnd_runtime.errors import check_option
 from rnd_runtime.files import write_json
 
-from .eval_cli import EvalOptions, need_extra, wide_console
+from .eval_cli import EvalOptions, check_outputs, need_extra, wide_console
 
 if TYPE_CHECKING:
     from .ablate import StudyRow
@@ -33,6 +33,7 @@ def run_study(options: EvalOptions) -> None:
     check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
     check_option(options.seeds <= MOST_SEEDS, "--seeds", f"at most {MOST_SEEDS}", options.seeds)
     check_mode(options.shade)
+    check_outputs(options)
     rows = time_encoders(_trained(options, _config(options), variants), options.run, variants, seed=0)
     summary = summarise(rows, variants)
     _show(summary, options.study)

@@ -14,6 +14,8 @@ from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
 
 Floats32 = NDArray[np.float32]
+MOST = float(np.finfo(np.float32).max)
+"""radiance that a picture can hold"""
 STRIP = 8  # rows sampled at once, so that they stay in the cache: 67 ms instead of 103 at 512²
 
 
@@ -42,7 +44,7 @@ class Background:
             red, green, blue = (float(channel) for channel in text.split(","))
         except ValueError:
             red = green = blue = np.nan
-        if not (np.isfinite([red, green, blue]).all() and min(red, green, blue) >= 0):
+        if not all(0 <= channel <= MOST for channel in (red, green, blue)):  # false for NaN
             raise InputError("--background", expected="none, hdr, #rrggbb or r,g,b", got=text)
         return cls("colour", (red, green, blue))
 

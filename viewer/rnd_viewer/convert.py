@@ -13,10 +13,10 @@ from rnd_runtime.amass import write_amass
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError, check_option, refuse_outside
-from rnd_runtime.files import existing_file, output_folder
+from rnd_runtime.files import existing_file, output_folder, refuse_input
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, light_notes
-from rnd_runtime.motion import Motion
+from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import Skeleton
 
@@ -162,6 +162,7 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
 def _motion(options: AmassOptions) -> Iterator[str]:
     check_option(options.out.suffix.lower() == ".npz", "--out", "a name in .npz", options.out)
     file = existing_file(options.skeleton, what="avatar or body")
+    refuse_input(options.out, file, *motion_inputs(options.motion), options.joint_map)
     skeleton = Body.load(file).skeleton if file.suffix.lower() == ".npz" else Avatar.load(file).skeleton
     motion = options.read_motion(options.motion, skeleton)
     yield from _notes(motion.notes)

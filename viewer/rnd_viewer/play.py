@@ -40,7 +40,7 @@ from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
 from .report import FRAME, LATENCY, print_summary, warn, with_progress
-from .run_folder import claim, part_name
+from .run_folder import claim, is_of_a_run, part_name
 from .timing import StageTimes
 from .writers import frame_writer, parse_formats, tone_map_for, write_report
 
@@ -66,8 +66,7 @@ def play(options: PlayOptions) -> int:
         warn(note)
     seconds = played.render()
     for note in played.afterthoughts():
-        played.notes.append(note)
-        warn(note)
+        played.note(note)
     played.report(seconds)
     return 0
 
@@ -89,7 +88,6 @@ class _Run:
         notes: what the inputs' readers found, and what the run itself has to say.
         qualities: of every frame that was drawn, in turn.
         in_view: whether anything of the avatar was seen yet.
-        removed: files that another run had left in the folder.
     """
 
     options: PlayOptions
@@ -107,7 +105,6 @@ class _Run:
     governor: Governor | None
     qualities: list[Quality] = field(default_factory=list)
     in_view: bool = False
-    removed: int = 0
 
     @classmethod
     def of(cls, options: PlayOptions) -> _Run:
@@ -126,6 +123,9 @@ class _Run:
             )
             shader = Shader(light, mode=options.shade)
             rasterizer = make_rasterizer(options.raster)
+        for path in _inputs(options):
+            if is_of_a_run(path, out):
+                raise InputError("cannot be an input: runs write such files into --out", file=path)
         fps = options.fps or motion.fps
         count = motion.frames_at(fps)
         frames = parse_frames(options.frames, count)
@@ -157,13 +157,13 @@ class _Run:
     def render(self) -> float:
         """Leave every frame in the folder; how many seconds it took."""
         times, overlap = self.player.times, self.options.pipeline
-        clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=times)
+        clips = frame_writer(
+            self.out, self.formats, name=self.name, fps=self.fps, times=times, begin=self._begin
+        )
         with self.rasterizer, clips as write:
             started = before = perf_counter()
 
             def put(number: int, drawn: tuple[Frame, Camera]) -> None:
-                if number == self.frames.start:  # not before: what fails at once leaves the folder as it was
-                    self.removed = claim(self.out, _common(self.options), _inputs(self.options))
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
             for _ in with_progress(
@@ -173,6 +173,18 @@ class _Run:
                 times.add(FRAME, now - before)
                 before = now
         return perf_counter() - started
+
+    def _begin(self, number: int) -> None:
+        if number != self.frames.start:
+            return
+        # not before: what fails at once leaves the folder as it was
+        if removed := claim(self.out, _common(self.options), _inputs(self.options)):
+            self.note(f"{removed} files that another run had left in {self.out} were removed")
+
+    def note(self, note: str) -> None:
+        """Say ``note``, here and in the report."""
+        self.notes.append(note)
+        warn(note)
 
     def _encode(self, number: int) -> _Turn:
         asked = perf_counter()
@@ -202,8 +214,6 @@ class _Run:
 
     def afterthoughts(self) -> Iterator[str]:
         """What can be said of the frames only once they are there."""
-        if self.removed:
-            yield f"{self.removed} files that another run had left in {self.out} were removed"
         if lowered := sum(quality != FULL for quality in self.qualities):
             share = f"{lowered} of {len(self.frames)} frames"
             yield f"{share} at less than full quality, for {self.options.fps_floor:g} frames/s"

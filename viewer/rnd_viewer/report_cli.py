@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from rnd_runtime.errors import InputError, check_option, flag, parse_options, run_command
-from rnd_runtime.files import is_folder
+from rnd_runtime.files import is_folder, output_file
 
 from .options import LitOptions
 
@@ -45,15 +45,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError("--pictures", expected="0 or more", got=options.pictures)
         if options.motion is None:
             options.refuse_unread("needs --motion: the rest pose does not move")
-        if not (options.run / "avatar.onnx").is_file():
-            for name in ("motion", "hdr"):  # played and lit by the avatar alone
-                check_option(not getattr(options, name), flag(name), "an avatar.onnx in RUN", "none")
         if options.bench is not None and not is_folder(options.bench):
             raise InputError("folder of --bench not found", file=options.bench)
         from .report import say
-        from .run_report import write_run_report
+        from .run_files import read_config
+        from .run_report import why_no_avatar, write_run_report
 
         out = options.out or options.run / "report.html"
+        check_option(out.suffix.lower() == ".html", "--out", "a name in .html", out)
+        if why_not := why_no_avatar(options.run, read_config(options.run)):
+            for name in ("motion", "hdr"):  # played and lit by the avatar alone
+                if getattr(options, name):
+                    raise InputError(flag(name), expected="an avatar that can be shown", hint=why_not)
+        output_file(out)
         motion = None if options.motion is None else partial(options.read_motion, options.motion)
         notes = write_run_report(
             options.run,

@@ -2,7 +2,7 @@
 
 A run is known by its settings and inputs. The process that finds no mark of its run in the folder leaves one and takes
 away what other runs left, but nothing that is younger than the mark: that is of processes that render other parts of
-the same run. Where no other run left a mark, pictures are the user's own.
+the same run. What is older than every other run's mark is the user's own.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ _FRAME = re.compile(
 )  # a picture as writers.py names it, and nothing that a user put there
 _PICTURES = ("frames/*", "frames_exr/*", "aov/*/*")  # and nothing deeper, see writers.py
 _WHOLE = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp)")  # beside them, see part_name
+_OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/{_FRAME.pattern}|{_WHOLE.pattern}")
 
 
 def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> int:
@@ -37,17 +38,25 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) 
     if not others:
         return 0
     try:
-        oldest = mark.stat().st_mtime_ns
+        began = mark.stat().st_mtime_ns
+        oldest = min(other.stat().st_mtime_ns for other in others)
     except FileNotFoundError:  # another run has claimed the folder since
         return 0
     frames = (file for place in _PICTURES for file in folder.glob(place) if _FRAME.fullmatch(file.name))
     whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
-    left = [file for file in [*frames, *whole] if file.is_file() and file.stat().st_mtime_ns < oldest]
+    files = (file for file in [*frames, *whole] if file.is_file())
+    left = [file for file in files if oldest <= file.stat().st_mtime_ns < began]
     for file in left:
         file.unlink(missing_ok=True)
     for other in others:
         other.unlink(missing_ok=True)
     return len(left)
+
+
+def is_of_a_run(file: Path, folder: Path) -> bool:
+    """Whether ``file`` lies in ``folder`` under a name that runs write there, and take away."""
+    file, folder = file.resolve(), folder.resolve()
+    return file.is_relative_to(folder) and bool(_OF_A_RUN.fullmatch(file.relative_to(folder).as_posix()))
 
 
 def part_name(stem: str, frames: range, count: int) -> str:

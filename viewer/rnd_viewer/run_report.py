@@ -77,7 +77,7 @@ def write_run_report(
     # before the avatar is filmed: what is damaged is found at once
     read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run))]
     read += [_bench(bench), _configuration(config)]
-    if why_not := _why_no_avatar(run, config):
+    if why_not := why_no_avatar(run, config):
         avatar, notes = _missing("The avatar", why_not), [why_not]
     else:
         shots = Shots(run / "avatar.onnx", motion)
@@ -96,7 +96,7 @@ def _facts(rows: Sequence[dict[str, Any]]) -> str:
     return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
 
 
-def _why_no_avatar(run: Path, config: dict[str, Any]) -> str:
+def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
     """Why the avatar is not shown; empty where it is."""
     avatar, checkpoint = run / "avatar.onnx", run / "avatar.ckpt"
     if not avatar.is_file():

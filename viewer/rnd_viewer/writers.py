@@ -61,13 +61,20 @@ def _pixels(name: str, frame: Frame) -> NDArray[np.uint8]:
 
 @contextmanager
 def frame_writer(
-    folder: Path, formats: tuple[str, ...], *, name: str = "play", fps: float, times: StageTimes
+    folder: Path,
+    formats: tuple[str, ...],
+    *,
+    name: str = "play",
+    fps: float,
+    times: StageTimes,
+    begin: Callable[[int], None] = lambda number: None,
 ) -> Iterator[FrameWriter]:
     """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
 
     ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
     one, and into pictures of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
-    at the end.
+    at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse, and before any
+    file of it is written.
     """
     output_folder(folder)
     with ExitStack() as clips:
@@ -81,6 +88,9 @@ def frame_writer(
             files: dict[Path, NDArray[np.uint8]] = {}
             number_name = f"{number:06d}"
             with times.stage("write"):
+                for kind, add in append.items():
+                    add(_pixels(kind, frame))
+                begin(number)
                 if "png" in formats:
                     files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
                 if "png" in formats or "exr" not in formats:
@@ -91,8 +101,6 @@ def frame_writer(
                     write_image(path, pixels)
                 if "exr" in formats:
                     _write_exr(folder / f"frames_exr/{number_name}.exr", frame)
-                for kind, add in append.items():
-                    add(_pixels(kind, frame))
 
         yield write
 

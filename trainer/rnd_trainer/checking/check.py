@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.capture import Capture, Frame, FrameImages, load_capture
 from rnd_runtime.capture_format import decode_normals, read_unit_range
+from rnd_runtime.errors import InputError
 from rnd_trainer.data import usable
 from rnd_trainer.silhouette import overlap
 
@@ -92,8 +93,8 @@ def check_capture(
 ) -> Report:
     """Check a capture against itself.
 
-    Files, sizes, channels and indices are checked by reading it; then units, cameras, masks, backgrounds, the
-    template's silhouette against every mask, normal axes, timing, frame rate and lens distortion.
+    Files, sizes, channels and indices are checked by reading it; then what trains, lights, units, cameras, masks,
+    backgrounds, the template's silhouette against every mask, normal axes, timing, frame rate and lens distortion.
 
     Args:
         on_frame: called with (frames done, frames in all).
@@ -103,6 +104,7 @@ def check_capture(
     """
     capture = load_capture(path)
     findings = [Finding("ok", "files", f"{len(capture.frames)} pictures of {len(capture.cameras)} cameras")]
+    findings += [*_training(capture), *_lights(capture)]
     findings += [*_units(capture), *_cameras(capture), *_speed(capture)]
     sights, overlaps, normal_pixels, bad_masks, bright = [], [], [], [], []
     for done, frame in enumerate(capture.frames):
@@ -131,6 +133,28 @@ def check_capture(
 
 def _frame_overlap(frame: Frame, iou: float) -> FrameOverlap:
     return FrameOverlap(frame.image, frame.camera, frame.frame, frame.split, iou)
+
+
+def _training(capture: Capture) -> list[Finding]:
+    frames = capture.split("train")
+    if not frames:
+        sentence = f'no picture trains: none of {len(capture.frames)} is of the split "train"'
+        return [Finding("wrong", "training", sentence)]
+    names = sorted({frame.light or "unknown" for frame in frames})
+    if len(names) > 1:
+        sentence = f"the training pictures have {len(names)} lights ({', '.join(names)}); one can be learned"
+        return [Finding("wrong", "training", sentence)]
+    return []
+
+
+def _lights(capture: Capture) -> list[Finding]:
+    findings = []
+    for name in capture.lights:
+        try:
+            capture.load_light(name)
+        except InputError as error:
+            findings.append(Finding("wrong", "lights", f"{name}: {error}"))
+    return findings
 
 
 def _units(capture: Capture) -> list[Finding]:

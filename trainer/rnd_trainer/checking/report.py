@@ -30,14 +30,20 @@ def check_and_report(capture: Path, out: Path) -> int:
         report = check_capture(
             capture, on_frame=lambda done, total: progress.update(task, completed=done, total=total)
         )
-    save_report(report, out)
+    try:
+        save_report(report, out)
+    finally:  # shown where they cannot be saved, and saved where nobody reads them
+        _show(report)
+    Console().print(f"      overlay: {escape(str(out / 'check.png'))}", soft_wrap=True)
+    return 1 if report.wrong else 0
+
+
+def _show(report: Report) -> None:
     console = Console()
     for finding in report.findings:
         console.print(
             f"{_MARKS[finding.level]:>5} {finding.subject}: {escape(finding.sentence)}", soft_wrap=True
         )
-    console.print(f"      overlay: {escape(str(out / 'check.png'))}", soft_wrap=True)
-    return 1 if report.wrong else 0
 
 
 def save_report(report: Report, out: Path) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import npz_output, refuse_input
 from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
 from rnd_runtime.npz import Npz
 from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
@@ -116,6 +117,7 @@ def convert_body_model(
     model: str | Path, out: str | Path, betas: tuple[float, ...] = (), license: str | None = None
 ) -> str:
     """Write the body of ``model`` for ``betas`` to ``out`` as ``body.npz``; say in a line what it is."""
+    refuse_input(npz_output(Path(out)), model)
     loaded = load_body_model(model)
     if betas and loaded.joint_regressor is None:
         given = " ".join(f"{beta:g}" for beta in betas)

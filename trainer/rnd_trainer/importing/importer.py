@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.errors import InputError, check_option, flag, refuse_changed
+from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.motion_files import FPS_LIMITS
 
 from . import (
     arah,
@@ -58,6 +59,8 @@ def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
     """
     if not source.exists():
         raise InputError("source not found", file=source)
+    if (source / "capture.json").is_file():
+        raise InputError("a capture already", file=source, hint="rnd-train takes it as it is")
     if name in LAYOUTS:
         found = _detect(name, source)
         if found is None and name == "easymocap":  # then it says how the poses' root is meant
@@ -167,8 +170,7 @@ def _check_numbers(options: ImportOptions) -> None:
         len(options.distortion) in _COEFFICIENTS and all(map(math.isfinite, options.distortion)),
         "--distortion", "k1 k2 p1 p2 [k3 …], as OpenCV has them", " ".join(map(str, options.distortion)),
     )  # fmt: skip
-    if options.fps is not None:
-        check_option(0 < options.fps < math.inf, "--fps", "more than 0", options.fps)
+    refuse_outside(options, {"fps": FPS_LIMITS})
 
 
 def _refuse_unused(layout: str, options: ImportOptions) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +155,14 @@ def fitting(pixels: NDArray[Any], camera: Camera, what: str) -> NDArray[Any]:
         expected = f"{camera.width} x {camera.height} as the camera"
         raise InputError(f"size of {what}", expected=expected, got=f"{width} x {height}")
     return pixels
+
+
+def fitting_file(read: Callable[[Path], NDArray[Any]], file: Path, camera: Camera, what: str) -> NDArray[Any]:
+    """What ``read`` makes of ``file``, if it is of the camera's size."""
+    try:
+        return fitting(read(file), camera, what)
+    except InputError as error:
+        raise error.at(file=file) from error
 
 
 def undistorted(

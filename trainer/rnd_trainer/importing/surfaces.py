@@ -19,7 +19,7 @@ from rnd_trainer.silhouette import DrawnMesh, draw
 from .masks import make_masks
 from .networks import ImageNetwork
 from .normals import Normals, find_axes, normal_map, normal_network, read_normals, smoothed, to_opencv
-from .pictures import Bytes, last_number, listed, read_mask
+from .pictures import Bytes, fitting_file, last_number, listed, read_mask
 from .recording import Recording, Shot
 from .write import Scene
 
@@ -39,11 +39,13 @@ def attached(recording: Recording, masks: Path | None, normals: Path | None) -> 
         return file
 
     def replaced(shot: Shot) -> Shot:
+        camera = recording.lenses[shot.camera].camera
         if masks is not None:
-            shot = replace(shot, mask=partial(read_mask, file_of(masks, shot, (".png", ".npy", ".jpg"))))
+            file = file_of(masks, shot, (".png", ".npy", ".jpg"))
+            shot = replace(shot, mask=partial(fitting_file, read_mask, file, camera, "mask"))
         if normals is not None:
             file = file_of(normals, shot, (".npy", ".png", ".exr"))
-            shot = replace(shot, normals=partial(read_normals, file))
+            shot = replace(shot, normals=partial(fitting_file, read_normals, file, camera, "normals"))
         return shot
 
     shots = [replaced(shot) for shot in recording.shots]

@@ -34,11 +34,14 @@ _SMALL = (
 
 
 def detect(source: Path) -> str | None:
-    """A video file, or a folder that holds nothing but pictures."""
+    """A video file, or a folder of pictures that holds no folders."""
     if source.is_file() and source.suffix.lower() in SUFFIXES:
         return "a video"
-    if source.is_dir() and any(p.suffix.lower() in PICTURES for p in source.iterdir() if p.is_file()):
-        return "a folder of frames"
+    if source.is_dir():
+        inside = [path for path in source.iterdir() if not path.name.startswith(".")]
+        pictures = any(path.suffix.lower() in PICTURES for path in inside)
+        if pictures and all(path.is_file() for path in inside):
+            return "a folder of frames"
     return None
 
 

@@ -13,10 +13,10 @@ import tyro
 from numpy.typing import NDArray
 
 from rnd_runtime.errors import InputError, parse_options, run_command
-from rnd_runtime.files import output_folder, write_json
+from rnd_runtime.files import output_file, output_folder, write_json
 from rnd_runtime.images import to_bytes, write_image
 
-from .plan import BenchmarkOptions, Recipe
+from .plan import BenchmarkOptions, Recipe, check_step
 from .variants import Variant, need_extra, use_variant
 
 _DESCRIPTION = """Film a coded person on a light stage: many views, many lights, the truth beside every picture.
@@ -161,10 +161,11 @@ def _agreement(options: Agreement) -> None:
         raise InputError(
             "--size, --samples", expected="at least 16, 2", got=f"{options.size}, {options.samples}"
         )
+    check_step(options.step)
     if options.picture is not None and options.picture.suffix.lower() != ".png":
         raise InputError("--picture", expected="a .png", got=options.picture.name)
     for file in filter(None, (options.json, options.picture)):
-        output_folder(file.parent)
+        output_file(file)
     variant = use_variant(options.variant)
     from rich.console import Console
     from rich.table import Table
@@ -230,6 +231,8 @@ def _benchmark(options: Benchmark) -> None:
 
     perceptual = load_lpips(options.perceptual_weights)
     output_folder(options.out)
+    if options.json is not None:
+        output_file(options.json)
     with Progress(console=Console(stderr=True), speed_estimate_period=600) as progress:
         filming = progress.add_task("filming", total=None)
         film_subjects(

@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from rnd_runtime.capture_format import TRAIN_SHARE, Frame, Split
-from rnd_runtime.errors import InputError, flag
+from rnd_runtime.errors import InputError, flag, refuse_changed
 
 from .lights import WHITE
 
 TRAIN_CAMERA = "cam00"
+
+
+def check_step(step: float | None) -> None:
+    """Refuse metres between vertices of which no person is made."""
+    if step is not None and not 1e-3 <= step <= 0.03:
+        raise InputError("--step", expected="0.001 to 0.03 m", got=step)
 
 
 @dataclass(frozen=True)
@@ -61,8 +67,9 @@ class Recipe:
         ):  # fmt: skip
             if getattr(self, name) < least:
                 raise InputError(flag(name), expected=f"at least {least}", got=getattr(self, name))
-        if self.step is not None and not 1e-3 <= self.step <= 0.03:
-            raise InputError("--step", expected="0.001 to 0.03 m", got=self.step)
+        if self.character is not None:
+            refuse_changed(self, ["subject", "step"], "--character has its own")
+        check_step(self.step)
         if not 0 <= self.estimate_strength <= 10:
             raise InputError("--estimate-strength", expected="0 to 10", got=self.estimate_strength)
 
