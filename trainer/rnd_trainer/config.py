@@ -75,8 +75,8 @@ class TrainConfig:
     rate_networks: float = 2e-3
     """Adam's step for the networks; decays to a tenth"""
     rate_residuals: float = 3e-2
-    """Adam's step for the per-Gaussian residuals; decays to a tenth. Half of it leaves LPIPS higher, twice as much loses
-    0.2 dB (docs/tried.md)"""
+    """Adam's step for the per-Gaussian residuals; decays to a tenth. Half of it leaves LPIPS higher, twice as much
+    loses 0.2 dB (docs/tried.md)"""
     rate_light: float = 1e-2
     """Adam's step for the logarithms of the probe's texels"""
 
