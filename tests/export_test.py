@@ -270,7 +270,7 @@ def test_a_file_that_poses_otherwise_is_refused(what, tiny_checkpoint, tmp_path,
         (Variant(nodes=100), "--nodes: expected --encoder coarse, got --encoder full"),
         (
             Variant("static", window_poses=3),
-            "--window-poses: expected dynamic skinning, got --encoder static",
+            "--window-poses: expected dynamic skinning, got the template's weights",
         ),
         (Variant(window_poses=6), "--window-poses: expected 2 to 5, got 6"),
         (Variant(visibility_degree=4), "--visibility-degree: expected 0 to 3, got 4"),
