@@ -80,9 +80,10 @@ class Variant:
                 raise InputError(option, expected=f"{low} to {most[name]}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
-        if self.skinning_nodes is not None and (self.encoder == "static" or not config.dynamic_skinning):
+        static = self.encoder == "static" or not config.dynamic_skinning
+        if self.skinning_nodes is not None and static:
             raise InputError("--skinning-nodes", expected="dynamic skinning", got="the template's weights")
-        if self.window_poses is not None and (self.encoder == "static" or not config.dynamic_skinning):
+        if self.window_poses is not None and static:
             got = "the template's weights, which have no window"
             raise InputError("--window-poses", expected="dynamic skinning", got=got)
 

@@ -223,8 +223,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
         smooth = [float("nan")]
 
         def on_step(step: Any) -> None:
-            if training.light_found is False:
-                training.light_found = None
+            if step.index + 1 == max(training.stage1_steps, 1) and training.light_found is False:
                 progress.console.print(
                     "no sky and sun could be told from these pictures (too little is seen of the person, or always "
                     "from one side): the light is learned from white, which costs several dB"

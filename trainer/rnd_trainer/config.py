@@ -159,8 +159,7 @@ def preset(name: str) -> TrainConfig:
     if name == "full":
         return dataclasses.replace(standard, steps=5 * standard.steps)
     if name == "quick":
-        small = dataclasses.replace(standard.model, gaussians=12_000, nodes=1_500)
-        return dataclasses.replace(standard, model=small, steps=2_000, preview_every=250, save_every=250)
+        return dataclasses.replace(resized(standard, 12_000, 2_000), preview_every=250, save_every=250)
     raise InputError("preset", expected="quick, standard or full", got=name)
 
 

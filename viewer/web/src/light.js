@@ -20,7 +20,7 @@ export function readLight(bytes, name) {
   return repair({ ...image, name });
 }
 
-/** What the user should know of a light, one sentence each (rnd_viewer/lights.py). */
+/** What the user should know of a light, one sentence each (rnd_runtime/light.py). */
 export function lightNotes({ radiance, repaired, chromaticities, exposure = 1 }) {
   const notes = [];
   if (exposure !== 1) notes.push(`the light's pixels are divided by the exposure that its file states, ${short(exposure, 4)}`);
