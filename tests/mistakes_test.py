@@ -77,7 +77,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ),
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected 2 to 1000, got 1"),
-        (f"rnd-export {BODY} --out {BODY}", "--out: expected another file than the checkpoint, got"),
+        (f"rnd-export {BODY} --out {BODY}", "output: expected another file than what is read, got"),
         (f"rnd-export {BODY} --out a.json", "--out: expected a name in .onnx, got a.json"),
         ("rnd-export .", "avatar.ckpt: checkpoint not found"),
         (f"rnd-export {AVATAR}", "not a checkpoint: expected an avatar.ckpt of rnd-train, got .onnx"),

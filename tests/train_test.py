@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from safetensors.torch import save_file
 
 import rnd_trainer.cli
+from perceptual_test import write_alexnet
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
@@ -27,7 +28,7 @@ from rnd_trainer.eval_cli import EvalOptions, evaluate_run
 from rnd_trainer.light import LightProbe
 from rnd_trainer.losses import linear_to_srgb
 from rnd_trainer.objective import Objective
-from rnd_trainer.perceptual import load_features
+from rnd_trainer.perceptual import load_features, load_lpips
 from rnd_trainer.perceptual_nets import BACKBONES
 from rnd_trainer.train import MAX_BAD_STEPS, Training
 from rnd_trainer.training_run import run
@@ -245,6 +246,24 @@ def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config
     Training(tiny_capture, config, consistency=blocks).resume(tmp_path / "training.state")
     with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
         Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
+
+
+def test_a_training_with_lpips_and_its_features_is_resumed(tiny_capture, tiny_config, tmp_path) -> None:
+    """One network in both roles, as --perceptual-weights gives it."""
+    write_alexnet(tmp_path / "alexnet.safetensors")
+    network = load_lpips(tmp_path / "alexnet.safetensors")
+    Training(tiny_capture, tiny_config, network).save(tmp_path)
+    Training(tiny_capture, tiny_config, network).resume(tmp_path / "training.state")
+    for other in ({}, {"perceptual": network, "consistency": load_features(_half_of(tmp_path))}):
+        with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
+            Training(tiny_capture, tiny_config, **other).resume(tmp_path / "training.state")
+
+
+def _half_of(folder: Path) -> Path:
+    """Another network's first blocks."""
+    tensors = {name: torch.randn(shape) / 30 for name, shape in BACKBONES[-1].shapes(2).items()}
+    save_file(tensors, folder / "blocks.safetensors")
+    return folder / "blocks.safetensors"
 
 
 @pytest.mark.parametrize(

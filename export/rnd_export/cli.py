@@ -90,7 +90,7 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
-    from rnd_runtime.files import existing_file, output_file
+    from rnd_runtime.files import existing_file, output_file, refuse_input
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
     from rnd_trainer.notes import say_notes
@@ -106,7 +106,8 @@ def _export(options: Options) -> None:
     if options.out is None and file.suffix == ".onnx":
         raise InputError("not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=file)
     out = options.out or file.with_suffix(".onnx")
-    check_option(out.resolve() != file.resolve(), "--out", "another file than the checkpoint", out)
+    for written in filter(None, (out, options.json)):
+        refuse_input(written, file, options.motion, options.hdr)
     check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
     for written in filter(None, (out, options.json)):
         output_file(written)

@@ -25,7 +25,8 @@ from rnd_runtime import __version__
 from rnd_runtime.body import Body
 from rnd_runtime.errors import InputError
 
-NODES_PER_GAUSSIAN = 0.25
+from .config import TrainConfig, resized
+
 SEED = 7
 # out layers of the networks, as multiples of their usual start: set by eye on trained ones
 LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
@@ -113,21 +114,19 @@ def sources(package: str) -> list[Path]:
 
 def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
     """avatar.ckpt of the seeded avatar with ``count`` Gaussians on the body of ``body_file``, made once."""
-    out = folder / f"seeded_{count}_{content_key(body_file)}.ckpt"
+    config = resized(TrainConfig(), count, None)
+    out = folder / f"seeded_{count}_{content_key(body_file, repr(config.model))}.ckpt"
     if out.exists():
         return out
     import torch
 
     from .checkpoint import save_checkpoint
-    from .config import ModelConfig, TrainConfig
     from .model import AvatarModel
     from .template import sample_template
 
     body = Body.load(body_file)
-    nodes = max(16, int(NODES_PER_GAUSSIAN * count))
-    config = TrainConfig(model=ModelConfig(gaussians=count, nodes=nodes))
     torch.manual_seed(SEED)
-    model = AvatarModel(config.model, sample_template(body, count, nodes, seed=SEED))
+    model = AvatarModel(config.model, sample_template(body, count, config.model.nodes, seed=SEED))
     with torch.no_grad():
         _speak(model)
         appearance = model.appearance_residual

@@ -24,6 +24,7 @@ from .bench_clock import times
 from .bench_grid import Inputs, Setting, measured
 from .bench_raster import Row
 from .checkpoint import load_checkpoint
+from .config import NODE_SHARE
 from .model import AvatarModel
 
 SECONDS = 3.0  # of frames at each amount
@@ -133,7 +134,7 @@ def encoder_operations(model: AvatarModel) -> float:
 def _joints(amounts: Amounts, threads: int, rates: Rates) -> Row:
     """Posing of the usual number of Gaussians by skeletons of several sizes."""
     n = amounts.gaussians[-2]
-    nodes, before = n // 4, numba.get_num_threads()
+    nodes, before = n // NODE_SHARE, numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
         taken = []

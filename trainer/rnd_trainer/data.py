@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rnd_runtime.camera import Camera
-from rnd_runtime.capture import Capture, Frame
+from rnd_runtime.capture import Capture, Frame, Split
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
@@ -66,7 +66,7 @@ class TrainingView:
 
 
 def load_views(
-    capture: Capture, split: str, scale: float = 1.0, true_normals: bool = False
+    capture: Capture, split: Split, scale: float = 1.0, true_normals: bool = False
 ) -> tuple[list[TrainingView], list[int]]:
     """The usable views of a split, and the motion frames whose masks were empty or full.
 
@@ -99,8 +99,8 @@ def load_views(
     return views, bad
 
 
-def _frames(capture: Capture, split: str) -> list[Frame]:
-    frames = [frame for frame in capture.frames if frame.split == split]
+def _frames(capture: Capture, split: Split) -> list[Frame]:
+    frames = capture.split(split)
     if not frames:
         raise InputError(f"split {split!r}", expected="at least one frame", got="none", file=capture.folder)
     return frames

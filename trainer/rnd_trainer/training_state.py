@@ -73,7 +73,7 @@ class TrainingState:
 
 
 def _in_words(networks: dict[str, str | None]) -> str:
-    return ", ".join(f"{digest} for {role}" for role, digest in networks.items() if digest) or "none"
+    return ", ".join(f"{digest} for {role}" for role, digest in sorted(networks.items()) if digest) or "none"
 
 
 def read_state(path: Path) -> TrainingState:
