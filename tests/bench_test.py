@@ -487,7 +487,7 @@ def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
         "--encoder", "coarse", "--precision", "f16", "--window-poses", "5",
     ]  # fmt: skip
     rates = Encoders("rates").words(seeded_checkpoint(800, ASSETS / "body.npz", tmp_path))
-    assert rates[4:] == ["--skinning-nodes", "50", "--offset-nodes", "25"] and rates[1] == "full"
+    assert rates[4:] == ["--skinning-nodes", "25", "--offset-nodes", "12"] and rates[1] == "full"
 
 
 def test_peers_say_the_same(tiny_checkpoint, tiny_avatar, monkeypatch) -> None:

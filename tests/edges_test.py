@@ -13,7 +13,8 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig, TrainConfig
 from rnd_trainer.data import pose_input
-from rnd_trainer.edges import BETWEEN_BONES, LEAST_LENGTH, TURNED_JOINTS, WIDEST_TURN, EdgeLengths, drawn_pose
+from rnd_trainer.drawn_poses import TURNED_JOINTS, WIDEST_SHAKE, WIDEST_TURN, drawn_pose, shaken_pose
+from rnd_trainer.edges import BETWEEN_BONES, LEAST_LENGTH, EdgeLengths
 from rnd_trainer.losses import ALLOWED_STRETCH, stretch_penalty
 from rnd_trainer.model import AvatarModel, PoseInput
 from rnd_trainer.stability.subject import EXTREMES
@@ -58,6 +59,27 @@ def test_a_drawn_pose_turns_a_few_joints_within_bounds_and_comes_there_from_less
         assert pose.velocity[~turned].abs().max() < 1e-4
         assert pose.velocity.norm(dim=-1).max() < WIDEST_TURN / CONFIG.window_seconds
         assert torch.allclose(pose.bones[0, :, :3], torch.eye(3), atol=1e-6)  # the root stays
+
+
+def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
+    skeleton = body().skeleton
+    rng = np.random.default_rng(3)
+    angles = np.cumsum(0.03 * rng.standard_normal((40, len(skeleton), 3)), axis=0)
+    motion = Motion(axis_angle_to_matrix(angles), rng.standard_normal((40, 3)), 30.0, skeleton.names)
+    filmed = pose_input(motion, skeleton, 0.9, CONFIG)
+    for seed in range(8):
+        shaken = shaken_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
+        assert torch.allclose(
+            shaken.bones[0], filmed.bones[0], atol=1e-5
+        )  # where the person stands and looks
+        ours, theirs = (pose.velocity.norm(dim=-1) for pose in (shaken, filmed))
+        assert torch.allclose(ours, theirs, atol=1e-3)  # a window turned as a whole
+        moved = shaken.bones[1:, :, :3] - filmed.bones[1:, :, :3]
+        assert float(moved.abs().max()) > 0
+        own = (shaken.window - filmed.window).abs().amax(-1)
+        assert float(own.mean()) < 2 * WIDEST_SHAKE
+    twice = [shaken_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(1)).window for _ in range(2)]
+    assert torch.equal(*twice)
 
 
 def test_stretch_is_the_templates_before_anything_is_learned(model, template) -> None:

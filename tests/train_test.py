@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from safetensors.torch import save_file
 
 import rnd_trainer.cli
+import rnd_trainer.train
 from perceptual_test import write_alexnet
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
@@ -445,6 +446,7 @@ def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, m
         for raw in training.refinement.raw:
             raw += 0.3
     training.step_index, given = tiny_config.steps, []
+    monkeypatch.setattr(rnd_trainer.train, "SHAKEN_SHARE", 0)
     monkeypatch.setattr(training, "_unseen", lambda: lambda model, pose, step: given.append(pose) or {})
     training._unseen_terms(training.views[0], training.poses[0])
     expected = training.refinement.bones(training.views[0].frame.frame)

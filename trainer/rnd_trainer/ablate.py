@@ -88,7 +88,13 @@ VARIANTS = (
         "static skinning", "the template's weights, no L_gc", "ours", {"dynamic_skinning": False}, _NO_GC
     ),
     StudyRow("+ D_W", "dynamic skinning, no L_gc", "static skinning", {}, _NO_GC),
-    StudyRow("+ unseen poses", "the third stage: edge lengths", "ours", {}, {"unseen_fraction": 0.3}),
+    StudyRow(
+        "+ unseen poses",
+        "the third stage: edge lengths",
+        "ours",
+        {},
+        {"unseen_fraction": TrainConfig().unseen_fraction},
+    ),
     StudyRow("spatial only", "no temporal attention", "ours", {"motion_encoder": "spatial"}),
     *(_window(d) for d in (2, 5, 20, 30)),
     StudyRow("grey light", "a probe of one channel, as printed", "ours", {}, {"probe_channels": 1}),

@@ -55,7 +55,7 @@ class TrainConfig:
     """optimisation steps, one picture each"""
     stage1_fraction: float = 0.25
     """share of the steps spent on geometry with a plain colour before the light is learned"""
-    unseen_fraction: float = 0.3
+    unseen_fraction: float = 0.5
     """as many steps more, by this share of them, without pictures: skinning learns poses that nobody filmed"""
     image_scale: float = 1.0
     """training pictures are shrunk by this factor"""

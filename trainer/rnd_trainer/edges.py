@@ -13,12 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from rnd_runtime.motion import Motion
-from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_runtime.skeleton import Skeleton
-
-from .config import ModelConfig
-from .data import pose_input
 from .interpolate import NodeInterpolation
 from .model import AvatarModel, PoseInput
 from .skinning import blend_transforms, transform_points
@@ -29,12 +23,6 @@ BETWEEN_BONES = 0.02
 """Σ_j |ΔW_j| of the template from which an edge counts: what hangs on one bone cannot be stretched"""
 LEAST_LENGTH = 1e-3
 """metres that an edge has at least: two Gaussians may lie on one another"""
-TURNED_JOINTS = 10
-"""joints that a drawn pose turns: lengths are local, so it need not be likely, and many joints tell more at once"""
-WIDEST_TURN = 2.2
-"""radians that it turns them at most, about any axis: a knee's and a hip's reach"""
-FASTEST_SHARE = 0.5
-"""of its turns that a pose may have made within the window"""
 
 
 class EdgeLengths:
@@ -72,23 +60,6 @@ class EdgeLengths:
         posed = transform_points(blend_transforms(weights, pose.bones), rest)
         long, short = ((p[self._first] - p[self._second]).norm(dim=-1) for p in (posed, rest))
         return long / short.clamp(min=LEAST_LENGTH)
-
-
-def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
-    """Ten joints turned far about any axis, and a window in which they come there from up to half-way."""
-    joints = len(skeleton)
-    turned = 1 + rng.permutation(joints - 1)[:TURNED_JOINTS]
-    axes = rng.standard_normal((len(turned), 3))
-    angles = np.zeros((joints, 3))
-    angles[turned] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    angles[turned] *= rng.uniform(0, WIDEST_TURN, (len(turned), 1))
-    frames = max(config.window_poses, 2)
-    reached = np.linspace(1 - rng.uniform(0, FASTEST_SHARE), 1, frames)
-    fps = (frames - 1) / config.window_seconds
-    motion = Motion(
-        axis_angle_to_matrix(reached[:, None, None] * angles), np.zeros((frames, 3)), fps, skeleton.names
-    )
-    return pose_input(motion, skeleton, (frames - 1) / fps, config)
 
 
 def _between_bones(codes: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.int64]:

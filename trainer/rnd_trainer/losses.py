@@ -9,7 +9,7 @@ from .light import luminance, natural_sky
 from .metrics import SSIM_WINDOW, ssim_map
 from .model import Posed
 
-ALLOWED_STRETCH = 1.5
+ALLOWED_STRETCH = 1.7
 """ratio of lengths that costs nothing: skin does stretch"""
 
 
@@ -43,7 +43,7 @@ def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:
 
 
 def stretch_penalty(stretch: Tensor) -> Tensor:
-    """Mean of max(0, stretch − 1.5)² over edges [E] of given stretch (length over length at rest); 0 of none.
+    """Mean of max(0, stretch − 1.7)² over edges [E] of given stretch (length over length at rest); 0 of none.
 
     What as-isometric-as-possible deformation (Kilian et al. 2007) holds against lengths, beyond what skin does.
     """

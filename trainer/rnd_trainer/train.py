@@ -25,6 +25,7 @@ from . import light_start
 from .checkpoint import save_checkpoint, write_tensors
 from .config import TrainConfig, to_dict
 from .data import TrainingView, load_views, pose_input, training_light, training_light_name
+from .drawn_poses import shaken_pose
 from .light import PROBE_SHAPE, LightProbe, as_probe
 from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
@@ -38,6 +39,8 @@ REFINED_MOTION = "refined_motion.npz"
 """beside the checkpoint: the capture's motion, its training frames corrected"""
 MAX_BAD_STEPS = 10
 """non-finite steps in a row after which training stops: it will not recover"""
+SHAKEN_SHARE = 0.5
+"""of the third stage's steps that keep skin in a pose near a filmed one, the rest in the filmed one itself"""
 
 
 @dataclass
@@ -172,6 +175,9 @@ class Training:
             self.unseen = self._unseen()
         if self.refinement is not None:  # where the pictures put the skin
             pose = dataclasses.replace(pose, bones=self.refinement.bones(view.frame.frame).detach())
+        rng = np.random.default_rng((self.config.seed, self.step_index, 1))
+        if rng.random() < SHAKEN_SHARE:
+            pose = self._shaken(view, rng)
         return self.unseen(self.model, pose, self.step_index)
 
     # -- schedule ------------------------------------------------------------------------------------------
@@ -276,6 +282,11 @@ class Training:
         motion = self.capture.motion if motion is None else motion
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
+
+    def _shaken(self, view: TrainingView, rng: np.random.Generator) -> PoseInput:
+        motion, skeleton = self.capture.motion, self.capture.body.skeleton
+        time_s = view.frame.frame / motion.fps
+        return shaken_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
 
     def _refinement(self) -> PoseRefinement:
         frames = [view.frame.frame for view in self.views]

@@ -1,8 +1,8 @@
 """The last steps, without pictures: the skinning network learns poses that nobody filmed.
 
-Every step holds two things. In a filmed pose skin stays where the pictures have put it: the network as it was after
-the last of them is the teacher (self-distillation). In a drawn pose, far from all that was filmed, edges keep their
-lengths.
+Every step holds two things. In a filmed pose, or in one near it, skin stays where the pictures have put it: the network
+as it was after the last of them is the teacher (self-distillation). In a drawn pose, far from all that was filmed,
+edges keep their lengths.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from torch import Tensor
 from rnd_runtime.skeleton import Skeleton
 
 from .config import TrainConfig
-from .edges import EdgeLengths, drawn_pose
+from .drawn_poses import drawn_pose
+from .edges import EdgeLengths
 from .encoders import DynamicSkinning
 from .losses import stretch_penalty
 from .model import AvatarModel, PoseInput
@@ -51,7 +52,7 @@ class UnseenPoses:
         self._nodes = encoded, model.log_weights[:nodes], self._points[:nodes]
 
     def __call__(self, model: AvatarModel, pose: PoseInput, step: int) -> dict[str, Tensor]:
-        """Weighted terms by name: skin kept in the filmed ``pose``, edges' stretch in one that ``step`` gives."""
+        """Weighted terms by name: skin kept in ``pose``, edges' stretch in one that ``step`` gives."""
         rng = np.random.default_rng((self._config.seed, step))
         drawn = drawn_pose(self._skeleton, self._config.model, rng).to(self._points.device)
         stretch = self._edges.stretch(model, self._points, drawn)
