@@ -15,9 +15,12 @@ import pytest
 from rnd_runtime.files import atomic_path
 from rnd_runtime.images import read_image, write_image
 from rnd_trainer import cli
+from rnd_trainer.config import TrainConfig
 from rnd_trainer.live_view import POINTS, Metrics, live_view, state
+from rnd_trainer.schedule import UNSEEN_COST, Schedule
 
 TOTAL = 1000
+SCHEDULE = Schedule(TrainConfig(steps=800, unseen_fraction=0.25))
 
 
 def _row(step: int, **more: object) -> dict[str, object]:
@@ -47,9 +50,11 @@ def _get(url: str, host: str | None = None) -> tuple[int, bytes]:
 
 def test_state_says_how_far_and_how_long_still():
     rows = [_row(step) for step in range(501)]
-    now = state(rows, TOTAL, ["step_000250.png"])
+    now = state(rows, SCHEDULE, ["step_000250.png"])
     assert (now["done"], now["total"], now["stage"], now["skipped"]) == (501, TOTAL, 2, 0)
-    assert now["seconds_left"] == pytest.approx(0.5 * 499)
+    assert now["seconds_left"] == pytest.approx(
+        0.5 * (299 + 200 * UNSEEN_COST)
+    )  # the last 200 without pictures
     assert set(now["curves"]) == {"image"} and len(now["curves"]["image"]) <= POINTS
     step, value = now["curves"]["image"][0]
     assert step == 2 and value == pytest.approx(
@@ -58,9 +63,9 @@ def test_state_says_how_far_and_how_long_still():
 
 
 def test_state_of_nothing_and_of_steps_that_failed():
-    assert state([], TOTAL, [])["seconds_left"] is None
+    assert state([], SCHEDULE, [])["seconds_left"] is None
     rows = [_row(0), _row(1, image=float("nan"), skipped=True), _row(2, grey=0.5)]
-    now = state(rows, TOTAL, [])
+    now = state(rows, SCHEDULE, [])
     assert now["skipped"] == 1 and now["curves"]["grey"] == [[2, 0.5]]
     json.dumps(now, allow_nan=False)  # the browser's parser knows no NaN
 
@@ -85,7 +90,7 @@ def test_metrics_are_read_on_and_torn_lines_wait(tmp_path):
 def test_a_run_is_served_to_this_machine_alone(tmp_path):
     folder = _write_run(tmp_path, 300)
     (tmp_path / "secret.png").write_bytes(b"no")
-    with live_view(folder, TOTAL, port=0) as page:
+    with live_view(folder, SCHEDULE, port=0) as page:
         assert page.startswith("http://127.0.0.1:")
         status, html = _get(page)
         assert (
@@ -99,7 +104,7 @@ def test_a_run_is_served_to_this_machine_alone(tmp_path):
         for path in ("previews/../secret.png", "secret.png", "previews/step_999999.png", "metrics.jsonl"):
             assert _get(page + path)[0] == 404, path
         assert _get(page, host="evil.example")[0] == 403  # a page that had its own name resolve to us
-        with live_view(folder, TOTAL, port=int(page.rsplit(":")[-1][:-1])) as second:
+        with live_view(folder, SCHEDULE, port=int(page.rsplit(":")[-1][:-1])) as second:
             assert second != page and _get(second)[0] == 200
     with pytest.raises(urllib.error.URLError):
         _get(page)
@@ -108,11 +113,11 @@ def test_a_run_is_served_to_this_machine_alone(tmp_path):
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_the_page_shows_the_training(tmp_path):
     folder = _write_run(tmp_path, 501)
-    with live_view(folder, TOTAL, port=0) as page:
+    with live_view(folder, SCHEDULE, port=0) as page:
         line = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1500"]
         line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page]
         dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert "step 501 of 1000 · stage 2 · 4 min 10 s so far · 4 min 10 s left" in dom
+    assert "step 501 of 1000 · stage 2 · 4 min 10 s so far · 2 min 42 s left" in dom
     assert 'src="/previews/step_000500.png"' in dom and "image (log)" in dom and "<path d=" in dom
 
 

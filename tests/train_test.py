@@ -149,7 +149,7 @@ def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, l
         training.step()
     before = {name: p.detach().clone() for name, p in training.model.named_parameters()}
     probe = training.probe.raw.detach().clone()
-    while training.step_index < training.total_steps:
+    while training.step_index < training.schedule.total:
         training.step()
     changed = {
         name.split(".")[0]
@@ -161,7 +161,7 @@ def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, l
 
 def test_skinning_that_is_not_learned_has_no_third_stage(tiny_capture, tiny_config) -> None:
     still = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
-    assert Training(tiny_capture, dataclasses.replace(tiny_config, model=still)).total_steps == 12
+    assert Training(tiny_capture, dataclasses.replace(tiny_config, model=still)).schedule.total == 12
 
 
 def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, tiny_config) -> None:

@@ -343,9 +343,10 @@ def _train(
     training = Training(seen, config, perceptual, consistency=consistency)
     if (place / STATE_FILE).exists():
         training.resume(place / STATE_FILE)
+    effort = training.schedule.effort
 
     def on_step(step: Step) -> None:
-        on_share((step.index + 1) / training.total_steps)
+        on_share(effort(step.index + 1) / effort(training.schedule.total))
 
     if run(training, place, on_step=on_step, on_preview=lambda: None):
         raise KeyboardInterrupt

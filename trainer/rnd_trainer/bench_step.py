@@ -49,7 +49,7 @@ def bench_step(
     within = 1 - config.stage1_fraction - config.full_light_fraction
     steps = math.ceil((repeats + WARMUP + 1) / within)
     training = Training(capture, resized(config, None, steps), perceptual)
-    first = training.stage1_steps + WARMUP
+    first = training.schedule.first_stage + WARMUP
     for done in range(first):
         on_step(done, first + repeats)
         training.step()

@@ -118,8 +118,8 @@ def _train(options: TrainOptions) -> None:
         _say(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
     for frame in training.bad_masks:
         _say(f"frame {frame}: mask empty or full, skipped")
-    _say(f"{folder}: {training.total_steps} steps in all")
-    with live_view(folder, training.total_steps) if options.view else nullcontext() as page:
+    _say(f"{folder}: {training.schedule.total} steps in all")
+    with live_view(folder, training.schedule) if options.view else nullcontext() as page:
         if page:
             _say(page)
         with _memory_runs_out():
@@ -200,7 +200,6 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
-        MofNCompleteColumn,
         Progress,
         TextColumn,
         TimeElapsedColumn,
@@ -213,25 +212,31 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
     shown = [training.views[k] for k in dict.fromkeys(chosen)]
     columns = (
-        TextColumn("stage {task.fields[stage]}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("image loss {task.fields[loss]:.4f}"), TimeElapsedColumn(), TextColumn("gone,"),
+        TextColumn("stage {task.fields[stage]}"), BarColumn(), TextColumn("{task.fields[told]}"),
+        TimeElapsedColumn(), TextColumn("gone,"),
         TimeRemainingColumn(), TextColumn("left"),
     )  # fmt: skip
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=60) as progress:
+        schedule, begun = training.schedule, training.step_index
         task = progress.add_task(
-            "training", total=training.total_steps, completed=training.step_index, stage=1, loss=float("nan")
-        )
-        smooth = [float("nan")]
+            "training", total=schedule.effort(schedule.total), completed=int(schedule.effort(begun)),
+            stage=training.stage, told=f"{begun}/{schedule.total}",
+        )  # fmt: skip
+        smooth: list[float] = []  # of the image loss
 
         def on_step(step: Any) -> None:
-            if step.index + 1 == max(training.stage1_steps, 1) and training.light_found is False:
+            done = step.index + 1
+            if done == max(schedule.first_stage, 1) and training.light_found is False:
                 progress.console.print(
                     "no sky and sun could be told from these pictures (too little is seen of the person, or always "
                     "from one side): the light is learned from white, which costs several dB"
                 )
-            loss = step.terms.get("image", smooth[0])  # the third stage has no pictures
-            smooth[0] = loss if smooth[0] != smooth[0] else 0.98 * smooth[0] + 0.02 * loss
-            progress.update(task, completed=step.index + 1, stage=step.stage, loss=smooth[0])
+            told = f"{done}/{schedule.total}"
+            if "image" in step.terms:  # the third stage has no pictures
+                loss = step.terms["image"]
+                smooth[:] = [0.98 * smooth[0] + 0.02 * loss if smooth else loss]
+                told += f" image loss {smooth[0]:.4f}"
+            progress.update(task, completed=schedule.effort(done), stage=step.stage, told=told)
             if step.skipped:
                 progress.console.print(f"step {step.index}: not finite, skipped")
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from .metrics_log import row_of
+from .schedule import Schedule
 
 PORT = 7860
 """tried first; any free one when it is taken"""
@@ -57,17 +58,17 @@ class Metrics:
             return list(self.rows)
 
 
-def state(rows: list[dict[str, Any]], total: int, previews: list[str]) -> dict[str, Any]:
+def state(rows: list[dict[str, Any]], schedule: Schedule, previews: list[str]) -> dict[str, Any]:
     """What the page shows: progress, seconds left, one binned curve for each loss term, the preview's names.
 
     Curves are ``[[step, mean], …]`` with at most ``POINTS`` points.
     """
-    seconds_left = None
+    seconds_left, total = None, schedule.total
     if len(rows) > 1:
-        first, last = rows[max(0, len(rows) - RECENT)], rows[-1]
-        seconds_left = (total - 1 - last["step"]) * (last["seconds"] - first["seconds"]) / (
-            last["step"] - first["step"]
-        )  # fmt: skip
+        recent = rows[max(0, len(rows) - RECENT)], rows[-1]
+        first, last = (schedule.effort(row["step"] + 1) for row in recent)
+        seconds = recent[1]["seconds"] - recent[0]["seconds"]
+        seconds_left = (schedule.effort(total) - last) * seconds / (last - first)
     curves: dict[str, list[list[float]]] = {}
     terms = list(dict.fromkeys(name for row in rows for name in row))
     for term in terms:
@@ -96,13 +97,13 @@ def _binned(points: list[tuple[int, float]], width: int) -> list[list[float]]:
 
 
 @contextmanager
-def live_view(folder: Path, total_steps: int, port: int = PORT) -> Iterator[str]:
+def live_view(folder: Path, schedule: Schedule, port: int = PORT) -> Iterator[str]:
     """Serve the run in ``folder`` while the block runs; yields the page's address."""
     try:
         server = _Server(("127.0.0.1", port), _Handler)
     except OSError:  # somebody else's, perhaps another training's
         server = _Server(("127.0.0.1", 0), _Handler)
-    server.folder, server.total = folder, total_steps
+    server.folder, server.schedule = folder, schedule
     server.metrics = Metrics(folder / "metrics.jsonl")
     thread = threading.Thread(target=server.serve_forever, name="live view", daemon=True)
     thread.start()
@@ -117,7 +118,7 @@ def live_view(folder: Path, total_steps: int, port: int = PORT) -> Iterator[str]
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     folder: Path
-    total: int
+    schedule: Schedule
     metrics: Metrics
 
 
@@ -137,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
             page = files("rnd_trainer").joinpath("live_view.html").read_bytes()
             self._answer(page, "text/html; charset=utf-8")
         elif self.path == "/state.json":
-            now = state(self.server.metrics.read(), self.server.total, names)
+            now = state(self.server.metrics.read(), self.server.schedule, names)
             self._answer(json.dumps(now).encode(), "application/json")
         elif name in names and _PREVIEW.fullmatch(name):
             self._answer((previews / name).read_bytes(), "image/png")

@@ -31,6 +31,7 @@ from .model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from .objective import Objective, noisy
 from .perceptual import Perceptual, networks_by_role, networks_sha256
 from .pose_refinement import PoseRefinement
+from .schedule import Schedule
 from .template import sample_template
 from .training_state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
 from .unseen import UnseenPoses
@@ -75,7 +76,7 @@ class Training:
     ) -> None:
         if config.light == "learn":
             training_light_name(capture, "learning a light")
-        self.capture, self.config = capture, config
+        self.capture, self.config, self.schedule = capture, config, Schedule(config)
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.device = torch.device(device)
@@ -162,7 +163,7 @@ class Training:
             self.lit = True
 
     def _picture_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
-        refinement = self.refinement if self.step_index >= self._refine_from else None
+        refinement = self.refinement if self.schedule.refines(self.step_index) else None
         if refinement is not None:
             pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
         terms = self.objective(self.model, view, pose, self.step_index, stage)
@@ -183,28 +184,9 @@ class Training:
     # -- schedule ------------------------------------------------------------------------------------------
 
     @property
-    def stage1_steps(self) -> int:
-        """Steps of the first stage."""
-        if self.config.light == "none":
-            return self.config.steps
-        return round(self.config.stage1_fraction * self.config.steps)
-
-    @property
-    def total_steps(self) -> int:
-        """Of all stages; ``config.steps`` are those with a picture."""
-        unseen = self.config.unseen_fraction if self.config.model.dynamic_skinning else 0
-        return self.config.steps + round(unseen * self.config.steps)
-
-    @property
-    def _refine_from(self) -> float:
-        return self.config.refine_after * self.config.steps
-
-    @property
     def stage(self) -> int:
-        """Of the next step: 1 geometry under plain colours, 2 the light, 3 skinning in poses that nobody filmed."""
-        if self.step_index >= self.config.steps:
-            return 3
-        return 1 if self.step_index < self.stage1_steps else 2
+        """Of the next step; see :class:`Schedule`."""
+        return self.schedule.stage(self.step_index)
 
     def light(self) -> Tensor:
         """The light [32, 64, 3] of the training pictures: learned, or the capture's own."""
@@ -216,16 +198,9 @@ class Training:
             self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
         )
 
-    def _decay(self) -> float:
-        """1 at the start, 0.1 at the last picture, exponential; and once more in the third stage."""
-        steps = self.config.steps
-        if self.stage < 3:
-            return 0.1 ** (self.step_index / steps)
-        return 0.1 ** ((self.step_index - steps) / (self.total_steps - steps))
-
     def _set_rates(self) -> None:
         for group in self.optimizer.param_groups:
-            group["lr"] = group["start_rate"] * self._decay()
+            group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
 
     def _next_view(self) -> int:
         """Every picture once an epoch, in an order that depends on the seed and the epoch alone."""
@@ -366,7 +341,7 @@ class Training:
             self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
             self.bad_steps = int(header["bad_steps"])
             # before states said so, the second stage began with its first step
-            self.lit = bool(header.get("lit", self.step_index > self.stage1_steps))
+            self.lit = bool(header.get("lit", self.step_index > self.schedule.first_stage))
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
@@ -388,7 +363,7 @@ class Training:
             "lights": {name: self.capture.light_sha256(name) for name in self._lights()},
             "body_license": self.capture.body.license,
             "step": self.step_index,
-            "steps_planned": self.total_steps,
+            "steps_planned": self.schedule.total,
             "lit": self.lit,
             "minutes": round(self.seconds / 60, 3),
             "pictures": len(self.views),

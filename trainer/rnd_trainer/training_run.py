@@ -31,7 +31,7 @@ def run(
         _keep_until(folder / "metrics.jsonl", training.step_index) as log,
         _deferred_interrupt() as interrupted,
     ):
-        while training.step_index < training.total_steps and not interrupted():
+        while training.step_index < training.schedule.total and not interrupted():
             step = training.step()
             row = {
                 "step": step.index,
@@ -44,10 +44,13 @@ def run(
             if training.step_index % config.save_every == 0:
                 log.flush()
                 training.save(folder)
-            if training.step_index % config.preview_every == 0 or training.step_index == training.total_steps:
+            if (
+                training.step_index % config.preview_every == 0
+                or training.step_index == training.schedule.total
+            ):
                 on_preview()
         training.save(folder)
-        return interrupted() and training.step_index < training.total_steps
+        return interrupted() and training.step_index < training.schedule.total
 
 
 def _keep_until(path: Path, step: int) -> TextIO:

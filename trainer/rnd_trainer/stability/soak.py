@@ -70,7 +70,11 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
         training.step()
         return ""
 
-    borders = [training.stage1_steps, math.ceil(config.steps * (1 - config.full_light_fraction)), steps]
+    borders = [
+        training.schedule.first_stage,
+        math.ceil(config.steps * (1 - config.full_light_fraction)),
+        steps,
+    ]
     return _soak("training", step, _fixed_load(subject), steps, state, same=0, borders=borders)
 
 
