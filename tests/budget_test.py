@@ -123,6 +123,22 @@ def test_options_that_would_do_nothing_are_refused(
     assert end.value.code == 2 and refused in capsys.readouterr().err and not out.exists()
 
 
+def test_a_bound_is_searched_only_where_the_whole_avatar_is_torchs(
+    tiny_checkpoint, tmp_path, monkeypatch, capsys
+) -> None:
+    def drifts(*_: object) -> None:
+        raise InputError("export refused: places of onnxruntime and torch differ")
+
+    out = tmp_path / "small.onnx"
+    monkeypatch.setattr("rnd_export.bounded.export", drifts)
+    monkeypatch.setattr(
+        "sys.argv", ["rnd-export", str(tiny_checkpoint), "--min-psnr", "45", "--out", str(out)]
+    )
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2 and "export refused: places" in capsys.readouterr().err and not out.exists()
+
+
 class _Formula:
     """A workbench whose files are their recipes and whose measures follow from them."""
 

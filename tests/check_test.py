@@ -21,6 +21,7 @@ from rnd_trainer.checking.check import check_capture
 from rnd_trainer.checking.normals import judge, parse_axes
 from rnd_trainer.checking.overlay import CAPTION, TILE
 from rnd_trainer.checking.report import check_and_report
+from rnd_trainer.data import load_views
 from rnd_trainer.data_cli import check
 
 SOUND = 0.97  # IoU of the silhouette with a mask that the same mesh made: pixels on the edge when scaled
@@ -224,6 +225,23 @@ def test_bad_masks_and_backgrounds_are_counted(folder) -> None:
     assert findings["masks"].level == "wrong" and "2 of 8" in findings["masks"].sentence
     assert "they look like 0 and 1" in findings["masks"].sentence
     assert findings["background"].level == "note" and bright.name in findings["background"].sentence
+
+
+def test_masks_are_counted_as_a_training_counts_them(folder) -> None:
+    """Of the training pictures a fifth may be bad; held-out ones do not weigh them up."""
+    _edit(
+        folder,
+        lambda record: [
+            f.update(split="train" if k < 4 else "novel_pose") for k, f in enumerate(record["frames"])
+        ],
+    )
+    empty = sorted((folder / "masks").iterdir())
+    write_image(empty[7], np.zeros_like(read_image(empty[7])))
+    assert "masks" not in _wrong(folder)
+    write_image(empty[0], np.zeros_like(read_image(empty[0])))
+    with pytest.raises(InputError, match="masks: expected at most 20% empty or full, got 1 of 4"):
+        load_views(load_capture(folder), "train")
+    assert "2 of 8" in _wrong(folder)["masks"]
 
 
 def test_what_would_not_train_is_named(folder) -> None:

@@ -520,10 +520,11 @@ def test_runs_begun_before_are_looked_at_before_any_is_trained(
     def train(*_: object) -> None:
         raise AssertionError("trained")
 
-    def begin(steps: int, **more: str) -> None:
+    def begin(steps: int, rate_residuals: float = tiny_config.rate_residuals, **more: str) -> None:
         """A state of the second variant, LBS with plain colours, that was to have ``steps``."""
         model = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
         others = {"light": "none", "weight_consistency": 0.0, "unseen_fraction": 0.0, "steps": steps}
+        others["rate_residuals"] = rate_residuals
         config = to_dict(dataclasses.replace(tiny_config, model=model, **others))
         header = {"schema": STATE_SCHEMA, "config": config, "perceptual_sha256": None, **more}
         folder = tmp_path / "lbs__plain_colour-0"
@@ -545,6 +546,18 @@ def test_runs_begun_before_are_looked_at_before_any_is_trained(
         go()
     begin(tiny_config.steps)
     with pytest.raises(AssertionError, match="trained"):
+        go()
+    row = {
+        "method": "LBS, plain colour",
+        "split": "novel_view",
+        "seed": 0,
+        "psnr": 20.0,
+        "steps": tiny_config.steps,
+    }
+    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
+    write_json(tmp_path / "lbs__plain_colour-0" / "rows.json", [row])
+    begin(tiny_config.steps, rate_residuals=tiny_config.rate_residuals / 2)  # done, but at another rate
+    with pytest.raises(InputError, match=r"a run begun before: expected .* other \['rate_residuals'\]"):
         go()
 
 

@@ -44,7 +44,14 @@ def _imported(folder: Path, **more: object) -> Capture:
 
 
 @pytest.mark.parametrize(
-    ("frame_name", "mask_name"), [("{:05d}", "{:05d}"), ("{:05d}", "mask_{:d}"), ("f{:d}.me", "f{:d}.me")]
+    ("frame_name", "mask_name"),
+    [
+        ("{:05d}", "{:05d}"),
+        ("{:05d}", "mask_{:d}"),
+        ("f{:d}.me", "f{:d}.me"),
+        ("f_{:04d}", "f_{:04d}_mask"),
+        ("f_{:d}", "f_{:d}.jpg"),
+    ],
 )
 @pytest.mark.parametrize("first", [0, 1, 17])
 def test_masks_are_found_by_the_names_of_the_frames(tmp_path, frame_name, mask_name, first) -> None:
@@ -55,6 +62,15 @@ def test_masks_are_found_by_the_names_of_the_frames(tmp_path, frame_name, mask_n
     for frame in capture.frames:
         mask = capture.load_frame(frame).mask
         assert np.array_equal(mask > 0.5, view_of(CAMERA, frame.frame).mask), frame.frame
+
+
+def test_masks_whose_numbers_cannot_be_told_are_refused_where_the_frames_have_some(tmp_path) -> None:
+    """By their places, each would be of the frame before."""
+    _write(tmp_path, "f_{:04d}", "{:04d}_mask", first=1)
+    with pytest.raises(
+        InputError, match=r"file: expected one numbered \d, got 0001_mask\.png … 0004_mask\.png"
+    ):
+        _imported(tmp_path)
 
 
 @pytest.mark.parametrize("names", ["{:05d}", "mask_{:d}"])

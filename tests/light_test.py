@@ -338,6 +338,8 @@ def test_what_a_radiance_file_states_of_its_exposure_and_colours(tmp_path):
         tmp_path / "b.hdr", rgbe, "EXPOSURE=1.000000\nPRIMARIES=0.64 0.33 0.3 0.6 0.15 0.06 0.3127 0.329\n"
     )
     assert load_light(tmp_path / "b.hdr").notes == ()
+    _write_rgbe(tmp_path / "b.hdr", rgbe, "PRIMARIES=0 0 0 0 0 0 0 0\n")  # Photoshop's for "unstated"
+    assert load_light(tmp_path / "b.hdr").notes == ()
     for broken in ("0", "-1", "nan", "1e99", "1 2", ""):
         _write_rgbe(tmp_path / "c.hdr", rgbe, f"EXPOSURE={broken}\n")
         with pytest.raises(InputError, match=r"c\.hdr: EXPOSURE of the light probe: expected numbers"):

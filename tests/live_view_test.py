@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
+import struct
 import subprocess
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -111,6 +114,24 @@ def test_a_run_is_served_to_this_machine_alone(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_a_page_that_goes_away_leaves_nothing_on_the_terminal(tmp_path, capfd):
+    folder = _write_run(tmp_path, 3)
+    (folder / "previews" / "step_000250.png").write_bytes(bytes(32 << 20))  # more than a socket takes at once
+    with live_view(folder, SCHEDULE, port=0) as page:
+        port = int(page.rsplit(":")[-1][:-1])
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as asked:
+            asked.sendall(
+                f"GET /previews/step_000250.png HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode()
+            )
+            asked.setsockopt(
+                socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+            )  # reset, not closed
+            assert asked.recv(9) == b"HTTP/1.0 "
+        assert _get(page)[0] == 200
+        time.sleep(0.5)
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_the_page_shows_the_training(tmp_path):
     folder = _write_run(tmp_path, 501)
     with live_view(folder, SCHEDULE, port=0) as page:

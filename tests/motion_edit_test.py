@@ -124,6 +124,11 @@ def test_a_loop_that_no_whole_number_of_frames_goes_round_is_open():
     after = resampled(loop, 26.0)
     assert after.frame_count == 21 and not after.closed
     assert loop.loop_notes(30.0) == () == after.loop_notes(7.0)
+    long = looped(_motion(0.8 * np.sin(np.arange(6011) / 7)))
+    for rate in (23.0, 24.0, 29.97, 47.3):
+        (note,) = long.loop_notes(rate)
+        named = float(note.rpartition("(")[2].partition(" ")[0])
+        assert long.goes_round_at(named) and long.frames_at(named) == round(long.duration * rate)
     (note,) = loop.loop_notes(26.0)
     assert (
         note.startswith("the loop of 0.8 s is no whole number of frames at 26") and "26.25 go round" in note

@@ -512,7 +512,41 @@ NAMINGS = {
             "*_wrist": "hand_*", "*_hip": "thigh_*", "*_knee": "calf_*", "*_ankle": "foot_*", "*_foot": "ball_*",
         }, ("l", "r"),
     ),
+    "xsens": _names(
+        {
+            **TRUNK, "spine1": "Chest", "spine2": "Chest2", "spine3": "Chest4", "*_collar": "*Collar",
+            "*_shoulder": "*Shoulder", "*_elbow": "*Elbow", "*_wrist": "*Wrist", "*_hip": "*Hip", "*_knee": "*Knee",
+            "*_ankle": "*Ankle", "*_foot": "*Toe",
+        }, ("Left", "Right"),
+    ),
+    "rokoko": _names(
+        {
+            **TRUNK, "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "*_collar": "*Shoulder",
+            "*_shoulder": "*Arm", "*_elbow": "*ForeArm", "*_wrist": "*Hand", "*_hip": "*Thigh", "*_knee": "*Shin",
+            "*_ankle": "*Foot", "*_foot": "*Toe",
+        }, ("Left", "Right"),
+    ),
+    "daz": _names(
+        {
+            "pelvis": "hip", "spine1": "abdomenLower", "spine2": "abdomenUpper", "spine3": "chestUpper",
+            "neck": "neckLower", "head": "head", "*_collar": "*Collar", "*_shoulder": "*ShldrBend",
+            "*_elbow": "*ForearmBend", "*_wrist": "*Hand", "*_hip": "*ThighBend", "*_knee": "*Shin", "*_ankle": "*Foot",
+            "*_foot": "*Toe",
+        }, ("l", "r"),
+    ),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("collars", [True, False])
+def test_a_shoulder_is_the_upper_arms_where_the_elbow_is_called_so(collars):
+    """ "LeftShoulder" is a collar bone beside a "LeftArm", and no joint of the trunk is left out."""
+    names = ["Hips", "Chest", "Neck", "Head"]
+    for side in ("Left", "Right"):
+        parts = (*(("Collar",) if collars else ()), "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle")
+        names += [side + part for part in parts]
+    matched = match_joints(names, SMPL_NAMES)
+    assert len(matched) == len(names)
+    assert names[matched["left_shoulder"]] == "LeftShoulder" and names[matched["spine1"]] == "Chest"
 
 
 @pytest.mark.parametrize("naming", NAMINGS)

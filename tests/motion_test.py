@@ -208,6 +208,16 @@ def test_amass_can_be_declared_y_up(tmp_path):
     assert_allclose(motion.rotations[:, 0], axis_angle_to_matrix(pose[:, 0]), atol=ROUND_OFF)
 
 
+def test_a_root_that_is_called_so_counts_wherever_it_stands(tmp_path):
+    """Else what hangs on it would be turned by the file's own root, which stands still."""
+    pose = _axis_angles(3)
+    file = _save(
+        tmp_path / "a.npz", poses=_flat(pose), trans=TRANS, fps=30, joint_names=["world", "leg", "root"]
+    )
+    motion = load_motion(file, Skeleton(("root", "leg"), [-1, 0], np.zeros((2, 3))))
+    assert_allclose(motion.rotations, axis_angle_to_matrix(pose)[:, [2, 1]], atol=ROUND_OFF)
+
+
 def test_missing_frame_rate_is_sixty_and_noted_unless_given(tmp_path):
     file = _save(tmp_path / "a.npz", poses=_axis_angles(24), trans=TRANS)
     motion = load_motion(file, _skeleton())

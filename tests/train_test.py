@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 import torch
 from msgspec.structs import replace
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 
+import rnd_trainer.checkpoint
 import rnd_trainer.cli
 import rnd_trainer.train
 from perceptual_test import write_alexnet
@@ -247,6 +249,33 @@ def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config
     Training(tiny_capture, config, consistency=blocks).resume(tmp_path / "training.state")
     with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
         Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
+
+
+def test_a_training_on_shrunk_pictures_is_resumed_where_a_byte_of_them_differs(
+    tiny_capture, tiny_config, tmp_path
+) -> None:
+    """Another CPU may round a sum's last bit otherwise."""
+    config = dataclasses.replace(tiny_config, image_scale=0.5)
+    Training(tiny_capture, config).save(tmp_path)
+    other = Training(tiny_capture, config)
+    other.views[0].image[0, 0, 0] += 1
+    other.resume(tmp_path / "training.state")
+    whole = Training(tiny_capture, tiny_config)
+    whole.save(tmp_path)
+    other = Training(tiny_capture, tiny_config)
+    other.views[0].image[0, 0, 0] += 1
+    with pytest.raises(InputError, match="expected the pictures and poses it was started with"):
+        other.resume(tmp_path / "training.state")
+
+
+def test_a_state_that_the_disk_does_not_take_is_one_line(tmp_path, monkeypatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(rnd_trainer.checkpoint, "save_file", full)
+    with pytest.raises(InputError, match=r"a\.ckpt: cannot be written: got .*No space left on device"):
+        write_tensors(tmp_path / "a.ckpt", {"a": torch.zeros(1)}, {})
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_training_with_lpips_and_its_features_is_resumed(tiny_capture, tiny_config, tmp_path) -> None:

@@ -230,6 +230,7 @@ def test_an_attribute_of_negative_size_ends(tmp_path):
         "EXPOSURE= 3\nEXPOSURE=7.5\n",
         "EXPOSURE=1.0\nPRIMARIES=0.7 0.3 0.2 0.7 0.1 0.1 0.33 0.33\n",
         "PRIMARIES=1 2 3\n",
+        "PRIMARIES=0 0 0 0 0 0 0 0\n",
         "EXPOSURE=0\n",
         "EXPOSURE=fast\n",
         "EXPOSURE=1e31\n",

@@ -255,6 +255,8 @@ LAYOUTS: dict[str, dict[str, object]] = {
     "EasyMocap, no root": EASYMOCAP | {"poses": _poses(69)},
     "EasyMocap, SMPL-X": EASYMOCAP | {"poses": _poses(165)},
     "named": NAMED | {"fps": 30},
+    "named, a world before the root": NAMED
+    | {"joint_names": ["world", "left_knee", "head", _skeleton().names[0], "left_index1"]},
     "named, Z up": NAMED | {"up_axis": ["z"]},
     "named parts": {
         "pose_body": _poses(63),

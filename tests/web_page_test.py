@@ -79,6 +79,7 @@ def site(tmp_path_factory) -> Path:
     save_motion(folder / "slow.npz", slow)
     save_motion(folder / "whole.npz", walk)
     save_motion(folder / "a #1, 50%.npz", first)
+    save_motion(folder / "what? 1:2.npz", first)
     rng = np.random.default_rng(3)
     # AMASS' SMPL-H: Z up, joints by number, fingers beside
     poses = np.zeros((8, 52, 3))
@@ -434,6 +435,9 @@ def test_addresses_name_files_of_any_name(address, tmp_path):
         browser.wait("window.rnd && rnd.scene()")
         assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
         assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
+        browser.open(f"{address}?avatar=avatar.onnx&motion={quote('what? 1:2.npz')}")
+        browser.wait("window.rnd && rnd.scene()")
+        assert browser.run("rnd.scene().motion.name") == "what? 1:2.npz"
 
 
 def test_without_webgl_the_reason_stays(address, site, tmp_path):

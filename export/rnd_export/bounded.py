@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
@@ -22,6 +23,7 @@ from rnd_trainer.notes import say_notes
 from .budget import Bound, Found, given_up, search
 from .candidates import Scene, Workbench
 from .cli import BOUNDS, Options
+from .export import export
 from .shots import shots_of
 
 
@@ -59,6 +61,10 @@ def export_bounded(
         moves = capture.motion_for(checkpoint.skeleton)
         say_notes("rnd-export", moves.notes)
         scene = Scene(moves, light, options.size, shots=shots_of(capture, options.size))
+    with (
+        TemporaryDirectory() as folder
+    ):  # all that follows is held against the whole avatar: it has to be torch's
+        export(checkpoint, Path(folder) / "avatar.onnx", motion)
     bench = Workbench(checkpoint, scene)
     console, steps = Console(), []
 
@@ -79,7 +85,7 @@ def export_bounded(
         f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen "
         f"(in this machine's calm moments; just now {median:.1f} ms, 95 frames of a hundred within {p95:.1f}). "
         f"Given up: {lost}",
-        markup=False, highlight=False, soft_wrap=True,
+        markup=False, emoji=False, highlight=False, soft_wrap=True,
     )  # fmt: skip
     if options.json is not None:
         row = {

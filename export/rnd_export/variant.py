@@ -19,7 +19,7 @@ from .bake import BakedAvatar, BakedSkinning, Rates
 from .places import moving_sites, nodes_in_order
 
 COARSE_SHARE = 4
-"""``coarse`` evaluates the networks at one of this many nodes: 16 mm apart become 32 mm on a person"""
+"""``coarse`` evaluates the networks at one of this many nodes: 23 mm apart become 45 mm on a person"""
 
 
 OWN_NODES = {"skinning_nodes": "skinning", "offset_nodes": "offsets", "visibility_nodes": "visibility"}

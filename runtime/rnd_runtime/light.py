@@ -194,7 +194,7 @@ def _radiance_header(path: str | Path) -> tuple[float, tuple[float, ...] | None]
                 numbers = ()
             if name == b"EXPOSURE":
                 exposure *= numbers[0] if len(numbers) == 1 else np.nan
-            elif len(numbers) == 8 and np.isfinite(numbers).all():
+            elif len(numbers) == 8 and np.isfinite(numbers).all() and any(numbers):  # zeros state nothing
                 primaries = numbers
     if not 1 / _MOST_EXPOSED <= exposure <= _MOST_EXPOSED:
         expected = f"numbers whose product is {1 / _MOST_EXPOSED:g} to {_MOST_EXPOSED:g}"

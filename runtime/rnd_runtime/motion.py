@@ -32,7 +32,7 @@ Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 # SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
 _STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 
-_PART_OF_A_FRAME = 1e-6  # less than which a duration's rounding may add or take
+_PART_OF_A_FRAME = 1e-4  # less than which the rounding of a duration, or of a rate in words, may add or take
 
 _MOCAP_READERS = {".bvh": read_bvh, ".amc": read_acclaim}
 
@@ -93,7 +93,7 @@ class Motion:
             return ()
         even = max(round(self.duration * fps), 1) / self.duration
         what = f"the loop of {self.duration:.4g} s is no whole number of frames at {fps:g} per second"
-        return (f"{what}: it jerks where it begins anew ({even:.6g} go round)",)
+        return (f"{what}: it jerks where it begins anew ({even:.9g} go round)",)
 
     def at(self, times_s: ArrayLike) -> Motion:
         """The poses at ``times_s`` [T] seconds: :mod:`.interpolation` between frames.
@@ -244,7 +244,7 @@ def _match_joints(
     for hand, finger in _STAND_INS.items():
         if hand not in columns and finger in columns:
             columns[hand] = columns[finger]
-    columns[skeleton.names[0]] = 0
+    columns.setdefault(skeleton.names[0], 0)  # the root by any name
     matched = [name in columns for name in skeleton.names]
     if sum(matched) < min(2, len(skeleton)):
         raise InputError(

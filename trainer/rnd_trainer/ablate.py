@@ -176,7 +176,7 @@ def ablate(
             config = _config(base, variant, seed)
             place = _place(folder, variant, seed)
             found = _done_before(place, same(config))
-            if not found and (place / STATE_FILE).exists():
+            if (place / STATE_FILE).exists():
                 begun = read_state(place / STATE_FILE)
                 networks = networks_by_role(perceptual, consistency or perceptual)
                 begun.refuse_other(config, networks, what="a run begun before", hint=ELSEWHERE)

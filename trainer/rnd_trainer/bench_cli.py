@@ -91,7 +91,7 @@ def _frame(options: Frame) -> None:
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
     console = Console()
-    console.print(_line(row), markup=False, highlight=False, soft_wrap=True)
+    console.print(_line(row), markup=False, emoji=False, highlight=False, soft_wrap=True)
     for name, milliseconds in row["stages"].items():
         console.print(f"  {name:16} {milliseconds:6.2f} ms")
     _write(options.json, row)
@@ -117,7 +117,7 @@ def _grid(options: Grid) -> None:
         measured += new
         minutes = (perf_counter() - started) / 60 * left / max(measured, 1)
         state = f"{left} left, about {minutes:.0f} min" if new else "kept"
-        console.print(f"{_line(row)}  ({state})", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{_line(row)}  ({state})", markup=False, emoji=False, highlight=False, soft_wrap=True)
 
     rows = grid(
         _inputs(options.files),
@@ -129,12 +129,15 @@ def _grid(options: Grid) -> None:
         on_row=show,
     )
     draw_chart(rows, list(options.chart))
-    console.print(f"{options.json}, {', '.join(map(str, options.chart))}", markup=False, soft_wrap=True)
+    console.print(
+        f"{options.json}, {', '.join(map(str, options.chart))}", markup=False, emoji=False, soft_wrap=True
+    )
     others = len(earlier_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)
     if others:
         console.print(
             f"{options.json} also keeps {others} points of earlier grids, not in the chart (--fresh drops them)",
             markup=False,
+            emoji=False,
             soft_wrap=True,
         )
 

@@ -269,4 +269,4 @@ def _show(console: Any, name: str, figures: Sequence[Figure]) -> None:
         line = (
             f"{mark} {name:4} {figure.what}: {amount(figure.measured, figure.unit)} {figure.line}{baseline}"
         )
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False, markup=False, emoji=False)

@@ -142,7 +142,10 @@ def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skele
 def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
     """One safetensors file with ``header`` as JSON, under a temporary name until it is whole."""
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={_KEY: json.dumps(header, sort_keys=True)})
+        try:
+            save_file(tensors, temporary, metadata={_KEY: json.dumps(header, sort_keys=True)})
+        except SafetensorError as error:  # which a full disk is
+            raise InputError("cannot be written", got=str(error).splitlines()[0], file=path) from error
 
 
 def read_tensors(path: str | Path, schema: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

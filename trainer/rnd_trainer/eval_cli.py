@@ -157,7 +157,7 @@ def evaluate_run(options: EvalOptions) -> None:
         console.print(f"flicker on the held-out motion: {rows[0]['flicker']:.2f} of 255 levels")
     if "fps" in rows[0]:
         line = f"{exported.name}: {rows[0]['file_mb']:.1f} MB, {rows[0]['fps']:.0f} frames a second"
-        console.print(line, markup=False)
+        console.print(line, markup=False, emoji=False)
 
 
 def check_outputs(options: EvalOptions) -> None:

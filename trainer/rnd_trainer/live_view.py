@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,6 +121,11 @@ class _Server(ThreadingHTTPServer):
     folder: Path
     schedule: Schedule
     metrics: Metrics
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A page that was closed or reloaded breaks its connection: nobody needs to read of it."""
+        if not isinstance(sys.exception(), ConnectionError):
+            super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):

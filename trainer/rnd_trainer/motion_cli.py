@@ -68,10 +68,10 @@ def motion(
         *made.notes,
         *([f"joints that SMPL-H lacks are left out: {', '.join(lost)}"] if lost else []),
     ]:
-        console.print(f"note: {note}", markup=False, soft_wrap=True, highlight=False)
+        console.print(f"note: {note}", markup=False, emoji=False, soft_wrap=True, highlight=False)
     seconds = f"{made.fps:g} per second, {made.duration:.1f} s"
     line = f"{out}: {made.frame_count} frames, {seconds}"
-    console.print(line, markup=False, soft_wrap=True, highlight=False)
+    console.print(line, markup=False, emoji=False, soft_wrap=True, highlight=False)
     return 0
 
 

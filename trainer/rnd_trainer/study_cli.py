@@ -36,11 +36,11 @@ def run_study(options: EvalOptions) -> None:
     check_outputs(options)
     rows = time_encoders(_trained(options, _config(options), variants), options.run, variants, seed=0)
     summary = summarise(rows, variants)
-    _show(summary, options.study)
     if options.json is not None:
         write_json(options.json, {"summary": summary, "rows": rows})
     if options.chart is not None:
         draw_lengths(rows, [options.chart])
+    _show(summary, options.study)
 
 
 def _config(options: EvalOptions) -> TrainConfig:

@@ -348,7 +348,7 @@ class Training:
     @cached_property
     def _learned_from_sha256(self) -> str:
         light = training_light(self.capture) if self.config.light == "capture" else None
-        return learned_sha256(self.views, self.capture, light)
+        return learned_sha256(self.views, self.capture, self.config.image_scale, light)
 
     def _lights(self) -> list[str]:
         """Names of the lights that its pictures were taken under."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rnd_runtime.capture import Capture
 from rnd_runtime.errors import InputError
+from rnd_runtime.files import sha256_of
 from rnd_runtime.light import Light
 
 from .checkpoint import read_tensors
@@ -57,8 +58,10 @@ class TrainingState:
             got = str(error)
             raise InputError("not a training state of this version", got=got, file=self.path) from error
         free = {"save_every", "preview_every"} | (set() if self.part("taught") else _OF_THE_THIRD_STAGE)
-        now = to_dict(config).items()
-        wrong = sorted(name for name, value in now if before[name] != value and name not in free)
+        now = _flat(to_dict(config))
+        wrong = sorted(
+            name for name, value in _flat(before).items() if now[name] != value and name not in free
+        )
         if wrong:
             expected = "the configuration it was started with"
             raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
@@ -72,6 +75,11 @@ class TrainingState:
             raise InputError(what, expected=expected, got=given, file=self.path, hint=hint)
 
 
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    """The model's fields among the others: no two have one name."""
+    return {**{name: value for name, value in config.items() if name != "model"}, **config["model"]}
+
+
 def _in_words(networks: dict[str, str | None]) -> str:
     return ", ".join(f"{digest} for {role}" for role, digest in sorted(networks.items()) if digest) or "none"
 
@@ -81,10 +89,13 @@ def read_state(path: Path) -> TrainingState:
     return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
 
 
-def learned_sha256(views: list[TrainingView], capture: Capture, light: tuple[str, Light] | None) -> str:
+def learned_sha256(
+    views: list[TrainingView], capture: Capture, scale: float, light: tuple[str, Light] | None
+) -> str:
     """Of all that a capture teaches: pictures, cameras, which pose is whose, poses, body, and a ``light`` if given.
 
-    The same on every CPU: what was computed is rounded, since a sine may differ in its last bit.
+    The same on every CPU: what was computed is rounded, since a sine may differ in its last bit, and of pictures that
+    were shrunk to ``scale`` it is their files.
     """
     digest = hashlib.sha256()
 
@@ -94,7 +105,13 @@ def learned_sha256(views: list[TrainingView], capture: Capture, light: tuple[str
                 digest.update(np.ascontiguousarray(array).data)
 
     for view in views:
-        add(np.array(view.frame.frame), view.image, view.mask, view.normal)
+        frame = view.frame
+        if scale == 1:
+            add(np.array(frame.frame), view.image, view.mask, view.normal)
+        else:
+            add(np.array(frame.frame))
+            for name in filter(None, (frame.image, frame.mask, frame.normal, frame.normal_gt)):
+                digest.update(sha256_of(capture.folder / name).encode())
         add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
     motion, body = capture.motion, capture.body
     add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))

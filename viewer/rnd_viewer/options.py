@@ -33,7 +33,8 @@ class MotionOptions:
     motion_up: Literal["auto", "y", "z"] = "auto"
     """Which axis points up in the motion's file."""
     motion_fps: Annotated[float | None, option("FLOAT")] = None
-    """Frames per second of the motion's recording, whatever its file says. Default: the file's, else 60."""
+    """Frames per second of the motion's recording, whatever its file says. Default: the file's, else what its
+    program records: 60 for an .npz, 30 for WHAM and its like, 120 for an .amc."""
     joint_map: Annotated[Path | None, option("FILE")] = None
     """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
     smooth: Annotated[float | None, option("HZ")] = None

@@ -44,7 +44,7 @@ def view(options: ViewOptions) -> int:
     try:
         token = None if options.local else secrets.token_urlsafe(16)
         with serve(scene, options.host, options.port, token) as (server, url):
-            console.print(f"rnd-view: {url}", soft_wrap=True, markup=False)
+            console.print(f"rnd-view: {url}", soft_wrap=True, markup=False, emoji=False)
             if options.browser and options.local:
                 Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
             server.serve_forever()

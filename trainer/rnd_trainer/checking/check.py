@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rnd_runtime.capture import Capture, Frame, FrameImages, load_capture
 from rnd_runtime.capture_format import decode_normals, read_unit_range
 from rnd_runtime.errors import InputError
-from rnd_trainer.data import usable
+from rnd_trainer.data import MAX_BAD_MASKS, usable
 from rnd_trainer.silhouette import overlap
 
 from .hypotheses import explain, explain_timing
@@ -125,7 +125,7 @@ def check_capture(
         outside = images.image_srgb[images.mask == 0]
         bright.append(bool(len(outside)) and float(outside.mean()) > BACKGROUND)
         on_frame(done + 1, len(capture.frames))
-    findings += [*_masks(bad_masks, len(capture.frames)), *_background(capture, bright)]
+    findings += [*_masks(bad_masks, capture), *_background(capture, bright)]
     findings += _fit(capture, sights, overlaps)
     findings += _normals(capture, normal_pixels, sum(frame.normal is not None for frame in capture.frames))
     return Report(capture, tuple(findings), tuple(overlaps), tuple(sights))
@@ -228,13 +228,17 @@ def _speed(capture: Capture) -> list[Finding]:
     ]
 
 
-def _masks(bad: list[tuple[Frame, FrameImages]], count: int) -> list[Finding]:
+def _masks(bad: list[tuple[Frame, FrameImages]], capture: Capture) -> list[Finding]:
+    count, learned = len(capture.frames), len(capture.split("train"))
     if not bad:
         return [Finding("ok", "masks", f"all {count} usable")]
     frame, images = bad[0]
     dim = 0 < float(images.mask.max()) < 0.1
     why = ": they look like 0 and 1 of 255" if dim else ""
-    level: Level = "wrong" if len(bad) > count / 5 or dim else "note"
+    too_many = (
+        sum(frame.split == "train" for frame, _ in bad) > MAX_BAD_MASKS * learned
+    )  # rnd-train's own rule
+    level: Level = "wrong" if too_many or dim else "note"
     return [Finding(level, "masks", f"{len(bad)} of {count} empty or full, the first {frame.mask}{why}")]
 
 

@@ -55,17 +55,22 @@ def attached(recording: Recording, masks: Path | None, normals: Path | None) -> 
 def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...], length: int) -> tuple[Path, bool]:
     """The file of ``shot`` in the camera's folder, where there is one, and whether frames are counted from 1 there.
 
-    It is called like the picture, or has the number at its end that the picture has there; of a picture without
-    either, such as a video's, the number of its frame. Where a film of ``length`` frames has as many files, from 1 on,
-    its first frame is 1.
+    It is called like the picture, whatever follows (but no digit), or has the number at its end that the picture has
+    there; of a picture without either, such as a video's, the number of its frame, or else that place. Where a film of
+    ``length`` frames has as many files, from 1 on, its first frame is 1.
     """
     inner = folder / shot.camera if (folder / shot.camera).is_dir() else folder
     files = listed(inner, suffixes)
     named = {file.stem: file for file in files}
     if shot.name in named:
         return named[shot.name], False
-    numbered = {k if (n := last_number(file.stem)) is None else n: file for k, file in enumerate(files)}
+    longer = [file for file in files if _continues(file.name, shot.name)]
+    if len(longer) == 1:
+        return longer[0], False
     number = last_number(shot.name)
+    numbered = {last_number(file.stem): file for file in files}
+    if number is None and numbered.keys() == {None}:
+        numbered = dict(enumerate(files))
     from_one = number is None and sorted(numbered) == list(range(1, length + 1))
     number = shot.frame + from_one if number is None else number
     if number not in numbered:
@@ -73,6 +78,10 @@ def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...], length: int) -
             "file", expected=f"one numbered {number}", got=f"{files[0].name} … {files[-1].name}", file=inner
         )
     return numbered[number], from_one
+
+
+def _continues(name: str, start: str) -> bool:
+    return name.startswith(start) and not name[len(start) :][:1].isdigit()
 
 
 class _Lazy(Sequence[Any]):

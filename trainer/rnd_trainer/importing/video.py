@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -181,6 +182,8 @@ def _choose(
 def _stills(film: Film | _Folder, frames: list[int]) -> np.ndarray:
     """The frames [n, H, W, 3] uint8 on disk: masks need them in any order, a video gives them in its own."""
     with tempfile.TemporaryFile() as file:
+        if hasattr(os, "posix_fallocate"):  # now: a page that the disk does not have later is a bus error
+            os.posix_fallocate(file.fileno(), 0, len(frames) * film.height * film.width * 3)
         stills = np.memmap(file, np.uint8, "w+", shape=(len(frames), film.height, film.width, 3))
         for k, frame in enumerate(frames):
             stills[k] = film.frame(frame)

@@ -107,10 +107,12 @@ def _stage(options: StageOptions) -> None:
     with console.status("dressing"):
         production = prepare(options.recipe, options.out)
     for note in production.motion.notes:
-        console.print(f"rnd-stage: {note}", markup=False, soft_wrap=True)
+        console.print(f"rnd-stage: {note}", markup=False, emoji=False, soft_wrap=True)
     seconds = _film_with_progress(production, options, shard, console)
     if finish(production, options.out, variant, seconds):
-        console.print(f"{options.out / 'capture.json'}: {production.title}", markup=False, soft_wrap=True)
+        console.print(
+            f"{options.out / 'capture.json'}: {production.title}", markup=False, emoji=False, soft_wrap=True
+        )
     else:
         console.print("rnd-stage: this shard is filmed; others are missing, so there is no capture.json yet")
 
@@ -207,12 +209,12 @@ def _agreement(options: Agreement) -> None:
                 rows.append(row)
                 strips.append(result.strip())
                 status.update(f"{name}: {row['light']} is done")
-    Console().print(table)
     write_json(options.json, rows)
     if options.picture is not None:
         half = len(strips) // 2
         sheet = np.concatenate([np.concatenate(part) for part in (strips[:half], strips[half:])], axis=1)
         write_image(options.picture, to_bytes(sheet))
+    Console().print(table)
 
 
 def _benchmark(options: Benchmark) -> None:
@@ -252,10 +254,10 @@ def _benchmark(options: Benchmark) -> None:
                 training, description=what, completed=done, total=total
             ),
         )
+    if options.json is not None:
+        write_json(options.json, result)
     table = Table("method", "split", *FIGURES, title=f"means of {settings.subjects} subjects")
     for line in result["means"]:
         cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)
         table.add_row(line["method"], line["split"], *cells)
     wide_console().print(table)
-    if options.json is not None:
-        write_json(options.json, result)

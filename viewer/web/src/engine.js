@@ -70,10 +70,11 @@ function addressed() {
   return ["avatar", "motion", "hdr"].flatMap(names).map((text) => new URLSearchParams(`name=${text}`).get("name"));
 }
 
-/** What is fetched for a name: itself where it is a whole address, else a path that may have # and % in it. */
+/** What is fetched for a name: itself where it is a whole address, else a path that may have # % ? and : in it. */
 function addressOf(name) {
-  const address = /^[a-z][a-z0-9+.-]*:/i.test(name) ? name : name.replaceAll("%", "%25").replaceAll("#", "%23");
-  return new URL(address, location.href);
+  if (/^([a-z][a-z0-9+.-]*:\/\/|blob:|data:)/i.test(name)) return new URL(name);
+  const path = name.replaceAll("%", "%25").replaceAll("#", "%23").replaceAll("?", "%3F");
+  return new URL(/^[^/]*:/.test(path) ? `./${path}` : path, location.href);
 }
 
 function shownName(address) {

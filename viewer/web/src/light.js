@@ -52,7 +52,8 @@ function readHdr(bytes) {
     if (/^FORMAT=/.test(text) && text !== RGBE) throw refusal("the .hdr file", { expected: RGBE, got: text });
     const [name, value = ""] = text.split("="), numbers = value.trim().split(/\s+/).map((word) => Number(word || NaN));
     if (name === "EXPOSURE") exposure *= numbers.length === 1 ? numbers[0] : NaN;
-    if (name === "PRIMARIES" && numbers.length === 8 && numbers.every(Number.isFinite)) chromaticities = numbers;
+    if (name === "PRIMARIES" && numbers.length === 8 && numbers.every(Number.isFinite) && numbers.some(Boolean))
+      chromaticities = numbers;  // zeros state nothing
   }
   if (!(exposure >= 1 / MOST_EXPOSED && exposure <= MOST_EXPOSED)) {
     const expected = `numbers whose product is ${short(1 / MOST_EXPOSED, 6)} to ${short(MOST_EXPOSED, 6)}`;

@@ -45,7 +45,7 @@ function matchJoints({ name: file, rotations, frames, joints, jointNames }, skel
   const columns = new Map(jointNames.map((name, column) => [name, column]));
   for (const [hand, finger] of Object.entries(STAND_INS))
     if (!columns.has(hand) && columns.has(finger)) columns.set(hand, columns.get(finger));
-  columns.set(skeleton.names[0], 0);
+  if (!columns.has(skeleton.names[0])) columns.set(skeleton.names[0], 0);  // the root by any name
   const missing = skeleton.names.filter((name) => !columns.has(name));
   if (skeleton.names.length - missing.length < Math.min(2, skeleton.names.length)) {
     const some = (names) => `${names.slice(0, 4).join(", ")}, …`;
