@@ -68,8 +68,8 @@ def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...], length: int) -
     if len(longer) == 1:
         return longer[0], False
     number = last_number(shot.name)
-    numbered = {last_number(file.stem): file for file in files}
-    if number is None and numbered.keys() == {None}:
+    numbered = {n: file for file in files if (n := last_number(file.stem)) is not None}
+    if number is None and not numbered:
         numbered = dict(enumerate(files))
     from_one = number is None and sorted(numbered) == list(range(1, length + 1))
     number = shot.frame + from_one if number is None else number
