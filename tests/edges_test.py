@@ -13,7 +13,16 @@ from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig, TrainConfig
 from rnd_trainer.data import pose_input
-from rnd_trainer.drawn_poses import TURNED_JOINTS, WIDEST_SHAKE, WIDEST_TURN, drawn_pose, shaken_pose
+from rnd_trainer.drawn_poses import (
+    NUDGE,
+    NUDGED_SPEED,
+    TURNED_JOINTS,
+    WIDEST_SHAKE,
+    WIDEST_TURN,
+    drawn_pose,
+    nudged_pose,
+    shaken_pose,
+)
 from rnd_trainer.edges import BETWEEN_BONES, LEAST_LENGTH, EdgeLengths
 from rnd_trainer.losses import ALLOWED_STRETCH, stretch_penalty
 from rnd_trainer.model import AvatarModel, PoseInput
@@ -39,6 +48,10 @@ def model(template) -> AvatarModel:
 
 def _poses(count: int, seed: int) -> list[PoseInput]:
     return [drawn_pose(body().skeleton, CONFIG, np.random.default_rng((seed, k))) for k in range(count)]
+
+
+def _stretch(lengths: EdgeLengths, model: AvatarModel, pose: PoseInput) -> torch.Tensor:
+    return lengths.stretch(lengths.weights(model, pose), model.points, pose)
 
 
 def _squat() -> PoseInput:
@@ -82,9 +95,41 @@ def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
     assert torch.equal(*twice)
 
 
+def test_a_nudged_pose_is_hardly_another(model) -> None:
+    pose = _poses(1, seed=4)[0]
+    nudged = nudged_pose(pose, np.random.default_rng(0))
+    moved, faster = nudged.window - pose.window, nudged.velocity - pose.velocity
+    assert torch.allclose(moved, moved[:1].expand_as(moved), atol=1e-6)  # the window as a whole
+    assert float(moved[0].std()) == pytest.approx(NUDGE, rel=0.3)
+    assert float(faster.std()) == pytest.approx(NUDGED_SPEED, rel=0.3)
+    assert torch.equal(nudged.bones, pose.bones)
+
+
+def test_descending_calms_weights_that_jump(model) -> None:
+    """A network that is told to change a lot by a little learns not to, in poses that were never drawn."""
+    with torch.no_grad():
+        model.skinning.logits.weight.copy_(3 * torch.randn(model.skinning.logits.weight.shape))
+    unseen = UnseenPoses(model, body().skeleton, TrainConfig(model=CONFIG))
+    lengths, far, filmed = EdgeLengths(model), _poses(12, seed=6), _poses(2, seed=5)
+
+    @torch.no_grad()
+    def jump() -> float:
+        pairs = ((pose, nudged_pose(pose, np.random.default_rng(k))) for k, pose in enumerate(far))
+        return float(np.mean([float((lengths.weights(model, a) - lengths.weights(model, b)).abs().sum(-1).mean())
+                              for a, b in pairs]))  # fmt: skip
+
+    before = jump()
+    optimizer = torch.optim.Adam(model.skinning.parameters(), lr=2e-3)
+    for step in range(60):
+        unseen(model, filmed[step % 2], step)["smooth"].backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    assert jump() < 0.5 * before
+
+
 def test_stretch_is_the_templates_before_anything_is_learned(model, template) -> None:
     pose = _squat()
-    stretch = EdgeLengths(model).stretch(model, model.points, pose).detach().numpy()
+    stretch = _stretch(EdgeLengths(model), model, pose).detach().numpy()
     posed = skin(template.points, template.weights, pose.bones.double().numpy())
     expected = []
     codes = template.codes.astype(np.float32)
@@ -155,7 +200,7 @@ def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_
 
     @torch.no_grad()
     def torn() -> float:
-        stretches = (lengths.stretch(model, model.points, pose) for pose in far)
+        stretches = (_stretch(lengths, model, pose) for pose in far)
         return float(np.mean([float(stretch_penalty(stretch)) for stretch in stretches]))
 
     before = torn()

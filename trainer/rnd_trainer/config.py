@@ -102,6 +102,9 @@ class TrainConfig:
     weight_edges: float = 100.0
     """of the stretch of skin between bones in poses that nobody filmed, beside the mean square in mm that skin moves in
     filmed ones: in the third stage alone"""
+    weight_smooth: float = 3e4
+    """of the mean square change of such skin's weights where a pose hardly changes, in the third stage alone: without it
+    some trainings flicker in slow motion (P9 in docs/stability.md)"""
     weight_offset: float = 2.0
     """of the mean square of Δx in units of its bound"""
     weight_residual: float = 0.02
@@ -190,7 +193,7 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     A missing one has the value it has today: a checkpoint from before a switch existed was trained without it. So the
     third stage, the repulsion and the black backgrounds, which are on today, are off there.
     """
-    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0}
+    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0, "weight_smooth": 0.0}
     return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import torch
+from torch import Tensor
 
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
@@ -21,6 +25,9 @@ FASTEST_SHARE = 0.5
 """of its turns that a pose may have made within the window"""
 WIDEST_SHAKE = 0.5
 """radians, the largest standard deviation of the turns that make a near pose of a filmed one"""
+NUDGE, NUDGED_SPEED = 0.03, 0.09
+"""standard deviations of what nudges a pose: of the columns of its rotations, and of joint velocities in rad/s. In slow
+motion as much happens in a frame"""
 
 
 def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
@@ -54,3 +61,13 @@ def shaken_pose(
     rotations = window.rotations @ axis_angle_to_matrix(turns)
     shaken = Motion(rotations, window.translations, fps, skeleton.names)
     return pose_input(shaken, skeleton, (frames - 1) / fps, config)
+
+
+def nudged_pose(pose: PoseInput, rng: np.random.Generator) -> PoseInput:
+    """What the networks are told of ``pose``, hardly changed: all poses of its window alike, and the velocities."""
+
+    def noise(like: Tensor, sigma: float) -> Tensor:
+        return sigma * torch.from_numpy(rng.standard_normal(like.shape)).to(like)
+
+    window = pose.window + noise(pose.window[0], NUDGE)
+    return replace(pose, window=window, velocity=pose.velocity + noise(pose.velocity, NUDGED_SPEED))

@@ -32,7 +32,7 @@ class EdgeLengths:
     Only skinning weights feel it: points are taken as given.
 
     Args:
-        model: of which the template is read once; every call evaluates its weights as they are then.
+        model: of which the template is read once; :meth:`weights` evaluates its network as it is then.
     """
 
     def __init__(self, model: AvatarModel) -> None:
@@ -52,10 +52,13 @@ class EdgeLengths:
         self._encoded = model.encoded_nodes()[rows]
         self._log_template = model.log_weights[self._gaussians]
 
-    def stretch(self, model: AvatarModel, points: Tensor, pose: PoseInput) -> Tensor:
-        """Of every edge [E] in ``pose``, with ``points`` [N, 3] m of the rest pose."""
+    def weights(self, model: AvatarModel, pose: PoseInput) -> Tensor:
+        """Skinning weights [G, J] in ``pose`` of the Gaussians that such edges join."""
         logits = self._interpolate(model.skinning(self._encoded, pose.window, pose.velocity))
-        weights = torch.softmax(self._log_template + logits, dim=-1)
+        return torch.softmax(self._log_template + logits, dim=-1)
+
+    def stretch(self, weights: Tensor, points: Tensor, pose: PoseInput) -> Tensor:
+        """Of every edge [E] by those ``weights`` in ``pose``, with ``points`` [N, 3] m of the rest pose."""
         rest = points[self._gaussians].detach()
         posed = transform_points(blend_transforms(weights, pose.bones), rest)
         long, short = ((p[self._first] - p[self._second]).norm(dim=-1) for p in (posed, rest))

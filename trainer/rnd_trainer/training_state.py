@@ -23,7 +23,7 @@ from .data import TrainingView
 STATE_SCHEMA = "rnd-training/1"
 STATE_FILE = "training.state"
 """in a run's folder"""
-_OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges"}
+_OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges", "weight_smooth"}
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Every step holds two things. In a filmed pose, or in one near it, skin stays where the pictures have put it: the network
 as it was after the last of them is the teacher (self-distillation). In a drawn pose, far from all that was filmed,
-edges keep their lengths.
+edges keep their lengths, and weights hardly change where the pose hardly does.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from rnd_runtime.skeleton import Skeleton
 
 from .config import TrainConfig
-from .drawn_poses import drawn_pose
+from .drawn_poses import drawn_pose, nudged_pose
 from .edges import EdgeLengths
 from .encoders import DynamicSkinning
 from .losses import stretch_penalty
@@ -52,13 +52,15 @@ class UnseenPoses:
         self._nodes = encoded, model.log_weights[:nodes], self._points[:nodes]
 
     def __call__(self, model: AvatarModel, pose: PoseInput, step: int) -> dict[str, Tensor]:
-        """Weighted terms by name: skin kept in ``pose``, edges' stretch in one that ``step`` gives."""
+        """Weighted terms by name: skin kept in ``pose``; in one that ``step`` gives edges' stretch and weights' calm."""
         rng = np.random.default_rng((self._config.seed, step))
         drawn = drawn_pose(self._skeleton, self._config.model, rng).to(self._points.device)
-        stretch = self._edges.stretch(model, self._points, drawn)
+        weights, near = (self._edges.weights(model, p) for p in (drawn, nudged_pose(drawn, rng)))
         return {
             "kept": MM2 * self._moved(model, pose, step % KEPT_NODES).square().sum(-1).mean(),
-            "edges": self._config.weight_edges * stretch_penalty(stretch),
+            "edges": self._config.weight_edges
+            * stretch_penalty(self._edges.stretch(weights, self._points, drawn)),
+            "smooth": self._config.weight_smooth * (weights - near).square().sum(-1).mean(),
         }
 
     def _moved(self, model: AvatarModel, pose: PoseInput, first: int) -> Tensor:
