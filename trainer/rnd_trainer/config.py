@@ -103,8 +103,8 @@ class TrainConfig:
     """of the stretch of skin between bones in poses that nobody filmed, beside the mean square in mm that skin moves in
     filmed ones: in the third stage alone"""
     weight_smooth: float = 3e4
-    """of the mean square change of such skin's weights where a pose hardly changes, in the third stage alone: without it
-    some trainings flicker in slow motion (P9 in docs/stability.md)"""
+    """of the mean square change of such skin's weights where a pose hardly changes, in the third stage alone: without
+    it some trainings flicker in slow motion (P9 in docs/stability.md)"""
     weight_offset: float = 2.0
     """of the mean square of Δx in units of its bound"""
     weight_residual: float = 0.02

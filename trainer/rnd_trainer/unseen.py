@@ -52,7 +52,7 @@ class UnseenPoses:
         self._nodes = encoded, model.log_weights[:nodes], self._points[:nodes]
 
     def __call__(self, model: AvatarModel, pose: PoseInput, step: int) -> dict[str, Tensor]:
-        """Weighted terms by name: skin kept in ``pose``; in one that ``step`` gives edges' stretch and weights' calm."""
+        """Weighted terms by name: skin kept in ``pose``; in one that ``step`` gives edges' stretch, weights' calm."""
         rng = np.random.default_rng((self._config.seed, step))
         drawn = drawn_pose(self._skeleton, self._config.model, rng).to(self._points.device)
         weights, near = (self._edges.weights(model, p) for p in (drawn, nudged_pose(drawn, rng)))
