@@ -74,7 +74,7 @@ def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     assert [row["step"] for row in rows] == list(range(14))
     assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
     assert "grey" in rows[11] and "grey" not in rows[0]
-    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges"}
+    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges", "smooth"}
     assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
 
 
