@@ -82,9 +82,8 @@ def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
     filmed = pose_input(motion, skeleton, 0.9, CONFIG)
     for seed in range(8):
         shaken = shaken_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
-        assert torch.allclose(
-            shaken.bones[0], filmed.bones[0], atol=1e-5
-        )  # where the person stands and looks
+        # where the person stands and looks
+        assert torch.allclose(shaken.bones[0], filmed.bones[0], atol=1e-5)
         ours, theirs = (pose.velocity.norm(dim=-1) for pose in (shaken, filmed))
         assert torch.allclose(ours, theirs, atol=1e-3)  # a window turned as a whole
         moved = shaken.bones[1:, :, :3] - filmed.bones[1:, :, :3]

@@ -55,9 +55,8 @@ def test_state_says_how_far_and_how_long_still():
     rows = [_row(step) for step in range(501)]
     now = state(rows, SCHEDULE, ["step_000250.png"])
     assert (now["done"], now["total"], now["stage"], now["skipped"]) == (501, TOTAL, 2, 0)
-    assert now["seconds_left"] == pytest.approx(
-        0.5 * (299 + 200 * UNSEEN_COST)
-    )  # the last 200 without pictures
+    left = 299 + 200 * UNSEEN_COST  # the last 200 without pictures
+    assert now["seconds_left"] == pytest.approx(0.5 * left)
     assert set(now["curves"]) == {"image"} and len(now["curves"]["image"]) <= POINTS
     step, value = now["curves"]["image"][0]
     assert step == 2 and value == pytest.approx(
@@ -113,7 +112,6 @@ def test_a_run_is_served_to_this_machine_alone(tmp_path):
         _get(page)
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_a_page_that_goes_away_leaves_nothing_on_the_terminal(tmp_path, capfd):
     folder = _write_run(tmp_path, 3)
     (folder / "previews" / "step_000250.png").write_bytes(bytes(32 << 20))  # more than a socket takes at once
@@ -123,15 +121,15 @@ def test_a_page_that_goes_away_leaves_nothing_on_the_terminal(tmp_path, capfd):
             asked.sendall(
                 f"GET /previews/step_000250.png HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode()
             )
-            asked.setsockopt(
-                socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
-            )  # reset, not closed
+            reset = struct.pack("ii", 1, 0)  # instead of closing
+            asked.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
             assert asked.recv(9) == b"HTTP/1.0 "
         assert _get(page)[0] == 200
         time.sleep(0.5)
     assert "Traceback" not in capfd.readouterr().err
 
 
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_the_page_shows_the_training(tmp_path):
     folder = _write_run(tmp_path, 501)
     with live_view(folder, SCHEDULE, port=0) as page:

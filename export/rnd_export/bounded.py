@@ -17,6 +17,7 @@ from rnd_runtime.errors import InputError, flag
 from rnd_runtime.files import atomic_path, earlier_rows, write_json
 from rnd_runtime.light import Light, light_notes, load_light
 from rnd_runtime.motion import Motion
+from rnd_runtime.plain import print_plain
 from rnd_trainer.checkpoint import Checkpoint
 from rnd_trainer.notes import say_notes
 
@@ -61,9 +62,8 @@ def export_bounded(
         moves = capture.motion_for(checkpoint.skeleton)
         say_notes("rnd-export", moves.notes)
         scene = Scene(moves, light, options.size, shots=shots_of(capture, options.size))
-    with (
-        TemporaryDirectory() as folder
-    ):  # all that follows is held against the whole avatar: it has to be torch's
+    # all that follows is held against the whole avatar: it has to be torch's
+    with TemporaryDirectory() as folder:
         export(checkpoint, Path(folder) / "avatar.onnx", motion)
     bench = Workbench(checkpoint, scene)
     console, steps = Console(), []
@@ -81,12 +81,12 @@ def export_bounded(
     held, lost = found.held_out, "; ".join(given_up(bench, found.plan))
     usual = bench.usual_times(found.model)
     median, p95 = float(np.median(usual)), float(np.percentile(usual, 95))
-    console.print(
+    print_plain(
+        console,
         f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen "
         f"(in this machine's calm moments; just now {median:.1f} ms, 95 frames of a hundred within {p95:.1f}). "
         f"Given up: {lost}",
-        markup=False, emoji=False, highlight=False, soft_wrap=True,
-    )  # fmt: skip
+    )
     if options.json is not None:
         row = {
             "bound": f"{flag(BOUNDS[kind])} {value:g}", "given_up": lost,

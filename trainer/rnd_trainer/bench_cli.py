@@ -12,6 +12,7 @@ import tyro
 
 from rnd_runtime.errors import check_option, flag, parse_options, run_command
 from rnd_runtime.files import earlier_rows, write_json
+from rnd_runtime.plain import print_plain
 
 from .bench_options import Files, Frame, Grid, Peers, Raster, Shards, Step
 from .bench_scenes import USUAL
@@ -91,7 +92,7 @@ def _frame(options: Frame) -> None:
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
     console = Console()
-    console.print(_line(row), markup=False, emoji=False, highlight=False, soft_wrap=True)
+    print_plain(console, _line(row))
     for name, milliseconds in row["stages"].items():
         console.print(f"  {name:16} {milliseconds:6.2f} ms")
     _write(options.json, row)
@@ -117,7 +118,7 @@ def _grid(options: Grid) -> None:
         measured += new
         minutes = (perf_counter() - started) / 60 * left / max(measured, 1)
         state = f"{left} left, about {minutes:.0f} min" if new else "kept"
-        console.print(f"{_line(row)}  ({state})", markup=False, emoji=False, highlight=False, soft_wrap=True)
+        print_plain(console, f"{_line(row)}  ({state})")
 
     rows = grid(
         _inputs(options.files),

@@ -128,11 +128,16 @@ def training_light_name(capture: Capture, what: str) -> str:
 
     Raises :class:`InputError` where there are several, or no training pictures.
     """
-    names = {frame.light or "unknown" for frame in _frames(capture, "train")}
+    names = light_names(_frames(capture, "train"))
     if len(names) != 1:
-        got = ", ".join(sorted(names))
+        got = ", ".join(names)
         raise InputError(what, expected="one light in the train split", got=got, file=capture.folder)
-    return names.pop()
+    return names[0]
+
+
+def light_names(frames: Iterable[Frame]) -> list[str]:
+    """Names of the lights that ``frames`` were taken under, each once, "unknown" where one has none."""
+    return sorted({frame.light or "unknown" for frame in frames})
 
 
 def usable(mask: NDArray[np.floating[Any]]) -> bool:

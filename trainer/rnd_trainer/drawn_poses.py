@@ -38,9 +38,8 @@ def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator
     angles = np.zeros((joints, 3))
     angles[turned] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     angles[turned] *= rng.uniform(0, WIDEST_TURN, (len(turned), 1))
-    frames = max(config.window_poses, 2)
+    frames, fps = _window(config)
     reached = np.linspace(1 - rng.uniform(0, FASTEST_SHARE), 1, frames)
-    fps = (frames - 1) / config.window_seconds
     motion = Motion(
         axis_angle_to_matrix(reached[:, None, None] * angles), np.zeros((frames, 3)), fps, skeleton.names
     )
@@ -52,8 +51,7 @@ def shaken_pose(
 ) -> PoseInput:
     """The pose of ``motion`` at ``time_s`` and its window, every joint but the root turned a little, by the same
     throughout: what a person who was filmed might as well have done."""
-    frames = max(config.window_poses, 2)
-    fps = (frames - 1) / config.window_seconds
+    frames, fps = _window(config)
     window = motion.at(time_s + (np.arange(frames) - frames + 1) / fps)
     joints = len(skeleton)
     turns = rng.uniform(0, WIDEST_SHAKE) * rng.standard_normal((joints, 3))
@@ -71,3 +69,9 @@ def nudged_pose(pose: PoseInput, rng: np.random.Generator) -> PoseInput:
 
     window = pose.window + noise(pose.window[0], NUDGE)
     return replace(pose, window=window, velocity=pose.velocity + noise(pose.velocity, NUDGED_SPEED))
+
+
+def _window(config: ModelConfig) -> tuple[int, float]:
+    """Frames that a motion needs to fill the networks' window to its end, and how many of them a second has."""
+    frames = max(config.window_poses, 2)
+    return frames, (frames - 1) / config.window_seconds

@@ -18,6 +18,7 @@ from rnd_runtime.files import existing_file, npz_output, refuse_input
 from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
 from rnd_runtime.motion_files import FPS_LIMITS
+from rnd_runtime.plain import print_plain
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
 
 # Joints of an adult in cm, SMPL's order, standing about SMPL's origin: what matters are the proportions of the legs.
@@ -68,10 +69,10 @@ def motion(
         *made.notes,
         *([f"joints that SMPL-H lacks are left out: {', '.join(lost)}"] if lost else []),
     ]:
-        console.print(f"note: {note}", markup=False, emoji=False, soft_wrap=True, highlight=False)
+        print_plain(console, f"note: {note}")
     seconds = f"{made.fps:g} per second, {made.duration:.1f} s"
     line = f"{out}: {made.frame_count} frames, {seconds}"
-    console.print(line, markup=False, emoji=False, soft_wrap=True, highlight=False)
+    print_plain(console, line)
     return 0
 
 

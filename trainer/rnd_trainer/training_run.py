@@ -24,14 +24,14 @@ def run(
     Ctrl-C finishes the step in hand, saves, and returns True where steps are left: resuming continues the very same
     curve.
     """
-    config = training.config
+    config, total = training.config, training.schedule.total
     if training.step_index < config.steps:
         training.rehearse()
     with (
         _keep_until(folder / "metrics.jsonl", training.step_index) as log,
         _deferred_interrupt() as interrupted,
     ):
-        while training.step_index < training.schedule.total and not interrupted():
+        while training.step_index < total and not interrupted():
             step = training.step()
             row = {
                 "step": step.index,
@@ -44,13 +44,10 @@ def run(
             if training.step_index % config.save_every == 0:
                 log.flush()
                 training.save(folder)
-            if (
-                training.step_index % config.preview_every == 0
-                or training.step_index == training.schedule.total
-            ):
+            if training.step_index % config.preview_every == 0 or training.step_index == total:
                 on_preview()
         training.save(folder)
-        return interrupted() and training.step_index < training.schedule.total
+        return interrupted() and training.step_index < total
 
 
 def _keep_until(path: Path, step: int) -> TextIO:

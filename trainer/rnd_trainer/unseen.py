@@ -56,10 +56,10 @@ class UnseenPoses:
         rng = np.random.default_rng((self._config.seed, step))
         drawn = drawn_pose(self._skeleton, self._config.model, rng).to(self._points.device)
         weights, near = (self._edges.weights(model, p) for p in (drawn, nudged_pose(drawn, rng)))
+        stretch = self._edges.stretch(weights, self._points, drawn)
         return {
             "kept": MM2 * self._moved(model, pose, step % KEPT_NODES).square().sum(-1).mean(),
-            "edges": self._config.weight_edges
-            * stretch_penalty(self._edges.stretch(weights, self._points, drawn)),
+            "edges": self._config.weight_edges * stretch_penalty(stretch),
             "smooth": self._config.weight_smooth * (weights - near).square().sum(-1).mean(),
         }
 

@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from rnd_runtime.doctor import Finding
+from rnd_runtime.plain import print_plain
 
 FRAME = "frame to frame"
 LATENCY = "pose to pixels"
@@ -17,12 +18,12 @@ _stderr = Console(stderr=True)
 
 def say(line: str) -> None:
     """One plain line on stdout."""
-    Console().print(line, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    print_plain(Console(), line)
 
 
 def warn(message: str) -> None:
     """One warning line on stderr."""
-    _stderr.print(f"rnd-play: warning: {message}", markup=False, emoji=False, highlight=False, soft_wrap=True)
+    print_plain(_stderr, f"rnd-play: warning: {message}")
 
 
 def with_progress(frames: range, done: Iterable[int]) -> Iterable[int]:
@@ -47,7 +48,7 @@ def print_summary(summary: dict[str, dict[str, float]], *, headline: str) -> Non
         table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
     console = Console()
     console.print(table)
-    console.print(headline, markup=False, emoji=False, highlight=False, soft_wrap=True)
+    print_plain(console, headline)
 
 
 def print_findings(findings: Iterable[Finding]) -> None:
@@ -57,4 +58,4 @@ def print_findings(findings: Iterable[Finding]) -> None:
         lines = [f"{finding.label:<14} {finding.value}"]
         if finding.advice is not None:
             lines.append(f"{'':<14} → {finding.advice}")
-        console.print("\n".join(lines), markup=False, emoji=False, highlight=False, soft_wrap=True)
+        print_plain(console, "\n".join(lines))

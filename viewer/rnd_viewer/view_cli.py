@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.plain import print_plain
 from rnd_runtime.threads import set_threads
 
 from .view_options import ViewOptions
@@ -44,7 +45,7 @@ def view(options: ViewOptions) -> int:
     try:
         token = None if options.local else secrets.token_urlsafe(16)
         with serve(scene, options.host, options.port, token) as (server, url):
-            console.print(f"rnd-view: {url}", soft_wrap=True, markup=False, emoji=False)
+            print_plain(console, f"rnd-view: {url}")
             if options.browser and options.local:
                 Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
             server.serve_forever()

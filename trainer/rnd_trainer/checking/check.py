@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rnd_runtime.capture import Capture, Frame, FrameImages, load_capture
 from rnd_runtime.capture_format import decode_normals, read_unit_range
 from rnd_runtime.errors import InputError
-from rnd_trainer.data import MAX_BAD_MASKS, usable
+from rnd_trainer.data import MAX_BAD_MASKS, light_names, usable
 from rnd_trainer.silhouette import overlap
 
 from .hypotheses import explain, explain_timing
@@ -140,7 +140,7 @@ def _training(capture: Capture) -> list[Finding]:
     if not frames:
         sentence = f'no picture trains: none of {len(capture.frames)} is of the split "train"'
         return [Finding("wrong", "training", sentence)]
-    names = sorted({frame.light or "unknown" for frame in frames})
+    names = light_names(frames)
     if len(names) > 1:
         sentence = f"the training pictures have {len(names)} lights ({', '.join(names)}); one can be learned"
         return [Finding("wrong", "training", sentence)]
@@ -235,9 +235,8 @@ def _masks(bad: list[tuple[Frame, FrameImages]], capture: Capture) -> list[Findi
     frame, images = bad[0]
     dim = 0 < float(images.mask.max()) < 0.1
     why = ": they look like 0 and 1 of 255" if dim else ""
-    too_many = (
-        sum(frame.split == "train" for frame, _ in bad) > MAX_BAD_MASKS * learned
-    )  # rnd-train's own rule
+    not_learned = sum(frame.split == "train" for frame, _ in bad)
+    too_many = not_learned > MAX_BAD_MASKS * learned  # rnd-train's own rule
     level: Level = "wrong" if too_many or dim else "note"
     return [Finding(level, "masks", f"{len(bad)} of {count} empty or full, the first {frame.mask}{why}")]
 

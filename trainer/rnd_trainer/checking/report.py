@@ -34,12 +34,12 @@ def check_and_report(capture: Path, out: Path) -> int:
         save_report(report, out)
     finally:  # shown where they cannot be saved, and saved where nobody reads them
         _show(report)
-    Console().print(f"      overlay: {escape(str(out / 'check.png'))}", soft_wrap=True)
+    Console(emoji=False).print(f"      overlay: {escape(str(out / 'check.png'))}", soft_wrap=True)
     return 1 if report.wrong else 0
 
 
 def _show(report: Report) -> None:
-    console = Console()
+    console = Console(emoji=False)
     for finding in report.findings:
         console.print(
             f"{_MARKS[finding.level]:>5} {finding.subject}: {escape(finding.sentence)}", soft_wrap=True
