@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
+import numba
 import numpy as np
 import pytest
 import torch
@@ -435,6 +436,13 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
 ) -> None:
     calls: list[tuple[str, int, float, int]] = []
     config = dataclasses.replace(tiny_config, steps=4)
+    read = Capture.load_frame
+
+    def with_albedo(capture, frame):
+        images = read(capture, frame)
+        return dataclasses.replace(images, albedo_srgb=images.image_srgb)
+
+    monkeypatch.setattr(Capture, "load_frame", with_albedo)
 
     def go():
         return ablate(
@@ -478,6 +486,9 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(
     ssim = [r["ssim"] for r in rows if (r["method"], r["split"]) == ("static skinning", "novel_view")]
     assert cell["ssim"] == pytest.approx(sum(ssim) / 2) and "lpips" not in cell
     assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
+    # plain colours have no albedo that could be compared
+    assert {row["method"] for row in rows if "psnr_albedo" in row} == {"ours", "static skinning"}
+    assert {row["train_threads"] for row in rows} == {numba.get_num_threads()}
 
 
 def test_runs_done_before_are_looked_at_before_any_is_trained(
@@ -584,7 +595,11 @@ def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tin
     assert {(row["method"], row["steps"]) for row in rows} == {("ours", 8), ("1/4", 2), ("1/2", 4)}
     draw_lengths(rows, [tmp_path / "lengths.svg"])
     drawn = (tmp_path / "lengths.svg").read_text(encoding="utf-8")
-    for said in ("minutes of training", *{row["split"] for row in rows}):
+    for said in (
+        "minutes of training",
+        *{row["split"] for row in rows},
+        *{row["train_machine"] for row in rows},
+    ):
         assert said in drawn
     draw_lengths(rows, [tmp_path / "again.svg"])
     assert (tmp_path / "again.svg").read_text(encoding="utf-8") == drawn

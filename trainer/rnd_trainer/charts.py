@@ -48,7 +48,8 @@ def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
 def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
     """PSNR of every split against minutes of training, of ``rnd-eval --ablate --study lengths``.
 
-    A point is a training of its own, with its own schedule; the mean over seeds, with their range.
+    A point is a training of its own, with its own schedule; the mean over seeds, with their range. The title names
+    every machine that any of them was trained on.
     """
     with chart(files, (7.5, 4.2)) as figure:
         from matplotlib.ticker import LogLocator, NullFormatter  # here, as of an extra
@@ -56,17 +57,18 @@ def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
         axes = figure.add_subplot()
         for split in dict.fromkeys(row["split"] for row in rows):
             points = []
-            for steps in sorted({row["steps"] for row in rows}):
-                of = [row for row in rows if row["split"] == split and row["steps"] == steps]
+            for method in dict.fromkeys(row["method"] for row in rows):
+                of = [row for row in rows if row["split"] == split and row["method"] == method]
                 figures = [row["psnr"] for row in of]
                 points.append((sum(row["minutes"] for row in of) / len(of), sum(figures) / len(of), figures))
-            minutes, means, spreads = zip(*points)
+            minutes, means, spreads = zip(*sorted(points))
             low = [mean - min(figures) for mean, figures in zip(means, spreads)]
             high = [max(figures) - mean for mean, figures in zip(means, spreads)]
             axes.errorbar(minutes, means, yerr=(low, high), marker="o", ms=4, lw=1, capsize=2, label=split)
         first = rows[0]
         what = f"{first['gaussians']:,} Gaussians".replace(",", " ")
-        axes.set_title(f"Held-out PSNR against training time: {what}, {first['machine']}", loc="left")
+        machines = sorted({row.get("train_machine") or row["machine"] for row in rows})
+        axes.set_title(f"Held-out PSNR against training time: {what}, {'; '.join(machines)}", loc="left")
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")

@@ -90,6 +90,8 @@ def score(
         result = evaluate(
             judge, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep
         )
+        if not lit:
+            result.scores.pop("psnr_albedo", None)
         if folder is not None:
             contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
         exact = all(frame.normal_gt is not None for frame in capture.split(split))
@@ -144,7 +146,8 @@ def sizes(capture: Capture, splits: Iterable[Split] = HELD_OUT) -> list[tuple[in
 def _provenance(checkpoint: Any) -> dict[str, Any]:
     info, config = checkpoint.info, checkpoint.config
     return {
-        "minutes": info.get("minutes"), "capture": info.get("capture"), "train_motion": info.get("motion"),
+        "minutes": info.get("minutes"), "train_threads": info.get("threads"), "train_machine": info.get("machine"),
+        "capture": info.get("capture"), "train_motion": info.get("motion"),
         "steps": config.steps,
         "step": info.get("step"), "seed": config.seed,
         "gaussians": config.model.gaussians, "image_scale": config.image_scale, "light": config.light,

@@ -11,11 +11,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from rnd_runtime.capture import Capture
+from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import sha256_of
 from rnd_runtime.light import texel_directions
@@ -366,6 +368,8 @@ class Training:
             "steps_planned": self.schedule.total,
             "lit": self.lit,
             "minutes": round(self.seconds / 60, 3),
+            "threads": numba.get_num_threads(),
+            "machine": machine(),
             "pictures": len(self.views),
             "spacing_m": float(self.model.spacing),
             "perceptual": None if self.perceptual is None else self.perceptual.backbone,

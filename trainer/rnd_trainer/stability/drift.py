@@ -11,7 +11,7 @@ import torch
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.gaussians import Gaussians
-from rnd_runtime.motion import Motion
+from rnd_runtime.motion import Motion, save_motion
 from rnd_runtime.raster_cpu import rasterize
 from rnd_trainer.checkpoint import load_checkpoint
 from rnd_trainer.data import pose_input
@@ -72,7 +72,7 @@ def stored_precisions(subject: Subject) -> Result:
         for name, file in files.items()
     ]
     figures: list[Figure] = []
-    motion = wild_motion(subject, subject.few(12, 60))
+    motion = wild_motion(subject, subject.few(12, 200))
     for (name, file), done in zip(files.items(), run_commands(subject.work, runs)):
         if done.code != 0:
             figures.append(holds(f"{name} export", [f"exit {done.code}: {done.errors.strip()[-120:]}"]))
@@ -123,7 +123,7 @@ def threads(subject: Subject) -> Result:
         ),
     ]
     if not subject.small:
-        figures.append(_plain_cpu(subject, one, image_one))
+        figures.append(_plain_cpu(subject, walk, time, image_one))
     return Result(tuple(figures))
 
 
@@ -135,31 +135,34 @@ def _picture(subject: Subject, posed: Gaussians) -> np.ndarray:
 
 _PLAIN = """
 import sys, numpy as np
-from pathlib import Path
+from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
+from rnd_runtime.light import Light
+from rnd_runtime.motion import load_motion
 from rnd_runtime.raster_cpu import rasterize
-given = np.load(sys.argv[1])
+from rnd_runtime.shading import Shader
+avatar, motion, given, made, time = sys.argv[1:]
+given, avatar = np.load(given), Avatar.load(avatar)
 camera = Camera(int(given["size"]), int(given["size"]), given["K"], given["w2c"])
-image = rasterize(given["means"], given["covariances"], given["opacities"], given["radiance"], camera).image
-np.save(sys.argv[2], image)
+posed = avatar.pose(load_motion(motion, avatar.skeleton), float(time))
+radiance = Shader(Light(given["light"]), "table+sun").shade(posed, camera.position)
+np.save(made, rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera).image)
 """
 
 
-def _plain_cpu(subject: Subject, posed: Gaussians, image: np.ndarray) -> Figure:
-    """The rasteriser compiled for a CPU without AVX-512 (x86-64-v3), in a process of its own."""
+def _plain_cpu(subject: Subject, walk: Motion, time: float, image: np.ndarray) -> Figure:
+    """Posing, shading and splatting compiled for a CPU without AVX-512 (x86-64-v3), in a process of its own."""
     camera = subject.camera()
-    given, made = subject.work / "plain_in.npz", subject.work / "plain_out.npy"
-    radiance = subject.shader.shade(posed, camera.position)
-    np.savez(
-        given, means=posed.means, covariances=posed.covariances, opacities=posed.opacities, radiance=radiance,
-        size=camera.width, K=camera.K, w2c=camera.world_to_camera,
-    )  # fmt: skip
+    given, made, motion = (subject.work / f"plain_{name}" for name in ("in.npz", "out.npy", "walk.npz"))
+    save_motion(motion, walk)
+    np.savez(given, size=camera.width, K=camera.K, w2c=camera.world_to_camera, light=subject.light.radiance)
     more = environment(
         NUMBA_CPU_NAME="haswell",
         NUMBA_CPU_FEATURES="+avx,+avx2,+fma,+sse4.2",
         NUMBA_CACHE_DIR=str(subject.work / "plain_cache"),
     )
-    subprocess.run([sys.executable, "-c", _PLAIN, str(given), str(made)], env=more, check=True, timeout=600)
+    files = (str(file) for file in (subject.avatar_file, motion, given, made))
+    subprocess.run([sys.executable, "-c", _PLAIN, *files, str(time)], env=more, check=True, timeout=600)
     return at_most(
         "picture without AVX-512, largest difference", float(np.abs(np.load(made) - image).max()), 1e-5
     )

@@ -16,6 +16,9 @@ from .commands import PLAY, run_commands
 from .figures import Result, at_most, holds, refusal
 from .subject import Subject
 
+HIGH = 6.0
+"""metres: no camera that sees a body there sees one at the origin"""
+
 
 def bad_motions(subject: Subject) -> Result:
     """P13: each broken file ends in one line that names file, field and frame; the command exits with 2."""
@@ -130,26 +133,33 @@ def other_betas(subject: Subject) -> Result:
 
 
 def wrong_camera(subject: Subject) -> Result:
-    """P16: a camera of another fit, and a motion whose up axis is taken wrongly."""
-    motion, wrong = subject.work / "still.npz", []
+    """P16: a camera of another fit; and one motion, y up and six metres above the floor, by either up axis."""
+    motion, lifted = subject.work / "still.npz", subject.work / "lifted.npz"
     subject.save_motion(motion)
+    np.savez(lifted, poses=np.zeros((2, 72)), trans=np.tile([0.0, HIGH, 0.0], (2, 1)), mocap_framerate=60.0)
     view = subject.camera(0.0, 0.1, 32)
-    away = view.world_to_camera.copy()
+    away, above = view.world_to_camera.copy(), view.world_to_camera.copy()
     away[:3, 3] = [0, 0, -40.0]
-    camera = {"width": 32, "height": 32, "K": view.K.tolist(), "world_to_camera": away.tolist()}
-    file = subject.work / "elsewhere.json"
-    file.write_text(json.dumps(camera), encoding="utf-8")
-    aist = subject.work / "aist.npz"  # z up, three metres above the floor, seen by a camera of the y-up fit
-    np.savez(aist, poses=np.zeros((2, 72)), trans=np.tile([0.0, 0.0, 30.0], (2, 1)), mocap_framerate=60.0)
-    upright = subject.work / "upright.json"
-    camera["world_to_camera"] = view.world_to_camera.tolist()
-    upright.write_text(json.dumps(camera), encoding="utf-8")
-    base = [str(subject.avatar_file), "--out", str(subject.work / "out_view"), "--format", "png"]
+    above[:3, 3] -= above[:3, :3] @ [0, HIGH, 0]
+    files = {}
+    for name, world_to_camera in (("away", away), ("above", above)):
+        camera = {"width": 32, "height": 32, "K": view.K.tolist()}
+        camera["world_to_camera"] = world_to_camera.tolist()
+        files[name] = subject.work / f"{name}.json"
+        files[name].write_text(json.dumps(camera), encoding="utf-8")
+    cases = {
+        "another fitter's camera": (motion, "away", "y", 2),
+        "the right up axis": (lifted, "above", "y", 0),
+        "the wrong up axis": (lifted, "above", "z", 2),
+    }
+    base = [str(subject.avatar_file), "--format", "png"]
     runs = [
-        (PLAY, [*base, "--motion", str(motion), "--camera", str(file)]),
-        (PLAY, [*base, "--motion", str(aist), "--camera", str(upright), "--motion-up", "z"]),
-    ]
-    for name, done in zip(("another fitter's camera", "wrong up axis"), run_commands(subject.work, runs)):
-        if done.code != 2 or "nothing of the avatar is in view" not in done.errors:
+        (PLAY, [*base, "--motion", str(file), "--camera", str(files[camera]), "--motion-up", up,
+                "--out", str(subject.work / f"out_view_{place}")])
+        for place, (file, camera, up, _) in enumerate(cases.values())
+    ]  # fmt: skip
+    wrong = []
+    for (name, (*_, code)), done in zip(cases.items(), run_commands(subject.work, runs), strict=True):
+        if done.code != code or (code == 2 and "nothing of the avatar is in view" not in done.errors):
             wrong.append(f"{name}: exit {done.code}, {done.errors[-80:]!r}")
     return Result((holds("empty first frames not called so", wrong),))

@@ -137,7 +137,10 @@ def candy_wrapper(subject: Subject) -> Result:
         above("cross-section ratio at 150°, thinnest slice", min(ratios), 0.5,
               baseline=("template LBS", min(by_template))),
         below("not finite by 180°", float(not finite), 1, "poses"),
-        below("normal error at 120°, mean", max(errors), 15, "°", baseline=("A_R n", max(plain_errors))),
+        below("normal error at 120°, mean of the slice that errs most", max(e.max() for e in errors), 15, "°",
+              baseline=("A_R n", max(e.max() for e in plain_errors))),
+        stated("the same, mean of all slices", max(e.mean() for e in errors), "°",
+               baseline=("A_R n", max(e.mean() for e in plain_errors))),
     )  # fmt: skip
     return Result(figures)
 
@@ -161,16 +164,21 @@ class _Limb:
     def ratio(self, posed: Gaussians) -> float:
         """Radius over that at rest, of the slice that lost most."""
         radii = self._radii(posed.means)[1]
-        slices = [self.around & (self.slice == k) for k in np.unique(self.slice[self.around])]
-        return min(float(radii[s].mean() / self.radii[s].mean()) for s in slices if s.sum() >= RING_COUNT)
+        return min(float(radii[s].mean() / self.radii[s].mean()) for s in self._slices())
 
-    def normal_error(self, posed: Gaussians, normals: NDArray[np.floating]) -> float:
-        """Mean angle in degrees to the rest normals as the surface around them moved, known from places alone.
+    def _slices(self) -> list[NDArray[np.bool_]]:
+        """The limb's rings [N] along its bone, but those of few Gaussians."""
+        slices = [self.around & (self.slice == k) for k in np.unique(self.slice[self.around])]
+        return [s for s in slices if s.sum() >= RING_COUNT]
+
+    def normal_error(self, posed: Gaussians, normals: NDArray[np.floating]) -> Floats:
+        """Mean angle of each slice [S], degrees, to the rest normals as the surface around them moved, known from
+        places alone.
 
         Planes through twelve neighbours, at rest and posed, give a map F of tangents and normal; the normal to be is
         F's inverse transpose times the one at rest.
         """
-        error = []
+        error = np.zeros(len(self.around))
         for index, near in zip(np.flatnonzero(self.around), self.near):
             normal = self.rest.normals[index].astype(np.float64)
             first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
@@ -183,8 +191,8 @@ class _Limb:
             true = np.linalg.inv(true).T @ normal
             ours = normals[index].astype(np.float64)
             cosine = true @ ours / max(np.linalg.norm(true) * np.linalg.norm(ours), 1e-12)
-            error.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-        return float(np.mean(error))
+            error[index] = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        return np.array([error[s].mean() for s in self._slices()])
 
 
 def _frame(flat: Floats, offsets: Floats) -> Floats:

@@ -291,9 +291,7 @@ def grazing(subject: Subject) -> Result:
             eye = 60.0 * np.array(way)
             view = eye - dark.means
             cosine = (dark.normals * view).sum(1) / np.linalg.norm(view, axis=1)
-            edge = np.flatnonzero(np.abs(cosine) < GRAZING)
-            edge = edge[:: max(1, len(edge) // subject.few(30, 150))]
-            part = _part(dark, edge)
+            part = _part(dark, np.flatnonzero((cosine > 0) & (cosine < GRAZING)))
             ours = Shader(subject.light, "table+sun").shade(part, eye)
             exact = shade_reference(part, subject.light, eye, texels=(256, 512))
             finite &= bool(np.isfinite(ours).all())

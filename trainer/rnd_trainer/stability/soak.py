@@ -58,7 +58,8 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
     """Train for ``steps`` steps in one go (a resumed training is R11's), after a rehearsal as every training has.
 
     Steps are of three kinds: plain colours, drawn texels, the whole light. The last does several times the first's
-    work by design, so the pace is looked at within each kind too.
+    work by design, so the pace is looked at within each kind too. The third stage, whose steps have no picture and
+    take an eighth of the time, is left out: it would make the end look fast.
     """
     from rnd_trainer.train import Training
 

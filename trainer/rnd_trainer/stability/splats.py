@@ -6,7 +6,7 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime import raster_oracle as oracle
 from rnd_runtime.camera import Camera
@@ -17,7 +17,9 @@ from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.raster_gl import GlRasterizer
 from rnd_runtime.rotations import quaternion_to_matrix
+from rnd_trainer.posing import pose_gaussians
 from rnd_trainer.raster_reference import rasterize as rasterize_by_torch
+from rnd_trainer.twist import TwistFrames
 
 from .figures import Bytes, Figure, Floats, Result, above, at_most, below, coded, decibels, holds, refusal
 from .poses import BYTE
@@ -69,43 +71,56 @@ def _camera(width: int = 96, height: int = 96, eye: tuple[float, float, float] =
 
 
 def broken_quaternions(subject: Subject) -> Result:
-    """G2: zero, NaN and denormal rotations and covariances; q and −q, and the paper's sum of quaternions."""
+    """G2: zero, NaN, denormal and infinite rotations, scales and covariances; q and −q, and the paper's sum of
+    quaternions. Rotations and scales go through the model's own posing, which has vectors: 2 xyz/w of a quaternion."""
     means, covariances, opacities, features = _scene(1)
     camera = _camera()
-    wrong = []
-    for name, value in (("zero", 0.0), ("NaN", np.nan), ("denormal", 1e-45), ("infinite", np.inf)):
-        broken = covariances.copy()
-        broken[::7] = value
-        raster = rasterize(means, broken, opacities, features, camera)
-        if not (np.isfinite(raster.image).all() and np.isfinite(raster.alpha).all()):
-            wrong.append(f"{name} covariances")
     rng = np.random.default_rng(2)
     q = rng.normal(size=(len(means), 4))
-    scales = rng.uniform(0.01, 0.05, (len(means), 1, 3))
     delta = 0.3 * rng.normal(size=q.shape)
+    scales = rng.uniform(0.01, 0.05, (len(means), 3))
+    given = {"rotation": 2 * q[:, 1:] / q[:, :1], "turn": delta[:, 1:], "scales": scales}
 
-    def image(quaternions: Floats) -> Floats32:
-        factors = quaternion_to_matrix(quaternions) * scales
-        upper = (factors @ factors.transpose(0, 2, 1)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        return rasterize(means, upper.astype(np.float32), opacities, features, camera).image
+    def image(upper: Floats32) -> Floats32:
+        raster = rasterize(means, upper, opacities, features, camera)
+        return np.dstack([raster.image, raster.alpha])
 
-    turned = _multiply(np.concatenate([np.ones((len(q), 1)), delta[:, 1:] / 2], axis=1), q)
-    turned_negative = _multiply(np.concatenate([np.ones((len(q), 1)), delta[:, 1:] / 2], axis=1), -q)
-    ours = float(np.abs(image(turned) - image(turned_negative)).max())
+    wrong = []
+    for what in ("covariances", *given):
+        for name, value in (("zero", 0.0), ("NaN", np.nan), ("denormal", 1e-45), ("infinite", np.inf)):
+            broken = np.array(covariances if what == "covariances" else given[what], np.float32)
+            broken[::7] = value
+            upper = broken if what == "covariances" else _posed(**{**given, what: broken})
+            if not np.isfinite(image(upper)).all():
+                wrong.append(f"{name} {what}")
+    negative = {**given, "rotation": 2 * -q[:, 1:] / -q[:, :1]}
+    ours = float(np.abs(image(_posed(**given)) - image(_posed(**negative))).max())
     unit = q / np.linalg.norm(q, axis=1, keepdims=True)
-    added = float(np.abs(image(unit + delta) - image(-unit + delta)).max())
+    added = [image(_upper(quaternion_to_matrix(sign * unit + delta), scales)) for sign in (1, -1)]
+    baseline = "r + Δr", float(np.abs(added[0] - added[1]).max())
     return Result((
         holds("injected values that come through", wrong),
-        at_most("image of q against −q with Δr, largest difference", ours, 1e-6, baseline=("r + Δr", added)),
+        at_most("image of q against −q with Δr, largest difference", ours, 1e-6, baseline=baseline),
     ))  # fmt: skip
 
 
-def _multiply(a: Floats, b: Floats) -> Floats:
-    """Products of quaternions [N, 4] (wxyz)."""
-    w = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], 1, keepdims=True)
-    return np.concatenate(
-        [w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])], axis=1
-    )
+def _posed(rotation: ArrayLike, turn: ArrayLike, scales: ArrayLike) -> Floats32:
+    """Covariances [N, 6] as the model poses Gaussians of these vectors [N, 3] and scales [N, 3] m at rest."""
+    count = len(np.asarray(scales))
+    vectors, turns, sizes = (torch.tensor(np.array(x, np.float32)) for x in (rotation, turn, scales))
+    up = torch.tensor([0.0, 1.0, 0.0]).expand(count, 3)
+    nothing, frames = torch.zeros(count, 3), torch.eye(3).expand(count, 3, 3)
+    limbs = TwistFrames(up, nothing, torch.zeros(count))
+    weights, bones = torch.ones(count, 1), torch.eye(3, 4)[None]
+    posed = pose_gaussians(weights, bones, nothing, turns, frames, vectors, sizes, up, limbs)
+    return posed[1].numpy()
+
+
+def _upper(rotations: Floats, scales: Floats) -> Floats32:
+    """Covariances [N, 6] m² of rotations [N, 3, 3] and scales [N, 3] m."""
+    factors = rotations * scales[:, None]
+    upper = (factors @ factors.transpose(0, 2, 1)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    return upper.astype(np.float32)
 
 
 def fly_through(subject: Subject) -> Result:
