@@ -40,8 +40,8 @@ class TrainOptions:
     resume: bool = False
     """continue a stopped training in OUT"""
     steps: int | None = None
-    """with pictures, instead of the preset's 4500 (quick: 2000); the third stage, of unseen poses, adds half as many,
-    which are short"""
+    """with pictures, instead of the preset's 6000 (quick: 2000); the third stage, of unseen poses, adds three eighths
+    as many (quick: half), which are short"""
     gaussians: int | None = None
     """instead of the preset's; an eighth of them are nodes"""
     save_every: int | None = None

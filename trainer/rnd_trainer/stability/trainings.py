@@ -23,7 +23,7 @@ from .subject import Subject
 
 NOISE_DEGREES = 2.0
 SHORT = 12
-"""steps with a picture of a training that is only compared with another; half as many without one follow"""
+"""steps with a picture of a training that is only compared with another; more without one follow"""
 
 
 def tiny_config(*, steps: int, gaussians: int = 1200) -> TrainConfig:
