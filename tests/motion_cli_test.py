@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from motion_formats_test import FRAMES, MATRICES, _easymocap_json, _phalp
+from motion_formats_test import FRAMES, MATRICES, NAMINGS, _bvh, _easymocap_json, _phalp
 from rnd_runtime.body import Body
 from rnd_runtime.motion import load_motion
+from rnd_runtime.skeleton import SMPL_NAMES
 from rnd_trainer.data_cli import main
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -34,6 +35,29 @@ def test_a_walk_goes_out_as_amass_and_comes_back(tmp_path, monkeypatch, capsys):
     before, after = load_motion(ASSETS / "walk.npz", skeleton), load_motion(out, skeleton)
     assert_allclose(after.rotations, before.rotations, atol=1e-9)
     assert_allclose(after.translations, before.translations, atol=1e-9)
+
+
+FEET = [SMPL_NAMES.index(f"{side}_foot") for side in ("left", "right")]
+
+
+def _lowest_foot(file: Path) -> float:
+    """m above the floor, of the embedded body."""
+    skeleton = Body.load(ASSETS / "body.npz").skeleton
+    motion = load_motion(file, skeleton)
+    heights = skeleton.joint_transforms(motion.rotations, motion.translations)[:, FEET, 1, 3]
+    return float(np.percentile(heights.min(1), 5))
+
+
+def test_without_a_body_people_stand_on_the_floor(tmp_path, monkeypatch, capsys):
+    """SMPL's mean body is about its chest: a BVH and a walk from a body that stands on y = 0 come up to the floor."""
+    out = tmp_path / "out.npz"
+    for source in (_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), ASSETS / "walk.npz"):
+        assert _run(monkeypatch, source, out) == 0
+        assert abs(_lowest_foot(out)) < 0.1
+        lifted = "lifted by 1.17 m" in capsys.readouterr().out
+        assert lifted == (source.suffix == ".npz")
+    _run(monkeypatch, out, tmp_path / "again.npz")
+    assert "lifted" not in capsys.readouterr().out
 
 
 def test_edits_and_rates(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import json
 import pickle  # noqa: TID251  # to write what others write
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -590,6 +591,16 @@ def test_feet_come_down_to_the_floor(tmp_path):
     joints = SKELETON.joint_transforms(motions[0].rotations, motions[0].translations)[:, feet, 1, 3]
     lowest = (joints - SKELETON.rest_joints[feet, 1]).min(1)
     assert -0.01 < lowest.min() < 0.01 and lowest.max() < 0.2
+
+
+@pytest.mark.parametrize("down", [0.0, 1.15])
+def test_feet_come_down_to_the_floor_wherever_the_template_rests(tmp_path, down):
+    """A template about SMPL's origin plays a recording at the height of one that stands on its feet."""
+    skeleton = replace(SKELETON, rest_joints=SKELETON.rest_joints - [0, down, 0])
+    motion = load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), skeleton)
+    feet = [SMPL_NAMES.index(f"{side}_foot") for side in ("left", "right")]
+    lowest = skeleton.joint_transforms(motion.rotations, motion.translations)[:, feet, 1, 3].min()
+    assert lowest == pytest.approx(SKELETON.rest_joints[feet, 1].min(), abs=0.02)
 
 
 def test_a_recording_is_turned_to_the_front_and_a_reference_pose_left_out(tmp_path):

@@ -22,6 +22,8 @@ _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulde
 _STANDS = np.cos(np.radians(30))  # a zero pose that leans less is taken to stand
 _UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero pose's up
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
+_ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
+_STANDS_AT_ZERO = 0.05  # m by which the sole of a template that stands on y = 0 may be off
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
@@ -41,7 +43,7 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     A joint's world rotation is the recorded one after the rotation that takes our rest pose to the recording's
     zero pose: ``G_k = W Q_k Bᵀ A_k``, with Q_k the recorded world rotation, B and W the turns from the zero pose's
     and the world's axes to ours, and A_k the least rotation from our bone's direction to theirs. Lengths are scaled by
-    the legs; the floor is where the feet come down. Which way a recording faces says nothing, so it is turned by
+    the legs; the feet come down to y = 0, wherever the template has its origin. Which way a recording faces says nothing, so it is turned by
     quarters to begin facing the front (+Z). A T-pose for reference before the motion is left out.
 
     Args:
@@ -216,12 +218,24 @@ def _leg(joints: Mapping[str, Floats]) -> float:
 
 
 def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float:
-    """By how much feet that stand are above where they stand at rest."""
-    feet = [k for k, name in enumerate(skeleton.names) if name.endswith(("_ankle", "_foot"))]
+    """By how much feet that stand are above the floor, y = 0; none without feet."""
+    feet = [k for k, name in enumerate(skeleton.names) if name.endswith(tuple(_ABOVE_SOLE))]
     if not feet:
         return 0.0
     height = skeleton.joint_transforms(rotations, translations)[:, feet, 1, 3] - skeleton.rest_joints[feet, 1]
-    return float(np.percentile(height.min(1), _FLOOR_PERCENTILE))
+    return float(np.percentile(height.min(1), _FLOOR_PERCENTILE)) + sole(skeleton)
+
+
+def sole(skeleton: Skeleton) -> float:
+    """The height y in m of the soles at rest; 0 for a skeleton without feet, or about as high."""
+    heights = [
+        float(place[1]) - above
+        for name, place in zip(skeleton.names, skeleton.rest_joints)
+        for end, above in _ABOVE_SOLE.items()
+        if name.endswith(end)
+    ]
+    height = min(heights, default=0.0)
+    return height if abs(height) > _STANDS_AT_ZERO else 0.0
 
 
 def _reference_frames(rotations: Floats) -> int:

@@ -15,10 +15,11 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.errors import check_option
 from rnd_runtime.files import existing_file, npz_output, refuse_input
-from rnd_runtime.motion import load_motion, motion_inputs
+from rnd_runtime.motion import Motion, load_motion, motion_inputs
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
 from rnd_runtime.motion_files import FPS_LIMITS
 from rnd_runtime.plain import print_plain
+from rnd_runtime.retarget import sole
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
 
 # Joints of an adult in cm, SMPL's order, standing about SMPL's origin: what matters are the proportions of the legs.
@@ -30,6 +31,7 @@ _MEAN_PERSON = (
     (-77, 21, -6),
 )
 # fmt: on
+_NEAR = 0.3  # m from there at which feet are taken to stand where the mean person's do at rest
 
 
 def motion(
@@ -60,6 +62,8 @@ def motion(
         check_option(rate is None or low <= rate <= high, name, f"{low:g} to {high:g}", rate)
     skeleton = _skeleton(body)
     made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
+    if body is None:
+        made = _lifted(made, skeleton)
     if fps is not None:
         notes = made.notes + made.loop_notes(fps)
         made = replace(resampled(made, fps), notes=notes)
@@ -74,6 +78,17 @@ def motion(
     line = f"{out}: {made.frame_count} frames, {seconds}"
     print_plain(console, line)
     return 0
+
+
+def _lifted(motion: Motion, mean: Skeleton) -> Motion:
+    """``motion`` on the floor, where a file whose ``trans`` begin at another body's rest has it about SMPL's origin."""
+    feet = [k for k, name in enumerate(mean.names) if name.endswith("_foot")]
+    heights = mean.joint_transforms(motion.rotations, motion.translations)[:, feet, 1, 3].min(1)
+    below = sole(mean)
+    if abs(np.percentile(heights, 5) - mean.rest_joints[feet, 1].min()) > _NEAR:
+        return motion
+    note = f"lifted by {-below:.2f} m, so that SMPL's mean body stands on the floor; --body names the motion's own"
+    return replace(motion, translations=motion.translations - [0, below, 0], notes=(*motion.notes, note))
 
 
 def _skeleton(body: Path | None) -> Skeleton:
