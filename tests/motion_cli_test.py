@@ -60,6 +60,27 @@ def test_without_a_body_people_stand_on_the_floor(tmp_path, monkeypatch, capsys)
     assert "lifted" not in capsys.readouterr().out
 
 
+def test_fingers_go_through(tmp_path, monkeypatch, capsys):
+    """An AMASS file comes out as it went in; what SMPL-H lacks, or a body given, is said to be left out."""
+    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
+    poses = 0.3 * np.random.default_rng(0).normal(size=(FRAMES, 55, 3))
+    members = {"trans": np.tile([0, 0, 1.2], (FRAMES, 1)), "mocap_framerate": 30.0}
+    for poses_in, left_out in (
+        (np.delete(poses, [22, 23, 24], 1), None),
+        (poses, "jaw, left_eye, right_eye"),
+    ):
+        np.savez(source, poses=poses_in.reshape(FRAMES, -1), **members)
+        assert _run(monkeypatch, source, out) == 0
+        with np.load(out) as archive:
+            assert_allclose(
+                archive["poses"].reshape(FRAMES, 52, 3), np.delete(poses, [22, 23, 24], 1), atol=1e-9
+            )
+        printed = capsys.readouterr().out
+        assert (f"left out: {left_out}\n" in printed) if left_out else ("left out" not in printed)
+    assert _run(monkeypatch, source, out, "--body", ASSETS / "body.npz") == 0
+    assert "the skeleton lacks are left out: jaw, left_eye, right_eye, left_index2" in capsys.readouterr().out
+
+
 def test_edits_and_rates(tmp_path, monkeypatch, capsys):
     arguments = ("--speed", 2, "--in-place", "--loop", "--smooth", 3, "--fps", 60)
     assert _run(monkeypatch, ASSETS / "walk.npz", tmp_path / "w.npz", *arguments) == 0

@@ -18,7 +18,7 @@ from rnd_runtime.joint_names import load_joint_map, match_joints
 from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from rnd_runtime.retarget import Retargeted, retarget
-from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS
+from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS, Skeleton
 
 SKELETON = Body.load(Path(__file__).parents[1] / "assets" / "body.npz").skeleton
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "motion"
@@ -601,6 +601,16 @@ def test_feet_come_down_to_the_floor_wherever_the_template_rests(tmp_path, down)
     feet = [SMPL_NAMES.index(f"{side}_foot") for side in ("left", "right")]
     lowest = skeleton.joint_transforms(motion.rotations, motion.translations)[:, feet, 1, 3].min()
     assert lowest == pytest.approx(SKELETON.rest_joints[feet, 1].min(), abs=0.02)
+
+
+def test_recorded_joints_that_nothing_follows_are_told(tmp_path):
+    """Not those that carry others, as the second joint of this spine does."""
+    file = _bvh(tmp_path / "a.bvh", NAMINGS["smpl"])
+    assert load_motion(file, SKELETON).left_out == ()  # hands stand still there
+    few = [k for k, name in enumerate(SMPL_NAMES) if name not in ("spine2", "head", "left_foot")]
+    parents = [-1, 0, 0, 0, 1, 2, 4, 5, 3, 7, 8, 8, 8, 11, 12, 13, 14, 15, 16, 17, 18]
+    skeleton = Skeleton(tuple(SMPL_NAMES[k] for k in few), parents, SKELETON.rest_joints[few])
+    assert load_motion(file, skeleton).left_out == ("left_foot", "head")
 
 
 def test_a_recording_is_turned_to_the_front_and_a_reference_pose_left_out(tmp_path):

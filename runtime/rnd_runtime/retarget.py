@@ -24,17 +24,22 @@ _UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero po
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
 _STANDS_AT_ZERO = 0.05  # m by which the sole of a template that stands on y = 0 may be off
+_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest."""
+    """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest.
+
+    ``left_out`` are the recorded joints that turn and that nothing here follows.
+    """
 
     rotations: Floats
     translations: Floats
     notes: tuple[str, ...]
+    left_out: tuple[str, ...]
 
 
 def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up: str = "auto") -> Retargeted:
@@ -43,8 +48,9 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     A joint's world rotation is the recorded one after the rotation that takes our rest pose to the recording's
     zero pose: ``G_k = W Q_k Bᵀ A_k``, with Q_k the recorded world rotation, B and W the turns from the zero pose's
     and the world's axes to ours, and A_k the least rotation from our bone's direction to theirs. Lengths are scaled by
-    the legs; the feet come down to y = 0, wherever the template has its origin. Which way a recording faces says nothing, so it is turned by
-    quarters to begin facing the front (+Z). A T-pose for reference before the motion is left out.
+    the legs; the feet come down to y = 0, wherever the template has its origin. Which way a recording faces says
+    nothing, so it is turned by quarters to begin facing the front (+Z). A T-pose for reference before the motion is
+    left out.
 
     Args:
         matched: for our joints the index of theirs; the rest stay at rest.
@@ -91,7 +97,17 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     resting = [name for name in skeleton.names if name not in matched]
     if resting:
         notes.append(f"joints that the motion lacks stay at rest: {', '.join(resting)}")
-    return Retargeted(rotations, translations, tuple(notes))
+    return Retargeted(rotations, translations, tuple(notes), _left_out(tree, set(matched.values())))
+
+
+def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
+    """The joints of ``tree`` that turn and carry none of those ``matched``."""
+    carry = {0, *matched}
+    for joint in reversed(range(len(tree.names))):
+        if joint in carry and joint:
+            carry.add(tree.parents[joint])
+    turns = np.abs(tree.rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return tuple(tree.names[k] for k in np.flatnonzero(turns) if k not in carry)
 
 
 def _world_rotations(

@@ -17,7 +17,7 @@ from rnd_runtime.errors import check_option
 from rnd_runtime.files import existing_file, npz_output, refuse_input
 from rnd_runtime.motion import Motion, load_motion, motion_inputs
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
-from rnd_runtime.motion_files import FPS_LIMITS
+from rnd_runtime.motion_files import FPS_LIMITS, SMPLH_NAMES
 from rnd_runtime.plain import print_plain
 from rnd_runtime.retarget import sole
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
@@ -31,6 +31,7 @@ _MEAN_PERSON = (
     (-77, 21, -6),
 )
 # fmt: on
+_FINGERS = frozenset(SMPLH_NAMES[22:])
 _NEAR = 0.3  # m from there at which feet are taken to stand where the mean person's do at rest
 
 
@@ -61,7 +62,11 @@ def motion(
     for name, rate in (("--source-fps", source_fps), ("--fps", fps)):
         check_option(rate is None or low <= rate <= high, name, f"{low:g} to {high:g}", rate)
     skeleton = _skeleton(body)
-    made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
+    loaded = load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map)
+    if body is None and not _FINGERS.isdisjoint(loaded.left_out):
+        skeleton = _with_fingers(skeleton)
+        loaded = load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map)
+    made = edit_motion(loaded, edits)
     if body is None:
         made = _lifted(made, skeleton)
     if fps is not None:
@@ -71,6 +76,11 @@ def motion(
     console = Console()
     for note in [
         *made.notes,
+        *(
+            [f"joints that turn and the skeleton lacks are left out: {', '.join(made.left_out)}"]
+            if made.left_out
+            else []
+        ),
         *([f"joints that SMPL-H lacks are left out: {', '.join(lost)}"] if lost else []),
     ]:
         print_plain(console, f"note: {note}")
@@ -89,6 +99,17 @@ def _lifted(motion: Motion, mean: Skeleton) -> Motion:
         return motion
     note = f"lifted by {-below:.2f} m, so that SMPL's mean body stands on the floor; --body names the motion's own"
     return replace(motion, translations=motion.translations - [0, below, 0], notes=(*motion.notes, note))
+
+
+def _with_fingers(skeleton: Skeleton) -> Skeleton:
+    """SMPL's ``skeleton`` with SMPL-H's fingers beside its hands, where they are: what matters is that they turn."""
+    names, parents, places = list(skeleton.names), list(skeleton.parents), list(skeleton.rest_joints)
+    for finger in SMPLH_NAMES[22:]:
+        side, bone = finger.split("_")[0], int(finger[-1])
+        parents.append(names.index(f"{side}_wrist" if bone == 1 else f"{finger[:-1]}{bone - 1}"))
+        places.append(skeleton.rest_joints[names.index(f"{side}_hand")])
+        names.append(finger)
+    return Skeleton(tuple(names), np.array(parents), np.array(places))
 
 
 def _skeleton(body: Path | None) -> Skeleton:
