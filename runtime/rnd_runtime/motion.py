@@ -132,7 +132,8 @@ def load_motion(
     """Read a motion file for ``skeleton``, Y up.
 
     Arrays (.npz, .pkl, .pt, .npy; layouts: :func:`motion_files.read_motion_file`): joints are matched by name; the
-    root is always the root. Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
+    root is always the root, and where a file's first joint is nobody's here, it stands above the root and turns it.
+    Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
     file that ``skeleton`` lacks are left out (:attr:`Motion.left_out`). Z-up files are of the SMPL family: they place
     the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In
     Y-up files ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
@@ -211,8 +212,7 @@ def _load_arrays(
             names[place] = ours
     z_up = (record.up if up == "auto" else up) == "z"
     rotations, used, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
-    turns = np.abs(record.rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
-    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(turns) if k not in used)
+    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(_turns(record.rotations)) if k not in used)
     translations, rest_root = record.translations, record.rest_root
     if z_up and rest_root is None:
         rest_root = SMPL_REST_ROOT
@@ -265,7 +265,19 @@ def _match_joints(
     for joint, name in enumerate(skeleton.names):
         if name in columns:
             result[:, joint] = rotations[:, columns[name]]
-    missing = [name for name, found in zip(skeleton.names, matched) if not found]
-    notes = (f"joints that the motion lacks stay at rest: {', '.join(missing)}",) if missing else ()
     used = {columns[name] for name in skeleton.names if name in columns}
-    return result, used, notes
+    notes = []
+    if 0 not in used and _turns(rotations)[0]:  # the first joint is above all others, and no other's
+        used.add(0)
+        result[:, 0] = rotations[:, 0] @ result[:, 0]
+        notes.append(f"{names[0] or 'the first joint'}, above {skeleton.names[0]}, turns all below it")
+    missing = [name for name, found in zip(skeleton.names, matched) if not found]
+    if missing:
+        notes.append(f"joints that the motion lacks stay at rest: {', '.join(missing)}")
+    return result, used, tuple(notes)
+
+
+def _turns(rotations: Floats) -> NDArray[np.bool_]:
+    """Which of the joints of ``rotations`` [F, J, 3, 3] turn at all: [J]."""
+    turns: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return turns
