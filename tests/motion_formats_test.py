@@ -603,6 +603,35 @@ def test_feet_come_down_to_the_floor_wherever_the_template_rests(tmp_path, down)
     assert lowest == pytest.approx(SKELETON.rest_joints[feet, 1].min(), abs=0.02)
 
 
+def _placed(file: Path, height: float) -> Path:
+    """The file with its hips at ``height`` along Y and in the middle."""
+    head, mark, frames = file.read_text().partition("Frame Time: 0.0083333\n")
+    lines = [" ".join(["0", f"{height}", "0", *line.split()[3:]]) for line in frames.splitlines()]
+    file.write_text(head + mark + "\n".join(lines) + "\n")
+    return file
+
+
+def test_who_lies_or_crawls_is_not_stood_upright(tmp_path):
+    """Hips at 0.35 m, trunk level: Y stays up, as in the zero pose, and a note says so."""
+    level = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    file = _placed(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"], facing=level), 0.35)
+    told, as_said = load_motion(file, SKELETON), load_motion(file, SKELETON, up="y")
+    assert_allclose(told.rotations, as_said.rotations, atol=TEXT)
+    assert abs(told.rotations[:, 0, 1, 1].mean()) < 0.3
+    assert (
+        "the trunk lies along z, and y stays up, as in the zero pose; --motion-up z overrules" in told.notes
+    )
+    assert not any("--motion-up" in note for note in as_said.notes)
+
+
+def test_a_trunk_that_stands_along_another_axis_makes_it_up_with_a_note(tmp_path):
+    """A Z-up world on a zero pose that stands along Y: hips a leg above the floor."""
+    level = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    motion = load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"], facing=level), SKELETON)
+    assert motion.rotations[:, 0, 1, 1].mean() > 0.9
+    assert "z is taken for up, as the trunk stands along it; --motion-up y overrules" in motion.notes
+
+
 def test_recorded_joints_that_nothing_follows_are_told(tmp_path):
     """Not those that carry others, as the second joint of this spine does."""
     file = _bvh(tmp_path / "a.bvh", NAMINGS["smpl"])

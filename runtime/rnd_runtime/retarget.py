@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 # in a back the joints lie, and a straight back must stay straight. Hands and feet follow the bone they hang on.
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
 _STANDS = np.cos(np.radians(30))  # a zero pose that leans less is taken to stand
+_LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # legs above the floor that hips are
 _UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero pose's up
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
@@ -71,7 +72,8 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     to_ours = _body_frame(ours) @ _body_frame(theirs).T
     recorded = tree.global_rotations()
     root = matched.get(skeleton.names[0], 0)
-    world = _upright(recorded[:, root], to_ours, up)
+    path = tree.path(root, recorded)
+    world, said = _upright(recorded[:, root], path / _leg(theirs), to_ours, up)
     turned = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
     rotations = _local_rotations(turned, skeleton)
     limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
@@ -85,11 +87,11 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
     hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
-    hips = (tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
+    hips = (path + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
     pelvis = scale * hips @ world.T - rotations[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)
-    notes = [*tree.notes]
+    notes = [*tree.notes, *said]
     if quarters:
         notes.append(f"turned by {quarters * 90:+d}° about the vertical, so that it begins facing the front")
     if first:
@@ -163,17 +165,40 @@ def _body_frame(joints: Mapping[str, Floats]) -> Floats:
     return frame
 
 
-def _upright(root: Floats, to_ours: Floats, up: str) -> Floats:
-    """The turn [3, 3] that makes the file's up axis ours."""
+def _upright(root: Floats, path: Floats, to_ours: Floats, up: str) -> tuple[Floats, tuple[str, ...]]:
+    """The turn [3, 3] that makes the file's up axis ours, and a note where the trunk stands along another.
+
+    ``path`` [F, 3] is the root's, in lengths of a leg. Whose trunk lies, and whose hips are half a leg above the floor
+    rather than a leg above one across the trunk, lies or crawls.
+    """
     trunk = to_ours.T[:, 1]  # up in the zero pose
     stands = (root @ trunk).mean(0)
+    axis = trunk
+    notes: tuple[str, ...] = ()
     if up != "auto":
         axis = np.eye(3)["xyz".index(up)]
-    elif stands @ trunk > _UP_CLEAR:
-        axis = trunk
-    else:
-        axis = np.eye(3)[np.abs(stands).argmax()] * np.sign(stands[np.abs(stands).argmax()])
-    return _swing(axis, np.array([0.0, 1.0, 0.0]))
+    elif stands @ trunk <= _UP_CLEAR:
+        along = np.eye(3)[np.abs(stands).argmax()] * np.sign(stands[np.abs(stands).argmax()])
+        low, high = (float(np.median(path @ direction)) for direction in (trunk, along))
+        ours, other = _axis_name(trunk), _axis_name(along)
+        if _LIES[0] < low < _LIES[1] and not _STANDS_HIGH[0] < high < _STANDS_HIGH[1]:
+            notes = (
+                f"the trunk lies along {other}, and {ours} stays up, as in the zero pose{_overrules(other)}",
+            )
+        else:
+            axis = along
+            notes = (f"{other} is taken for up, as the trunk stands along it{_overrules(ours)}",)
+    return _swing(axis, np.array([0.0, 1.0, 0.0])), notes
+
+
+def _axis_name(axis: Floats) -> str:
+    """The coordinate axis nearest to ``axis``: "y", "-z"."""
+    largest = int(np.abs(axis).argmax())
+    return ("-" if axis[largest] < 0 else "") + "xyz"[largest]
+
+
+def _overrules(axis: str) -> str:
+    return f"; --motion-up {axis} overrules" if axis in ("y", "z") else ""
 
 
 def _quarters_to_front(root: Floats) -> int:

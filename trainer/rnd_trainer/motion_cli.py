@@ -39,7 +39,7 @@ def motion(
     source: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.Positional],
     body: Path | None = None,
-    up: Literal["auto", "y", "z"] = "auto",
+    up: Annotated[Literal["auto", "y", "z"], tyro.conf.arg(aliases=["--motion-up"])] = "auto",
     source_fps: float | None = None,
     fps: float | None = None,
     joint_map: Path | None = None,
