@@ -152,6 +152,22 @@ def test_another_motion_can_take_the_place(folder):
     assert "motion.npz" in _refusal(folder)
 
 
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("names", [("root", "arm"), ("root", "hand", "arm")])
+def test_an_avatar_that_rests_elsewhere_is_where_the_pictures_have_it(folder, names, up):
+    axis_angles = np.random.default_rng(1).normal(size=(FRAMES, 6))
+    trans = np.random.default_rng(2).normal(size=(FRAMES, 3))
+    np.savez(folder / "motion.npz", poses=axis_angles, trans=trans, mocap_framerate=30, up_axis=up)
+    capture = load_capture(folder)
+    own = capture.body.skeleton
+    root = own.rest_joints[0] + capture.motion.translations
+    rest = np.random.default_rng(3).normal(size=(len(names), 3))
+    skeleton = Skeleton(names, np.arange(len(names)) - 1, rest)
+    motion = capture.motion_for(skeleton)
+    assert motion.joint_names == names
+    assert_allclose(motion.translations + rest[0], root, atol=1e-12)
+
+
 def test_motion_columns_follow_the_body_without_names(folder):
     """motion.npz has no joint names: its columns are the body's joints."""
     axis_angles = np.random.default_rng(1).normal(size=(FRAMES, 6))

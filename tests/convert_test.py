@@ -29,6 +29,7 @@ from rnd_runtime.npz import save_npz
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
+from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.convert_cli import main
 from rnd_viewer.player import Player
@@ -509,6 +510,25 @@ def test_joints_that_smplh_lacks_are_named(tmp_path, capsys):
     line = ["motion", str(tmp_path / "robot.npz"), "--motion", str(tmp_path / "nod.npz")]
     assert main([*line, "--out", str(tmp_path / "out.npz")]) == 0
     assert "left out: antenna" in capsys.readouterr().out
+
+
+def test_fingers_that_turn_are_left_as_they_are(tmp_path, capsys):
+    """Of a skeleton with hands and fingers; one without fingers leaves them out, and the command says so."""
+    names, rng = (*SMPL_NAMES, *SMPLH_NAMES[22:]), np.random.default_rng(0)
+    skeleton = Skeleton(names, np.maximum(np.arange(54) - 1, -1), np.zeros((54, 3)))
+    poses = 0.3 * rng.normal(size=(4, 52, 3))
+    save_npz(
+        tmp_path / "in.npz", {"poses": poses, "trans": np.zeros((4, 3)), "mocap_framerate": np.array(30.0)}
+    )
+    moves = load_motion(tmp_path / "in.npz", skeleton)
+    assert write_amass(tmp_path / "out.npz", moves, skeleton) == ()
+    with np.load(tmp_path / "out.npz") as archive:
+        np.testing.assert_allclose(archive["poses"].reshape(4, 52, 3), poses, atol=1e-9)
+    moves.rotations[:, names.index("left_hand")] = axis_angle_to_matrix([0.1, 0, 0])
+    assert write_amass(tmp_path / "out.npz", moves, skeleton) == ("left_hand",)
+    line = ["motion", str(ASSETS / "body.npz"), "--motion", str(tmp_path / "in.npz"), "--smooth", "2"]
+    assert main([*line, "--out", str(tmp_path / "out.npz")]) == 0
+    assert "the skeleton lacks are left out: left_index2, left_index3" in capsys.readouterr().out
 
 
 def test_a_body_is_known_by_its_suffix_in_capitals_too(tmp_path):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from motion_formats_test import FRAMES, MATRICES, _easymocap_json, _phalp
+from motion_formats_test import FRAMES, MATRICES, NAMINGS, _bvh, _easymocap_json, _phalp
 from rnd_runtime.body import Body
 from rnd_runtime.motion import load_motion
+from rnd_runtime.skeleton import SMPL_NAMES
 from rnd_trainer.data_cli import main
 
 ASSETS = Path(__file__).parents[1] / "assets"
@@ -34,6 +35,50 @@ def test_a_walk_goes_out_as_amass_and_comes_back(tmp_path, monkeypatch, capsys):
     before, after = load_motion(ASSETS / "walk.npz", skeleton), load_motion(out, skeleton)
     assert_allclose(after.rotations, before.rotations, atol=1e-9)
     assert_allclose(after.translations, before.translations, atol=1e-9)
+
+
+FEET = [SMPL_NAMES.index(f"{side}_foot") for side in ("left", "right")]
+
+
+def _lowest_foot(file: Path) -> float:
+    """m above the floor, of the embedded body."""
+    skeleton = Body.load(ASSETS / "body.npz").skeleton
+    motion = load_motion(file, skeleton)
+    heights = skeleton.joint_transforms(motion.rotations, motion.translations)[:, FEET, 1, 3]
+    return float(np.percentile(heights.min(1), 5))
+
+
+def test_without_a_body_people_stand_on_the_floor(tmp_path, monkeypatch, capsys):
+    """SMPL's mean body is about its chest: a BVH and a walk from a body that stands on y = 0 come up to the floor."""
+    out = tmp_path / "out.npz"
+    for source in (_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), ASSETS / "walk.npz"):
+        assert _run(monkeypatch, source, out) == 0
+        assert abs(_lowest_foot(out)) < 0.1
+        lifted = "lifted by 1.17 m" in capsys.readouterr().out
+        assert lifted == (source.suffix == ".npz")
+    _run(monkeypatch, out, tmp_path / "again.npz")
+    assert "lifted" not in capsys.readouterr().out
+
+
+def test_fingers_go_through(tmp_path, monkeypatch, capsys):
+    """An AMASS file comes out as it went in; what SMPL-H lacks, or a body given, is said to be left out."""
+    source, out = tmp_path / "in.npz", tmp_path / "out.npz"
+    poses = 0.3 * np.random.default_rng(0).normal(size=(FRAMES, 55, 3))
+    members = {"trans": np.tile([0, 0, 1.2], (FRAMES, 1)), "mocap_framerate": 30.0}
+    for poses_in, left_out in (
+        (np.delete(poses, [22, 23, 24], 1), None),
+        (poses, "jaw, left_eye, right_eye"),
+    ):
+        np.savez(source, poses=poses_in.reshape(FRAMES, -1), **members)
+        assert _run(monkeypatch, source, out) == 0
+        with np.load(out) as archive:
+            assert_allclose(
+                archive["poses"].reshape(FRAMES, 52, 3), np.delete(poses, [22, 23, 24], 1), atol=1e-9
+            )
+        printed = capsys.readouterr().out
+        assert (f"left out: {left_out}\n" in printed) if left_out else ("left out" not in printed)
+    assert _run(monkeypatch, source, out, "--body", ASSETS / "body.npz") == 0
+    assert "the skeleton lacks are left out: jaw, left_eye, right_eye, left_index2" in capsys.readouterr().out
 
 
 def test_edits_and_rates(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 import json
 import pickle  # noqa: TID251  # to write what others write
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from rnd_runtime.joint_names import load_joint_map, match_joints
 from rnd_runtime.motion import load_motion, motion_inputs
 from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from rnd_runtime.retarget import Retargeted, retarget
-from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS
+from rnd_runtime.skeleton import SMPL_NAMES, SMPL_PARENTS, Skeleton
 
 SKELETON = Body.load(Path(__file__).parents[1] / "assets" / "body.npz").skeleton
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "motion"
@@ -590,6 +591,55 @@ def test_feet_come_down_to_the_floor(tmp_path):
     joints = SKELETON.joint_transforms(motions[0].rotations, motions[0].translations)[:, feet, 1, 3]
     lowest = (joints - SKELETON.rest_joints[feet, 1]).min(1)
     assert -0.01 < lowest.min() < 0.01 and lowest.max() < 0.2
+
+
+@pytest.mark.parametrize("down", [0.0, 1.15])
+def test_feet_come_down_to_the_floor_wherever_the_template_rests(tmp_path, down):
+    """A template about SMPL's origin plays a recording at the height of one that stands on its feet."""
+    skeleton = replace(SKELETON, rest_joints=SKELETON.rest_joints - [0, down, 0])
+    motion = load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), skeleton)
+    feet = [SMPL_NAMES.index(f"{side}_foot") for side in ("left", "right")]
+    lowest = skeleton.joint_transforms(motion.rotations, motion.translations)[:, feet, 1, 3].min()
+    assert lowest == pytest.approx(SKELETON.rest_joints[feet, 1].min(), abs=0.02)
+
+
+def _placed(file: Path, height: float) -> Path:
+    """The file with its hips at ``height`` along Y and in the middle."""
+    head, mark, frames = file.read_text().partition("Frame Time: 0.0083333\n")
+    lines = [" ".join(["0", f"{height}", "0", *line.split()[3:]]) for line in frames.splitlines()]
+    file.write_text(head + mark + "\n".join(lines) + "\n")
+    return file
+
+
+def test_who_lies_or_crawls_is_not_stood_upright(tmp_path):
+    """Hips at 0.35 m, trunk level: Y stays up, as in the zero pose, and a note says so."""
+    level = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    file = _placed(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"], facing=level), 0.35)
+    told, as_said = load_motion(file, SKELETON), load_motion(file, SKELETON, up="y")
+    assert_allclose(told.rotations, as_said.rotations, atol=TEXT)
+    assert abs(told.rotations[:, 0, 1, 1].mean()) < 0.3
+    assert (
+        "the trunk lies along z, and y stays up, as in the zero pose; --motion-up z overrules" in told.notes
+    )
+    assert not any("--motion-up" in note for note in as_said.notes)
+
+
+def test_a_trunk_that_stands_along_another_axis_makes_it_up_with_a_note(tmp_path):
+    """A Z-up world on a zero pose that stands along Y: hips a leg above the floor."""
+    level = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    motion = load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"], facing=level), SKELETON)
+    assert motion.rotations[:, 0, 1, 1].mean() > 0.9
+    assert "z is taken for up, as the trunk stands along it; --motion-up y overrules" in motion.notes
+
+
+def test_recorded_joints_that_nothing_follows_are_told(tmp_path):
+    """Not those that carry others, as the second joint of this spine does."""
+    file = _bvh(tmp_path / "a.bvh", NAMINGS["smpl"])
+    assert load_motion(file, SKELETON).left_out == ()  # hands stand still there
+    few = [k for k, name in enumerate(SMPL_NAMES) if name not in ("spine2", "head", "left_foot")]
+    parents = [-1, 0, 0, 0, 1, 2, 4, 5, 3, 7, 8, 8, 8, 11, 12, 13, 14, 15, 16, 17, 18]
+    skeleton = Skeleton(tuple(SMPL_NAMES[k] for k in few), parents, SKELETON.rest_joints[few])
+    assert load_motion(file, skeleton).left_out == ("left_foot", "head")
 
 
 def test_a_recording_is_turned_to_the_front_and_a_reference_pose_left_out(tmp_path):

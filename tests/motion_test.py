@@ -211,11 +211,26 @@ def test_amass_can_be_declared_y_up(tmp_path):
 def test_a_root_that_is_called_so_counts_wherever_it_stands(tmp_path):
     """Else what hangs on it would be turned by the file's own root, which stands still."""
     pose = _axis_angles(3)
+    pose[:, 0] = 0
     file = _save(
         tmp_path / "a.npz", poses=_flat(pose), trans=TRANS, fps=30, joint_names=["world", "leg", "root"]
     )
     motion = load_motion(file, Skeleton(("root", "leg"), [-1, 0], np.zeros((2, 3))))
     assert_allclose(motion.rotations, axis_angle_to_matrix(pose)[:, [2, 1]], atol=ROUND_OFF)
+
+
+def test_a_root_above_the_pelvis_turns_it(tmp_path):
+    """What a world joint does first, the pelvis does within it; a joint of the avatar's is above nobody."""
+    pose = _axis_angles(3)
+    turns = axis_angle_to_matrix(pose)
+    skeleton = Skeleton(("pelvis", "leg"), [-1, 0], np.zeros((2, 3)))
+    for above, expected in (("world", turns[:, 0] @ turns[:, 1]), ("leg", turns[:, 1])):
+        names = [above, "pelvis", "leg" if above == "world" else "arm"]
+        file = _save(tmp_path / "a.npz", poses=_flat(pose), trans=TRANS, fps=30, joint_names=names)
+        motion = load_motion(file, skeleton)
+        assert_allclose(motion.rotations[:, 0], expected, atol=ROUND_OFF)
+        assert motion.notes == (("world, above pelvis, turns all below it",) if above == "world" else ())
+        assert motion.left_out == (() if above == "world" else ("arm",))
 
 
 def test_missing_frame_rate_is_sixty_and_noted_unless_given(tmp_path):

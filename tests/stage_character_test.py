@@ -39,8 +39,8 @@ def body() -> Body:
     return Body.load(ASSETS / "body.npz")
 
 
-def write_glb(path: Path, body: Body) -> None:
-    """The body as a skinned GLB with Mixamo's names and a four-coloured texture."""
+def write_glb(path: Path, body: Body, above: dict | None = None) -> None:
+    """The body as a skinned GLB with Mixamo's names and a four-coloured texture, its joints below a node ``above``."""
     order = np.argsort(-body.skinning_weights, axis=1)[:, :4]
     weights = np.take_along_axis(body.skinning_weights, order, axis=1)
     weights = weights / weights.sum(axis=1, keepdims=True)
@@ -64,12 +64,17 @@ def write_glb(path: Path, body: Body) -> None:
     starts = np.cumsum([0, *map(len, blobs)])
     views = [{"buffer": 0, "byteOffset": int(s), "byteLength": len(b)} for s, b in zip(starts, blobs)]
     names = [f"mixamorig:{MIXAMO[name]}" for name in SMPL_NAMES]
-    nodes: list[dict] = [{"name": name, "children": []} for name in names]
+    shifts = body.skeleton.rest_joints - np.where(
+        np.arange(24)[:, None] > 0, body.skeleton.rest_joints[np.maximum(SMPL_PARENTS, 0)], 0
+    )
+    nodes: list[dict] = [
+        {"name": name, "children": [], "translation": shift.tolist()} for name, shift in zip(names, shifts)
+    ]
     for child, parent in enumerate(SMPL_PARENTS[1:], 1):
         nodes[parent]["children"].append(child)
     document = {
         "asset": {"version": "2.0"},
-        "nodes": [*nodes, {"mesh": 0, "skin": 0}],
+        "nodes": [*nodes, {"mesh": 0, "skin": 0}, {"name": "Armature", "children": [0]} | (above or {})],
         "skins": [{"joints": list(range(24)), "inverseBindMatrices": 5}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "TEXCOORD_0": 4},
                                     "indices": 1, "material": 0}]}],
@@ -105,6 +110,65 @@ def test_a_skinned_glb_keeps_its_shape_weights_and_colours(body: Body, tmp_path:
     head_left = (dressed.vertices[:, 1] > 1.5) & (dressed.vertices[:, 0] > 0.01)
     np.testing.assert_allclose(dressed.colour[head_left].mean(0), [0.03, 0.80, 0.03], atol=1e-6)
     assert (dressed.drape.radius > 0).all()  # its only material is a shirt
+
+
+HALF = np.sqrt(0.5)
+ABOVE = {
+    "centimetres": (100 * np.eye(3), {"scale": [0.01, 0.01, 0.01]}),
+    "Z up": ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], {"rotation": [-HALF, 0, 0, HALF]}),
+    "both, moved": (
+        [[100, 0, 0], [0, 0, -100], [0, 100, 0]],
+        {"matrix": [0.01, 0, 0, 0, 0, 0, -0.01, 0, 0, 0.01, 0, 0, 0.3, 1, 0.5, 1]},
+    ),
+}
+
+
+@pytest.mark.parametrize("stored", ABOVE)
+def test_a_node_above_the_skeleton_brings_it_to_metres_and_upright(
+    body: Body, tmp_path: Path, stored: str
+) -> None:
+    """As what was FBX once often is: mesh and binds in other units and axes, and a node that takes them to glTF's."""
+    axes, node = np.array(ABOVE[stored][0]), ABOVE[stored][1]
+    joints = body.skeleton.rest_joints @ axes.T
+    theirs = Body(
+        body.vertices @ axes.T, body.faces, body.skinning_weights, replace(body.skeleton, rest_joints=joints)
+    )
+    write_glb(tmp_path / "plain.glb", body)
+    write_glb(tmp_path / "theirs.glb", theirs, node)
+    plain, dressed = (characters.load_character(tmp_path / f"{name}.glb") for name in ("plain", "theirs"))
+    moved = np.array([0.3, 0, 0.5]) if "moved" in stored else np.zeros(3)  # they stand on the floor
+    np.testing.assert_allclose(np.sort(dressed.vertices, 0), np.sort(plain.vertices + moved, 0), atol=1e-4)
+    places = dressed.body.skeleton.rest_joints
+    np.testing.assert_allclose(places, plain.body.skeleton.rest_joints + moved, atol=1e-4)
+
+
+def test_who_is_as_tall_as_a_house_is_refused(body: Body, tmp_path: Path) -> None:
+    joints = 100 * body.skeleton.rest_joints
+    tall = Body(
+        100 * body.vertices, body.faces, body.skinning_weights, replace(body.skeleton, rest_joints=joints)
+    )
+    write_glb(tmp_path / "tall.glb", tall)
+    said = r"tall\.glb: height of the character: expected 0\.4 to 2\.6 m along Y, got 17\d$"
+    with pytest.raises(InputError, match=said):
+        characters.load_character(tmp_path / "tall.glb")
+
+
+def test_a_node_above_itself_is_refused(body: Body, tmp_path: Path) -> None:
+    write_glb(tmp_path / "ring.glb", body, {"children": [0, 25]})
+    with pytest.raises(InputError, match="node 25 is above itself"):
+        characters.load_character(tmp_path / "ring.glb")
+
+
+def test_buffers_with_spaces_and_suffixes_in_capitals_are_read(body: Body, tmp_path: Path) -> None:
+    write_glb(tmp_path / "PERSON.GLB", body)
+    content = (tmp_path / "PERSON.GLB").read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20 : 20 + length])
+    document["buffers"][0]["uri"] = "my%20person.bin"
+    (tmp_path / "my person.bin").write_bytes(content[28 + length :])
+    (tmp_path / "me.GLTF").write_text(json.dumps(document))
+    one, other = (characters.load_character(tmp_path / name) for name in ("PERSON.GLB", "me.GLTF"))
+    np.testing.assert_array_equal(one.vertices, other.vertices)
 
 
 def test_bent_arms_are_straightened(body: Body, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -76,10 +76,15 @@ class Capture:
         return self.motion.fps
 
     def motion_for(self, skeleton: Skeleton) -> Motion:
-        """Its motion for an avatar of ``skeleton``, which may not be the one it was captured with."""
-        if self.motion.joint_names == skeleton.names:
-            return self.motion
-        return load_motion(self.motion.source, skeleton, joint_names=self.body.skeleton.names)
+        """Its motion for an avatar of ``skeleton``, which may not be the one it was captured with.
+
+        The root is where the pictures have it, wherever either rests.
+        """
+        motion, own = self.motion, self.body.skeleton
+        if motion.joint_names != skeleton.names:
+            motion = load_motion(motion.source, skeleton, joint_names=own.names)
+        shift = own.rest_joints[0] - skeleton.rest_joints[0]
+        return replace(motion, translations=self.motion.translations + shift)
 
     def split(self, name: Split) -> list[Frame]:
         """The frames of one split, in file order."""

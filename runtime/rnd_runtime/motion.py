@@ -30,9 +30,10 @@ Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0
 """(x, y, z) of a Z-up world is (x, z, −y) of ours: a quarter turn about X."""
 
 # SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
-_STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
+STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 
 _PART_OF_A_FRAME = 1e-4  # less than which the rounding of a duration, or of a rate in words, may add or take
+_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
 
 _MOCAP_READERS = {".bvh": read_bvh, ".amc": read_acclaim}
 
@@ -49,6 +50,7 @@ class Motion:
         source: where it came from, for messages.
         notes: what the reader assumed or left out, one sentence each, for the user to see.
         closed: whether the frame after the last is the first again.
+        left_out: joints of the file that turn and that nothing here follows, by the file's names.
     """
 
     rotations: Floats
@@ -58,6 +60,7 @@ class Motion:
     source: str = ""
     notes: tuple[str, ...] = ()
     closed: bool = False
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         frames, joints = len(self.translations), len(self.joint_names)
@@ -108,7 +111,7 @@ class Motion:
             place, path = np.clip(place, 0, self.frame_count - 1), (self.rotations, self.translations)
         rotations = interpolate_rotations(path[0], place)
         translations = interpolate_points(path[1], place)
-        return Motion(rotations, translations, self.fps, self.joint_names, self.source, self.notes)
+        return replace(self, rotations=rotations, translations=translations, closed=False)
 
     @cached_property
     def _lap(self) -> tuple[Floats, Floats]:
@@ -129,10 +132,11 @@ def load_motion(
     """Read a motion file for ``skeleton``, Y up.
 
     Arrays (.npz, .pkl, .pt, .npy; layouts: :func:`motion_files.read_motion_file`): joints are matched by name; the
-    root is always the root. Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
-    file that ``skeleton`` lacks are left out. Z-up files are of the SMPL family: they place the pelvis at
-    ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In Y-up files
-    ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
+    root is always the root, and where a file's first joint is nobody's here, it stands above the root and turns it.
+    Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
+    file that ``skeleton`` lacks are left out (:attr:`Motion.left_out`). Z-up files are of the SMPL family: they place
+    the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In
+    Y-up files ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
 
     BVH and AMC have a skeleton of their own: :func:`retarget.retarget`.
 
@@ -186,7 +190,10 @@ def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | 
         got = "others after retargeting"
         raise InputError("motion", expected="finite numbers", got=got, frame=first + int(np.argmin(finite)))
     check_translations(moved.translations, path, first)
-    return Motion(moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes)
+    return Motion(
+        moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes,
+        left_out=moved.left_out,
+    )  # fmt: skip
 
 
 def _load_arrays(
@@ -204,7 +211,8 @@ def _load_arrays(
         for ours, place in matched.items():
             names[place] = ours
     z_up = (record.up if up == "auto" else up) == "z"
-    rotations, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
+    rotations, used, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
+    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(_turns(record.rotations)) if k not in used)
     translations, rest_root = record.translations, record.rest_root
     if z_up and rest_root is None:
         rest_root = SMPL_REST_ROOT
@@ -215,7 +223,7 @@ def _load_arrays(
             rotations[:, 0] = Z_UP_TO_Y_UP @ rotations[:, 0]
         translations = root_positions - skeleton.rest_joints[0]
     notes = record.notes + notes
-    return Motion(rotations, translations, record.fps, skeleton.names, str(path), notes)
+    return Motion(rotations, translations, record.fps, skeleton.names, str(path), notes, left_out=left_out)
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:
@@ -238,10 +246,10 @@ def save_motion(path: str | Path, motion: Motion) -> None:
 
 def _match_joints(
     rotations: Floats, names: tuple[str, ...], skeleton: Skeleton, path: str | Path
-) -> tuple[Floats, tuple[str, ...]]:
-    """``rotations`` [F, ·, 3, 3] of ``names`` in the order of ``skeleton``, and a note on what is missing."""
+) -> tuple[Floats, set[int], tuple[str, ...]]:
+    """``rotations`` [F, ·, 3, 3] of ``names`` in the order of ``skeleton``, their columns, and notes."""
     columns = {name: column for column, name in enumerate(names)}
-    for hand, finger in _STAND_INS.items():
+    for hand, finger in STAND_INS.items():
         if hand not in columns and finger in columns:
             columns[hand] = columns[finger]
     columns.setdefault(skeleton.names[0], 0)  # the root by any name
@@ -257,6 +265,19 @@ def _match_joints(
     for joint, name in enumerate(skeleton.names):
         if name in columns:
             result[:, joint] = rotations[:, columns[name]]
+    used = {columns[name] for name in skeleton.names if name in columns}
+    notes = []
+    if 0 not in used and _turns(rotations)[0]:  # the first joint is above all others, and no other's
+        used.add(0)
+        result[:, 0] = rotations[:, 0] @ result[:, 0]
+        notes.append(f"{names[0] or 'the first joint'}, above {skeleton.names[0]}, turns all below it")
     missing = [name for name, found in zip(skeleton.names, matched) if not found]
-    notes = (f"joints that the motion lacks stay at rest: {', '.join(missing)}",) if missing else ()
-    return result, notes
+    if missing:
+        notes.append(f"joints that the motion lacks stay at rest: {', '.join(missing)}")
+    return result, used, tuple(notes)
+
+
+def _turns(rotations: Floats) -> NDArray[np.bool_]:
+    """Which of the joints of ``rotations`` [F, J, 3, 3] turn at all: [J]."""
+    turns: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return turns

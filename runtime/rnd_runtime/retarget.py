@@ -20,19 +20,27 @@ Floats = NDArray[np.float64]
 # in a back the joints lie, and a straight back must stay straight. Hands and feet follow the bone they hang on.
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
 _STANDS = np.cos(np.radians(30))  # a zero pose that leans less is taken to stand
+_LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # legs above the floor that hips are
 _UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero pose's up
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
+_ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
+_STANDS_AT_ZERO = 0.05  # m by which the sole of a template that stands on y = 0 may be off
+_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest."""
+    """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest.
+
+    ``left_out`` are the recorded joints that turn and that nothing here follows.
+    """
 
     rotations: Floats
     translations: Floats
     notes: tuple[str, ...]
+    left_out: tuple[str, ...]
 
 
 def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up: str = "auto") -> Retargeted:
@@ -41,8 +49,9 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     A joint's world rotation is the recorded one after the rotation that takes our rest pose to the recording's
     zero pose: ``G_k = W Q_k Bᵀ A_k``, with Q_k the recorded world rotation, B and W the turns from the zero pose's
     and the world's axes to ours, and A_k the least rotation from our bone's direction to theirs. Lengths are scaled by
-    the legs; the floor is where the feet come down. Which way a recording faces says nothing, so it is turned by
-    quarters to begin facing the front (+Z). A T-pose for reference before the motion is left out.
+    the legs; the feet come down to y = 0, wherever the template has its origin. Which way a recording faces says
+    nothing, so it is turned by quarters to begin facing the front (+Z). A T-pose for reference before the motion is
+    left out.
 
     Args:
         matched: for our joints the index of theirs; the rest stay at rest.
@@ -63,7 +72,8 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     to_ours = _body_frame(ours) @ _body_frame(theirs).T
     recorded = tree.global_rotations()
     root = matched.get(skeleton.names[0], 0)
-    world = _upright(recorded[:, root], to_ours, up)
+    path = tree.path(root, recorded)
+    world, said = _upright(recorded[:, root], path / _leg(theirs), to_ours, up)
     turned = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
     rotations = _local_rotations(turned, skeleton)
     limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
@@ -77,11 +87,11 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
     hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
-    hips = (tree.path(root, recorded) + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
+    hips = (path + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
     pelvis = scale * hips @ world.T - rotations[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)
-    notes = [*tree.notes]
+    notes = [*tree.notes, *said]
     if quarters:
         notes.append(f"turned by {quarters * 90:+d}° about the vertical, so that it begins facing the front")
     if first:
@@ -89,7 +99,17 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     resting = [name for name in skeleton.names if name not in matched]
     if resting:
         notes.append(f"joints that the motion lacks stay at rest: {', '.join(resting)}")
-    return Retargeted(rotations, translations, tuple(notes))
+    return Retargeted(rotations, translations, tuple(notes), _left_out(tree, set(matched.values())))
+
+
+def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
+    """The joints of ``tree`` that turn and carry none of those ``matched``."""
+    carry = {0, *matched}
+    for joint in reversed(range(len(tree.names))):
+        if joint in carry and joint:
+            carry.add(tree.parents[joint])
+    turns = np.abs(tree.rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return tuple(tree.names[k] for k in np.flatnonzero(turns) if k not in carry)
 
 
 def _world_rotations(
@@ -145,17 +165,40 @@ def _body_frame(joints: Mapping[str, Floats]) -> Floats:
     return frame
 
 
-def _upright(root: Floats, to_ours: Floats, up: str) -> Floats:
-    """The turn [3, 3] that makes the file's up axis ours."""
+def _upright(root: Floats, path: Floats, to_ours: Floats, up: str) -> tuple[Floats, tuple[str, ...]]:
+    """The turn [3, 3] that makes the file's up axis ours, and a note where the trunk stands along another.
+
+    ``path`` [F, 3] is the root's, in lengths of a leg. Whose trunk lies, and whose hips are half a leg above the floor
+    rather than a leg above one across the trunk, lies or crawls.
+    """
     trunk = to_ours.T[:, 1]  # up in the zero pose
     stands = (root @ trunk).mean(0)
+    axis = trunk
+    notes: tuple[str, ...] = ()
     if up != "auto":
         axis = np.eye(3)["xyz".index(up)]
-    elif stands @ trunk > _UP_CLEAR:
-        axis = trunk
-    else:
-        axis = np.eye(3)[np.abs(stands).argmax()] * np.sign(stands[np.abs(stands).argmax()])
-    return _swing(axis, np.array([0.0, 1.0, 0.0]))
+    elif stands @ trunk <= _UP_CLEAR:
+        along = np.eye(3)[np.abs(stands).argmax()] * np.sign(stands[np.abs(stands).argmax()])
+        low, high = (float(np.median(path @ direction)) for direction in (trunk, along))
+        ours, other = _axis_name(trunk), _axis_name(along)
+        if _LIES[0] < low < _LIES[1] and not _STANDS_HIGH[0] < high < _STANDS_HIGH[1]:
+            notes = (
+                f"the trunk lies along {other}, and {ours} stays up, as in the zero pose{_overrules(other)}",
+            )
+        else:
+            axis = along
+            notes = (f"{other} is taken for up, as the trunk stands along it{_overrules(ours)}",)
+    return _swing(axis, np.array([0.0, 1.0, 0.0])), notes
+
+
+def _axis_name(axis: Floats) -> str:
+    """The coordinate axis nearest to ``axis``: "y", "-z"."""
+    largest = int(np.abs(axis).argmax())
+    return ("-" if axis[largest] < 0 else "") + "xyz"[largest]
+
+
+def _overrules(axis: str) -> str:
+    return f"; --motion-up {axis} overrules" if axis in ("y", "z") else ""
 
 
 def _quarters_to_front(root: Floats) -> int:
@@ -216,12 +259,24 @@ def _leg(joints: Mapping[str, Floats]) -> float:
 
 
 def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float:
-    """By how much feet that stand are above where they stand at rest."""
-    feet = [k for k, name in enumerate(skeleton.names) if name.endswith(("_ankle", "_foot"))]
+    """By how much feet that stand are above the floor, y = 0; none without feet."""
+    feet = [k for k, name in enumerate(skeleton.names) if name.endswith(tuple(_ABOVE_SOLE))]
     if not feet:
         return 0.0
     height = skeleton.joint_transforms(rotations, translations)[:, feet, 1, 3] - skeleton.rest_joints[feet, 1]
-    return float(np.percentile(height.min(1), _FLOOR_PERCENTILE))
+    return float(np.percentile(height.min(1), _FLOOR_PERCENTILE)) + sole(skeleton)
+
+
+def sole(skeleton: Skeleton) -> float:
+    """The height y in m of the soles at rest; 0 for a skeleton without feet, or about as high."""
+    heights = [
+        float(place[1]) - above
+        for name, place in zip(skeleton.names, skeleton.rest_joints)
+        for end, above in _ABOVE_SOLE.items()
+        if name.endswith(end)
+    ]
+    height = min(heights, default=0.0)
+    return height if abs(height) > _STANDS_AT_ZERO else 0.0
 
 
 def _reference_frames(rotations: Floats) -> int:

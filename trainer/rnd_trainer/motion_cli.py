@@ -15,10 +15,11 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.errors import check_option
 from rnd_runtime.files import existing_file, npz_output, refuse_input
-from rnd_runtime.motion import load_motion, motion_inputs
+from rnd_runtime.motion import Motion, load_motion, motion_inputs
 from rnd_runtime.motion_edit import MotionEdits, edit_motion, resampled
-from rnd_runtime.motion_files import FPS_LIMITS
+from rnd_runtime.motion_files import FPS_LIMITS, SMPLH_NAMES
 from rnd_runtime.plain import print_plain
+from rnd_runtime.retarget import sole
 from rnd_runtime.skeleton import Skeleton, smpl_skeleton
 
 # Joints of an adult in cm, SMPL's order, standing about SMPL's origin: what matters are the proportions of the legs.
@@ -30,13 +31,15 @@ _MEAN_PERSON = (
     (-77, 21, -6),
 )
 # fmt: on
+_FINGERS = frozenset(SMPLH_NAMES[22:])
+_NEAR = 0.3  # m from there at which feet are taken to stand where the mean person's do at rest
 
 
 def motion(
     source: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.Positional],
     body: Path | None = None,
-    up: Literal["auto", "y", "z"] = "auto",
+    up: Annotated[Literal["auto", "y", "z"], tyro.conf.arg(aliases=["--motion-up"])] = "auto",
     source_fps: float | None = None,
     fps: float | None = None,
     joint_map: Path | None = None,
@@ -59,7 +62,13 @@ def motion(
     for name, rate in (("--source-fps", source_fps), ("--fps", fps)):
         check_option(rate is None or low <= rate <= high, name, f"{low:g} to {high:g}", rate)
     skeleton = _skeleton(body)
-    made = edit_motion(load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map), edits)
+    loaded = load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map)
+    if body is None and not _FINGERS.isdisjoint(loaded.left_out):
+        skeleton = _with_fingers(skeleton)
+        loaded = load_motion(source, skeleton, up=up, fps=source_fps, joint_map=joint_map)
+    made = edit_motion(loaded, edits)
+    if body is None:
+        made = _lifted(made, skeleton)
     if fps is not None:
         notes = made.notes + made.loop_notes(fps)
         made = replace(resampled(made, fps), notes=notes)
@@ -67,6 +76,11 @@ def motion(
     console = Console()
     for note in [
         *made.notes,
+        *(
+            [f"joints that turn and the skeleton lacks are left out: {', '.join(made.left_out)}"]
+            if made.left_out
+            else []
+        ),
         *([f"joints that SMPL-H lacks are left out: {', '.join(lost)}"] if lost else []),
     ]:
         print_plain(console, f"note: {note}")
@@ -74,6 +88,28 @@ def motion(
     line = f"{out}: {made.frame_count} frames, {seconds}"
     print_plain(console, line)
     return 0
+
+
+def _lifted(motion: Motion, mean: Skeleton) -> Motion:
+    """``motion`` on the floor, where a file whose ``trans`` begin at another body's rest has it about SMPL's origin."""
+    feet = [k for k, name in enumerate(mean.names) if name.endswith("_foot")]
+    heights = mean.joint_transforms(motion.rotations, motion.translations)[:, feet, 1, 3].min(1)
+    below = sole(mean)
+    if abs(np.percentile(heights, 5) - mean.rest_joints[feet, 1].min()) > _NEAR:
+        return motion
+    note = f"lifted by {-below:.2f} m, so that SMPL's mean body stands on the floor; --body names the motion's own"
+    return replace(motion, translations=motion.translations - [0, below, 0], notes=(*motion.notes, note))
+
+
+def _with_fingers(skeleton: Skeleton) -> Skeleton:
+    """SMPL's ``skeleton`` with SMPL-H's fingers beside its hands, where they are: what matters is that they turn."""
+    names, parents, places = list(skeleton.names), list(skeleton.parents), list(skeleton.rest_joints)
+    for finger in SMPLH_NAMES[22:]:
+        side, bone = finger.split("_")[0], int(finger[-1])
+        parents.append(names.index(f"{side}_wrist" if bone == 1 else f"{finger[:-1]}{bone - 1}"))
+        places.append(skeleton.rest_joints[names.index(f"{side}_hand")])
+        names.append(finger)
+    return Skeleton(tuple(names), np.array(parents), np.array(places))
 
 
 def _skeleton(body: Path | None) -> Skeleton:

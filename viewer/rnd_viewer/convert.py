@@ -166,6 +166,8 @@ def _motion(options: AmassOptions) -> Iterator[str]:
     skeleton = Body.load(file).skeleton if file.suffix.lower() == ".npz" else Avatar.load(file).skeleton
     motion = options.read_motion(options.motion, skeleton)
     yield from _notes(motion.notes)
+    if motion.left_out:
+        yield f"joints that turn and the skeleton lacks are left out: {', '.join(motion.left_out)}"
     lost = write_amass(options.out, motion, skeleton)
     if lost:
         yield f"joints that SMPL-H lacks were left out: {', '.join(lost)}"

@@ -55,6 +55,7 @@ CLEAR = 0.5  # opacity below which a triangle of a hair card is left out
 RADIUS, SLACK, GAP = 0.015, 0.035, 0.010  # of the cloth: m, share, m
 MOST_VERTICES = 60_000  # before triangles are halved for the sake of their textures
 WELD = 1e-5  # m
+HEIGHTS = (0.4, 2.6)  # m that a person may be tall: others are in centimetres, or lie
 
 # what a joint of SMPL is called elsewhere, left side; lower case, without "mixamorig:" and punctuation
 _ALIASES = {
@@ -116,9 +117,10 @@ def load_character(path: Path) -> Dressed:
     Raises:
         InputError: unreadable, or without the joints of a person.
     """
-    if path.suffix == ".npz":
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
         character = _read_npz(path)
-    elif path.suffix in (".glb", ".gltf"):
+    elif suffix in (".glb", ".gltf"):
         from .gltf import read_gltf
 
         character = read_gltf(path)
@@ -136,6 +138,15 @@ def dress_character(character: Character, path: Path) -> Dressed:
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
     vertices, joints = _t_pose(character.vertices, weights, joints)
 
+    height = float(np.ptp(vertices[:, 1]))
+    low, high = HEIGHTS
+    if not low <= height <= high:
+        raise InputError(
+            "height of the character",
+            expected=f"{low:g} to {high:g} m along Y",
+            got=f"{height:.3g}",
+            file=path,
+        )
     shown = ~(character.opacity[character.faces] < CLEAR).all(axis=1)
     faces, material = character.faces[shown], character.material[shown]
     of_vertex = np.zeros(len(vertices), np.int64)

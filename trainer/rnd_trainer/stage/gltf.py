@@ -6,6 +6,7 @@ import base64
 import json
 import struct
 import tempfile
+import urllib.parse
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
 from rnd_runtime.images import read_image
+from rnd_runtime.rotations import quaternion_to_matrix
 
 from .characters import Character, sample_texture
 
@@ -26,7 +28,7 @@ _GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 
 
 def read_gltf(path: Path) -> Character:
-    """Read the skinned meshes of a glTF file, in the pose they were bound in.
+    """Read the skinned meshes of a glTF file, in the pose they were bound in and where its nodes put the skeleton.
 
     Raises:
         InputError: not glTF 2.0, without a skin, compressed, or with indices that lead nowhere.
@@ -41,7 +43,7 @@ def read_gltf(path: Path) -> Character:
 
 def _open(path: Path) -> tuple[dict[str, Any], bytes]:
     content = path.read_bytes()
-    if path.suffix == ".gltf":
+    if path.suffix.lower() == ".gltf":
         return json.loads(content), b""
     magic, version, _ = struct.unpack_from("<III", content)
     if magic != _GLB or version != 2:
@@ -73,7 +75,11 @@ class _Gltf:
         above = {child: parent for parent, node in enumerate(nodes) for child in node.get("children", [])}
         parents = np.array([joints.index(above[j]) if above.get(j) in joints else -1 for j in joints])
         bind = self.accessor(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)  # column-major
-        places = np.asarray(np.linalg.inv(bind)[:, :3, 3], np.float64)
+        top = int(np.argmin(parents))
+        # A skinned point p is where jointWorld · inverseBind · p puts it: the same for all joints in the bound pose.
+        # What the nodes above the skeleton do (metres, Y up) is in there, what a mesh's own node does is not.
+        world = self._world(joints[top], above) @ bind[top]
+        places = _moved(np.asarray(np.linalg.inv(bind)[:, :3, 3], np.float64), world)
         parts = [
             self._primitive(primitive, len(joints))
             for node in nodes
@@ -91,6 +97,7 @@ class _Gltf:
             name: np.concatenate([part[name] for part in parts])
             for name in ("vertices", "weights", "albedo", "opacity")
         }
+        joined["vertices"] = _moved(joined["vertices"], world)
         return Character(
             faces=np.concatenate([part["faces"] + offset for part, offset in zip(parts, offsets)]),
             material=np.concatenate(material),
@@ -100,6 +107,18 @@ class _Gltf:
             joints=places,
             **joined,
         )
+
+    def _world(self, node: int, above: dict[int, int]) -> Floats:
+        """[4, 4] of a node at rest, with all that is above it."""
+        chain = [node]
+        while (parent := above.get(chain[-1])) is not None:
+            if parent in chain:
+                raise ValueError(f"node {parent} is above itself")
+            chain.append(parent)
+        world = np.eye(4)
+        for number in reversed(chain):
+            world = world @ _local(self.document["nodes"][number])
+        return world
 
     def accessor(self, number: int) -> Floats:
         """The values of an accessor [N, C] as float64, integers scaled where it says so."""
@@ -170,7 +189,23 @@ class _Gltf:
             return binary
         if uri.startswith("data:"):
             return base64.b64decode(uri.partition(",")[2])
-        beside = (self.path.parent / uri).resolve()
+        beside = (self.path.parent / urllib.parse.unquote(uri)).resolve()
         if not beside.is_relative_to(self.path.parent.resolve()):
             raise ValueError(f"{uri} is not beside the file")
         return beside.read_bytes()
+
+
+def _local(node: dict[str, Any]) -> Floats:
+    """[4, 4] of a node in the one above it: its matrix, column by column, or a scale, then a turn, then a shift."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    turn = quaternion_to_matrix(np.roll(node.get("rotation", (0.0, 0, 0, 1)), 1))
+    local = np.eye(4)
+    local[:3, :3] = turn * np.array(node.get("scale", (1.0, 1, 1)))
+    local[:3, 3] = node.get("translation", (0.0, 0, 0))
+    return local
+
+
+def _moved(points: Floats, motion: Floats) -> Floats:
+    """``points`` [N, 3] after ``motion`` [4, 4]."""
+    return points @ motion[:3, :3].T + motion[:3, 3]

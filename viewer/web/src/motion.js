@@ -7,6 +7,7 @@ import { matrixToAxisAngle, multiply, transposedTimes } from "./rotations.js";
 
 // SMPL's hands are one joint each; files with fingers drive them by the index finger's base.
 const STAND_INS = { left_hand: "left_index1", right_hand: "right_index1" };
+const TURNS = 1e-6;  // of a matrix' elements, less than which a joint stands still
 const Z_UP_TO_Y_UP = new Float64Array([1, 0, 0, 0, 0, 1, 0, -1, 0]);
 
 /** A record of motion_files.js for `skeleton` ({names, rest}), Y up: {rotations [F·J·9], translations [F·3] m, frames, joints,
@@ -40,7 +41,7 @@ function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, s
   }
 }
 
-/** The record's rotations in the order of `skeleton`, those it lacks at rest and noted. */
+/** The record's rotations in the order of `skeleton`, those it lacks at rest and noted; a joint above the root turns it. */
 function matchJoints({ name: file, rotations, frames, joints, jointNames }, skeleton, notes) {
   const columns = new Map(jointNames.map((name, column) => [name, column]));
   for (const [hand, finger] of Object.entries(STAND_INS))
@@ -52,15 +53,29 @@ function matchJoints({ name: file, rotations, frames, joints, jointNames }, skel
     const expected = `some of the avatar's (${some(skeleton.names)})`;
     throw refusal("joints of the motion", { expected, got: some(jointNames), file });
   }
+  const above = skeleton.names.every((name) => columns.get(name) !== 0) && firstTurns(rotations, frames, joints);
+  if (above) notes.push(`${jointNames[0]}, above ${skeleton.names[0]}, turns all below it`);
   if (missing.length) notes.push(`joints that the motion lacks stay at rest: ${missing.join(", ")}`);
   const result = new Float64Array(frames * skeleton.names.length * 9);
-  for (let f = 0; f < frames; f++)
+  const root = columns.get(skeleton.names[0]);
+  for (let f = 0; f < frames; f++) {
     skeleton.names.forEach((name, joint) => {
       const to = 9 * (f * skeleton.names.length + joint), column = columns.get(name);
       if (column === undefined) result[to] = result[to + 4] = result[to + 8] = 1;
       else result.set(rotations.subarray(9 * (f * joints + column), 9 * (f * joints + column) + 9), to);
     });
+    const first = 9 * f * joints;
+    if (above) multiply(rotations, first, rotations, first + 9 * root, result, 9 * f * skeleton.names.length);
+  }
   return result;
+}
+
+/** Whether a file's first joint turns at all. */
+function firstTurns(rotations, frames, joints) {
+  for (let f = 0; f < frames; f++)
+    for (let k = 0; k < 9; k++)
+      if (Math.abs(rotations[9 * f * joints + k] - (k % 4 === 0 ? 1 : 0)) > TURNS) return true;
+  return false;
 }
 
 /** Local rotations [J·9] and the root's translation [3] at `time` seconds; the end poses beyond the ends. */
