@@ -30,12 +30,13 @@ from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
+from rnd_viewer import convert
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.convert_cli import main
 from rnd_viewer.player import Player
 from rnd_viewer.splat_files import TRANSFORM
 from rnd_viewer.splats import fixed_colour, make_splats, stored_colours, turned_over
-from rnd_viewer.visionary import check_clip, write_visionary
+from rnd_viewer.visionary import check_clip, packed, write_visionary
 from tiny import ASSETS, body, motion
 
 AVATAR, WALK, SKY = ASSETS / "avatar.onnx", ASSETS / "walk.npz", ASSETS / "sky.exr"
@@ -324,6 +325,19 @@ def test_a_clip_for_visionary_is_its_frames(tmp_path):
         assert np.abs(to_bytes(picture).astype(int) - to_bytes(wanted)).max() <= ONE_STEP, time
 
 
+def test_a_frame_that_waits_for_its_clip_is_no_larger_than_in_it(tmp_path, monkeypatch):
+    kept = []
+
+    def write(path: Path, frames: list[tuple[np.ndarray, ...]], fps: float) -> None:
+        kept.extend(sum(part.nbytes for part in parts) for parts in frames)
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(convert, "write_visionary", write)
+    line = ["splats", str(AVATAR), "--motion", str(WALK), "--out", str(tmp_path), "--shade", "ao"]
+    assert main([*line, "--frames", "0:2", "--format", "visionary"]) == 0
+    assert kept == 2 * [Avatar.load(AVATAR, threads=1).gaussians * (10 + 4) * 4]
+
+
 def test_a_clip_that_no_webgpu_buffer_holds_is_refused():
     check_clip(2**27 // (40 * 30_000), 30_000)
     with pytest.raises(
@@ -336,7 +350,7 @@ def test_a_clip_of_ever_other_numbers_of_gaussians_is_refused(tmp_path):
     avatar = Avatar.load(AVATAR, threads=1)
     posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
     parts = [posed.only(np.arange(count)) for count in (7, 9)]
-    clip = [make_splats(part, fixed_colour(part.albedo)) for part in parts]
+    clip = [packed(make_splats(part, fixed_colour(part.albedo))) for part in parts]
     with pytest.raises(InputError, match="as many finite Gaussians in every frame, got 7 to 9"):
         write_visionary(tmp_path / "clip.onnx", clip, 30.0)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import rnd_viewer.play
 from play_fakes import FakeAvatar, fake_motion
@@ -452,6 +453,13 @@ def test_mp4_of_cameras_of_several_sizes_is_refused(files, tmp_path, capsys):
     walking.write_text(json.dumps(document))
     assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
     assert "mp4: expected pictures of one size, 48x48, got 64x64" in capsys.readouterr().err
+
+
+def test_a_webp_of_a_fast_run_says_that_it_keeps_fewer_frames(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", format="webp", fps=120, frames="0:3")) == 0
+    assert "warning: the WebP keeps one frame in 2, 60 a second" in capsys.readouterr().err
+    with Image.open(tmp_path / "out" / "play_000000-000003.webp") as clip:
+        assert clip.n_frames == 2
 
 
 def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from rnd_runtime.light import Light
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.sh import sh_basis, sphere_quadrature
+from rnd_viewer import run_folder
 from rnd_viewer.aov import CHANNELS, ambient_visibility, parse_aovs
 from rnd_viewer.background import Background
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
@@ -246,6 +248,61 @@ def test_pictures_that_no_run_left_stay(tmp_path) -> None:
     assert claim(tmp_path, {"size": 2}, []) == 1 and len(list(tmp_path.glob(".run-*"))) == 1
     assert mine.exists() and (tmp_path / "play.mp4").exists() and not other.exists()
     assert inner.exists()  # no run writes there
+
+
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_part_that_starts_while_the_folder_is_cleaned_keeps_its_frames(
+    tmp_path, monkeypatch, locks
+) -> None:
+    """Where the file system has locks it waits; elsewhere its frames are younger than the mark."""
+    if not locks:
+        monkeypatch.setattr(run_folder, "_lock", lambda file: None)
+    frames, original = _left_by_another_run(tmp_path), Path.unlink
+    at_hand: list[Path] = []
+
+    def render() -> None:
+        claim(tmp_path, {"size": 2}, [])
+        for frame in set(frames) - set(at_hand):
+            frame.write_bytes(b"new")
+
+    def unlink(file: Path, missing_ok: bool = False) -> None:
+        if not at_hand:
+            at_hand.append(file)
+            part.start()
+            part.join(timeout=0.3)
+        original(file, missing_ok)
+
+    part = Thread(target=render)
+    monkeypatch.setattr(Path, "unlink", unlink)
+    claim(tmp_path, {"size": 2}, [])
+    part.join()
+    assert sorted(frame.read_bytes() for frame in frames if frame.exists()) == [b"new", b"new"]
+
+
+def test_what_an_interrupted_run_did_not_take_away_the_next_one_does(tmp_path, monkeypatch) -> None:
+    frames, original = _left_by_another_run(tmp_path), Path.unlink
+
+    def unlink(file: Path, missing_ok: bool = False) -> None:
+        if sum(frame.exists() for frame in frames) == 2:
+            raise KeyboardInterrupt
+        original(file, missing_ok)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "unlink", unlink)
+        claim(tmp_path, {"size": 2}, [])
+    assert claim(tmp_path, {"size": 2}, []) == 2 and not any(frame.exists() for frame in frames)
+
+
+def _left_by_another_run(folder: Path) -> list[Path]:
+    """Three frames, of long ago."""
+    frames = [folder / "frames" / f"{number:06d}.png" for number in range(3)]
+    frames[0].parent.mkdir()
+    claim(folder, {"size": 1}, [])
+    _date(next(folder.glob(".run-*")), 1)
+    for frame in frames:
+        frame.write_bytes(b"old")
+        _date(frame, 1)
+    return frames
 
 
 def _date(file: Path, seconds: int) -> None:

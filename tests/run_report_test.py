@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -128,6 +129,15 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     assert pictures["truth, a"].shape[:2] == (15 + 16, 6 + 16)  # cropped to the person and a margin
     (clip,) = [attributes["src"] for tag, attributes in page.tags if tag == "video"]
     assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
+
+
+def test_a_name_that_is_not_utf8_and_a_folder_called_as_a_chart_are_no_mistake(run, tmp_path):
+    shutil.rmtree(run / "eval")
+    (run / "avatar.onnx").unlink()
+    renamed = run.rename(tmp_path / os.fsdecode(b"r\xe9n"))
+    (tmp_path / "bench" / "x.svg").mkdir(parents=True)
+    _, page = _write(renamed, "--bench", str(tmp_path / "bench"))
+    assert "r\\udce9n" in page.text and "neither *.svg nor stability.json" in page.text
 
 
 def test_what_a_run_lacks_is_named(run):

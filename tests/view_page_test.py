@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -111,6 +112,18 @@ def _pixels(page: Page, canvas: str = "picture") -> np.ndarray:
     return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
 
 
+def _screenshot_name(page: Page) -> str:
+    """The name under which the page's button offers a picture, which is not kept."""
+    return page.run("""new Promise((done) => {
+        const { click } = HTMLAnchorElement.prototype;
+        HTMLAnchorElement.prototype.click = function () {
+            HTMLAnchorElement.prototype.click = click;
+            done(this.download);
+        };
+        document.getElementById("screenshot").click();
+    })""")
+
+
 def _picture(page: Page, changes: str = "") -> np.ndarray:
     page.run(f"Object.assign(rnd.state, {{{changes}}}); rnd.picture().then(() => 1)")
     return _pixels(page)
@@ -207,15 +220,26 @@ def test_ground_truth_stands_beside(page):
         "0",
         "0",
     ]
+    before = page.run("rnd.state.azimuth += 0.1; ({ ...rnd.state })")
     page.drag((300, 300), (50, 0), shift=True)
-    assert page.run("rnd.state.yaw") == 2
-    assert page.run("document.getElementById('clip').disabled")  # it would film something else
+    page.drag((300, 300), (50, 60))
+    page.run("document.getElementById('stage').dispatchEvent(new WheelEvent('wheel', { deltaY: 500 }))")
+    for key in ("Space", "Period", "KeyR"):
+        page.press(key)
+    assert (
+        page.run("({ ...rnd.state })") == page.run("rnd.picture().then(() => ({ ...rnd.state }))") == before
+    )
+    for control in ("clip", "play", "time"):  # they would film or move something else
+        assert page.run(f"document.getElementById('{control}').disabled"), control
+    name = re.sub(r"[ ·]+", "_", page.run(f"rnd.scene().truths[{index}].label"))
+    assert _screenshot_name(page) == f"avatar_{name}.png"
     # the avatar was trained on this capture: 20 dB over the whole picture is far from what another pose gives
     assert np.mean((picture.astype(float) - image) ** 2) < 255**2 / 10**2.0
     page.run("document.getElementById('truth-on').click()")
     assert page.run("document.getElementById('truth-pane').hidden")
-    assert not page.run("document.getElementById('clip').disabled")
-    assert not page.run("document.getElementById('exposure').disabled")
+    for control in ("clip", "play", "time", "exposure"):
+        assert not page.run(f"document.getElementById('{control}').disabled"), control
+    page.press("KeyR")
     page.run("Object.assign(rnd.state, { yaw: 0, exposure: 0 })")
     _set(page, "size", str(SIZE))
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 INTERRUPTED = 130
+LONGEST_END_S = 60  # generously: a picture may still be drawn, on a busy machine
 START = "import sys; from rnd_viewer.view_cli import main; sys.exit(main())"
 
 
@@ -26,7 +27,11 @@ def running(*arguments: str) -> Iterator[str]:
             yield line.removeprefix("rnd-view: ").strip()
         finally:
             viewer.send_signal(signal.SIGINT)
-        assert viewer.wait() == INTERRUPTED
+            try:
+                ended = viewer.wait(LONGEST_END_S)
+            finally:
+                viewer.kill()
+        assert ended == INTERRUPTED
 
 
 def _heed_interrupts() -> None:

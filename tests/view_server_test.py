@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import http.client
 import json
+import os
 import re
 import socket
 import threading
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from time import perf_counter, sleep
 from typing import Any
 
 import av
@@ -47,6 +50,8 @@ from view_process import running
 
 SIZE = 64
 FRAMES = 6
+STALLING = 1536  # pixels square: two such pictures are more than the system's buffers hold
+LONGEST_END_S = 8  # on a busy machine; websockets gives a page ten seconds to ask for something
 LEAST_OVERLAP = 0.85  # of a body's outline with that of an eighth of its Gaussians: limbs grow stouter
 # JPEG of quality 90 halves the chroma: dark and light neighbours of different colours differ by this many levels.
 JPEG_MEAN_ERROR = 4
@@ -210,6 +215,33 @@ def test_the_clip_has_every_frame(options):
         assert np.abs(frames[0].astype(int) - frames[3]).max() > 50  # the camera has turned
 
 
+def test_a_clip_that_the_disk_has_no_room_for_is_told_in_one_line(options, monkeypatch):
+    def full(file, fps):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
+
+    monkeypatch.setattr(rnd_viewer.view_server, "clip_writer", full)
+    with _serving(options) as (port, _), _visiting(port) as visitor:
+        answer = visitor.ask(ask="clip", state=visitor.state(), fps=30)
+        assert answer["kind"] == "error" and answer["message"].endswith("clip.mp4: No space left on device")
+        assert visitor.picture().any()  # and the connection lives
+
+
+def test_however_much_is_asked_meanwhile_the_page_is_not_taken_for_gone(options, monkeypatch):
+    """What the server does not hear behind other messages, the answers to its own pings too."""
+    drawn, original = threading.Event(), Scene.render
+    monkeypatch.setattr(Scene, "render", lambda scene, state: drawn.wait() and original(scene, state))
+    with _serving(options) as (port, _), _visiting(port) as visitor:
+        visitor.socket.send(json.dumps({"ask": "render", "number": 1, "state": visitor.state()}))
+        for _ in range(40):
+            visitor.socket.send(json.dumps({"ask": "truth", "index": 0}))
+        sleep(0.3)  # or the ping comes in one piece with them
+        heard = visitor.socket.ping().wait(timeout=5)
+        drawn.set()
+        for _ in range(42):
+            visitor.socket.recv()
+        assert heard
+
+
 def test_a_clip_of_a_loop_that_does_not_go_round_says_so(options):
     save_motion(options.motion, fake_motion(12))
     with _serving(replace(options, loop=True)) as (port, scene), _visiting(port) as visitor:
@@ -327,6 +359,21 @@ def test_what_fails_before_anything_is_served_ends_it(options):
     thread.start()
     thread.join(timeout=30)
     assert ended
+
+
+def test_ctrl_c_ends_it_though_a_page_reads_no_more_and_another_never_asked():
+    with ExitStack() as pages:
+        with running(str(ASSETS / "avatar.onnx"), "--size", "64") as address:
+            port = int(address.split(":")[2].strip("/"))
+            pages.enter_context(socket.create_connection(("127.0.0.1", port)))
+            url = f"ws://127.0.0.1:{port}/socket"
+            frozen = pages.enter_context(connect(url, max_size=None, max_queue=1, close_timeout=1))
+            state = Visitor(frozen).state(light=0, width=STALLING, height=STALLING, output="albedo")
+            for number in range(4):
+                frozen.send(json.dumps({"ask": "render", "number": number, "state": state}))
+            sleep(3)  # until the buffers in between are full
+            asked = perf_counter()
+        assert perf_counter() - asked < LONGEST_END_S
 
 
 @pytest.mark.skipif(not has_ipv6_loopback(), reason="this machine has no ::1")

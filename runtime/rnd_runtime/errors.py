@@ -130,11 +130,18 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left in it
         return 128 + 13  # as a shell reports SIGPIPE
     except OSError as error:
-        if error.errno not in _OF_THE_MACHINE:
+        if (reason := withheld(error)) is None:
             raise
-        place = "" if error.filename is None else f"{error.filename}: "
-        print(f"{name}: {place}{error.strerror}", file=sys.stderr)  # noqa: T201
+        print(f"{name}: {reason}", file=sys.stderr)  # noqa: T201
         return 2
+
+
+def withheld(error: OSError) -> str | None:
+    """The line for a file that the machine withholds; None of any other error."""
+    if error.errno not in _OF_THE_MACHINE:
+        return None
+    place = "" if error.filename is None else f"{error.filename}: "
+    return f"{place}{error.strerror}"
 
 
 @contextlib.contextmanager

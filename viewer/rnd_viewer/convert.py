@@ -35,7 +35,7 @@ from .splats import (
     turned_over,
     view_dependent_colour,
 )
-from .visionary import check_clip, write_visionary
+from .visionary import check_clip, packed, write_visionary
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -73,7 +73,7 @@ def _splats(options: SplatOptions) -> Iterator[str]:
     shader = Shader(light, mode=options.shade)
     camera_at = _camera_path(options.camera, avatar.skeleton, motion, frames)
     out = output_folder(options.out)
-    clip: list[Splats] = []
+    clip: list[tuple[Floats32, Floats32]] = []  # no more of a frame than the file holds
     left_out = 0
     for number in frames:
         encoded = avatar.encode(motion, number / motion.fps)
@@ -91,7 +91,7 @@ def _splats(options: SplatOptions) -> Iterator[str]:
         if program is not None:
             _transformed(program, out / f"{number:06d}", stored, formats)
         if "visionary" in formats:
-            clip.append(stored)
+            clip.append(packed(stored))
     if left_out:
         yield from _notes(
             [f"Gaussians with numbers that are not finite were left out, {left_out} of a frame at most"]

@@ -42,6 +42,7 @@ from .player import Frame, Player
 from .report import FRAME, LATENCY, print_summary, warn, with_progress
 from .run_folder import claim, is_of_a_run, part_name
 from .timing import StageTimes
+from .video import clip_notes
 from .writers import frame_writer, parse_formats, tone_map_for, write_report
 
 DEFAULT_SIZE = 512
@@ -142,7 +143,7 @@ class _Run:
             count=count,
             framing=framing,
             camera_at=_camera_path(options, size, framing, frames),
-            notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light)],
+            notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light), *clip_notes(formats, fps)],
             governor=Governor(options.fps_floor) if options.fps_floor else None,
         )
 

@@ -1,19 +1,30 @@
 """One folder for a run, also where several processes render parts of it.
 
-A run is known by its settings and inputs. The process that finds no mark of its run in the folder leaves one and takes
-away what other runs left, but nothing that is younger than the mark: that is of processes that render other parts of
-the same run. What is older than every other run's mark is the user's own.
+A run is known by its settings and inputs. The process that finds no mark of its run in the folder takes away what other
+runs left and then leaves one; processes of other parts wait for that. What is older than every other run's mark is the
+user's own.
+
+The mark is its own lock, which the system releases when a process ends; it is empty until all is taken away, so that
+an interrupted process is made up for. On NFS the server locks. Where nothing does, a file is looked at just before it
+is removed: one younger than the mark is of another part.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 from rnd_runtime.files import sha256_of
+
+if sys.platform != "win32":
+    import fcntl
 
 _MARK = ".run-"
 _FRAME = re.compile(
@@ -30,10 +41,25 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) 
     How many files of other runs were removed.
     """
     mark = folder / f"{_MARK}{_identity(settings, inputs)}"
-    try:
-        mark.touch(exist_ok=False)
-    except FileExistsError:
-        return 0
+    with mark.open("a", encoding="utf-8") as file:
+        _lock(file)
+        if os.fstat(file.fileno()).st_size:
+            return 0
+        mark.touch()  # an interrupted process may have left it long ago
+        removed = _take_away(folder, mark)
+        file.write("what other runs left was taken away\n")
+    return removed
+
+
+def _lock(file: IO[str]) -> None:
+    """Wait until no other process has ``file`` locked, and lock it until it is closed."""
+    if sys.platform != "win32":
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(file, fcntl.LOCK_EX)
+
+
+def _take_away(folder: Path, mark: Path) -> int:
+    """Remove what other runs than that of ``mark`` left in ``folder``, then their marks; how many files."""
     others = [other for other in folder.glob(f"{_MARK}*") if other != mark]
     if not others:
         return 0
@@ -44,13 +70,15 @@ def claim(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) 
         return 0
     frames = (file for place in _PICTURES for file in folder.glob(place) if _FRAME.fullmatch(file.name))
     whole = (file for file in folder.iterdir() if _WHOLE.fullmatch(file.name))
-    files = (file for file in [*frames, *whole] if file.is_file())
-    left = [file for file in files if oldest <= file.stat().st_mtime_ns < began]
-    for file in left:
-        file.unlink(missing_ok=True)
+    removed = 0
+    for file in [*frames, *whole]:
+        with suppress(FileNotFoundError):  # as above
+            if file.is_file() and oldest <= file.stat().st_mtime_ns < began:
+                file.unlink()
+                removed += 1
     for other in others:
         other.unlink(missing_ok=True)
-    return len(left)
+    return removed
 
 
 def is_of_a_run(file: Path, folder: Path) -> bool:

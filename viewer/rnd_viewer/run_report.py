@@ -86,7 +86,7 @@ def write_run_report(
     page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
         text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # names that are not UTF-8
     return notes
 
 
@@ -202,7 +202,9 @@ def _bench(folder: Path | None) -> str:
         return _missing(title, "no charts and no table of stability: --bench FOLDER brings them")
     # as pictures, not inline: two charts may use one id for different things
     charts = [
-        (path.stem, data_uri(path.read_bytes(), "image/svg+xml")) for path in sorted(folder.glob("*.svg"))
+        (path.stem, data_uri(path.read_bytes(), "image/svg+xml"))
+        for path in sorted(folder.glob("*.svg"))
+        if path.is_file()
     ]
     parts = [f'<img class="chart" alt="{escape(name)}" src="{chart}">' for name, chart in charts]
     stability = folder / "stability.json"

@@ -7,9 +7,11 @@ through a decoder. WebP has one way to keep colours (BT.601, full chroma range h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -46,8 +48,7 @@ BT709 = {
 X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtree=0"}
 WEBP = {"quality": "85", "compression_level": "4"}
 
-
-WEBP_MOST_FPS = 1000  # its frames begin at whole milliseconds
+WEBP_LEAST_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
 
 INSTALL = "pip install 'rnd-avatar[video]'"
 
@@ -125,6 +126,21 @@ _KINDS = {
 CLIPS = tuple(_KINDS)
 
 
+def clip_notes(kinds: Iterable[str], fps: float) -> list[str]:
+    """What is to be said of clips of frames of so many a second."""
+    every = _webp_every(fps)
+    if "webp" not in kinds or every == 1:
+        return []
+    return [
+        f"the WebP keeps one frame in {every}, {fps / every:g} a second: browsers slow down what has more than 90"
+    ]
+
+
+def _webp_every(fps: float) -> int:
+    """One frame in how many a WebP keeps."""
+    return math.ceil(fps * WEBP_LEAST_MS / 1000)
+
+
 @contextmanager
 def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], None]]:
     """Yield a function that appends one sRGB frame uint8; the file appears when the block ends.
@@ -132,29 +148,25 @@ def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], N
     Args:
         path: a name in .mp4, which takes frames [H, W, 3], or in .webp, which also takes [H, W, 4], their alpha
             straight, and plays again and again.
-        fps: frames per second.
+        fps: frames per second; of more than 90 a WebP keeps every second, third, …
 
     The size is that of the first frame (mp4: rounded up to even). The same frames give the same bytes. Raises
-    InputError when PyAV is missing, the encoder refuses the size, or a WebP has more than 1000 frames per second.
+    InputError when PyAV is missing or the encoder refuses the size.
     """
     av, name = load_pyav(), Path(path).suffix[1:]
     kind = _KINDS[name]
-    if name == "webp" and fps > WEBP_MOST_FPS:
-        raise InputError(
-            "webp",
-            expected=f"at most {WEBP_MOST_FPS} frames per second",
-            got=f"{fps:g}",
-            hint="--fps sets them",
-        )
+    every, numbers = _webp_every(fps) if name == "webp" else 1, count()
     with (
         atomic_path(path) as temporary,
         av.open(str(temporary), "w", format=name, options=kind.container) as container,
     ):
         stream = container.add_stream(
-            kind.codec, rate=Fraction(fps).limit_denominator(1001), options=kind.options
+            kind.codec, rate=Fraction(fps / every).limit_denominator(1001), options=kind.options
         )
 
         def write(image_srgb: Bytes) -> None:
+            if next(numbers) % every:
+                return
             frame = av.VideoFrame.from_ndarray(kind.planes(image_srgb), format=kind.pixels)
             size = f"{frame.width}x{frame.height}"
             if not stream.codec_context.is_open:

@@ -12,24 +12,25 @@ import hmac
 import json
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from socket import AF_INET, AF_INET6, SOCK_DGRAM, gethostname, socket
+from socket import AF_INET, AF_INET6, SHUT_RDWR, SOCK_DGRAM, gethostname, socket
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from types import ModuleType
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
+from weakref import WeakSet
 
 import numpy as np
 from msgspec.structs import replace
 
-from rnd_runtime.errors import InputError
+from rnd_runtime.errors import InputError, withheld
 from rnd_runtime.threads import set_threads
 
 from .video import clip_writer
@@ -42,6 +43,7 @@ JPEG_QUALITY = 90
 HTTP_PORT = 80  # which browsers leave out of the host's name
 _ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one, for examples, that lies elsewhere
 MOST_BYTES_IN = 1 << 16  # a request is a few hundred
+GOODBYE_S = 1.0  # in which a page that still reads hears that the viewer ends
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -121,6 +123,12 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
     server_module = load_websockets()
     visitor = _Visitor(scene)
     access: list[Access] = []  # known once the port is
+    connections: WeakSet[Any] = WeakSet()  # also those that have asked for nothing yet
+
+    def connect(*arguments: Any, **options: Any) -> Any:
+        connection = server_module.ServerConnection(*arguments, **options)
+        connections.add(connection)
+        return connection
 
     def answer(connection: Any, request: Any) -> Any:
         refusal = access[0].refusal(request.path, request.headers)
@@ -137,6 +145,8 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
             process_request=answer,
             compression=None,
             max_size=MOST_BYTES_IN,
+            max_queue=None,  # behind a full queue pings wait too, and the page is taken for gone
+            create_connection=connect,
             server_header=None,
             logger=_quiet_logger(),
             family=AF_INET6 if ":" in host else AF_INET,
@@ -155,7 +165,17 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
         # Where nobody has served yet, shutdown would wait for ever; with its socket closed serving ends at once.
         if not server.socket_closed.is_set():
             server.serve_forever()
+        hanging_up = threading.Timer(GOODBYE_S, _hang_up, [connections])
+        hanging_up.start()
         server.shutdown()
+        hanging_up.cancel()
+
+
+def _hang_up(connections: Iterable[Any]) -> None:
+    """End what waits for a page that reads no more, or for one that never asked for anything."""
+    for connection in list(connections):
+        with suppress(OSError):  # closed already
+            connection.socket.shutdown(SHUT_RDWR)
 
 
 def _name_from_elsewhere(host: str) -> str:
@@ -208,7 +228,7 @@ class _Visitor:
         self._drawing = threading.Lock()
 
     def talk(self, socket: Any) -> None:
-        """Serve one websocket until it closes. A refused request is answered with its reason."""
+        """Serve one websocket until it closes. A request that cannot be met is answered with the reason."""
         from websockets.exceptions import ConnectionClosed
 
         set_threads(self._scene.threads)  # each visitor has a thread, and each thread a number of its own
@@ -219,6 +239,10 @@ class _Visitor:
                     self._answer(socket, parse_request(message))
                 except InputError as error:
                     self._send(socket, {"kind": "error", "message": str(error)})
+                except OSError as error:
+                    if (reason := withheld(error)) is None:
+                        raise
+                    self._send(socket, {"kind": "error", "message": reason})
 
     def _answer(self, socket: Any, request: Request) -> None:
         if isinstance(request, RenderRequest):

@@ -64,17 +64,17 @@ def check_clip(frames: int, gaussians: int) -> None:
         raise InputError("--frames", expected=f"at most {most} of this avatar for visionary", got=frames)
 
 
-def write_visionary(path: Path, frames: Sequence[Splats], fps: float) -> None:
-    """Write a clip of ``frames``.
+def write_visionary(path: Path, frames: Sequence[tuple[Floats32, Floats32]], fps: float) -> None:
+    """Write a clip of ``frames``, each as :func:`packed`.
 
     Raises:
         InputError: they have not as many Gaussians each.
     """
-    counts = [len(splats.means) for splats in frames]
+    counts = [len(gaussians) for gaussians, _ in frames]
     if min(counts) < max(counts):
         got = f"{min(counts)} to {max(counts)}"
         raise InputError("visionary", expected="as many finite Gaussians in every frame", got=got, file=path)
-    gaussians, colours = (np.stack(parts) for parts in zip(*map(packed, frames)))
+    gaussians, colours = (np.stack(parts) for parts in zip(*frames))
     with atomic_path(path) as temporary:
         temporary.write_bytes(_model(gaussians, colours, fps))
 

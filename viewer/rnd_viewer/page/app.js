@@ -160,10 +160,8 @@ function setScene(description) {
   $("compare").hidden = scene.truths.length === 0;
   $("time").step = 1 / scene.motion.fps;
   $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // a slider stops short of an end that rounding put off its steps
-  $("time").disabled = scene.motion.duration === 0;
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
-  $("play").disabled = scene.motion.duration === 0;
-  freeClip();
+  freeMotion();
   state.time = Math.min(state.time, scene.motion.duration);
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
   setGaussians();
@@ -187,7 +185,7 @@ async function setTruth() {
   $("truth-pane").hidden = !on;
   for (const name of ["light", "yaw", "exposure"]) $(name).disabled = on;  // the picture's own shines, as it is
   say("");  // what was said of another picture
-  freeClip();
+  freeMotion();
   if (on) {
     play(false);
     engine.truth(index);
@@ -220,7 +218,8 @@ function picture(exact = true) {
 }
 
 async function screenshot() {
-  const name = `avatar_${state.time.toFixed(2)}s.png`;
+  const truth = state.truth === null ? null : scene.truths[state.truth].label.replaceAll(/[^\p{L}\p{N}._-]+/gu, "_");
+  const name = `avatar_${truth ?? `${state.time.toFixed(2)}s`}.png`;
   if (!await picture().catch(() => null)) return;  // the page says why
   const canvas = document.createElement("canvas");
   Object.assign(canvas, { width: $("picture").width, height: $("picture").height });
@@ -233,7 +232,7 @@ function clip() {
   play(false);
   clipMade = {};
   clipMade.promise = new Promise((done) => { clipMade.resolve = done; });
-  freeClip();
+  freeMotion();
   say("making a clip …");
   const turn = $("turntable").checked ? 2 * Math.PI : 0;
   const fps = Math.min(Math.max(scene.motion.fps, 1), MOST_CLIP_FPS);
@@ -243,12 +242,14 @@ function clip() {
 function endClip() {
   clipMade?.resolve();
   clipMade = null;
-  freeClip();
+  freeMotion();
 }
 
-function freeClip() {
-  const compared = state.truth !== null;
-  $("clip").disabled = clipMade !== null || compared || !scene?.motion.duration;
+/** What moves the avatar or films it: not beside a truth, whose pose and camera are shown. */
+function freeMotion() {
+  const compared = state.truth !== null, still = !scene?.motion.duration;
+  $("play").disabled = $("time").disabled = compared || still;
+  $("clip").disabled = clipMade !== null || compared || still;
   $("clip").title = compared ? "a clip films the motion: switch “ground truth beside” off" : "";
 }
 
@@ -278,6 +279,7 @@ function bind() {
   $("clip").addEventListener("click", clip);
   document.addEventListener("keydown", (event) => {
     if (event.target.matches("select") || !scene || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (state.truth !== null) return;  // see freeMotion
     if (event.code === "Space") {
       if (event.target.matches("button, [type=checkbox], [type=file]")) return;  // which it presses
       event.preventDefault();
@@ -330,7 +332,7 @@ const handlers = {
   picture: show,
   truth: showTruth,
   message: (text) => say(text, { untilPicture: true }),
-  progress: (done, of) => say(`making a clip: ${done} of ${of}`),
+  progress: (done, of, note = "") => say(`making a clip: ${done} of ${of}${note}`),
   clip: (blob, name, notes = []) => { endClip(); say(notes.join(" · ")); download(blob, name); },
   refused: (text) => say(text, { wrong: true }),
   error: fail,

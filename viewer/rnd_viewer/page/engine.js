@@ -5,8 +5,9 @@ const UNREACHABLE = "rnd-view does not answer; is it still running?";
 
 /**
  * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap or
- * null where the browser cannot decode it), progress(done, of), clip(blob, name, notes), error(text, ends): of a
- * picture or of a clip, which ends with it unless told otherwise. None of them is called before what asks for it has returned.
+ * null where the browser cannot decode it), progress(done, of, note or nothing), clip(blob, name, notes), error(text, ends):
+ * of a picture or of a clip, which ends with it unless told otherwise. None of them is called before what asks for it has
+ * returned.
  */
 export async function connect(on) {
   const address = new URL("socket", location.href);

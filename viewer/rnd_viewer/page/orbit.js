@@ -4,7 +4,10 @@ const LIMIT = 89 * Math.PI / 180;
 const PER_PIXEL = 0.01;  // rad
 const NEAREST = 0.2, FARTHEST = 100;  // m
 
-/** Lets `element` turn `state` (azimuth, elevation, distance, target, yaw in rad and m); calls `changed` after. */
+/**
+ * Lets `element` turn `state` (azimuth, elevation, distance, target, yaw in rad and m), unless a truth stands beside, whose
+ * camera and light are shown; calls `changed` after.
+ */
 export function orbit(element, state, changed) {
   const fingers = new Map();  // pointer → its last place
   element.addEventListener("contextmenu", (event) => event.preventDefault());
@@ -16,13 +19,11 @@ export function orbit(element, state, changed) {
     element.addEventListener(end, (event) => fingers.delete(event.pointerId));
   element.addEventListener("pointermove", (event) => {
     const last = fingers.get(event.pointerId);
-    if (!last) return;
+    if (!last || state.truth !== null) return;
     const apart = spread(fingers), dx = event.clientX - last[0], dy = event.clientY - last[1];
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     if (fingers.size > 1) approach(state, apart / Math.max(spread(fingers), 1));
-    else if (event.shiftKey) {
-      if (state.truth === null) state.yaw = wrapped(state.yaw + dx * PER_PIXEL);  // else the picture's own light shines
-    }
+    else if (event.shiftKey) state.yaw = wrapped(state.yaw + dx * PER_PIXEL);
     else if (event.buttons & 2 || event.ctrlKey) pan(state, dx, dy, element.clientHeight);
     else {
       state.azimuth = wrapped(state.azimuth - dx * PER_PIXEL);
@@ -32,6 +33,7 @@ export function orbit(element, state, changed) {
   });
   element.addEventListener("wheel", (event) => {
     event.preventDefault();
+    if (state.truth !== null) return;
     approach(state, Math.exp(event.deltaY * 1e-3));
     changed();
   }, { passive: false });

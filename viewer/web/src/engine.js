@@ -3,6 +3,7 @@
 const MOST_CLIP_FRAMES = 900;
 const MOST_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
 const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder; it halves the chroma as well
+const KEEP_IN_VIEW = " · keep this tab in view";  // browsers slow a hidden one down to about a frame a second
 // H.264 of level 4.0, which 1024² at 30 fps need, before 3.0; then what has none
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E028", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
@@ -110,7 +111,7 @@ async function record(picture, state, { fps, turn, duration }, on) {
   for (let k = 0; k < count; k++) {
     show((await picture({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
     frames.push(await new Promise((done) => { canvas.toBlob(done, "image/jpeg", FRAME_QUALITY); }));
-    on.progress(k + 1, count);
+    on.progress(k + 1, count, KEEP_IN_VIEW);
   }
   show(await createImageBitmap(frames[0]));
   const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: type, videoBitsPerSecond: 12e6 });
