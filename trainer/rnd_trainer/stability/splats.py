@@ -79,7 +79,11 @@ def broken_quaternions(subject: Subject) -> Result:
     q = rng.normal(size=(len(means), 4))
     delta = 0.3 * rng.normal(size=q.shape)
     scales = rng.uniform(0.01, 0.05, (len(means), 3))
-    given: dict[str, ArrayLike] = {"rotation": 2 * q[:, 1:] / q[:, :1], "turn": delta[:, 1:], "scales": scales}
+    given: dict[str, ArrayLike] = {
+        "rotation": 2 * q[:, 1:] / q[:, :1],
+        "turn": delta[:, 1:],
+        "scales": scales,
+    }
 
     def image(upper: Floats32) -> Floats32:
         raster = rasterize(means, upper, opacities, features, camera)
