@@ -28,7 +28,7 @@ from rnd_runtime.video_fits import (
     with_root,
 )
 
-from .pictures import listed, natural, numbers_of
+from .pictures import count_shift, listed, natural, numbers_of
 from .recording import Floats, Lens, Poses, easymocap_poses, moved, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
@@ -130,26 +130,17 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
 def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
     """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
 
-    Numbers mean the same in both where all of one's are among the other's. Else one may have been counted from 0 and
-    the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
-    poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
-
-    Poses without numbers belong to the frames from the first on; that there are more or fewer is noted.
+    Numbers of files may be counted from elsewhere: :func:`.pictures.count_shift`. Poses without numbers belong to the frames from the first on; that there are more or fewer is noted.
 
     Raises:
         InputError: no frame has a pose.
     """
     poses = found.poses
-    ours, theirs = set(numbers), set(poses.frames.tolist())
     begin, first, last = numbers[0], int(poses.frames[0]), int(poses.frames[-1])
-    if found.numbered and not (ours <= theirs or theirs <= ours):
-        extent = last - first + 1
-        as_many = extent == len(numbers) and min(begin, first) <= 1
-        from_zero = extent <= len(numbers) and (first, begin) == (0, 1)
-        if numbers[-1] - begin + 1 == len(numbers) and (as_many or from_zero):
-            note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
-            return replace(poses, frames=poses.frames + (begin - first)), (note,)
-    if not ours & theirs:
+    if found.numbered and (shift := count_shift(numbers, poses.frames.tolist())):
+        note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
+        return replace(poses, frames=poses.frames + shift), (note,)
+    if not {*numbers} & {*poses.frames.tolist()}:
         raise InputError(
             "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
         )  # fmt: skip
