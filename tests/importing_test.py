@@ -309,6 +309,18 @@ def test_a_damaged_file_of_a_layout_is_named(tmp_path, name, content) -> None:
         find_layout(tmp_path)
 
 
+@pytest.mark.parametrize("key", ["w", "time_index"])
+def test_a_width_or_a_time_that_is_endless_is_refused(tmp_path, key) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    layouts.write_nerfstudio(source)
+    record = json.loads((source / "transforms.json").read_text())
+    record["frames"][0][key] = float("inf")
+    (source / "transforms.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"source.*: expected .*, got .*infinity to integer"):
+        import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
+
+
 def test_records_of_another_kind_than_the_first_are_named(tmp_path) -> None:
     source, refusal = _arah(tmp_path)
     (source / "cam_params.json").write_text('["1", "2"]')

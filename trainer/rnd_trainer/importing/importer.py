@@ -129,7 +129,7 @@ def import_source(
     model = load_body_model(options.body)
     try:
         recording = _read(layout, source, model, options)
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(f"{layout} cannot be read", expected=_needs(layout), got=got, file=source) from error
     if convention is not None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.motion_files import names_of_joints
+from rnd_runtime.motion_files import frame_rate, names_of_joints
 from rnd_runtime.npz import Npz
 from rnd_runtime.unpickle import read_pickle
 from rnd_runtime.video_fits import (
@@ -117,7 +117,7 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
                 return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes, in_camera=True)
         except InputError as error:
             raise error.at(file=path) from error
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise InputError(
                 "body poses", expected="the layout its keys promise", got=repr(error), file=path
             ) from error
@@ -130,7 +130,8 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
 def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
     """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
 
-    Numbers of files may be counted from elsewhere: :func:`.pictures.count_shift`. Poses without numbers belong to the frames from the first on; that there are more or fewer is noted.
+    Numbers of files may be counted from elsewhere: :func:`.pictures.count_shift`. Poses without numbers belong to the
+    frames from the first on; that there are more or fewer is noted.
 
     Raises:
         InputError: no frame has a pose.
@@ -270,8 +271,7 @@ def _npz(path: Path) -> FoundPoses:
         betas = None if betas_name is None else archive.numbers(betas_name)
         notes = () if betas is None else _gender(archive)
         smplx = _is_smplx(archive) or poses.shape[1] == 165
-        rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
-        fps = None if rate is None else float(archive.numbers(rate).reshape(-1)[0])
+        fps = frame_rate(archive)
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
         Rh, trans = (
             np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift)

@@ -55,9 +55,8 @@ def _files_of(recording: Recording, folder: Path, suffixes: tuple[str, ...]) -> 
     pictures: dict[Path, list[tuple[str, int]]] = {}
     for shot in recording.shots:
         pictures.setdefault(inner[shot.camera], []).append((shot.name, shot.frame))
-    if recording.film:
-        pictures = dict.fromkeys(pictures, [(name, frame) for frame, name in recording.film.items()])
-    stocks = {place: _Stock(place, suffixes, of) for place, of in pictures.items()}
+    film = [(name, frame) for frame, name in recording.film.items()]
+    stocks = {place: _Stock(place, suffixes, film or of) for place, of in pictures.items()}
     notes = dict.fromkeys(
         f"{folder.name} are numbered from {stock.first - stock.shift}, frames from {stock.first}: taken for the same"
         for stock in stocks.values()
