@@ -225,6 +225,50 @@ def test_a_picture_of_another_size_is_named(tmp_path) -> None:
     )
 
 
+def _refusal(folder: Path, source: str, out: Path, **more: object) -> str:
+    options = ImportOptions(
+        body=str(layouts.body_file(folder)), poses=folder / "poses.npz", intrinsics=(77, 77, WIDTH / 2, HEIGHT / 2),
+        **more,
+    )  # fmt: skip
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(InputError) as caught:
+        import_source(folder / source, out, options)
+    assert sorted(folder.rglob("*")) == before
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["images", "masks", "normals"])
+def test_a_capture_is_not_written_among_other_files(tmp_path, name) -> None:
+    _write(tmp_path)
+    out = tmp_path / "out"
+    write_image(out / name / "somebodys.png", _masks()[0])
+    expected = f"{out}: holds {name} already (choose another folder, or remove them)"
+    assert _refusal(tmp_path, "frames", out) == expected
+
+
+def test_a_capture_is_not_written_among_what_it_is_made_of(tmp_path, monkeypatch) -> None:
+    _write(tmp_path)
+    (tmp_path / "frames").rename(tmp_path / "images")
+    expected = "OUT: expected another folder than that of {}, got {}"
+    assert _refusal(tmp_path, "images", tmp_path) == expected.format("the source", tmp_path)
+    (tmp_path / "images").rename(tmp_path / "frames")
+    assert _refusal(tmp_path, "frames", tmp_path, masks=tmp_path / "masks") == expected.format(
+        "--masks", tmp_path
+    )
+    (tmp_path / "masks").rename(tmp_path / "normals")
+    monkeypatch.chdir(tmp_path)
+    said = _refusal(tmp_path, "frames", Path(), normals=tmp_path / "normals")
+    assert said == expected.format("--normals", ".")
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_read(tmp_path, monkeypatch) -> None:
+    _write(tmp_path)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("rnd_trainer.importing.importer._read", lambda *_: pytest.fail("read"))
+    for out in (tmp_path / "file", tmp_path / "file" / "more" / "out"):
+        assert _refusal(tmp_path, "frames", out).startswith(f"{out}: output folder cannot be made: got ")
+
+
 @pytest.mark.parametrize("given", [(0.1,), (0.1, 0, 0, float("nan")), (0.0,) * 6])
 def test_a_distortion_that_opencv_does_not_know_is_refused(tmp_path, given) -> None:
     _write(tmp_path)
