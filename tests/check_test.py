@@ -216,6 +216,22 @@ def test_a_lens_that_was_not_undone_is_named(tmp_path) -> None:
         assert words in _wrong(tmp_path)["lens"]
 
 
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"turn": "none"}, {"turn": [1, 0, 0]}, {"turn": None}, {"distortion": 5}, {"distortion": {"0": "none"}},
+        {"distortion": {"0": ["none"]}}, {"normal_axes": "x,-y,-z"}, {"normal_axes": [["x"]]}, "by hand",
+    ],
+    ids=str,
+)  # fmt: skip
+def test_an_import_that_somebody_noted_by_hand_is_no_matter(tmp_path, told) -> None:
+    """Keys at the top of capture.json are free."""
+    write_true_capture(tmp_path, k1=-0.4)
+    before = check_capture(tmp_path).findings
+    _edit(tmp_path, lambda record: record.update({"import": told}))
+    assert check_capture(tmp_path).findings == before
+
+
 def test_bad_masks_and_backgrounds_are_counted(folder) -> None:
     for path in sorted((folder / "masks").iterdir())[:2]:
         write_image(path, read_image(path) // 255)  # 0 and 1

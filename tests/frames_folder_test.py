@@ -12,7 +12,7 @@ import layouts
 from known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
-from rnd_runtime.images import write_image
+from rnd_runtime.images import to_bytes, write_image
 from rnd_trainer.importing.importer import import_source
 from rnd_trainer.importing.options import Choice, ImportOptions
 from rnd_trainer.importing.pictures import read_mask
@@ -25,21 +25,36 @@ def _masks() -> list[np.ndarray]:
     return [(255 * view_of(CAMERA, k).mask).astype(np.uint8) for k in range(FRAMES)]
 
 
-def _write(folder: Path, frame_name: str = "{:05d}", mask_name: str = "{:05d}", first: int = 0) -> None:
+def _picture(mask: np.ndarray) -> np.ndarray:
+    return np.where(mask[..., None] > 0, np.uint8([180, 120, 90]), np.uint8(60)).astype(np.uint8)
+
+
+def _write(
+    folder: Path,
+    frame_name: str = "{:05d}",
+    mask_name: str = "{:05d}",
+    first: int = 0,
+    first_mask: int | None = None,
+) -> None:
+    first_mask = first if first_mask is None else first_mask
     for k, mask in enumerate(_masks()):
-        picture = np.where(mask[..., None] > 0, np.uint8([180, 120, 90]), np.uint8(60))
-        write_image(folder / "frames" / f"{frame_name.format(first + k)}.png", picture.astype(np.uint8))
-        write_image(folder / "masks" / f"{mask_name.format(first + k)}.png", mask)
+        write_image(folder / "frames" / f"{frame_name.format(first + k)}.png", _picture(mask))
+        write_image(folder / "masks" / f"{mask_name.format(first_mask + k)}.png", mask)
     world = layouts.camera_world()
     np.savez(folder / "poses.npz", thetas=world.thetas, trans=world.trans, betas=BETAS)
 
 
-def _imported(folder: Path, **more: object) -> Capture:
+def _film(folder: Path) -> Path:
+    layouts.write_video(folder / "me.mp4", [_picture(mask) for mask in _masks()])
+    return folder / "me.mp4"
+
+
+def _imported(folder: Path, source: Path | None = None, **more: object) -> Capture:
     options = ImportOptions(
         body=str(layouts.body_file(folder)), poses=folder / "poses.npz", intrinsics=(77, 77, WIDTH / 2, HEIGHT / 2),
         **{"masks": folder / "masks"} | more,
     )  # fmt: skip
-    import_source(folder / "frames", folder / "out", options)
+    import_source(source or folder / "frames", folder / "out", options)
     return load_capture(folder / "out")
 
 
@@ -87,6 +102,54 @@ def test_masks_of_frames_without_numbers_may_be_counted_from_one(tmp_path, names
         assert np.array_equal(capture.load_frame(frame).mask > 0.5, view_of(CAMERA, frame.frame).mask)
     notes = json.loads((tmp_path / "out" / "capture.json").read_text())["import"]["notes"]
     assert ("masks are numbered from 1, frames from 0: taken for the same" in notes) == bool(first)
+
+
+COUNTED = {
+    # the names of frames and masks, the number of the first of each
+    "ffmpeg's, masks from 0": ("f_{:04d}", "{:05d}", 1, 0),
+    "called alike": ("{:05d}", "{:05d}", 1, 0),
+    "masks from 1": ("{:05d}", "{:05d}", 0, 1),
+    "a part, masks from 0": ("f_{:d}", "f_{:d}", 51, 0),
+}
+
+
+@pytest.mark.parametrize("choice", [Choice(), Choice(start=1), Choice(stop=3)], ids=["all", "late", "early"])
+@pytest.mark.parametrize("name", COUNTED)
+def test_as_many_masks_as_frames_may_be_counted_from_elsewhere(tmp_path, name, choice) -> None:
+    """Whichever frames are taken of them."""
+    frame_name, mask_name, first, first_mask = COUNTED[name]
+    _write(tmp_path, frame_name, mask_name, first, first_mask)
+    capture = _imported(tmp_path, choice=choice)
+    for frame in capture.frames:
+        assert np.array_equal(capture.load_frame(frame).mask > 0.5, view_of(CAMERA, frame.frame).mask)
+    notes = json.loads((tmp_path / "out" / "capture.json").read_text())["import"]["notes"]
+    assert f"masks are numbered from {first_mask}, frames from {first}: taken for the same" in notes
+
+
+def test_masks_that_are_not_as_many_as_the_frames_are_those_of_their_numbers(tmp_path) -> None:
+    _write(tmp_path, "f_{:d}", "{:d}", first=1)
+    (tmp_path / "masks" / "1.png").rename(tmp_path / "masks" / "0.png")
+    (tmp_path / "masks" / "preview.png").hardlink_to(tmp_path / "masks" / "0.png")
+    (tmp_path / "masks" / "5.png").hardlink_to(tmp_path / "masks" / "0.png")
+    capture = _imported(tmp_path, choice=Choice(start=1))
+    assert len(capture.frames) == FRAMES - 1
+    for frame in capture.frames:
+        assert np.array_equal(capture.load_frame(frame).mask > 0.5, view_of(CAMERA, frame.frame).mask)
+
+
+@pytest.mark.parametrize("kind", ["masks", "normals"])
+def test_a_picture_without_a_number_is_no_mask_of_a_videos_frames(tmp_path, kind) -> None:
+    """Nor are they its normals: frames of a video have no name that it could go on."""
+    _write(tmp_path)
+    film = _film(tmp_path)
+    for k in range(FRAMES):
+        view = view_of(CAMERA, k)
+        write_image(tmp_path / "normals" / f"{k:05d}.png", to_bytes((view.normals + 1) / 2))
+    write_image(tmp_path / kind / "preview.png", np.full((2, 2, 3), 255, np.uint8))
+    capture = _imported(tmp_path, film, normals=tmp_path / "normals")
+    assert len(capture.frames) == FRAMES
+    for frame in capture.frames:
+        assert np.array_equal(capture.load_frame(frame).mask > 0.5, view_of(CAMERA, frame.frame).mask)
 
 
 def test_masks_from_one_that_are_fewer_than_the_frames_are_those_of_their_numbers(tmp_path) -> None:
@@ -160,6 +223,50 @@ def test_a_picture_of_another_size_is_named(tmp_path) -> None:
         f"{tmp_path / 'frames' / '00002.png'}: frame 2: size of image: expected {WIDTH} x {HEIGHT} as the first, "
         f"got {WIDTH} x {HEIGHT // 2}"
     )
+
+
+def _refusal(folder: Path, source: str, out: Path, **more: object) -> str:
+    options = ImportOptions(
+        body=str(layouts.body_file(folder)), poses=folder / "poses.npz", intrinsics=(77, 77, WIDTH / 2, HEIGHT / 2),
+        **more,
+    )  # fmt: skip
+    before = sorted(folder.rglob("*"))
+    with pytest.raises(InputError) as caught:
+        import_source(folder / source, out, options)
+    assert sorted(folder.rglob("*")) == before
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["images", "masks", "normals"])
+def test_a_capture_is_not_written_among_other_files(tmp_path, name) -> None:
+    _write(tmp_path)
+    out = tmp_path / "out"
+    write_image(out / name / "somebodys.png", _masks()[0])
+    expected = f"{out}: holds {name} already (choose another folder, or remove them)"
+    assert _refusal(tmp_path, "frames", out) == expected
+
+
+def test_a_capture_is_not_written_among_what_it_is_made_of(tmp_path, monkeypatch) -> None:
+    _write(tmp_path)
+    (tmp_path / "frames").rename(tmp_path / "images")
+    expected = "OUT: expected another folder than that of {}, got {}"
+    assert _refusal(tmp_path, "images", tmp_path) == expected.format("the source", tmp_path)
+    (tmp_path / "images").rename(tmp_path / "frames")
+    assert _refusal(tmp_path, "frames", tmp_path, masks=tmp_path / "masks") == expected.format(
+        "--masks", tmp_path
+    )
+    (tmp_path / "masks").rename(tmp_path / "normals")
+    monkeypatch.chdir(tmp_path)
+    said = _refusal(tmp_path, "frames", Path(), normals=tmp_path / "normals")
+    assert said == expected.format("--normals", ".")
+
+
+def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_read(tmp_path, monkeypatch) -> None:
+    _write(tmp_path)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("rnd_trainer.importing.importer._read", lambda *_: pytest.fail("read"))
+    for out in (tmp_path / "file", tmp_path / "file" / "more" / "out"):
+        assert _refusal(tmp_path, "frames", out).startswith(f"{out}: output folder cannot be made: got ")
 
 
 @pytest.mark.parametrize("given", [(0.1,), (0.1, 0, 0, float("nan")), (0.0,) * 6])

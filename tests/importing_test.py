@@ -19,9 +19,10 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
 from rnd_trainer.checking.check import check_capture
-from rnd_trainer.importing import nerfstudio
+from rnd_trainer.importing import instant_avatar, nerfstudio
 from rnd_trainer.importing.importer import find_layout, import_source
 from rnd_trainer.importing.options import Choice, ImportOptions
+from rnd_trainer.importing.surfaces import attached
 from rnd_trainer.silhouette import overlap
 
 # Measured over all layouts: 3e-7 m, nothing, nothing, cosine 0.99997
@@ -231,6 +232,41 @@ def test_instant_avatars_split_is_kept(tmp_path, subject) -> None:
         assert ((capture.load_frame(frame).mask > 0.5) == see("0", k).mask).all()
 
 
+def test_instant_avatars_subjects_are_known_wherever_one_stands(tmp_path, monkeypatch) -> None:
+    """In the folder, by a link to it or by one called so; of any other, optimised poses cannot be used, and a note
+    says so."""
+    source, other = tmp_path / "female-4-casual", tmp_path / "subject"
+    source.mkdir()
+    layouts.write_snapshot_split(source, *(range(a, b + 1, step) for a, b, step in SPLITS[source.name]))
+    other.symlink_to(source)
+    monkeypatch.chdir(source)
+    whole = instant_avatar.read(source)
+    for place in (Path(), Path("..", source.name), other):
+        found = instant_avatar.read(place)
+        assert [shot.split for shot in found.shots] == [shot.split for shot in whole.shots]
+        assert found.notes == whole.notes and "optimised" in found.notes[0]
+    other.unlink()
+    source.rename(other)
+    found = instant_avatar.read(other)
+    assert {shot.split for shot in found.shots} == {None}
+    assert len(found.notes) == 1 and "poses/anim_nerf_*.npz are left out" in found.notes[0]
+    source.symlink_to(other)
+    assert instant_avatar.read(source).notes == whole.notes
+
+
+def test_masks_of_a_split_are_counted_among_those_of_all_pictures(tmp_path) -> None:
+    source = tmp_path / "female-4-casual"
+    source.mkdir()
+    layouts.write_snapshot_split(source, *(range(a, b + 1, step) for a, b, step in SPLITS[source.name]))
+    (tmp_path / "masks").mkdir()
+    for k in range(len(list((source / "images").iterdir()))):
+        (tmp_path / "masks" / f"{k + 1}.npy").hardlink_to(source / "masks" / f"mask_{k % FRAMES:04d}.npy")
+    found = attached(instant_avatar.read(source), tmp_path / "masks", None)
+    assert "masks are numbered from 1, frames from 0: taken for the same" in found.notes
+    for shot in found.shots[::9]:
+        assert ((shot.mask() > 127) == see("0", shot.frame % FRAMES).mask).all()
+
+
 def test_poses_that_do_not_fill_a_split_are_refused(tmp_path) -> None:
     source = tmp_path / "female-3-casual"
     source.mkdir()
@@ -307,6 +343,18 @@ def test_a_damaged_file_of_a_layout_is_named(tmp_path, name, content) -> None:
     np.savez(tmp_path / "poses.npz", poses=np.zeros(3))
     with pytest.raises(InputError, match=f"{name}: cannot be read: expected JSON"):
         find_layout(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["w", "time_index"])
+def test_a_width_or_a_time_that_is_endless_is_refused(tmp_path, key) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    layouts.write_nerfstudio(source)
+    record = json.loads((source / "transforms.json").read_text())
+    record["frames"][0][key] = float("inf")
+    (source / "transforms.json").write_text(json.dumps(record))
+    with pytest.raises(InputError, match=r"source.*: expected .*, got .*infinity to integer"):
+        import_source(source, tmp_path / "out", ImportOptions(body=str(layouts.body_file(tmp_path))))
 
 
 def test_records_of_another_kind_than_the_first_are_named(tmp_path) -> None:

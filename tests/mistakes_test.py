@@ -96,6 +96,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         (f"{IMPORT} --fps 1e-9", "--fps: expected 0.001 to 10000, got 1e-09"),
         (f"{MOTION} --fps 20000", "--fps: expected 0.001 to 10000, got 20000"),
         (f"{MOTION} --source-fps 0", "--source-fps: expected 0.001 to 10000, got 0"),
+        ("rnd-data motion OUT/run.amc OUT/w.npz", "run.amc: motion not found"),
         (f"{MOTION} --speed 1e-7", "--speed: expected 0.01 to 100, got 1e-07"),
         (f"{MOTION} --smooth 1e4", "--smooth: expected 0.01 to 1000, got 10000"),
         (f"rnd-eval OUT {CAPTURE} --json {ASSETS}", "assets: cannot be written: it is a folder"),

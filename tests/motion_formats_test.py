@@ -899,6 +899,9 @@ def test_the_inputs_of_a_motion_are_the_files_that_it_is_read_from(tmp_path):
         (folder / name).write_text("{}")
     assert motion_inputs(folder) == [folder / f"{frame:06d}.json" for frame in range(FRAMES)]
     assert motion_inputs(tmp_path / "walk.npz") == [tmp_path / "walk.npz"]
+    with pytest.raises(InputError) as caught:
+        motion_inputs(tmp_path / "other" / "run.amc")
+    assert str(caught.value) == f"{tmp_path / 'other' / 'run.amc'}: motion not found"
 
 
 def test_acclaim_bones_keep_their_lengths(tmp_path):

@@ -20,6 +20,7 @@ from rnd_runtime.camera import Camera
 from rnd_runtime.capture import load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import to_bytes, write_image
+from rnd_runtime.motion import load_motion
 from rnd_runtime.motion_files import SMPLX_REST_ROOT
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import SMPL_NAMES
@@ -319,6 +320,33 @@ def test_a_shape_of_another_body_is_noted(tmp_path, gender, betas, said) -> None
     np.savez(tmp_path / "p.npz", poses=world.thetas, trans=world.trans, gender=gender, **shape)
     notes = read_poses(tmp_path / "p.npz").notes
     assert notes == ((f"the shape is meant for the {said} body model: give that as --body",) if said else ())
+
+
+def test_what_phalp_notes_beside_its_pictures_is_no_picture(tmp_path) -> None:
+    joblib, path = pytest.importorskip("joblib"), write_phalp(tmp_path)
+    joblib.dump({"version": "1.0", **joblib.load(path)}, path)
+    assert read_poses(path).poses.frames.tolist() == list(range(FRAMES))
+    assert load_motion(path, shaped_body().skeleton).frame_count == FRAMES
+
+
+def test_a_part_of_a_track_that_is_another_thing_is_refused(tmp_path) -> None:
+    joblib, path = pytest.importorskip("joblib"), write_phalp(tmp_path)
+    content = joblib.load(path)
+    next(iter(content.values()))["tracked_time"] = 1
+    next(iter(content.values()))["time"] = float("inf")
+    joblib.dump(content, path)
+    with pytest.raises(InputError, match=r"phalp_me\.pkl: body poses: expected the layout its keys promise"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize("rate", [-30.0, 0.0, 1e9, [30, 30]])
+def test_a_rate_at_which_nobody_records_is_refused(tmp_path, rate) -> None:
+    world = layouts.camera_world()
+    np.savez(tmp_path / "p.npz", thetas=world.thetas, trans=world.trans, mocap_framerate=rate)
+    with pytest.raises(
+        InputError, match=r"mocap_framerate: expected frames per second, 0\.001 to 10000, got \["
+    ):
+        read_poses(tmp_path / "p.npz")
 
 
 def test_a_track_that_phalp_lost_is_left_out_there(tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -222,6 +223,71 @@ def test_what_is_there_is_not_filmed_again(filmed: Path, production) -> None:
     assert len(times) - len(kept) == len(
         production.shots[0].truth_files(False)
     )  # the one shot's PNGs and its picture
+
+
+def test_who_filmed_a_capture_stays_where_nothing_was_filmed_since(
+    filmed, production, tmp_path, monkeypatch
+) -> None:
+    shutil.copytree(filmed, tmp_path / "again")
+    folder, told = tmp_path / "again", ("capture.json", "README.md")
+    assert manifest.finish(production, folder, "scalar_rgb", 1.25)
+    before = {name: (folder / name).read_bytes() for name in told}
+    monkeypatch.setattr(manifest, "machine", lambda: "another one")
+    (folder / "contact.png").unlink()
+    assert manifest.finish(production, folder, "llvm_ad_rgb", None)
+    assert {name: (folder / name).read_bytes() for name in told} == before
+    assert (folder / "contact.png").exists() and b"1.25 s of processor time" in before["README.md"]
+    (folder / "README.md").unlink()
+    assert manifest.finish(production, folder, "llvm_ad_rgb", None)
+    assert "another one" in (folder / "README.md").read_text()
+    assert (folder / "capture.json").read_bytes() == before["capture.json"]
+    assert manifest.finish(production, folder, "llvm_ad_rgb", 0.5)
+    assert json.loads((folder / "capture.json").read_text())["engine"]["variant"] == "llvm_ad_rgb"
+
+
+def test_a_readmes_command_can_be_pasted(production) -> None:
+    production = replace(
+        production, recipe=replace(production.recipe, motion="my walk.npz", hdr=("a'b.exr",))
+    )
+    words = shlex.split(
+        manifest._readme(production, "scalar_rgb", None).split("rnd-stage OUT")[1].split("\n")[0]
+    )
+    assert (
+        words[words.index("--motion") + 1] == "my walk.npz" and words[words.index("--hdr") + 1] == "a'b.exr"
+    )
+    assert words[words.index("--lights") + 1] == "red" and "--no-visibility" not in words
+
+
+def test_a_recipes_files_may_lie_elsewhere_and_not_say_something_else(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "more").mkdir()
+    for name in ("walk.npz", "more/dance.npz"):
+        shutil.copy(ASSETS / "walk.npz", tmp_path / name)
+    for name in ("sky.exr", "more/sky.exr", "more/dawn.exr"):
+        write_image(tmp_path / name, np.ones((8, 16, 3), np.float32))
+    for name in ("run.amc", "more/run.amc", "run.asf", "more/run.asf"):
+        (tmp_path / name).write_text("the same")
+    recipe = replace(RECIPE, motion="walk.npz", hdr=("sky.exr",))
+    write_json(tmp_path / film.RECIPE_FILE, film.recipe_for(recipe, tmp_path))
+    for motion in ("./walk.npz", str(tmp_path / "walk.npz"), "more/dance.npz"):
+        film.recipe_for(replace(recipe, motion=motion, hdr=("more/sky.exr",)), tmp_path)
+    for change, said in (
+        ({"motion": "sky.exr"}, "motion"),
+        ({"motion": None}, "motion"),
+        ({"hdr": ("more/dawn.exr",)}, "hdr"),  # its light would be called otherwise
+        ({"hdr": ("sky.exr", "more/dawn.exr")}, "hdr"),
+        ({"motion": "./walk.npz", "samples": 10}, "samples"),
+    ):
+        with pytest.raises(
+            InputError, match=f"holds another recipe: expected the same {said} \\(or another OUT"
+        ):
+            film.recipe_for(replace(recipe, **change), tmp_path)
+    recipe, out = replace(RECIPE, motion="run.amc"), tmp_path / "out"
+    write_json(out / film.RECIPE_FILE, film.recipe_for(recipe, out))
+    film.recipe_for(replace(recipe, motion="more/run.amc"), out)
+    (tmp_path / "more/run.asf").write_text("another")
+    with pytest.raises(InputError, match=r"the same motion \(or"):
+        film.recipe_for(replace(recipe, motion="more/run.amc"), out)
 
 
 def test_another_recipe_is_refused_and_one_that_cannot_be_filmed_leaves_nothing(tmp_path: Path) -> None:

@@ -262,6 +262,7 @@ def asf_beside(path: Path) -> Path:
             return own[0]
     if len(others) == 1:
         return others[0]
+    existing_file(path, what="motion")  # of one that is not there, no skeleton is missing
     got = f"{len(others)} of other names" if others else "none"
     raise InputError("skeleton of the AMC", expected=f"{path.stem}.asf beside it", got=got, file=path)
 

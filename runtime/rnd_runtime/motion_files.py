@@ -116,7 +116,10 @@ def _read(
     check_translations(translations, members.path)
     if "betas" in members.names:
         notes.append("the file's betas are ignored: the avatar keeps its own shape")
-    fps = _frame_rate(members, notes)
+    fps = frame_rate(members)
+    if fps is None:
+        notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
+        fps = _DEFAULT_FPS
     up = _up_axis(members, default="z" if amass or easymocap else "y")
     if rest_root is None and (amass or easymocap):
         rest_root = smpl_root
@@ -242,11 +245,15 @@ def check_translations(translations: Floats, path: str | Path, first: int = 0) -
         )
 
 
-def _frame_rate(archive: Members, notes: list[str]) -> float:
+def frame_rate(archive: Members) -> float | None:
+    """Frames per second, within :data:`FPS_LIMITS`; None where the file has none.
+
+    Raises:
+        InputError: another number, or several.
+    """
     member = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
     if member is None:
-        notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
-        return _DEFAULT_FPS
+        return None
     value = archive.numbers(member)
     low, high = FPS_LIMITS
     if value.size != 1 or not low <= value.item() <= high:

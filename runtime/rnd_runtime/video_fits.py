@@ -87,7 +87,7 @@ def easymocap_files(folder: Path) -> list[Path]:
 
 def is_phalp(content: Mapping[Any, Any]) -> bool:
     """Whether ``content`` is PHALP's or 4D-Humans': picture → {``tid``, ``smpl``, ``camera``, …}."""
-    moments = [value for value in content.values() if isinstance(value, Mapping)]
+    moments = _moments(content)
     return bool(moments) and all({"smpl", "camera", "tid"} <= moment.keys() for moment in moments)
 
 
@@ -97,7 +97,7 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
     ``person`` is a track number; the one with most frames when None. Frames are those of the picture list. A track
     that was not seen in a picture (its last sight repeated, ``tracked_time`` frames old) is left out there.
     """
-    moments = sorted(content.values(), key=lambda moment: int(moment.get("time", 0)))
+    moments = sorted(_moments(content), key=lambda moment: int(moment.get("time", 0)))
     tracks = [_phalp_tracks(moment) for moment in moments]
     chosen, others = one_of([track for seen in tracks for track in seen], person, path)
     frames, angles, translations, betas = [], [], [], []
@@ -116,6 +116,11 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
     return VideoFits(
         chosen, others, np.array(frames, np.int64), np.stack(angles), np.stack(translations), np.stack(betas)
     )
+
+
+def _moments(content: Mapping[Any, Any]) -> list[Mapping[str, Any]]:
+    """What ``content`` holds of pictures: some versions note other things beside."""
+    return [value for value in content.values() if isinstance(value, Mapping)]
 
 
 def _phalp_tracks(moment: Mapping[str, Any]) -> dict[int, int]:

@@ -256,8 +256,8 @@ def _fit(capture: Capture, sights: list[Sight], overlaps: list[FrameOverlap]) ->
     mean, worst = float(np.mean(scores)), overlaps[int(np.argmin(scores))]
     numbers = f"mean IoU {mean:.2f}, lowest {worst.iou:.2f} in {worst.image}"
     few = spread(sights, FEW)
-    turn = np.array(_imported(capture).get("turn", np.eye(3)), np.float64).reshape(3, 3)
-    verdict = explain(capture.body.skeleton.rest_joints[0], turn, few)
+    turn = _matrix(_imported(capture).get("turn"))
+    verdict = explain(capture.body.skeleton.rest_joints[0], np.eye(3) if turn is None else turn, few)
     if verdict is not None:
         sentence = f"mean IoU {mean:.2f}: {verdict.sentence} (mean IoU {verdict.overlap:.2f} then)"
         return [Finding("wrong", "silhouette", sentence)]
@@ -308,16 +308,26 @@ def _imported(capture: Capture) -> dict[str, Any]:
 
 def _told_distortion(capture: Capture) -> float:
     """k1 of the first lens that an import undid; 0 where there was none."""
-    first = next(iter(_imported(capture).get("distortion", {}).values()), None)
-    return float(first[0]) if first else 0.0
+    told = _imported(capture).get("distortion")
+    first = next(iter(told.values()), None) if isinstance(told, dict) else None
+    k1 = first[0] if isinstance(first, list) and first else 0.0
+    return float(k1) if isinstance(k1, int | float) else 0.0
+
+
+def _matrix(told: object) -> Floats | None:
+    """What an import noted as [3, 3]; None where there is no such thing: anybody may write into capture.json."""
+    try:
+        matrix = np.array(told, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return matrix if matrix.shape == (3, 3) and np.isfinite(matrix).all() else None
 
 
 def _normals(capture: Capture, pairs: list[tuple[Floats, Floats]], count: int) -> list[Finding]:
     pairs = [pair for pair in pairs if len(pair[0])]
     if not pairs:
         return [Finding("note", "normals", "none" if not count else "none where the template is")]
-    turned = _imported(capture).get("normal_axes")
-    axes = judge(pairs, None if turned is None else np.array(turned, np.float64).reshape(3, 3))
+    axes = judge(pairs, _matrix(_imported(capture).get("normal_axes")))
     degrees = np.degrees(np.arccos(np.clip(axes.cosine, -1, 1)))
     if axes.wrong:
         return [Finding("wrong", "normals", f"mean cosine {axes.cosine:.2f} to the template; with --normal-axes="

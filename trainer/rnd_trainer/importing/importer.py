@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.files import output_folder
 from rnd_runtime.motion_files import FPS_LIMITS
 
 from . import (
@@ -120,7 +122,8 @@ def import_source(
     name, convention = _said(options.layout)
     layout, found = find_layout(source, name)
     on_found(f"{layout}: {found}")
-    _refuse_full(out, source)
+    _refuse_full(out, source, options)
+    _refuse_unmakeable(out)
     if options.body is None:
         raise InputError(
             "--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none"
@@ -129,7 +132,7 @@ def import_source(
     model = load_body_model(options.body)
     try:
         recording = _read(layout, source, model, options)
-    except (LookupError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         got = f"{type(error).__name__}: {error}"
         raise InputError(f"{layout} cannot be read", expected=_needs(layout), got=got, file=source) from error
     if convention is not None:
@@ -149,14 +152,31 @@ def import_source(
     return scene
 
 
-def _refuse_full(out: Path, source: Path) -> None:
-    """Refuse a folder ``out`` with files whose place a capture's would take."""
+def _refuse_full(out: Path, source: Path, options: ImportOptions) -> None:
+    """Refuse a folder ``out`` with files whose place a capture's would take, or among which they would stand."""
     if out.resolve() == source.resolve():
         raise InputError("OUT", expected="another folder than the source", got=out)
     for name in ("capture.json", "motion.npz", "body.npz"):
         if (out / name).exists():
             what = "holds a capture already" if name == "capture.json" else f"holds a {name}"
             raise InputError(what, file=out, hint="choose another folder")
+    given = {"the source": source, "--masks": options.masks, "--normals": options.normals}
+    for name in ("images", "masks", "normals"):
+        place = out / name
+        for what, folder in given.items():
+            if folder is not None and place.resolve() == folder.resolve():
+                raise InputError("OUT", expected=f"another folder than that of {what}", got=out)
+        if place.is_file() or (place.is_dir() and any(place.iterdir())):
+            raise InputError(f"holds {name} already", file=out, hint="choose another folder, or remove them")
+
+
+def _refuse_unmakeable(out: Path) -> None:
+    """Refuse a folder ``out`` that cannot be made or written, before what takes long; made to try, it is removed."""
+    missing = [place for place in (out, *out.parents) if not place.exists()]
+    output_folder(out)
+    for place in missing:
+        with contextlib.suppress(OSError):  # somebody else put a file there
+            place.rmdir()
 
 
 def _check_numbers(options: ImportOptions) -> None:

@@ -39,7 +39,8 @@ def read(source: Path) -> Recording:
         size = int(archive.numbers("width").item()), int(archive.numbers("height").item())
     lens = Lens(camera_of(K, extrinsic[:3, :3], extrinsic[:3, 3], size))
     pictures = listed(source / "images")
-    splits = _SPLITS.get(source.name)
+    subject = next((name for name in (source.name, source.resolve().name) if name in _SPLITS), "")
+    splits = _SPLITS.get(subject)
     optimised = splits is not None and (source / "poses" / "anim_nerf_train.npz").is_file()
     notes: tuple[str, ...] = ()
     split_of: dict[int, Split] = {}
@@ -51,7 +52,7 @@ def read(source: Path) -> Recording:
         for name, part in parts:
             entry = read_smpl_npz(source / "poses" / f"anim_nerf_{name}.npz")
             if len(entry[0]) != len(part):
-                raise InputError("frames", expected=f"{len(part)} in the {name} split of {source.name}",
+                raise InputError("frames", expected=f"{len(part)} in the {name} split of {subject}",
                                  got=len(entry[0]), file=source / "poses" / f"anim_nerf_{name}.npz")  # fmt: skip
             frames = np.concatenate([frames, np.array(part)])
             rows.append(entry)
@@ -62,6 +63,11 @@ def read(source: Path) -> Recording:
         notes = ("poses: anim_nerf_*.npz, optimised, at InstantAvatar's own frames",)
     else:
         poses = _all_frames(source, len(pictures))
+        if splits is None and any((source / "poses").glob("anim_nerf_*.npz")):
+            known = ", ".join(_SPLITS)
+            notes = (
+                f"poses/anim_nerf_*.npz are left out: their frames are known for folders called {known}",
+            )
     shots = []
     for frame, picture in enumerate(pictures):
         if split_of and frame not in split_of:
@@ -70,7 +76,10 @@ def read(source: Path) -> Recording:
         read_it = None if mask is None else partial(read_mask, mask)
         image, split = partial(read_rgb, picture), split_of.get(frame)
         shots.append(Shot("0", frame, image, read_it, split=split, name=picture.stem))
-    return Recording("PeopleSnapshot as InstantAvatar ships it", {"0": lens}, shots, poses, FPS, notes)
+    film = {k: picture.stem for k, picture in enumerate(pictures)} if split_of else {}
+    return Recording(
+        "PeopleSnapshot as InstantAvatar ships it", {"0": lens}, shots, poses, FPS, notes, film=film
+    )
 
 
 def read_smpl_npz(path: Path) -> tuple[Floats, Floats, Floats | None]:

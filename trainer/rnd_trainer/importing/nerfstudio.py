@@ -118,7 +118,7 @@ def _lens(entry: dict[str, Any], picture: Path, file: Path) -> tuple[Lens, bytes
             float(entry.get(k, d)) for k, d in (("fl_y", fx), ("cx", width / 2), ("cy", height / 2))
         )
         pose = np.linalg.inv(np.asarray(entry["transform_matrix"], np.float64).reshape(4, 4) @ _FLIP)
-    except (KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, np.linalg.LinAlgError) as error:
         raise InputError(
             "frame", expected="fl_x or camera_angle_x, transform_matrix", got=repr(error), file=file
         ) from error

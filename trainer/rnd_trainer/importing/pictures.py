@@ -107,6 +107,22 @@ def numbers_of(files: Sequence[Path]) -> list[int] | None:
     return numbers if len(set(numbers)) == len(files) else None
 
 
+def count_shift(frames: Sequence[int], theirs: Sequence[int]) -> int:
+    """What to add to ``theirs``, numbers of files, to get those of ``frames``; both ascend. 0: they mean the same.
+
+    They do where all of one's are among the other's. Else one may have been counted from 0 and the other from 1
+    (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or theirs, some of them
+    missing, begin with a 0 that the frames, from 1, have not.
+    """
+    if set(frames) <= set(theirs) or set(theirs) <= set(frames):
+        return 0
+    extent = theirs[-1] - theirs[0] + 1
+    as_many = extent == len(frames) and min(frames[0], theirs[0]) <= 1
+    from_zero = extent <= len(frames) and (theirs[0], frames[0]) == (0, 1)
+    in_a_row = frames[-1] - frames[0] + 1 == len(frames)
+    return frames[0] - theirs[0] if in_a_row and (as_many or from_zero) else 0
+
+
 def beside(path: Path, *folders: Path) -> Path | None:
     """The first file called like ``path`` (any suffix of a mask) in ``folders``."""
     for folder in folders:

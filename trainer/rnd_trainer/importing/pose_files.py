@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.motion_files import names_of_joints
+from rnd_runtime.motion_files import frame_rate, names_of_joints
 from rnd_runtime.npz import Npz
 from rnd_runtime.unpickle import read_pickle
 from rnd_runtime.video_fits import (
@@ -28,7 +28,7 @@ from rnd_runtime.video_fits import (
     with_root,
 )
 
-from .pictures import listed, natural, numbers_of
+from .pictures import count_shift, listed, natural, numbers_of
 from .recording import Floats, Lens, Poses, easymocap_poses, moved, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
@@ -117,7 +117,7 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
                 return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes, in_camera=True)
         except InputError as error:
             raise error.at(file=path) from error
-        except (KeyError, TypeError, ValueError, IndexError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise InputError(
                 "body poses", expected="the layout its keys promise", got=repr(error), file=path
             ) from error
@@ -130,26 +130,18 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
 def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
     """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
 
-    Numbers mean the same in both where all of one's are among the other's. Else one may have been counted from 0 and
-    the other from 1 (ffmpeg's pictures do) or from somewhere in a longer video: then they are as many in a row, or the
-    poses, some of them missing, begin with a 0 that the pictures, from 1, have not.
-
-    Poses without numbers belong to the frames from the first on; that there are more or fewer is noted.
+    Numbers of files may be counted from elsewhere: :func:`.pictures.count_shift`. Poses without numbers belong to the
+    frames from the first on; that there are more or fewer is noted.
 
     Raises:
         InputError: no frame has a pose.
     """
     poses = found.poses
-    ours, theirs = set(numbers), set(poses.frames.tolist())
     begin, first, last = numbers[0], int(poses.frames[0]), int(poses.frames[-1])
-    if found.numbered and not (ours <= theirs or theirs <= ours):
-        extent = last - first + 1
-        as_many = extent == len(numbers) and min(begin, first) <= 1
-        from_zero = extent <= len(numbers) and (first, begin) == (0, 1)
-        if numbers[-1] - begin + 1 == len(numbers) and (as_many or from_zero):
-            note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
-            return replace(poses, frames=poses.frames + (begin - first)), (note,)
-    if not ours & theirs:
+    if found.numbered and (shift := count_shift(numbers, poses.frames.tolist())):
+        note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
+        return replace(poses, frames=poses.frames + shift), (note,)
+    if not {*numbers} & {*poses.frames.tolist()}:
         raise InputError(
             "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
         )  # fmt: skip
@@ -279,8 +271,7 @@ def _npz(path: Path) -> FoundPoses:
         betas = None if betas_name is None else archive.numbers(betas_name)
         notes = () if betas is None else _gender(archive)
         smplx = _is_smplx(archive) or poses.shape[1] == 165
-        rate = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
-        fps = None if rate is None else float(archive.numbers(rate).reshape(-1)[0])
+        fps = frame_rate(archive)
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
         Rh, trans = (
             np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift)

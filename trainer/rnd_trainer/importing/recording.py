@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -116,7 +116,7 @@ class Recording:
         fps: pictures' frames per second.
         notes: what was assumed, one sentence each.
         up: the world's axis that points up ("y", "-y", "z", …) where the layout says so; None to ask the poses.
-        film_length: the frames of a film that ``shots`` are some of, by numbers from 0; 0 for any other source.
+        film: where ``shots`` are only some of a camera's pictures, the names of all by frame; empty else.
     """
 
     kind: str
@@ -126,7 +126,7 @@ class Recording:
     fps: float = 30.0
     notes: tuple[str, ...] = field(default=())
     up: str | None = None
-    film_length: int = 0
+    film: Mapping[int, str] = field(default_factory=dict)
 
 
 def straightened(recording: Recording) -> Recording:

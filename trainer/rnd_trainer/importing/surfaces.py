@@ -19,7 +19,7 @@ from rnd_trainer.silhouette import DrawnMesh, draw
 from .masks import make_masks
 from .networks import ImageNetwork
 from .normals import Normals, find_axes, normal_map, normal_network, read_normals, smoothed, to_opencv
-from .pictures import Bytes, fitting_file, last_number, listed, read_mask
+from .pictures import Bytes, count_shift, fitting_file, last_number, listed, read_mask
 from .recording import Recording, Shot
 from .write import Scene
 
@@ -30,58 +30,90 @@ Turn = Callable[[Normals], Normals]
 
 def attached(recording: Recording, masks: Path | None, normals: Path | None) -> Recording:
     """``recording`` with masks and normals from the folders that the user names, by the picture's name or number."""
-    length, notes = recording.film_length, set()
-
-    def file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...]) -> Path:
-        file, counted = _file_of(folder, shot, suffixes, length)
-        if counted:
-            notes.add(f"{folder.name} are numbered from 1, frames from 0: taken for the same")
-        return file
-
-    def replaced(shot: Shot) -> Shot:
-        camera = recording.lenses[shot.camera].camera
-        if masks is not None:
-            file = file_of(masks, shot, (".png", ".npy", ".jpg"))
-            shot = replace(shot, mask=partial(fitting_file, read_mask, file, camera, "mask"))
-        if normals is not None:
-            file = file_of(normals, shot, (".npy", ".png", ".exr"))
-            shot = replace(shot, normals=partial(fitting_file, read_normals, file, camera, "normals"))
-        return shot
-
-    shots = [replaced(shot) for shot in recording.shots]
-    return replace(recording, shots=shots, notes=(*recording.notes, *sorted(notes)))
+    shots, notes = list(recording.shots), list(recording.notes)
+    lenses = recording.lenses
+    if masks is not None:
+        files, assumed = _files_of(recording, masks, (".png", ".npy", ".jpg"))
+        notes += assumed
+        shots = [
+            replace(shot, mask=partial(fitting_file, read_mask, file, lenses[shot.camera].camera, "mask"))
+            for shot, file in zip(shots, files)
+        ]
+    if normals is not None:
+        files, assumed = _files_of(recording, normals, (".npy", ".png", ".exr"))
+        notes += assumed
+        shots = [
+            replace(shot, normals=partial(fitting_file, read_normals, file, lenses[shot.camera].camera, "normals"))
+            for shot, file in zip(shots, files)
+        ]  # fmt: skip
+    return replace(recording, shots=shots, notes=tuple(notes))
 
 
-def _file_of(folder: Path, shot: Shot, suffixes: tuple[str, ...], length: int) -> tuple[Path, bool]:
-    """The file of ``shot`` in the camera's folder, where there is one, and whether frames are counted from 1 there.
+def _files_of(recording: Recording, folder: Path, suffixes: tuple[str, ...]) -> tuple[list[Path], list[str]]:
+    """The file of every shot in ``folder``, or in that of its camera there, and what was assumed."""
+    inner = {name: folder / name if (folder / name).is_dir() else folder for name in recording.lenses}
+    pictures: dict[Path, list[tuple[str, int]]] = {}
+    for shot in recording.shots:
+        pictures.setdefault(inner[shot.camera], []).append((shot.name, shot.frame))
+    film = [(name, frame) for frame, name in recording.film.items()]
+    stocks = {place: _Stock(place, suffixes, film or of) for place, of in pictures.items()}
+    notes = dict.fromkeys(
+        f"{folder.name} are numbered from {stock.first - stock.shift}, frames from {stock.first}: taken for the same"
+        for stock in stocks.values()
+        if stock.shift
+    )
+    return [stocks[inner[shot.camera]].file_of(shot.name, shot.frame) for shot in recording.shots], [*notes]
 
-    It is called like the picture, whatever follows (but no digit), or has the number at its end that the picture has
-    there; of a picture without either, such as a video's, the number of its frame, or else that place. Where a film of
-    ``length`` frames has as many files, from 1 on, its first frame is 1.
+
+class _Stock:
+    """The masks or normals of one folder, known by the names or numbers of the ``pictures`` (name, frame) there.
+
+    A file is called like the picture, whatever follows (but no digit), or has the number at its end that the picture
+    has there; of a picture without either, such as a video's, the number of its frame, or else that place. Where not
+    all pictures have a file of their name, files may be counted from elsewhere: ``shift`` is what their numbers lack.
     """
-    inner = folder / shot.camera if (folder / shot.camera).is_dir() else folder
-    files = listed(inner, suffixes)
-    named = {file.stem: file for file in files}
-    if shot.name in named:
-        return named[shot.name], False
-    longer = [file for file in files if _continues(file.name, shot.name)]
-    if len(longer) == 1:
-        return longer[0], False
-    number = last_number(shot.name)
-    numbered = {n: file for file in files if (n := last_number(file.stem)) is not None}
-    if number is None and not numbered:
-        numbered = dict(enumerate(files))
-    from_one = number is None and sorted(numbered) == list(range(1, length + 1))
-    number = shot.frame + from_one if number is None else number
-    if number not in numbered:
-        raise InputError(
-            "file", expected=f"one numbered {number}", got=f"{files[0].name} … {files[-1].name}", file=inner
-        )
-    return numbered[number], from_one
+
+    def __init__(self, folder: Path, suffixes: tuple[str, ...], pictures: Sequence[tuple[str, int]]) -> None:
+        self.folder, self.files = folder, listed(folder, suffixes)
+        self.stems = {file.stem: file for file in self.files}
+        self.numbered = {n: file for stem, file in self.stems.items() if (n := last_number(stem)) is not None}
+        numbers = sorted({_number(name, frame) for name, frame in pictures})
+        self.first, self.shift = numbers[0], 0
+        shift = count_shift(numbers, sorted(self.numbered)) if self.numbered else 0
+        if shift and any(self._named(name) is None for name, _ in pictures):
+            self.shift = shift
+
+    def file_of(self, name: str, frame: int) -> Path:
+        """The file of a picture."""
+        if (file := self._named(name)) is not None:
+            return file
+        number = _number(name, frame) - self.shift
+        numbered = self.numbered
+        if last_number(name) is None and not numbered:
+            numbered = dict(enumerate(self.files))
+        if number not in numbered:
+            got = f"{self.files[0].name} … {self.files[-1].name}"
+            raise InputError("file", expected=f"one numbered {number}", got=got, file=self.folder)
+        return numbered[number]
+
+    def _named(self, name: str) -> Path | None:
+        """The one file that is called like a picture; where counts differ, none that is called exactly so."""
+        if name in self.stems and not self.shift:
+            return self.stems[name]
+        longer = [file for stem, file in self.stems.items() if _continues(stem, name)]
+        return longer[0] if len(longer) == 1 else None
+
+
+def _number(name: str, frame: int) -> int:
+    """What a picture is known by: the number that its name ends in, else that of its frame."""
+    number = last_number(name)
+    return frame if number is None else number
 
 
 def _continues(name: str, start: str) -> bool:
-    return name.startswith(start) and not name[len(start) :][:1].isdigit()
+    """Whether ``name`` is ``start`` and something that begins with no digit; nothing continues an empty name."""
+    rest = name[len(start) :]
+    return bool(start and rest) and name.startswith(start) and not rest[0].isdigit()
 
 
 class _Lazy(Sequence[Any]):

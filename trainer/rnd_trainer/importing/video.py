@@ -111,8 +111,8 @@ def read(
         for k, (frame, split) in enumerate(chosen)
     ]
     kept = f"{len(shots)} of {film.count} frames kept, the sharpest of each pose"
-    length = film.count if film.numbers[0] == 0 else 0
-    return replace(recording, shots=shots, notes=(*recording.notes, kept), film_length=length)
+    names = {frame: film.name(frame) for frame in film.numbers}
+    return replace(recording, shots=shots, notes=(*recording.notes, kept), film=names)
 
 
 def _lens(

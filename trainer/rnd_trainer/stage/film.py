@@ -174,7 +174,11 @@ def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
     if file.exists():
         theirs = _recipe_in(file)
         earlier = theirs.get("sha256", {})  # older recipes have none
-        different = sorted(key for key in mine if theirs.get(key) != mine[key])
+        different = sorted(
+            key
+            for key in mine
+            if theirs.get(key) != mine[key] and _content(theirs, key, earlier) != _content(mine, key, digests)
+        )
         different += [
             f"content of {name}" for name in digests if earlier.get(name, digests[name]) != digests[name]
         ]
@@ -186,6 +190,21 @@ def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
                 hint="or another OUT",
             )
     return mine | {"sha256": digests}
+
+
+def _content(recipe: dict[str, Any], key: str, digests: dict[str, Any]) -> object:
+    """What the ``key`` of a recipe stands for: of files, wherever they lie, their digests; else its value.
+
+    Lights and people are called like their files, which have to be called alike, too; a motion may have an .asf beside.
+    """
+    value = recipe.get(key)
+    known = {Path(name): digest for name, digest in digests.items()}
+    files = [Path(name) for name in (value if isinstance(value, list) else [value]) if isinstance(name, str)]
+    if not files or not all(file in known for file in files):
+        return value
+    if key != "motion":
+        return [(file.stem, known[file]) for file in files]
+    return [digest for file, digest in known.items() if file in files or file.suffix.lower() == ".asf"]
 
 
 def _recipe_in(file: Path) -> dict[str, Any]:

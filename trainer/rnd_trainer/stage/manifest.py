@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +30,11 @@ _TILE, _COLUMNS = 128, 10  # pixels, pictures in a row
 
 
 def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_picture: float | None) -> bool:
-    """Write the manifest when every picture of every shard is there; False when some are still missing."""
+    """Write the manifest when every picture of every shard is there; False when some are still missing.
+
+    Where nothing was filmed, ``cpu_seconds_per_picture`` is None: a capture.json and a README that are there stay as
+    they are, as they say who filmed, and at what cost.
+    """
     if any(missing(folder, shot, production.recipe.visibility) for shot in production.shots):
         return False
     frames = tuple(row for shot in production.shots for row in shot.records(estimated=False))
@@ -38,8 +43,13 @@ def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_p
         for light in production.lights
     }
     dressed, recipe = production.dressed, production.recipe
-    capture = Capture(folder, production.cameras, lights, dressed.body, production.motion, frames)
-    save_capture(capture, subject=production.title, recipe=asdict(recipe), engine=_engine(variant))
+
+    def told(*names: str) -> bool:
+        return cpu_seconds_per_picture is None and all((folder / name).exists() for name in names)
+
+    if not told("capture.json", "body.npz", "motion.npz"):
+        capture = Capture(folder, production.cameras, lights, dressed.body, production.motion, frames)
+        save_capture(capture, subject=production.title, recipe=asdict(recipe), engine=_engine(variant))
     noisy = estimated_motion(production.motion, recipe.estimate_seed, recipe.estimate_strength)
     save_motion(folder / "motion_noisy.npz", noisy)
     _estimated_record(production, folder)
@@ -52,8 +62,9 @@ def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_p
             "roughness": dressed.roughness.astype(np.float32),
         },
     )
-    with atomic_path(folder / "README.md") as temporary:
-        temporary.write_text(_readme(production, variant, cpu_seconds_per_picture), encoding="utf-8")
+    if not told("README.md"):
+        with atomic_path(folder / "README.md") as temporary:
+            temporary.write_text(_readme(production, variant, cpu_seconds_per_picture), encoding="utf-8")
     contact_sheet(folder)
     return True
 
@@ -107,7 +118,7 @@ def _engine(variant: str) -> dict[str, str]:
 def _readme(production: Production, variant: str, seconds: float | None) -> str:
     recipe = production.recipe
     options = " ".join(
-        f"{flag(key)} {' '.join(map(str, value)) if isinstance(value, (list, tuple)) else value}"
+        shlex.join([flag(key), *map(str, value if isinstance(value, list | tuple) else (value,))])
         for key, value in asdict(recipe).items()
         if value not in (None, ()) and not isinstance(value, bool)
     )
