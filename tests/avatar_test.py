@@ -146,6 +146,39 @@ def test_a_posing_array_of_another_shape_is_named_alone(tiny_avatar, tmp_path, n
         Avatar.load(_changed(tiny_avatar, tmp_path / "other.onnx", reshape))
 
 
+@pytest.mark.parametrize("parent", [10**30, 2**32])
+def test_a_parent_that_no_joint_is_is_refused(tiny_avatar, tmp_path, parent) -> None:
+    skeleton = msgspec.json.decode(
+        next(prop.value for prop in onnx.load(tiny_avatar).metadata_props if prop.key == METADATA_KEY)
+    )["skeleton"]
+    skeleton["parents"][3] = parent
+    with pytest.raises(InputError, match=r"odd\.onnx: (skeleton parents: expected|.*Integer value out of range)"):
+        Avatar.load(_changed(tiny_avatar, tmp_path / "odd.onnx", lambda m: _metadata(m, skeleton=skeleton)))
+
+
+def test_a_graph_that_cannot_be_evaluated_is_named(tiny_avatar, tmp_path) -> None:
+    """onnxruntime looks at indices when it comes to them: at constants as the file is read, at others in a frame."""
+
+    def point_outside(model, name: str) -> None:
+        graph = model.graph
+        graph.initializer.append(onnx.numpy_helper.from_array(np.array([10**6]), "outside"))
+        graph.node.append(onnx.helper.make_node("Gather", [name, "outside"], ["lost"], axis=0))
+        graph.node.append(onnx.helper.make_node("ReduceSum", ["lost"], ["sum"], keepdims=0))
+        node = next(node for node in graph.node if name in node.output)
+        node.output[list(node.output).index(name)] = "before"
+        graph.node[-2].input[0] = "before"
+        graph.node.append(onnx.helper.make_node("Add", ["before", "sum"], [name]))
+
+    said = r"\.onnx: graph cannot be evaluated: got .*indices"
+    file = _changed(tiny_avatar, tmp_path / "constant.onnx", lambda model: point_outside(model, "albedo"))
+    with pytest.raises(InputError, match="constant" + said):
+        Avatar.load(file)
+    file = _changed(tiny_avatar, tmp_path / "frame.onnx", lambda model: point_outside(model, "node_offsets"))
+    avatar = Avatar.load(file)
+    with pytest.raises(InputError, match="frame" + said):
+        avatar.pose(motion(body()), 0.1)
+
+
 def test_external_data_is_not_followed(tiny_avatar, tmp_path) -> None:
     secret = tmp_path / "secret.bin"
     secret.write_bytes(b"\0" * 4 * 800)

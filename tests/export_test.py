@@ -20,13 +20,15 @@ from rnd_export.export import (
     export,
     measure_drift,
     random_motion,
+    written,
 )
 from rnd_export.places import gaussians_by_place
-from rnd_export.variant import Variant, line_through
+from rnd_export.variant import Variant, line_through, reduced
 from rnd_runtime.avatar import Avatar
-from rnd_runtime.avatar_file import POSED_OUTPUTS
+from rnd_runtime.avatar_file import POSED_OUTPUTS, read_metadata
 from rnd_runtime.errors import InputError
 from rnd_runtime.motion import Motion
+from rnd_runtime.onnx_parts import OnnxFile
 from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 from rnd_trainer.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
@@ -169,6 +171,26 @@ def test_each_network_may_have_fewer_nodes_of_its_own(
         wanted = np.einsum("mk,mkc->mc", shares, at_sites[neighbours]) if name == network else whole
         assert np.abs(ours - wanted).max() < MAX_WEIGHT_ERROR / 10
         assert name != network or np.abs(ours - whole).max() > MAX_WEIGHT_ERROR
+
+
+@pytest.mark.parametrize(
+    ("variant", "encoder", "nodes", "dynamic_nodes"),
+    [
+        (Variant(), "full", 200, 200),
+        (Variant(skinning_nodes=50, offset_nodes=25), "full", 200, 50),
+        (Variant(skinning_nodes=50, offset_nodes=25, visibility_nodes=25), "coarse", 50, 50),
+        (Variant(skinning_nodes=4, offset_nodes=4, visibility_nodes=4), "coarse", 4, 4),
+        (Variant("coarse", nodes=100, skinning_nodes=50), "coarse", 100, 50),
+        (Variant("static", offset_nodes=50, visibility_nodes=25), "static", 50, 0),
+    ],
+)
+def test_nodes_are_the_most_at_which_any_network_is_evaluated(
+    variant, encoder, nodes, dynamic_nodes, tiny_checkpoint, tmp_path
+) -> None:
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    baked = reduced(bake(checkpoint.model), checkpoint.config.model, variant)
+    stated = read_metadata(OnnxFile(written(checkpoint, baked, variant).SerializeToString())).variant
+    assert (stated.encoder, stated.nodes, stated.dynamic_nodes) == (encoder, nodes, dynamic_nodes)
 
 
 def test_networks_with_as_many_nodes_are_interpolated_together(tiny_checkpoint, tmp_path) -> None:

@@ -31,6 +31,7 @@ COMMANDS = {
 }
 BODY, AVATAR = ASSETS / "body.npz", ASSETS / "avatar.onnx"
 MOTION = f"rnd-data motion {ASSETS / 'walk.npz'} OUT/w.npz"
+IS_READ = "output: expected another file than what is read, got"
 IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 
 
@@ -102,6 +103,12 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         (f"rnd-eval OUT {CAPTURE} --json {ASSETS}", "assets: cannot be written: it is a folder"),
         (f"rnd-eval OUT {CAPTURE} --ablate --json {BODY}/a.json", "body.npz: output folder cannot be made"),
         (f"rnd-export {BODY} --out {BODY}/a.onnx", "body.npz: output folder cannot be made"),
+        (f"rnd-eval OUT {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
+        (f"rnd-eval OUT/avatar.ckpt {CAPTURE} --json OUT/avatar.ckpt", IS_READ),
+        (f"rnd-eval OUT {CAPTURE} --perceptual-weights {BODY} --json {BODY}", IS_READ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8 --json {CAPTURE}/capture.json", IS_READ),
+        (f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json OUT.onnx", IS_READ),
+        (f"rnd-export {BODY} --max-mb 5 --capture {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
         (
             f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json {ASSETS}",
             "assets: cannot be written: it is a folder",

@@ -181,6 +181,19 @@ def _real_skeleton() -> Skeleton:
         return Skeleton(tuple(body["joint_names"]), body["joint_parents"], body["rest_joints"])
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_members_damaged_in_any_compression_are_refused(tmp_path, method):
+    member = io.BytesIO()
+    np.save(member, np.random.default_rng(0).normal(size=(100, 24, 3)))
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", method) as archive:
+        archive.writestr("poses.npy", member.getvalue())
+    data = bytearray((tmp_path / "a.npz").read_bytes())
+    data[60:90] = bytes(30)
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.npz: poses: expected an array, got data that is cut short or damaged"):
+        load_motion(tmp_path / "a.npz", _skeleton())
+
+
 # Axes, rates, joints
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import numpy as np
 import onnx
 import onnxruntime as ort
@@ -9,7 +11,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from rnd_runtime.errors import InputError
-from rnd_runtime.onnx_parts import OnnxFile
+from rnd_runtime.onnx_parts import OnnxFile, _varint, number_field
 
 
 def _model() -> onnx.ModelProto:
@@ -75,6 +77,15 @@ def test_an_output_that_nothing_makes_is_refused():
 def test_a_file_cut_short_is_refused(length):
     with pytest.raises(InputError, match="not a readable ONNX model"):
         OnnxFile(_model().SerializeToString()[:length])
+
+
+@pytest.mark.parametrize("head", [b"", b"\x0a", b"\x08"])
+def test_a_number_without_an_end_is_refused_at_its_tenth_byte(head):
+    started = perf_counter()
+    with pytest.raises(InputError, match="not a readable ONNX model"):
+        OnnxFile(head + b"\xff" * 1_000_000)  # read to the end it is a number of 7 000 000 bits: ten seconds
+    assert perf_counter() - started < 1
+    assert _varint(memoryview(number_field(1, 2**64 - 1)), 1) == (2**64 - 1, 11)
 
 
 def test_any_bytes_are_read_or_refused():

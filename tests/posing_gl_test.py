@@ -9,7 +9,7 @@ import pytest
 
 import gl_devices
 from gl_devices import BACKENDS
-from posing_test import _scene
+from posing_test import BROKEN, _scene, broken_scene
 from raster_scenes import off_centre_camera, random_scene
 from rnd_runtime._raster_project import pinhole
 from rnd_runtime.camera import Camera
@@ -82,6 +82,17 @@ def test_posing_is_the_float64_formula(device, joints, harmonics, count, templat
         assert ours.shape == exact.shape
         assert np.abs(ours - exact).max() <= ROUNDING * np.abs(exact).max()
     assert count == 1 or 0.2 < (radii > 0).mean() < 0.8
+
+
+@pytest.mark.parametrize(("field", "value"), BROKEN)
+def test_what_is_no_number_is_not_drawn(device, field, value):
+    rest, inputs = broken_scene(field, value)
+    surfaces, count = device.posing.pose(_unposed(rest, inputs)), len(rest.points)
+    with np.errstate(all="ignore"):
+        means, covariances, *_ = pose_reference(rest, *inputs)
+    ours = [_rows(texture, count) for texture in (surfaces.points, surfaces.covariances, surfaces.covariances_z)]
+    exact = np.hstack([means, covariances])
+    assert (np.isfinite(np.hstack([ours[0][:, :3], *ours[1:]])).all(1) == np.isfinite(exact).all(1)).all()
 
 
 def test_another_avatar_takes_the_place_of_the_last(device):

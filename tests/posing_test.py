@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,35 @@ def test_without_logits_the_template_decides():
     rest, (_, *inputs) = _scene(24)
     for ours, exact in zip(rest.pose(None, *inputs), pose_reference(rest, None, *inputs)):
         assert np.abs(ours - exact).max() < ROUNDING * np.abs(exact).max()
+
+
+BROKEN = [
+    (field, value)
+    for field in ("logits", "log_template", "offsets", "turns", "bones", "points")
+    for value in (np.nan, np.inf, -np.inf)
+]
+
+
+def broken_scene(field, value):
+    """A scene of 24 joints with one number of Gaussian 0's that is not finite."""
+    rest, (logits, offsets, visibility, bones) = _scene(24)
+    changed = {"log_template": rest.log_template.copy(), "points": rest.points.copy()}
+    places = {
+        "logits": (logits, (rest.neighbours[0, 0], 2)),
+        "offsets": (offsets, (rest.neighbours[0, 0], 1)),
+        "turns": (offsets, (rest.neighbours[0, 0], 4)),
+        "bones": (bones, (3, 0, 0)),
+        **{name: (array, (0, 2)) for name, array in changed.items()},
+    }
+    array, place = places[field]
+    array[place] = value
+    return replace(rest, **changed), (logits, offsets, visibility, bones)
+
+
+@pytest.mark.parametrize(("field", "value"), BROKEN)
+def test_what_is_no_number_stays_none_and_nothing_else_becomes_it(field, value):
+    rest, inputs = broken_scene(field, value)
+    with np.errstate(all="ignore"):
+        exact = pose_reference(rest, *inputs)
+    for ours, wanted in zip(rest.pose(*inputs)[:3], exact):  # visibility goes through nothing
+        assert (np.isfinite(ours).all(1) == np.isfinite(wanted).all(1)).all()

@@ -184,7 +184,7 @@ def test_what_is_broken_or_behind_leaves_no_trace(rasterize):
     features[20, 1] = np.nan
     means[21] = camera.position + np.array([0, 0, 2])  # behind
     means[22] = camera.position  # at
-    means[23] = camera.position - np.array([0, 0, 0.009])  # nearer than 1 cm
+    means[23] = camera.position - np.array([0, 0, 0.099])  # nearer than 10 cm
     _assert_same_bits(rasterize(*broken, camera), expected)
 
 

@@ -184,7 +184,7 @@ def test_boxes_leave_nothing_out():
     [
         ((0, 0, -2), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
         ((0, 0, 0), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
-        ((0, 0, 0.0099), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
+        ((0, 0, 0.0999), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
         ((0, np.nan, 2), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
         ((0, 0, np.inf), (0.01, 0, 0, 0.01, 0, 0.01), 0.5, 1.0),
         ((0, 0, 2), (0, 0, 0, 0, 0, 0), 0.5, 1.0),
@@ -200,6 +200,11 @@ def test_what_is_not_drawn(mean, upper, opacity, feature):
     rows = np.array([mean, (0, 0, 3)], float), np.array([upper, (0.01, 0, 0, 0.01, 0, 0.01)], float)
     arrays = (*rows, np.array([opacity, 0.5]), np.array([[feature], [1.0]]))
     assert oracle.drawn(*arrays, straight(8, 8)).tolist() == [False, True]
+
+
+def test_drawing_begins_ten_centimetres_away():
+    means, upper = np.array([(0, 0, 0.0999), (0, 0, 0.1001)]), isotropic(0.01, 0.01)
+    assert oracle.drawn(means, upper, np.full(2, 0.5), np.ones((2, 1)), straight(8, 8)).tolist() == [False, True]
 
 
 def test_no_gaussians_give_an_empty_picture():

@@ -100,12 +100,16 @@ def test_smpl_tree():
         (("a", "b"), [-1, -1], np.zeros((2, 3)), "earlier one"),
         (("a", "b"), [0, 0], np.zeros((2, 3)), "earlier one"),
         (("a", "b", "c"), [-1, 2, 1], np.zeros((3, 3)), "earlier one"),
+        (("a", "b", "c"), [-1, 0, 10**30], np.zeros((3, 3)), "earlier one"),
+        (("a", "b", "c"), [-1, 0, 2**32], np.zeros((3, 3)), "earlier one"),  # as int32 it is 0
+        (("a", "b", "c"), [-1, 0, 0.5], np.zeros((3, 3)), "earlier one"),
+        (("a", "b", "c"), [-1, 0, np.nan], np.zeros((3, 3)), "earlier one"),
         (("a", "b"), [-1, 0], [[0, 0, 0], [0, np.nan, 0]], "finite"),
     ],
 )
 def test_broken_trees_are_refused(names, parents, joints, words):
     with pytest.raises(InputError) as caught:
-        Skeleton(names, np.array(parents, np.int32), joints)
+        Skeleton(names, np.array(parents), joints)
     assert words in str(caught.value)
 
 

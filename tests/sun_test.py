@@ -83,7 +83,7 @@ def test_two_suns_and_no_third():
     assert rest.radiance.max() > 1e4  # the third stays in the map
 
 
-@pytest.mark.parametrize("kind", ["overcast", "black", "constant", "window", "faint lamp"])
+@pytest.mark.parametrize("kind", ["overcast", "black", "constant", "window", "faint lamp", "lamp and panes"])
 def test_where_there_is_no_sun_none_is_found(kind):
     radiance = sky()
     directions = texel_directions(*radiance.shape[:2])
@@ -95,6 +95,11 @@ def test_where_there_is_no_sun_none_is_found(kind):
         radiance = np.where((directions[..., 0] > np.cos(np.radians(25)))[..., None], 100.0, radiance)
     elif kind == "faint lamp":
         radiance, _ = with_sun(radiance, direction_of(0.5, 0.5), 500)
+    elif kind == "lamp and panes":  # of 10° each, brighter from one to the next
+        azimuth, height = np.degrees(np.arctan2(directions[..., 2], directions[..., 0])), directions[..., 1]
+        pane = (np.abs(azimuth) < 50) & (np.abs(height) < np.sin(np.radians(15))) & (azimuth % 10 > 2)
+        radiance = np.where(pane[..., None], 20.0 + 0.2 * azimuth[..., None], radiance)
+        radiance, _ = with_sun(radiance, direction_of(1.0, 3.0), 500)
     light = Light(radiance)
     rest, suns = extract_suns(light)
     assert suns == ()
@@ -117,3 +122,21 @@ def test_large_and_tiny_maps():
     spot[1, 3] = 1e6
     rest, suns = extract_suns(Light(spot))
     assert suns == ()  # a texel of 45° is no sun
+
+
+def beside_a_lamp():
+    """A sun, what it adds, and a lamp of a tenth of its energy whose texels are brighter."""
+    radiance, sun_energy = with_sun(sky(256), direction_of(0.7, 1.0), 400, radius=3)
+    return with_sun(radiance, direction_of(0.2, -2.0), 600, radius=0.8)[0], sun_energy
+
+
+def test_a_brighter_lamp_too_weak_for_a_sun_hides_none():
+    radiance, sun_energy = beside_a_lamp()
+    light = Light(radiance)
+    brightest = texel_directions(*radiance.shape[:2]).reshape(-1, 3)[light.radiance[..., 1].argmax()]
+    assert brightest @ direction_of(0.2, -2.0) > np.cos(np.radians(1))
+    rest, suns = extract_suns(light)
+    assert len(suns) == 1
+    np.testing.assert_allclose(suns[0].direction, direction_of(0.7, 1.0), atol=HALF_TEXEL)
+    np.testing.assert_allclose(suns[0].irradiance, sun_energy, rtol=SUN_ENERGY)
+    assert rest.radiance.max() == light.radiance.max()  # the lamp stays in the map

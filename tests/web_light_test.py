@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from rnd_runtime.errors import InputError
 from rnd_runtime.light import REC709, light_notes, load_light
+from rnd_runtime.sun import extract_suns
+from sun_test import beside_a_lamp
 
 WEB = Path(__file__).parent.parent / "viewer/web"
 NODE = shutil.which("node")
@@ -37,12 +39,19 @@ try {
 } catch (error) { answer = { refused: error.message }; }
 console.log(JSON.stringify(answer));
 """
+_SUNS = """
+import { readFileSync } from "node:fs";
+const { readLight } = await import(process.argv[1] + "/light.js");
+const { extractSuns } = await import(process.argv[1] + "/sun.js");
+const { suns, sky } = extractSuns(readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]));
+console.log(JSON.stringify({ suns, sky: [...sky.radiance] }));
+"""
 
 
-def _page(file: Path) -> Any:
+def _page(file: Path, code: str = _READER) -> Any:
     """What the page's code makes of a probe, in Node.js."""
     assert NODE is not None
-    command = [NODE, "--input-type=module", "--eval", _READER, WEB.as_uri() + "/src", str(file)]
+    command = [NODE, "--input-type=module", "--eval", code, WEB.as_uri() + "/src", str(file)]
     return json.loads(subprocess.run(command, capture_output=True, check=True, timeout=60).stdout)
 
 
@@ -247,3 +256,14 @@ def test_what_a_radiance_file_states_is_taken_alike(tmp_path, stated):
     else:
         assert_array_equal(np.float32(page["radiance"]).reshape(light.radiance.shape), light.radiance)
         assert page["notes"] == light_notes(light)
+
+
+def test_a_sun_is_taken_out_beside_a_lamp_of_brighter_texels(tmp_path: Path) -> None:
+    radiance, _ = beside_a_lamp()
+    file = _exr(tmp_path / "sun.exr", radiance, kind="float")
+    rest, suns = extract_suns(load_light(file))
+    got = _page(file, _SUNS)
+    assert len(got["suns"]) == len(suns) == 1
+    for name in ("direction", "irradiance", "spread"):
+        assert_allclose(got["suns"][0][name], getattr(suns[0], name), rtol=1e-6)
+    assert_array_equal(np.array(got["sky"], np.float32), rest.radiance.ravel())

@@ -38,7 +38,7 @@ one network as shares of the file's"""
 MARGIN_DB = 0.3
 """that the search keeps from a least PSNR: shots it has not seen are a little worse"""
 LEAST_GAIN = 0.01
-"""of the cost: steps that save less are not taken while others are left"""
+"""of the cost: a step goes down a ladder to the first rung that saves more, and others are taken when none is left"""
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
             if _kept(bound, now):
                 return _relaxed(bench, bound, now, on_step)
         step = _best_step(bench, bound, now, worths)
-        if step is None and bound.kind == "ms":  # each for itself may save too little to be told from noise
-            step, worths = _mildest_step(bench, now), dict.fromkeys(LADDERS, np.inf)
+        if step is None and bound.kind != "psnr":  # each for itself saves little, all of them may be enough
+            step, worths = _mildest_step(bench, bound, now), dict.fromkeys(LADDERS, np.inf)
         if step is None:
             break
         path.append(step)
@@ -175,7 +175,6 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
     ``worths`` of each ladder are remembered from earlier rounds, and looked at again only where they promise most:
     what saves little once seldom saves more later.
     """
-    cost = "mb" if bound.kind == "mb" else "ms"
     made: dict[str, Found] = {}
     while True:
         name = max(worths, key=lambda name: worths[name])
@@ -183,23 +182,39 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
             return None
         if name in made:
             return made[name]
-        plan = _next(bench, now.plan, name, 1)
-        if plan is None:
+        found = _further(bench, bound, now, name, LEAST_GAIN)
+        if found is None or (bound.kind == "psnr" and found.measured.psnr < bound.value + MARGIN_DB):
             worths[name] = 0
             continue
-        found = _made(bench, plan)
-        saved = 1 - getattr(found.measured, cost) / getattr(now.measured, cost)
-        allowed = bound.kind != "psnr" or found.measured.psnr >= bound.value + MARGIN_DB
-        worths[name] = (
-            saved / max(_square(found) - _square(now), 1e-9) if allowed and saved > LEAST_GAIN else 0
-        )
+        worths[name] = _saved(bound, now, found) / max(_square(found) - _square(now), 1e-9)
         made[name] = found
 
 
-def _mildest_step(bench: Workbench, now: Found) -> Found | None:
-    """Of the steps further down, the one that costs least in the picture."""
-    plans = [_next(bench, now.plan, name, 1) for name in LADDERS]
-    return min((_made(bench, plan) for plan in plans if plan is not None), key=_square, default=None)
+def _mildest_step(bench: Workbench, bound: Bound, now: Found) -> Found | None:
+    """Of the steps further down, the one that costs least in the picture; of size, that makes the file any smaller."""
+    least = 0.0 if bound.kind == "mb" else -np.inf  # of time, that may be noise
+    steps = [_further(bench, bound, now, name, least) for name in LADDERS]
+    return min((step for step in steps if step is not None), key=_square, default=None)
+
+
+def _further(bench: Workbench, bound: Bound, now: Found, name: str, least: float) -> Found | None:
+    """The first rung of ``name`` down the ladder that saves more than ``least`` of the cost; None where none does.
+
+    The first rungs of a ladder may save nothing, as those of dynamic skinning do of the size until it is static.
+    """
+    plan = _next(bench, now.plan, name, 1)
+    while plan is not None:
+        found = _made(bench, plan)
+        if _saved(bound, now, found) > least:
+            return found
+        plan = _next(bench, plan, name, 1)
+    return None
+
+
+def _saved(bound: Bound, now: Found, found: Found) -> float:
+    """Share of the cost, the size for a bound of it and the time for others, that ``found`` saves over ``now``."""
+    cost = "mb" if bound.kind == "mb" else "ms"
+    return float(1 - getattr(found.measured, cost) / getattr(now.measured, cost))
 
 
 def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan | None:

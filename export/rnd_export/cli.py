@@ -90,6 +90,7 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
+    from rnd_runtime.capture import capture_file
     from rnd_runtime.files import existing_file, output_file, refuse_input
     from rnd_runtime.motion import load_motion
     from rnd_trainer.checkpoint import load_checkpoint
@@ -106,8 +107,10 @@ def _export(options: Options) -> None:
     if options.out is None and file.suffix == ".onnx":
         raise InputError("not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=file)
     out = options.out or file.with_suffix(".onnx")
+    captured = options.capture and capture_file(options.capture)
     for written in filter(None, (out, options.json)):
-        refuse_input(written, file, options.motion, options.hdr)
+        refuse_input(written, file, options.motion, options.hdr, captured)
+    refuse_input(out, options.json)  # rows are added to it
     check_option(out.suffix.lower() == ".onnx", "--out", "a name in .onnx", out)  # others are text to onnx
     for written in filter(None, (out, options.json)):
         output_file(written)

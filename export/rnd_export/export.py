@@ -179,6 +179,8 @@ def random_motion(skeleton: Skeleton, *, frames: int, seed: int) -> Motion:
 
 def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> str:
     skeleton, config = checkpoint.skeleton, checkpoint.config.model
+    moving, rates = len(moving_sites(baked)), baked.rates
+    most = max(moving, rates.offsets, rates.visibility)
     metadata = AvatarMetadata(
         schema=SCHEMA,
         gaussians=len(baked.points),
@@ -196,10 +198,10 @@ def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> s
         conventions=CONVENTIONS,
         generator=f"rnd-avatar {__version__}",
         variant=VariantMetadata(
-            encoder=variant.encoder if baked.skinning is not None else "static",
+            encoder="static" if baked.skinning is None else "coarse" if most < config.nodes else "full",
             precision=variant.precision,
-            nodes=len(baked.codes),
-            dynamic_nodes=len(moving_sites(baked)),
+            nodes=most,
+            dynamic_nodes=moving,
             visibility_degree=variant.visibility_degree,
         ),
     )

@@ -293,7 +293,7 @@ _EXP2 = _exp2_coefficients()
 
 @intrinsic
 def exp2(context, power):  # type: ignore[no-untyped-def]
-    """2^power for powers in [-126, 127]; elsewhere the lane holds rubbish, which the caller masks out."""
+    """2^power for powers in [-126, 127], NaN for NaN; elsewhere the lane holds rubbish, which the caller masks out."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         whole = _call(builder, "llvm.rint.v16f32", _FLOATS, args[0])

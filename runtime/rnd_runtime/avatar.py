@@ -66,8 +66,9 @@ class Avatar:
         metadata: AvatarMetadata,
         trained_light: NDArray[np.float32],
         threads: int | None = None,
+        path: Path | None = None,
     ) -> None:
-        self._file, self._threads = file, threads
+        self._file, self._threads, self._path = file, threads, path
         self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
         self.metadata = metadata
         self.trained_light = trained_light
@@ -98,7 +99,7 @@ class Avatar:
             file = OnnxFile(path.read_bytes())
             metadata = read_metadata(file)
             check_shapes(file, metadata)
-            return cls(file, metadata, decode_light(metadata), threads)
+            return cls(file, metadata, decode_light(metadata), threads, path)
         except InputError as error:
             raise error.at(file=path) from error
 
@@ -145,14 +146,28 @@ class Avatar:
     def run(
         self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike], outputs: Sequence[str]
     ) -> list[NDArray[np.float32]]:
-        """Named outputs of the graph for (pose_window, joint_velocity, bone_transforms); nothing else is computed."""
+        """Named outputs of the graph for (pose_window, joint_velocity, bone_transforms); nothing else is computed.
+
+        Raises :class:`InputError` where the file's graph cannot be evaluated: its indices are looked at only then.
+        """
         session = self._session(tuple(outputs))
         values = dict(zip(("pose_window", "joint_velocity", "bone_transforms"), inputs))
         values = {
             wanted.name: np.ascontiguousarray(values[wanted.name], np.float32)
             for wanted in session.get_inputs()
         }
-        results: list[NDArray[np.float32]] = session.run(list(outputs), values)
+        try:
+            return self._evaluated(session, outputs, values)
+        except InputError as error:
+            raise error.at(file=self._path) from error
+
+    def _evaluated(
+        self, session: ort.InferenceSession, outputs: Sequence[str], values: dict[str, NDArray[np.float32]]
+    ) -> list[NDArray[np.float32]]:
+        try:
+            results: list[NDArray[np.float32]] = session.run(list(outputs), values)
+        except Exception as error:
+            raise InputError("graph cannot be evaluated", got=first_line(error)) from error
         self._check_promised(outputs, results)
         return results
 
@@ -192,9 +207,7 @@ class Avatar:
         if session.get_inputs():
             names = ", ".join(outputs)
             raise InputError("graph outputs", expected=f"{names}: constants", got="some that need a pose")
-        results: list[NDArray[np.float32]] = session.run(list(outputs), {})
-        self._check_promised(outputs, results)
-        return results
+        return self._evaluated(session, outputs, {})
 
     def _session(self, outputs: tuple[str, ...]) -> ort.InferenceSession:
         """A session that computes ``outputs`` and no more; kept."""

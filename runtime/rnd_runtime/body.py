@@ -78,9 +78,7 @@ class Body:
             joints = len(names)
             parents = archive.numbers("joint_parents", (joints,))
             try:
-                skeleton = Skeleton(
-                    names, parents.astype(np.int32), archive.numbers("rest_joints", (joints, 3))
-                )
+                skeleton = Skeleton(names, parents, archive.numbers("rest_joints", (joints, 3)))  # type: ignore[arg-type]
                 return cls(
                     archive.numbers("vertices", (None, 3)),
                     archive.numbers("faces", (None, 3)),  # type: ignore[arg-type]  # checked to be whole

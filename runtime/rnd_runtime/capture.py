@@ -141,6 +141,11 @@ class Capture:
         return lights.load_light(self.folder / entry.file, yaw=entry.yaw).scaled(entry.scale)
 
 
+def capture_file(path: str | Path) -> Path:
+    """The ``capture.json`` of a folder, or ``path`` itself where it is none."""
+    return Path(path) / "capture.json" if is_folder(path) else Path(path)
+
+
 def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture:
     """Read a capture and check everything that can be checked without decoding pictures.
 
@@ -151,8 +156,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
     Raises:
         InputError: naming file, field or frame, and both values.
     """
-    path = Path(path)
-    file = existing_file(path / "capture.json" if is_folder(path) else path, what="capture")
+    file = existing_file(capture_file(path), what="capture")
     folder = file.parent
     record = read_record(file)
     cameras = {}

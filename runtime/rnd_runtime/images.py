@@ -23,6 +23,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 _MOST_COMPRESSED = 2000
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
+_PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
 # Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
 _LARGEST_UNBOUNDED = 1 << 31
@@ -76,11 +77,15 @@ def read_image(path: str | Path) -> Image:
     unless told not to). Only the first picture of a file is read.
 
     Raises:
-        InputError: not a file, not an image, cut short, turned by EXIF, or a crop of a larger canvas.
+        InputError: not a file, not an image, cut short, turned by EXIF, a crop of a larger canvas, or with a channel
+            of another type, such as an EXR's UINT.
     """
     with _opened(path) as source:
         spec = source.spec()
         _checked_header(spec, path)
+        kinds = [str(kind) for kind in (spec.format, *spec.channelformats)]
+        if other := next((kind for kind in kinds if kind not in _PIXEL_TYPES), None):
+            raise InputError("type of pixels", expected=" or ".join(_PIXEL_TYPES), got=other, file=path)
         kind = str(spec.format)
         pixels = source.read_image(0, 0, 0, spec.nchannels, kind if kind in ("uint8", "uint16") else "float")
         if pixels is None:

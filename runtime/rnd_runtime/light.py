@@ -244,21 +244,28 @@ def repair(radiance: Floats32) -> tuple[Floats32, int]:
         return radiance, 0
     if not valid.any((0, 1)).all():
         raise InputError("light probe", expected="finite radiance, not negative", got="none in some channel")
-    height, width = radiance.shape[:2]
-    values = np.where(valid, radiance, 0).astype(np.float64)
-    row, column, channel = np.nonzero(~valid)
-    while len(row):
-        total, count = np.zeros(len(row)), np.zeros(len(row))
-        for down in (-1, 0, 1):
-            for right in (-1, 0, 1):
-                near = (np.clip(row + down, 0, height - 1), (column + right) % width, channel)
-                total += np.where(valid[near], values[near], 0)
-                count += valid[near]
+    shape, valid = radiance.shape, valid.reshape(-1)
+    values = np.where(valid, radiance.reshape(-1), 0).astype(np.float64)
+    bad = np.flatnonzero(~valid)
+    while len(bad):
+        total, count = np.zeros(len(bad)), np.zeros(len(bad))
+        for near in _around(bad, shape):
+            total += np.where(valid[near], values[near], 0)
+            count += valid[near]
         rim = count > 0
-        filled = (row[rim], column[rim], channel[rim])
+        filled = bad[rim]
         values[filled], valid[filled] = total[rim] / count[rim], True
-        row, column, channel = row[~rim], column[~rim], channel[~rim]
-    return values.astype(np.float32), repaired
+        bad = np.unique(np.concatenate(_around(filled, shape)))
+        bad = bad[~valid[bad]]  # the next rim: what is deeper inside has no valid neighbour yet
+    return values.astype(np.float32).reshape(shape), repaired
+
+
+def _around(places: NDArray[np.int64], shape: tuple[int, ...]) -> list[NDArray[np.int64]]:
+    """Of flat ``places`` in [H, W, C] the neighbours within a texel, themselves too: nine arrays as long."""
+    row, column, channel = np.unravel_index(places, shape)
+    rows = [np.clip(row + down, 0, shape[0] - 1) for down in (-1, 0, 1)]
+    columns = [(column + right) % shape[1] for right in (-1, 0, 1)]
+    return [np.ravel_multi_index((r, c, channel), shape) for r in rows for c in columns]
 
 
 def texel_directions(height: int, width: int) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import lzma
 import struct
 import tokenize
 import zipfile
@@ -19,7 +20,7 @@ from .files import atomic_path, existing_file
 # What numpy and zipfile raise for archives that are cut, scrambled, encrypted or hold Python objects.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError),
-    *(zlib.error, zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, TypeError),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, TypeError),
 )
 
 

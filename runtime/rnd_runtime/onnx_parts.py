@@ -20,6 +20,7 @@ _TENSOR_NAME, _TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 8, 13, 14
 _FLOAT = 1  # TensorProto.DataType
 
 _VARINT, _EIGHT_BYTES, _LENGTH, _FOUR_BYTES = 0, 1, 2, 5  # wire types
+_LONGEST_VARINT = 10  # bytes: 64 bits, seven in each
 
 
 class Node(NamedTuple):
@@ -147,15 +148,14 @@ def _fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
 
 
 def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    """The number at ``at`` and where it ends."""
-    number = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
-        number |= (byte & 127) << shift
-        shift += 7
+    """The number at ``at`` and where it ends; IndexError where it is longer than any."""
+    number = 0
+    for k in range(_LONGEST_VARINT):
+        byte = data[at + k]
+        number |= (byte & 127) << 7 * k
         if byte < 128:
-            return number, at
+            return number, at + k + 1
+    raise IndexError(at)
 
 
 def bytes_field(number: int, value: bytes | bytearray) -> bytes:

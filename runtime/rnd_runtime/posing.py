@@ -196,15 +196,16 @@ def _interpolated(fields, rest, i, column):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _exp(x):  # type: ignore[no-untyped-def]
+    """What is no number stays none: here and in :func:`_tanh` comparisons fall to the bound only where they hold."""
     power = x * _LOG2_E
-    return exp2(select(power > _SMALLEST_POWER, power, _SMALLEST_POWER))
+    return exp2(select(power < _SMALLEST_POWER, _SMALLEST_POWER, power))
 
 
 @njit(inline="always")
 def _tanh(x):  # type: ignore[no-untyped-def]
     """To 1e-7, absolute."""
-    x = select(x < _LARGEST_TANH, x, _LARGEST_TANH)
-    x = select(x > -_LARGEST_TANH, x, -_LARGEST_TANH)
+    x = select(x > _LARGEST_TANH, _LARGEST_TANH, x)
+    x = select(x < -_LARGEST_TANH, -_LARGEST_TANH, x)
     return lanes(_ONE) - lanes(_TWO) / (_exp(x * _TWO) + _ONE)
 
 
@@ -221,7 +222,10 @@ def _logits_in_lanes(first, fields, rest, rows, logits):  # type: ignore[no-unty
 
 @njit(error_model="numpy")
 def _blend_sixteen(logits, bones, blend):  # type: ignore[no-untyped-def]
-    """A [3, 4] by component of sixteen Gaussians; their ``logits`` become e^(logit − the greatest)."""
+    """A [3, 4] by component of sixteen Gaussians; their ``logits`` become e^(logit − the greatest).
+
+    NaN where a logit is NaN or +∞, as a softmax is: their sum is.
+    """
     greatest = load(logits, 0)
     for j in range(1, len(bones)):
         logit = load(logits, j * WIDTH)

@@ -177,6 +177,7 @@ def _radii(covariances, opacities, radii):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, radiance):  # type: ignore[no-untyped-def]
+    """Add what ``suns`` lay on the Gaussians to ``radiance`` [N, 3]. A sun of one texel is a point: see ``sun``."""
     # A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks
     # for α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own.
     directions, irradiance, spread_squared = suns

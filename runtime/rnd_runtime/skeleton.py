@@ -45,24 +45,26 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
-        object.__setattr__(self, "parents", np.asarray(self.parents, np.int32))
+        parents = np.asarray(self.parents)  # as given: a cast would wrap what is too large around
         object.__setattr__(self, "rest_joints", np.asarray(self.rest_joints, np.float64))
         count = len(self.names)
-        if count == 0 or self.parents.shape != (count,) or self.rest_joints.shape != (count, 3):
+        if count == 0 or parents.shape != (count,) or self.rest_joints.shape != (count, 3):
             raise InputError(
                 "skeleton",
                 expected=f"parents [{count}] and rest joints [{count}, 3] for {count} names, at least one",
-                got=f"{list(self.parents.shape)} and {list(self.rest_joints.shape)}",
+                got=f"{list(parents.shape)} and {list(self.rest_joints.shape)}",
             )
         if len(set(self.names)) != count:
             twice = sorted({name for name in self.names if self.names.count(name) > 1})
             raise InputError("skeleton joint names", expected="each name once", got=", ".join(twice))
-        if self.parents[0] != -1 or (self.parents[1:] < 0).any() or (self.parents >= np.arange(count)).any():
+        earlier = (parents >= 0) & (parents < np.arange(count)) & (parents == np.floor(parents))
+        if parents[0] != -1 or not earlier[1:].all():
             raise InputError(
                 "skeleton parents",
                 expected="-1 first, then for every joint the index of an earlier one",
-                got=self.parents.tolist(),
+                got=parents.tolist(),
             )
+        object.__setattr__(self, "parents", parents.astype(np.int32))
         if not np.isfinite(self.rest_joints).all():
             raise InputError("skeleton rest joints", expected="finite metres")
 

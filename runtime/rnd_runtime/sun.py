@@ -2,7 +2,8 @@
 
 A lat-long map of 64 × 32 texels smears a half-degree sun over five degrees, and visibility of degree 3 blurs its
 shadow over fifty. Compact peaks are therefore split off as directional lights and the rest of the map keeps the
-background that surrounded them: sky + suns = map, per channel, to rounding.
+background that surrounded them: sky + suns = map, per channel, to rounding. How far a sun spreads is measured between
+centres of texels: a texel's own size does not count, as what a sun's texel of a coarse map shows is smaller than it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ _CAP = np.radians(6)  # a peak must fit into this radius: a sun with its glare, 
 _RING = np.radians(10)  # its background is the median between _CAP and here
 _LARGEST = (512, 1024)  # a third of a degree a texel tells the direction; larger maps only cost memory
 _LEAST_SHARE = 0.05  # of the map's luminance; less is not worth a shadow of its own
+_MOST_PEAKS = 16  # that are looked at: lamps too weak for a sun may be brighter than it
+_LAMP = np.radians(2)  # of their spread; what is wider and no sun is a window, and others would be pieces of it
+_RING_AREA = 2 * np.pi * (1 - np.cos(_RING))  # sr: more than a peak covers, whatever the texels
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +33,7 @@ class Sun:
     Attributes:
         direction: [3] unit, towards it, in the light probe's frame: the mean direction of its radiance.
         irradiance: [3] ∫ L dω, linear: what it lays on a surface that faces it.
-        spread: root mean square angle from ``direction``, radians.
+        spread: root mean square angle from ``direction``, radians, of its texels' centres: 0 for a single texel.
     """
 
     direction: Floats
@@ -41,8 +45,8 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
     """``light`` without its suns, and the suns, strongest first.
 
     A sun is what rises above the median of the ring around the brightest texel, within 6° of its own centre,
-    if that is at least 5 % of the map's luminance. An overcast sky or a wide window has none. Maps of more than
-    512 rows come back at 512.
+    if that is at least 5 % of the map's luminance; a small lamp that is weaker is passed over for the next brightest
+    texel more than 6° away. An overcast sky or a wide window has none. Maps of more than 512 rows come back at 512.
     """
     if len(light.radiance) > _LARGEST[0]:
         light = light.resized(*_LARGEST)
@@ -53,17 +57,24 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
     least = _LEAST_SHARE * float(luminance.sum(1) @ solid_angles)
     directions = texel_directions(height, width)
     suns: list[Sun] = []
-    while len(suns) < limit:
+    for _ in range(_MOST_PEAKS):
         peak = np.unravel_index(np.argmax(luminance), luminance.shape)
+        if not luminance[peak] * _RING_AREA >= least:  # neither this nor what is darker
+            break
         found = _peak_around(radiance, directions, solid_angles, directions[peak])
         if found is None:
             break
         sun, rows, sky = found
         if not sun.irradiance @ REC709_LUMINANCE >= max(least, 1e-30):
-            break
+            if sun.spread > _LAMP:
+                break
+            luminance[directions @ directions[peak] > np.cos(_CAP)] = -np.inf  # in the search alone
+            continue
         radiance[rows] = sky
-        luminance[rows] = sky @ REC709_LUMINANCE
+        luminance[rows] = np.minimum(luminance[rows], sky @ REC709_LUMINANCE)  # what is masked stays so
         suns.append(sun)
+        if len(suns) == limit:
+            break
     suns.sort(key=lambda sun: -float(sun.irradiance @ REC709_LUMINANCE))
     return replace(light, radiance=radiance.astype(np.float32)), tuple(suns)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
-from rnd_runtime.files import is_folder, output_file, output_folder, write_json
+from rnd_runtime.files import is_folder, output_file, output_folder, refuse_input, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -126,7 +126,7 @@ def evaluate_run(options: EvalOptions) -> None:
 
     check_mode(options.shade)
     check_outputs(options)
-    path = options.run / "avatar.ckpt" if is_folder(options.run) else options.run
+    path = _checkpoint_file(options)
     checkpoint = load_checkpoint(path)
     if note := checkpoint.note():
         print(f"rnd-eval: {note}", file=sys.stderr)  # noqa: T201
@@ -161,19 +161,30 @@ def evaluate_run(options: EvalOptions) -> None:
 
 
 def check_outputs(options: EvalOptions) -> None:
-    """Raise :class:`InputError` for a file or folder that could not be written once everything is scored."""
+    """Raise :class:`InputError` for what could not be written once everything is scored, or is read before."""
+    from rnd_runtime.capture import capture_file
+
+    checkpoint = _checkpoint_file(options)
+    read = (checkpoint, checkpoint.with_suffix(".onnx"), capture_file(options.capture))
     for file in filter(None, (options.json, options.chart)):
+        refuse_input(file, *read, options.perceptual_weights, options.consistency_weights)
         output_file(file)
     if options.pictures is not None:
         output_folder(options.pictures)
 
 
+def _checkpoint_file(options: EvalOptions) -> Path:
+    return options.run / "avatar.ckpt" if is_folder(options.run) else options.run
+
+
 def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
     """The poses that the training corrected, where it did and on this capture; says so."""
+    from rnd_runtime.capture import capture_file
+
     from .train import REFINED_MOTION
 
     file = path.with_name(REFINED_MOTION).resolve()
-    capture = options.capture / "capture.json" if is_folder(options.capture) else options.capture
+    capture = capture_file(options.capture)
     if not (checkpoint.config.refine_poses and file.is_file() and capture.is_file()):
         return None
     if not checkpoint.learned_from(capture):

@@ -16,7 +16,8 @@ const float SMALLEST_SQUARE = 1e-6;  // of |A_R u|
 const float SHORTEST = 1e-9;         // of a normal before it is normalised
 
 vec4 bounded(vec4 x) {
-    return 1.0 - 2.0 / (exp(2.0 * clamp(x, -9.0, 9.0)) + 1.0);  // tanh, which is 1 in float32 beyond 9
+    vec4 tanhs = 1.0 - 2.0 / (exp(2.0 * clamp(x, -9.0, 9.0)) + 1.0);  // 1 in float32 beyond 9
+    return mix(tanhs, x, isnan(x));  // which clamp may lose
 }
 
 // R of the quaternion normalize(1, v/2).

@@ -82,9 +82,18 @@ def target_of(name: str, folder: Path) -> Target:
         from rnd_trainer.checkpoint import load_checkpoint
 
         return Target(load_checkpoint, folder / "avatar.ckpt", _safetensors_damage)
-    from rnd_runtime.avatar import Avatar
+    return Target(_posed_once, folder / "avatar.onnx", None)
 
-    return Target(Avatar.load, folder / "avatar.onnx", None)
+
+def _posed_once(path: Path) -> object:
+    """An avatar, and its rest pose: what is wrong with a graph may show only when it is evaluated."""
+    from rnd_runtime.avatar import Avatar
+    from rnd_runtime.motion import Motion
+
+    avatar = Avatar.load(path)
+    names = avatar.skeleton.names
+    rest = Motion(np.eye(3)[None, None].repeat(len(names), 1), np.zeros((1, 3)), 30.0, names, "the rest pose")
+    return avatar, avatar.pose(rest, 0.0)
 
 
 def damage(draw: Any, honest: bytes, inner: Callable[[bytes, Any], bytes] | None) -> bytes:

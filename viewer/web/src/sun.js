@@ -2,26 +2,38 @@
 
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 
-const CAP = 6 * Math.PI / 180, RING = 10 * Math.PI / 180, LEAST_SHARE = 0.05, LARGEST = 512, LIMIT = 2;
+const CAP = 6 * Math.PI / 180, RING = 10 * Math.PI / 180, LEAST_SHARE = 0.05, LARGEST = 512, LIMIT = 2, MOST_PEAKS = 16, LAMP = 2 * Math.PI / 180;
+const RING_AREA = 2 * Math.PI * (1 - Math.cos(RING));
 
 /** {sky: light, suns: [{direction, irradiance, spread}]}, strongest first. */
 export function extractSuns(light) {
   const map = light.height > LARGEST ? downsize(light, LARGEST, 2 * LARGEST) : light;
   const { height, width } = map, radiance = Float64Array.from(map.radiance);
   const angles = texelSolidAngles(height, width), directions = texelDirections(height, width);
+  const bright = new Float64Array(height * width);  // luminance, -Infinity where a peak was passed over
   let total = 0;
-  for (let k = 0; k < height * width; k++)
-    total += luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]) * angles[Math.floor(k / width)];
-  const suns = [];
-  while (suns.length < LIMIT) {
-    let peak = 0, best = -1;
-    for (let k = 0; k < height * width; k++) {
-      const value = luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]);
-      if (value > best) { best = value; peak = k; }
+  for (let k = 0; k < height * width; k++) {
+    bright[k] = luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]);
+    total += bright[k] * angles[Math.floor(k / width)];
+  }
+  const suns = [], least = LEAST_SHARE * total;
+  for (let tried = 0; tried < MOST_PEAKS && suns.length < LIMIT; tried++) {
+    let peak = 0;
+    for (let k = 1; k < height * width; k++) if (bright[k] > bright[peak]) peak = k;
+    if (!(bright[peak] * RING_AREA >= least)) break;
+    const [x, y, z] = directions.subarray(3 * peak, 3 * peak + 3);
+    const found = peakAround({ radiance, directions, angles, height, width }, [x, y, z]);
+    if (!found) break;
+    if (!(luminance(...found.sun.irradiance) >= Math.max(least, 1e-30))) {
+      if (found.sun.spread > LAMP) break;
+      for (let k = 0; k < height * width; k++)
+        if (directions[3 * k] * x + directions[3 * k + 1] * y + directions[3 * k + 2] * z > Math.cos(CAP)) bright[k] = -Infinity;
+      continue;
     }
-    const found = peakAround({ radiance, directions, angles, height, width }, [...directions.subarray(3 * peak, 3 * peak + 3)]);
-    if (!found || !(luminance(...found.sun.irradiance) >= Math.max(LEAST_SHARE * total, 1e-30))) break;
-    for (const [k, ...value] of found.sky) radiance.set(value, 3 * k);
+    for (const [k, ...value] of found.sky) {
+      radiance.set(value, 3 * k);
+      bright[k] = Math.min(bright[k], luminance(...value));
+    }
     suns.push(found.sun);
   }
   suns.sort((a, b) => luminance(...b.irradiance) - luminance(...a.irradiance));
