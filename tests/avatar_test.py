@@ -152,7 +152,9 @@ def test_a_parent_that_no_joint_is_is_refused(tiny_avatar, tmp_path, parent) -> 
         next(prop.value for prop in onnx.load(tiny_avatar).metadata_props if prop.key == METADATA_KEY)
     )["skeleton"]
     skeleton["parents"][3] = parent
-    with pytest.raises(InputError, match=r"odd\.onnx: (skeleton parents: expected|.*Integer value out of range)"):
+    with pytest.raises(
+        InputError, match=r"odd\.onnx: (skeleton parents: expected|.*Integer value out of range)"
+    ):
         Avatar.load(_changed(tiny_avatar, tmp_path / "odd.onnx", lambda m: _metadata(m, skeleton=skeleton)))
 
 

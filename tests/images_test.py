@@ -131,7 +131,9 @@ def test_exr_of_halves_is_read_as_float32(tmp_path):
     assert (read_image(tmp_path / "a.exr") == pixels).all()
 
 
-@pytest.mark.parametrize("kinds", [("uint", "uint", "uint"), ("uint", "half", "float"), ("half", "half", "uint")])
+@pytest.mark.parametrize(
+    "kinds", [("uint", "uint", "uint"), ("uint", "half", "float"), ("half", "half", "uint")]
+)
 def test_exr_of_whole_numbers_is_refused_in_any_channel(tmp_path, kinds):
     """Read as floats, they come back divided by 2³² − 1."""
     _save(tmp_path / "a.exr", np.full((3, 5, 3), 7, np.float32), kinds[0], channelformats=kinds)

@@ -190,7 +190,9 @@ def test_members_damaged_in_any_compression_are_refused(tmp_path, method):
     data = bytearray((tmp_path / "a.npz").read_bytes())
     data[60:90] = bytes(30)
     (tmp_path / "a.npz").write_bytes(data)
-    with pytest.raises(InputError, match=r"a\.npz: poses: expected an array, got data that is cut short or damaged"):
+    with pytest.raises(
+        InputError, match=r"a\.npz: poses: expected an array, got data that is cut short or damaged"
+    ):
         load_motion(tmp_path / "a.npz", _skeleton())
 
 

@@ -90,7 +90,9 @@ def test_what_is_no_number_is_not_drawn(device, field, value):
     surfaces, count = device.posing.pose(_unposed(rest, inputs)), len(rest.points)
     with np.errstate(all="ignore"):
         means, covariances, *_ = pose_reference(rest, *inputs)
-    ours = [_rows(texture, count) for texture in (surfaces.points, surfaces.covariances, surfaces.covariances_z)]
+    ours = [
+        _rows(texture, count) for texture in (surfaces.points, surfaces.covariances, surfaces.covariances_z)
+    ]
     exact = np.hstack([means, covariances])
     assert (np.isfinite(np.hstack([ours[0][:, :3], *ours[1:]])).all(1) == np.isfinite(exact).all(1)).all()
 

@@ -204,7 +204,10 @@ def test_what_is_not_drawn(mean, upper, opacity, feature):
 
 def test_drawing_begins_ten_centimetres_away():
     means, upper = np.array([(0, 0, 0.0999), (0, 0, 0.1001)]), isotropic(0.01, 0.01)
-    assert oracle.drawn(means, upper, np.full(2, 0.5), np.ones((2, 1)), straight(8, 8)).tolist() == [False, True]
+    assert oracle.drawn(means, upper, np.full(2, 0.5), np.ones((2, 1)), straight(8, 8)).tolist() == [
+        False,
+        True,
+    ]
 
 
 def test_no_gaussians_give_an_empty_picture():
