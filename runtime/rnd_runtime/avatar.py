@@ -151,9 +151,9 @@ class Avatar:
         Raises :class:`InputError` where the file's graph cannot be evaluated: its indices are looked at only then.
         """
         session = self._session(tuple(outputs))
-        values = dict(zip(("pose_window", "joint_velocity", "bone_transforms"), inputs))
+        given = dict(zip(("pose_window", "joint_velocity", "bone_transforms"), inputs))
         values = {
-            wanted.name: np.ascontiguousarray(values[wanted.name], np.float32)
+            wanted.name: np.ascontiguousarray(given[wanted.name], np.float32)
             for wanted in session.get_inputs()
         }
         try:
