@@ -20,15 +20,8 @@ from .files import atomic_path, existing_file
 # What numpy and zipfile raise for archives that are cut, scrambled, encrypted or hold Python objects.
 _UNREADABLE = (
     *(ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError),
-    *(
-        zlib.error,
-        lzma.LZMAError,
-        zipfile.BadZipFile,
-        struct.error,
-        tokenize.TokenError,
-        SyntaxError,
-        TypeError,
-    ),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, struct.error),
+    *(tokenize.TokenError, SyntaxError, TypeError),
 )
 
 

@@ -22,9 +22,7 @@ _RING = np.radians(10)  # its background is the median between _CAP and here
 _LARGEST = (512, 1024)  # a third of a degree a texel tells the direction; larger maps only cost memory
 _LEAST_SHARE = 0.05  # of the map's luminance; less is not worth a shadow of its own
 _MOST_PEAKS = 16  # that are looked at: lamps too weak for a sun may be brighter than it
-_LAMP = np.radians(
-    2
-)  # of their spread; what is wider and no sun is a window, and others would be pieces of it
+_LAMP = np.radians(2)  # of their spread: what is wider and no sun is a window, whose pieces are none either
 _RING_AREA = 2 * np.pi * (1 - np.cos(_RING))  # sr: more than a peak covers, whatever the texels
 
 
