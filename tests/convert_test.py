@@ -26,6 +26,7 @@ from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.motion_files import SMPLH_NAMES
 from rnd_runtime.npz import save_npz
+from rnd_runtime.outline import sharpened
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
@@ -94,7 +95,7 @@ def _covariances(quaternions_xyzw: np.ndarray, scales: np.ndarray) -> np.ndarray
 
 def _drawn(means, covariances, opacities, colours) -> np.ndarray:
     arrays = (np.ascontiguousarray(a, np.float32) for a in (means, covariances, opacities, colours))
-    return rasterize(*arrays, _camera()).image
+    return sharpened(rasterize(*arrays, _camera())).image
 
 
 def _drawn_ply(path: Path, half_turn: bool) -> np.ndarray:

@@ -14,6 +14,7 @@ from rnd_runtime.frame import FrameRenderer, as_seen_from, facing
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.outline import sharpened
 from rnd_runtime.raster_cpu import Projected, rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
@@ -65,7 +66,9 @@ def test_a_frame_is_its_parts(avatar, motion, sky):
     gaussians = avatar.posed(encoded)
     shader, camera = as_seen_from(encoded.root, Shader(sky), CAMERA)
     radiance = shader.shade(gaussians, camera.position)
-    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera)
+    expected = sharpened(
+        rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera)
+    )
     np.testing.assert_array_equal(frame.radiance, expected.image)
     np.testing.assert_array_equal(frame.alpha, expected.alpha)
     np.testing.assert_array_equal(frame.image, to_bytes(linear_to_srgb(expected.image)))

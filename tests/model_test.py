@@ -12,7 +12,7 @@ from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.data import pose_input
 from rnd_trainer.encoders import SH_DC_OF_ONE, JointAttention, positional_encoding
-from rnd_trainer.model import ALBEDO_RANGE, AvatarModel, PoseInput
+from rnd_trainer.model import ALBEDO_RANGE, GLOSSIEST_RESIDUAL, AvatarModel, PoseInput
 from rnd_trainer.template import sample_template
 from tiny import body, motion
 
@@ -79,6 +79,20 @@ def test_attributes_are_valid_for_any_weights(model) -> None:
     assert torch.allclose(static.normals.norm(dim=-1), torch.ones(600), atol=1e-5)
     weights = model(_pose(model)).weights
     assert (weights >= 0).all() and torch.allclose(weights.sum(1), torch.ones(600), atol=1e-5)
+
+
+def test_what_is_played_is_hardly_glossier_than_the_networks_say(model) -> None:
+    with torch.no_grad():
+        model.appearance_residual[:, -1] = torch.tensor([-9, -0.3, 0, 9.0]).repeat(150)
+        trained = model.attributes(model.encoded_nodes()).roughness
+        played = model.eval().attributes(model.encoded_nodes()).roughness
+        model.appearance_residual[:, -1].clamp_(min=GLOSSIEST_RESIDUAL)
+        bounded = model.train().attributes(model.encoded_nodes()).roughness
+    assert torch.equal(played, bounded)
+    drifted = torch.tensor([True, False, False, False]).repeat(150)
+    assert (played[drifted] > trained[drifted] + 0.1).all() and torch.equal(
+        played[~drifted], trained[~drifted]
+    )
 
 
 def test_skinning_weights_change_with_motion_not_only_with_pose(model) -> None:

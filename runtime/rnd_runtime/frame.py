@@ -23,6 +23,7 @@ from .camera import Camera, Floats
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
 from .light import Light
 from .motion import Motion
+from .outline import sharpened
 from .raster import ChosenRasterizer, Kind, make_rasterizer
 from .shading import Shader
 from .tone import tone_map
@@ -118,7 +119,7 @@ def draw_encoded(
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
         unposed = avatar.unposed(encoded)
         if unposed is not None:
-            return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
+            return sharpened(rasterizer.renderer.draw(unposed, shader, camera, cull=cull))
     started = perf_counter()
     gaussians = avatar.posed(encoded)
     posing = perf_counter() - started
@@ -140,14 +141,14 @@ def draw(
     cull: float | None = None,
     kept: KeptRadiance | None = None,
 ) -> Raster:
-    """Shade what can be seen and splat it: the raster's picture is linear radiance [H, W, 3], without depth.
+    """Shade what can be seen, splat it and sharpen outlines: linear radiance [H, W, 3], without depth.
 
     ``cull`` as of :class:`FrameRenderer`. With ``kept``, only Gaussians are shaded that were not seen since it was
     made. The raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept``
     radiance, which is the CPU's.
     """
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
-        return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
+        return sharpened(rasterizer.renderer.draw(gaussians, shader, camera, cull=cull))
     started = perf_counter()
     opacities = gaussians.opacities
     if cull is not None:
@@ -156,13 +157,13 @@ def draw(
         radiance = _shade(gaussians, shader, camera, opacities >= _LEAST_OPACITY, kept)
         shaded = perf_counter()
         raster = rasterizer(gaussians.means, gaussians.covariances, opacities, radiance, camera, depth=False)
-        return replace(raster, seconds={"shading": shaded - started, **raster.seconds})
+        return sharpened(replace(raster, seconds={"shading": shaded - started, **raster.seconds}))
     projected = raster_cpu.Projected(gaussians.means, gaussians.covariances, opacities, camera)
     seen = perf_counter()
     radiance = _shade(gaussians, shader, camera, projected.drawn, kept)
     seconds = {"projection": seen - started, "shading": perf_counter() - seen}
     raster = projected.draw(radiance)
-    return replace(raster, seconds={**seconds, **raster.seconds})
+    return sharpened(replace(raster, seconds={**seconds, **raster.seconds}))
 
 
 class KeptRadiance:

@@ -56,7 +56,9 @@ def reference(avatar_file: Path, scene: Scene, size: int, folder: Path) -> Refer
         camera, pictures = bench_camera(size, scene.view), []
         for k in range(len(COMPARED)):
             arrays = (lit["means"][k], lit["covariances"][k], lit["opacities"], lit["radiance"][k])
-            pictures.append(raster_oracle.rasterize(*arrays, camera).image)
+            drawn = raster_oracle.rasterize(*arrays, camera)
+            covered = drawn.alpha[..., None]
+            pictures.append(drawn.image * covered * (3 - 2 * covered))  # as rnd_runtime.outline says
         return {"radiance": np.array(pictures)}
 
     pictures = _kept(folder / f"{stem}_{size}.npz", drawn)

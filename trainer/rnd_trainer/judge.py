@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.outline import sharpened
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_runtime.skeleton import taken_along
@@ -64,7 +65,9 @@ def render_runtime(
         radiance = _shade(model, gaussians, posed, pose, camera, shader.in_frame(root[:3, :3]))
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
-    raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
+    raster = sharpened(
+        rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
+    )
     image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
 

@@ -36,6 +36,9 @@ START_OPACITY = 2.2
 GEOMETRY_COLUMNS = {"opacity": 1, "rotation": 3, "scale": 3, "normal": 3, "offset": 3}
 LIMB_BUFFERS = ("limb_axes", "limb_levers", "limb_shares")
 APPEARANCE_COLUMNS = {"colour": 3, "albedo": 3, "roughness": 1}
+GLOSSIEST_RESIDUAL = -0.6
+"""how much glossier than the networks say a Gaussian may be played, before the sigmoid: where no picture shows the
+light's reflection, nothing keeps gloss from drifting. Bounded in training as well it is worth less (docs/tried.md)"""
 
 
 @dataclass
@@ -153,6 +156,8 @@ class AvatarModel(nn.Module):
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
         smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
         residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
+        if not self.training:
+            residual = torch.cat([residual[:, :-1], residual[:, -1:].clamp(min=GLOSSIEST_RESIDUAL)], dim=-1)
         part = _by_name(smooth + residual, columns)
         place = _by_name(smooth, columns)["offset"]
         tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0

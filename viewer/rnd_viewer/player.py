@@ -14,6 +14,7 @@ from rnd_runtime.frame import KeptRadiance, as_seen_from, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
+from rnd_runtime.outline import sharpened
 from rnd_runtime.shading import Shader
 from rnd_runtime.tone import tone_map, tone_map_straight
 
@@ -146,7 +147,7 @@ class Player:
         with self.times.stage("shading"):
             radiance = shader.shade(gaussians, camera.position)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
-        return self.rasterizer(
+        raster = self.rasterizer(
             gaussians.means,
             gaussians.covariances,
             gaussians.opacities,
@@ -154,6 +155,7 @@ class Player:
             camera,
             depth="depth" in self.aovs,
         )
+        return sharpened(raster)
 
     def _radiance_behind(self, camera: Camera) -> Floats32 | None:
         """The background, kept for as long as camera and light stand still."""

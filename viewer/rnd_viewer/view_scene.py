@@ -22,6 +22,7 @@ from rnd_runtime.gaussians import Gaussians, Raster
 from rnd_runtime.light import Light, downsize, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.motion_edit import edit_motion
+from rnd_runtime.outline import sharpened
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.tone import tone_map
@@ -125,7 +126,7 @@ class Scene:
         else:
             features = splat_features((state.output,), gaussians, beside)[0].astype(np.float32)
             arrays = gaussians.means, gaussians.covariances, gaussians.opacities
-            raster = self.rasterizer(*arrays, features, beside, depth=False)
+            raster = sharpened(self.rasterizer(*arrays, features, beside, depth=False))
         started = perf_counter()
         if state.output in ("lit", "light", "albedo"):
             srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))

@@ -64,6 +64,7 @@ vec3 srgb(vec3 linear) {
 void main() {
     ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
     vec4 value = blend(at);
+    value *= value.a * (3.0 - 2.0 * value.a);  // outlines as sharp as a body's: rnd_runtime/outline.py
     vec3 result;
     if (show == 0) {
         vec3 far = behind == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
