@@ -1,4 +1,4 @@
-"""What is done to outlines: the formula in float64, what it must leave alone, and that every picture has it."""
+"""What is done to outlines: the formula in float64, and what it must leave alone."""
 
 import numpy as np
 import pytest

@@ -152,6 +152,7 @@ class AvatarModel(nn.Module):
 
         The surface as a whole may leave the template by ``max_static_offset``; a Gaussian may stray from that
         surface by one spacing and no more: farther ones would show as spikes and as speckled shadows.
+        In evaluation mode the residual of roughness, the last column, is ``GLOSSIEST_RESIDUAL`` at least.
         """
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
         smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
