@@ -78,6 +78,11 @@ class FrameRenderer:
         self._shader = Shader(light, shade)
         self._rasterizer = make_rasterizer(raster)
 
+    @property
+    def draws_with(self) -> str:
+        """The rasteriser's name: ``cpu``, or one with OpenGL's backend and device."""
+        return self._rasterizer.name
+
     def turn(self, yaw: float) -> None:
         """Turn the light to ``yaw`` radians (as :class:`rnd_runtime.light.Light`); costs nothing."""
         self._shader = self._shader.turned(yaw)
@@ -93,7 +98,7 @@ class FrameRenderer:
             self.avatar, encoded, self._shader, self.camera, self._rasterizer, cull=self.cull
         )
         started = perf_counter()
-        image = tone_map(raster.image, raster.alpha)
+        image = tone_map(raster.image, raster.alpha) if raster.srgb is None else raster.srgb
         seconds = {**encoded.seconds, **raster.seconds, "tone map": perf_counter() - started}
         return Frame(image, raster.image, raster.alpha, seconds)
 
@@ -119,7 +124,7 @@ def draw_encoded(
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
         unposed = avatar.unposed(encoded)
         if unposed is not None:
-            return sharpened(rasterizer.renderer.draw(unposed, shader, camera, cull=cull))
+            return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
     started = perf_counter()
     gaussians = avatar.posed(encoded)
     posing = perf_counter() - started
@@ -148,7 +153,7 @@ def draw(
     radiance, which is the CPU's.
     """
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
-        return sharpened(rasterizer.renderer.draw(gaussians, shader, camera, cull=cull))
+        return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
     opacities = gaussians.opacities
     if cull is not None:

@@ -1,4 +1,4 @@
-"""Frames on an OpenGL device: posed, projected, shaded and splatted there.
+"""Frames on an OpenGL device: posed, projected, shaded, splatted and tone mapped there.
 
 What the networks say goes up and the picture comes back. In between nothing crosses where the device can sort (see
 ``projection_gl``).
@@ -12,6 +12,7 @@ import moderngl
 import numpy as np
 
 from .camera import Camera
+from .finish_gl import GlFinish
 from .gaussians import Gaussians, Raster
 from .gl_passes import Pass
 from .posing import Unposed
@@ -40,7 +41,9 @@ class GlRenderer:
     def draw(
         self, body: Gaussians | Unposed, shader: Shader, camera: Camera, *, cull: float | None = None
     ) -> Raster:
-        """The picture's linear radiance [H, W, 3], without depth; only Gaussians that reach it are shaded.
+        """The picture's linear radiance [H, W, 3], outlines sharpened, without depth.
+
+        Only Gaussians that reach it are shaded.
 
         Args:
             body: posed on the CPU, or what is posed here.
@@ -59,10 +62,9 @@ class GlRenderer:
                 self._passes = _Passes(context, self._sorting)
             seconds = self._draw(context, self._passes, body, shader, camera, cull)
             started = perf_counter()
-            (picture,) = self._rasterizer.read(RADIANCE, camera)
+            picture = self._passes.finish.read(camera)
             seconds["read-back"] = perf_counter() - started
-        alpha = picture[..., 3]
-        return Raster(picture[..., :3], alpha, np.zeros_like(alpha), seconds)
+        return Raster(picture.image, picture.alpha, np.zeros_like(picture.alpha), seconds, picture.srgb)
 
     def close(self) -> None:
         """Release everything but the rasteriser."""
@@ -106,6 +108,7 @@ class GlRenderer:
             )
         finished("shading")
         self._rasterizer.blend(passes.splat, textures, ranks, RADIANCE, camera)
+        passes.finish.run(self._rasterizer.targets_for(RADIANCE, camera).textures[0], camera)
         finished("raster")
         return seconds
 
@@ -117,7 +120,8 @@ class _Passes:
         self.posing, self.upload = GlPosing(context), SurfaceUpload(context)
         self.projection, self.shading = GlProjection(context, sorting), GlShading(context)
         self.splat: Pass = splat_pass(context, RADIANCE, lit=True)
+        self.finish = GlFinish(context)
 
     def release(self) -> None:
-        for part in (self.posing, self.upload, self.projection, self.shading, self.splat):
+        for part in (self.posing, self.upload, self.projection, self.shading, self.splat, self.finish):
             part.release()

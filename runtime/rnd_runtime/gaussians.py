@@ -55,12 +55,14 @@ class Raster:
         depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
         seconds: how long each stage took, by its name: "projection+sort", "raster" and, from a GL target, "read-back";
             who draws whole frames adds what comes before, and on the CPU tells "projection" and "sort" apart.
+        srgb: [H, W, 3] 8-bit over black, the bytes of :func:`rnd_runtime.tone.tone_map`, where a device made them.
     """
 
     image: Floats32
     alpha: Floats32
     depth: Floats32
     seconds: Mapping[str, float] = field(default_factory=dict)
+    srgb: NDArray[np.uint8] | None = None
 
 
 class Rasterizer(Protocol):

@@ -49,6 +49,11 @@ def tone_map_straight(radiance: ArrayLike, alpha: ArrayLike) -> Bytes:
     return image
 
 
+def code_steps() -> Floats32:
+    """The least float32 of every code, and infinity [257]: ``steps[c] <= x < steps[c + 1]`` has the code c."""
+    return _tables()[0]
+
+
 def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]:
     radiance, alpha = floats(radiance), floats(alpha)
     if alpha.ndim != 2 or radiance.shape != (*alpha.shape, 3):
@@ -58,7 +63,7 @@ def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]
 
 @cache
 def _tables() -> tuple[Floats32, NDArray[np.uint8]]:
-    """The least float32 of every code, infinity after the last [257], and the code that each cell starts with."""
+    """:func:`code_steps`, and the code that each cell starts with."""
     codes = np.arange(1, 256)
     low = np.zeros(255, np.int64)  # bits of positive floats are ordered as the floats are
     high = np.full(255, np.float32(1).view(np.int32), np.int64)

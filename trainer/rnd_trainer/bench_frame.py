@@ -57,7 +57,8 @@ class Drawn(NamedTuple):
     """Times of a point, and what it drew at the frames ``COMPARED``.
 
     ``row``: ms_median, ms_p95, stages (median ms), stages_p95, cold_start_ms (from the start of the process to its
-    first frame), peak_mb, file_mb, frames. ``radiance`` [K, H, W, 3] linear, premultiplied; ``means`` [K, N, 3] m.
+    first frame), peak_mb, file_mb, frames, renderer (what drew). ``radiance`` [K, H, W, 3] linear, premultiplied;
+    ``means`` [K, N, 3] m.
     """
 
     row: dict[str, Any]
@@ -139,6 +140,7 @@ def draw(folder: str, spawned: float) -> None:
         "file_mb": Path(point.avatar).stat().st_size / 1e6,
         "frames": len(taken),
         "warmup": WARMUP,
+        "renderer": renderer.draws_with,
     }
     (out / "row.json").write_text(json.dumps(row), encoding="utf-8")
     np.savez(out / "drawn.npz", radiance=np.array(compared), means=np.array(means))

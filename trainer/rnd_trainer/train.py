@@ -135,12 +135,16 @@ class Training:
         view, pose = self.views[view_index], self.poses[view_index]
         pose = noisy(pose, self.config.pose_noise, self.generator)
         terms = self._picture_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
-        total = torch.stack(list(terms.values())).sum()
+        values = torch.stack(list(terms.values()))
+        total = values.sum()
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(total))
         if finite:
             total.backward()
-            finite = all(bool(torch.isfinite(p.grad).all()) for p in self._parameters() if p.grad is not None)
+            grads = [p.grad for p in self._parameters() if p.grad is not None]
+            finite = bool(
+                torch.stack([torch.isfinite(grad).all() for grad in grads]).all()
+            )  # a GPU waits once
         if finite:
             self.optimizer.step()
         self.bad_steps = 0 if finite else self.bad_steps + 1
@@ -149,9 +153,7 @@ class Training:
                 f"training: {MAX_BAD_STEPS} steps in a row were not finite",
                 frame=view.frame.frame,
             )
-        done = Step(
-            self.step_index, stage, {name: float(value.detach()) for name, value in terms.items()}, not finite
-        )
+        done = Step(self.step_index, stage, dict(zip(terms, values.tolist())), not finite)
         self.step_index += 1
         self._light_up()  # now, so that what is saved and shown after the first stage is lit
         self.seconds += time.perf_counter() - started

@@ -35,12 +35,14 @@ class Frame:
         alpha: [H, W].
         behind: linear radiance of the background, [H, W, 3] or [3]; None leaves the picture transparent.
         aovs: what the EXR layers hold, [H, W, C] for each name (see :mod:`rnd_viewer.aov`).
+        on_black: [H, W, 3] 8-bit sRGB without the background, where a device has made it already.
     """
 
     radiance: Floats32
     alpha: Floats32
     behind: Floats32 | None
     aovs: dict[str, Floats32]
+    on_black: NDArray[np.uint8] | None = None
 
     def linear(self) -> Floats32:
         """Linear R, G, B, A [H, W, 4], premultiplied; over a background alpha is 1."""
@@ -54,6 +56,8 @@ class Frame:
 
         Splats are blended in linear light and coded at the end, as in training.
         """
+        if self.behind is None and self.on_black is not None:
+            return self.on_black
         return tone_map(self.radiance, self.alpha, self.behind)
 
     @cached_property
@@ -122,7 +126,7 @@ class Player:
                 splatted = raster.image[..., start : start + len(CHANNELS[name])]
                 start += len(CHANNELS[name])
             aovs[name] = aov_values(name, splatted, raster.alpha)
-        return Frame(raster.image[..., :3], raster.alpha, behind, aovs)
+        return Frame(raster.image[..., :3], raster.alpha, behind, aovs, raster.srgb)
 
     def _cheaper_raster(
         self, gaussians: Gaussians, shader: Shader, camera: Camera, quality: Quality

@@ -22,6 +22,11 @@ const float LOG2_255 = 7.9943534368588578;
 const float HALF_LOG2_E = 0.72134752044448170;
 const float HUGE = 1e30;
 
+// By its bits: drivers may turn comparisons round as if there were no NaN, and NVIDIA's do.
+bool finite(float x) {
+    return (floatBitsToUint(x) & 0x7f800000u) != 0x7f800000u;
+}
+
 void main() {
     ivec2 texel = ivec2(gl_FragCoord.xy);
     if (texel.y * ROW_GAUSSIANS + texel.x >= count) discard;
@@ -36,8 +41,10 @@ void main() {
 
     vec3 p = mean * axes + translation;
     vec3 to_eye = eye - mean;
+    float towards = dot(to_eye, outward.xyz);
+    if (!finite(p.x + p.y + p.z) || !finite(opacity) || !finite(trace) || !finite(towards)) return;
     bool usable = p.z >= NEAR && p.z < HUGE && opacity >= 1.0 / 255.0 && opacity < HUGE && trace > 0.0 && trace < HUGE;
-    if (!usable || !(dot(to_eye, outward.xyz) >= facing * length(to_eye))) return;
+    if (!usable || towards < facing * length(to_eye)) return;
 
     vec2 slope = clamp(p.xy / p.z, slopes.xy, slopes.zw);
     vec3 along_x = pinhole.x / p.z * (axes[0] - slope.x * axes[2]);
@@ -49,6 +56,7 @@ void main() {
     float yy = dot(along_y, sigma * along_y) + DILATION;
     float shear = xy / yy;
     float conditional = max(xx - xy * shear, DILATION);  // no less, were there no rounding
+    if (!finite(xx + yy) || !finite(conditional)) return;
     if (!(xx > 0.0 && xx < HUGE && yy > 0.0 && yy < HUGE && conditional < HUGE)) return;
 
     vec2 along = pinhole.xy * p.xy / p.z, centre = along + pinhole.zw;
