@@ -15,6 +15,7 @@ import numba
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils import get_total_norm
 
 from rnd_runtime.capture import Capture
 from rnd_runtime.doctor import machine
