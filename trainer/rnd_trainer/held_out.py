@@ -147,6 +147,7 @@ def _provenance(checkpoint: Any) -> dict[str, Any]:
     info, config = checkpoint.info, checkpoint.config
     return {
         "minutes": info.get("minutes"), "train_threads": info.get("threads"), "train_machine": info.get("machine"),
+        "train_device": info.get("device"),
         "capture": info.get("capture"), "train_motion": info.get("motion"),
         "steps": config.steps,
         "step": info.get("step"), "seed": config.seed,

@@ -143,9 +143,7 @@ class Training:
         if finite:
             total.backward()
             grads = [p.grad for p in self._parameters() if p.grad is not None]
-            finite = bool(
-                torch.stack([torch.isfinite(grad).all() for grad in grads]).all()
-            )  # a GPU waits once
+            finite = bool(torch.isfinite(get_total_norm(grads)))  # asked once: a GPU must be waited for
         if finite:
             self.optimizer.step()
         self.bad_steps = 0 if finite else self.bad_steps + 1
@@ -373,6 +371,7 @@ class Training:
             "minutes": round(self.seconds / 60, 3),
             "threads": numba.get_num_threads(),
             "machine": machine(),
+            "device": "cpu" if self.device.type == "cpu" else torch.cuda.get_device_name(self.device),
             "pictures": len(self.views),
             "spacing_m": float(self.model.spacing),
             "perceptual": None if self.perceptual is None else self.perceptual.backbone,
