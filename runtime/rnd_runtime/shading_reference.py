@@ -12,7 +12,7 @@ from .sh import sh_basis
 
 Floats = NDArray[np.float64]
 
-_CHUNK = 256  # Gaussians at a time: some arrays of 256 × 2048 float64, 4 MB each
+_AT_A_TIME = 2**19  # pairs of a Gaussian and a texel: some arrays of float64, 4 MB each
 
 
 def shade_reference(
@@ -38,8 +38,9 @@ def shade_reference(
     to_camera = np.asarray(camera_position, np.float64) - gaussians.means
     to_camera /= np.linalg.norm(to_camera, axis=-1, keepdims=True)
     radiance = np.empty((len(gaussians.means), 3))
-    for start in range(0, len(radiance), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    chunk = max(1, _AT_A_TIME // len(directions))
+    for start in range(0, len(radiance), chunk):
+        part = slice(start, start + chunk)
         normals = np.asarray(gaussians.normals[part], np.float64)
         n_dot_l, l_dot_v = normals @ directions.T, to_camera[part] @ directions.T  # [chunk, K]
         n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)

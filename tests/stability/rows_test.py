@@ -17,10 +17,6 @@ KNOWN: dict[str, tuple[tuple[str, ...], str]] = {
         ("albedo 0:",),
         "what GGX scatters twice is lost, as in the paper",
     ),
-    "L10": (
-        ("the same at roughness 0.1",),
-        "the split sum's lobe is wider than a mirror's at grazing angles",
-    ),
 }
 
 

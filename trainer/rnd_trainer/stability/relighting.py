@@ -277,10 +277,14 @@ def _flipped_capture(subject: Subject) -> Figure:
 
 
 def grazing(subject: Subject) -> Result:
-    """L10: the specular term at silhouettes against the sum over a map fine enough for the sharpest lobe."""
+    """L10: the specular term at silhouettes against the sum over a map fine enough for the lobe.
+
+    At roughness 0.1 the lobe is a degree wide: next to 2048 rows of texels, 256 err by up to 11 %, 512 by 3 % and 1024
+    by less than 1 %.
+    """
     worst: dict[float, float] = {}
     finite = True
-    for roughness in (0.1, 0.3, 0.6, 0.9):
+    for roughness, rows in ((0.1, subject.few(512, 1024)), (0.3, 256), (0.6, 256), (0.9, 256)):
         count = 3000
         dark = replace(
             ball(count),
@@ -293,7 +297,7 @@ def grazing(subject: Subject) -> Result:
             cosine = (dark.normals * view).sum(1) / np.linalg.norm(view, axis=1)
             part = _part(dark, np.flatnonzero((cosine > 0) & (cosine < GRAZING)))
             ours = Shader(subject.light, "table+sun").shade(part, eye)
-            exact = shade_reference(part, subject.light, eye, texels=(256, 512))
+            exact = shade_reference(part, subject.light, eye, texels=(rows, 2 * rows))
             finite &= bool(np.isfinite(ours).all())
             worst[roughness] = float(np.maximum(worst.get(roughness, 0.0), ours.mean() / exact.mean() - 1))
     rough = max(excess for roughness, excess in worst.items() if roughness > 0.1)
@@ -304,7 +308,7 @@ def grazing(subject: Subject) -> Result:
             10,
             "%",
         ),
-        at_most("the same at roughness 0.1, a lobe sharper than the map", 100 * worst[0.1], 10, "%"),
+        at_most("the same at roughness 0.1", 100 * worst[0.1], 10, "%"),
         at_most("not finite", float(not finite), 0),
     )
     return Result(figures)
