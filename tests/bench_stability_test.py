@@ -136,6 +136,18 @@ def test_a_short_soak_has_no_slope_of_memory():
     assert figures[0].measured is None and len(figures) == 2 and figures[1].passes
 
 
+def test_memory_that_a_kind_of_step_asks_for_once_is_no_leak_and_one_that_grows_is():
+    """Readings every twenty steps from the 200th on; the second kind begins with step 800."""
+    once, leak = [0] * 30 + [10**6] * 60, [2_000 * 20 * k for k in range(90)]
+    for memory, passes in ((once, True), (leak, False)):
+        segment = {"frames": 2000, "memory": memory, "seconds": [], "loads": [], "wrong": 0}
+        figures = soak._figures("training", [segment], False, (800, 2000))
+        assert [figure.what.partition(": ")[2] for figure in figures] == [
+            "memory a frame", "memory a frame, within each kind of step",
+        ]  # fmt: skip
+        assert figures[1].passes is passes
+
+
 @pytest.fixture(scope="module")
 def bare(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory) -> Subject:
     """A capture of five pictures to train on: no other lights or poses, no albedo, no normals."""

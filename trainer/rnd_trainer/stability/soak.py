@@ -139,6 +139,10 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
     frames = sum(segment["frames"] for segment in segments)
     what = f"{name}, {frames}: memory a frame"
     figures = [below(what, max(slopes), SLOPE_BYTES, "bytes") if slopes else not_measured(what, TOO_SHORT)]
+    within = [_slope(part) for s in segments for part in _parts(s["memory"], borders) if len(part) > 10]
+    if borders and within:
+        what = f"{name}, {frames}: memory a frame, within each kind of step"
+        figures.append(below(what, max(within), SLOPE_BYTES, "bytes"))
     paces: list[tuple[str, list[tuple[int, int | None]]]] = [("end over start", [(0, None)])]
     if borders:
         paces.append(("of each kind of step, end over start", list(pairwise((0, *borders)))))
@@ -154,6 +158,12 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
         wrong = sum(segment["wrong"] for segment in segments)
         figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
     return figures
+
+
+def _parts(readings: list[int], borders: Sequence[int]) -> list[list[int]]:
+    """``readings`` cut where a kind of frame or step begins, which asks for memory of its own, once."""
+    places = [max(0, -(-border // EVERY) - WARM // EVERY) for border in (0, *borders)]
+    return [readings[start:end] for start, end in pairwise(places)]
 
 
 def _slope(readings: list[int]) -> float:
