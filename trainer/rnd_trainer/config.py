@@ -74,12 +74,19 @@ class TrainConfig:
     """start the second stage from a sky and suns found by least squares, instead of from a white probe"""
 
     rate_networks: float = 2e-3
-    """Adam's step for the networks; decays to a tenth"""
+    """Adam's step for the networks, at the start"""
     rate_residuals: float = 3e-2
-    """Adam's step for the per-Gaussian residuals; decays to a tenth. Half of it leaves LPIPS higher, twice as much
-    loses 0.2 dB (docs/tried.md)"""
+    """Adam's step for the per-Gaussian residuals. Half of it leaves LPIPS higher, twice as much loses 0.2 dB
+    (docs/tried.md)"""
     rate_light: float = 1e-2
     """Adam's step for the logarithms of the probe's texels"""
+    rate_kept: float = 0.5
+    """share of all rates that is left at the last picture, falling exponentially. A tenth, as it was, ends a training
+    before it has learned what it could: half a dB at a quarter of the steps (docs/tried.md)"""
+    rate_cooled: float = 0.15
+    """what is left of that after the last steps, over which rates fall once more: large ones leave noise"""
+    cooling_fraction: float = 0.15
+    """share of the steps that are these"""
 
     weight_dssim: float = 0.2
     """of 1 − SSIM beside L1, in image terms"""
@@ -193,9 +200,12 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     """Rebuild a configuration; an unknown field is an error.
 
     A missing one has the value it has today: a checkpoint from before a switch existed was trained without it. So the
-    third stage, the repulsion and the black backgrounds, which are on today, are off there.
+    third stage, the repulsion and the black backgrounds, which are on today, are off there, and rates fall as they did.
     """
-    before = {"unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0, "weight_smooth": 0.0}
+    before = {
+        "unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0, "weight_smooth": 0.0,
+        "rate_kept": 0.1, "rate_cooled": 1.0,
+    }  # fmt: skip
     return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
 
 

@@ -36,11 +36,16 @@ class Schedule:
         return 1 if step < self.first_stage else 2
 
     def decay(self, step: int) -> float:
-        """Of the rates: 1 at the start, 0.1 at the last picture, exponential; and once more in the third stage."""
-        steps = self.config.steps
-        if step < steps:
-            return 0.1 ** (step / steps)
-        return 0.1 ** ((step - steps) / (self.total - steps))
+        """Of the rates: 1 at the start, then falling slowly, and fast in the last steps with a picture.
+
+        In the third stage from 1 to a tenth, exponentially.
+        """
+        config, steps = self.config, self.config.steps
+        if step >= steps:
+            return float(0.1 ** ((step - steps) / (self.total - steps)))
+        done, cooling = step / steps, config.cooling_fraction
+        cooled = max(0.0, done - (1 - cooling)) / cooling if cooling > 0 else 0.0
+        return float(config.rate_kept**done * config.rate_cooled**cooled)
 
     def refines(self, step: int) -> bool:
         """Whether body poses may move by then."""
