@@ -35,10 +35,10 @@ def main() -> None:
 
     def command() -> None:
         context = create_context("egl")
-        if is_software(context):
-            raise InputError(
-                "a graphics card", expected="OpenGL through EGL that runs on one", got=renderer(context)
-            )
+        software, name = is_software(context), renderer(context)
+        context.release()  # each point opens its own
+        if software:
+            raise InputError("a graphics card", expected="OpenGL through EGL that runs on one", got=name)
         assets = ROOT / "assets"
         checkpoints = (options.checkpoint,) if options.checkpoint else ()
         inputs = Inputs(

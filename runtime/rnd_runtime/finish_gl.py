@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .camera import Camera
 from .gaussians import Floats32
 from .gl_context import is_software
-from .gl_passes import Pass
+from .gl_passes import Pass, Targets
 from .tone import code_steps
 
 CHANNELS, PACKED = 3, 4  # of a pixel; numbers in a texel
@@ -46,13 +46,11 @@ class GlFinish:
         self._alpha_pass = Pass(context, ("fill.vert",), ("finish.glsl", "finish_alpha.frag"))
         self._steps = context.texture((len(code_steps()), 1), 1, code_steps().tobytes(), dtype="f4")
         self._steps.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        self._targets: tuple[moderngl.Framebuffer, moderngl.Framebuffer] | None = None
-        self._textures: list[moderngl.Texture] = []
-        self._size = (0, 0)
+        self._targets: tuple[Targets, Targets] | None = None
 
     def run(self, blended: moderngl.Texture, camera: Camera) -> None:
         """Finish ``blended``, a texture of the camera's size: premultiplied radiance and alpha."""
-        packed, alpha = self._targets_for(camera)
+        packed, alpha = (targets.framebuffer for targets in self._targets_for(camera))
         self._context.enable_only(moderngl.NOTHING)
         packed.use()
         self._pass.bind({"blended": blended, "steps": self._steps}, width=camera.width)
@@ -63,7 +61,7 @@ class GlFinish:
 
     def read(self, camera: Camera) -> Finished:
         """What :meth:`run` made for ``camera``."""
-        packed, coverage = self._targets_for(camera)
+        packed, coverage = (targets.framebuffer for targets in self._targets_for(camera))
         alpha = np.empty((camera.height, camera.width), np.float32)
         coverage.read_into(alpha, components=1, dtype="f4", alignment=1)
         rows = (camera.height, PACKED * _texels(camera.width))
@@ -77,33 +75,22 @@ class GlFinish:
         self._pass.release()
         self._alpha_pass.release()
         self._steps.release()
-        self._release_targets()
+        for targets in self._targets or ():
+            targets.release()
+        self._targets = None
 
-    def _targets_for(self, camera: Camera) -> tuple[moderngl.Framebuffer, moderngl.Framebuffer]:
-        size = camera.width, camera.height
-        if self._targets is None or self._size != size:
-            old, self._textures = (self._targets, self._textures), []
-            packed = (_texels(camera.width), camera.height)
-            self._textures.append(self._context.texture(packed, PACKED, dtype="f4"))
-            if self._tone:
-                self._textures.append(self._context.texture(packed, PACKED, dtype="f1"))
-            alpha = self._context.texture(size, 1, dtype="f4")
-            self._targets = self._context.framebuffer(self._textures), self._context.framebuffer([alpha])
-            self._textures.append(alpha)
-            self._size = size
-            _release(*old)  # only now: moderngl binds the framebuffer in use again whenever it makes another
+    def _targets_for(self, camera: Camera) -> tuple[Targets, Targets]:
+        """Of packed numbers, and of coverage; those of another size are released."""
+        size, old = (camera.width, camera.height), self._targets
+        if old is None or old[1].framebuffer.size != size:
+            packed, texture = (_texels(camera.width), camera.height), self._context.texture
+            textures = [texture(packed, PACKED, dtype=dtype) for dtype in ("f4", "f1")[: 1 + self._tone]]
+            coverage = [texture(size, 1, dtype="f4")]
+            self._targets = Targets.of(self._context, textures), Targets.of(self._context, coverage)
+            for targets in old or ():
+                targets.release()  # only now: moderngl binds the one in use again whenever it makes another
+        assert self._targets is not None
         return self._targets
-
-    def _release_targets(self) -> None:
-        _release(self._targets, self._textures)
-        self._targets, self._textures = None, []
-
-
-def _release(
-    targets: tuple[moderngl.Framebuffer, moderngl.Framebuffer] | None, textures: list[moderngl.Texture]
-) -> None:
-    for part in (*(targets or ()), *textures):
-        part.release()
 
 
 def _texels(width: int) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import moderngl
 import numpy as np
@@ -96,6 +96,22 @@ class GaussianTargets:
             self._made[1].release()
             self._made = None
         for texture in self._textures:
+            texture.release()
+
+
+class Targets(NamedTuple):
+    """Textures of one size that a pass draws into, and the framebuffer of them."""
+
+    textures: list[moderngl.Texture]
+    framebuffer: moderngl.Framebuffer
+
+    @classmethod
+    def of(cls, context: moderngl.Context, textures: list[moderngl.Texture]) -> Targets:
+        return cls(textures, context.framebuffer(textures))
+
+    def release(self) -> None:
+        self.framebuffer.release()
+        for texture in self.textures:
             texture.release()
 
 

@@ -27,24 +27,12 @@ from .camera import Camera
 from .errors import InputError
 from .gaussians import Floats32, Raster
 from .gl_context import Backend, create_context
-from .gl_passes import ROW_GAUSSIANS, Pass
+from .gl_passes import ROW_GAUSSIANS, Pass, Targets
 
 LOG2_255 = float(np.log2(255.0))
 GEOMETRY_TEXELS = 2  # centre from the picture's middle, reach, peak; √fall_x, √fall_y, shear, –
 PER_TARGET = 3  # attributes of a target; its fourth component is α
 FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
-
-
-class _Targets(NamedTuple):
-    """What one pass draws into."""
-
-    textures: list[moderngl.Texture]
-    framebuffer: moderngl.Framebuffer
-
-    def release(self) -> None:
-        self.framebuffer.release()
-        for texture in self.textures:
-            texture.release()
 
 
 class GlRasterizer:
@@ -62,7 +50,7 @@ class GlRasterizer:
     def __init__(self, backend: Backend = "auto", *, context: moderngl.Context | None = None) -> None:
         self.context = create_context(backend) if context is None else context
         self._programs: dict[int, Pass] = {}
-        self._targets: dict[tuple[int, int, int], _Targets] = {}
+        self._targets: dict[tuple[int, int, int], Targets] = {}
         self._records: moderngl.Texture | None = None
         info = self.context.info
         self._max_size = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
@@ -187,7 +175,7 @@ class GlRasterizer:
             pictures.append(picture)
         return pictures
 
-    def targets_for(self, attributes: int, camera: Camera) -> _Targets:
+    def targets_for(self, attributes: int, camera: Camera) -> Targets:
         """Float32 targets for ``attributes`` at the camera's size; those of other sizes are released."""
         key = (attributes, camera.width, camera.height)
         if key not in self._targets:
@@ -196,7 +184,7 @@ class GlRasterizer:
                 left = attributes - first
                 components = 4 if first == 0 or left >= PER_TARGET else left
                 textures.append(self.context.texture((camera.width, camera.height), components, dtype="f4"))
-            self._targets[key] = _Targets(textures, self.context.framebuffer(textures))
+            self._targets[key] = Targets.of(self.context, textures)
             # only now: making a framebuffer, moderngl binds the one in use before again, which must still be there
             for other in [old for old in self._targets if old[1:] != key[1:]]:
                 self._targets.pop(other).release()

@@ -140,7 +140,7 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
     what = f"{name}, {frames}: memory a frame"
     figures = [below(what, max(slopes), SLOPE_BYTES, "bytes") if slopes else not_measured(what, TOO_SHORT)]
     within = [_slope(part) for s in segments for part in _parts(s["memory"], borders) if len(part) > 10]
-    if borders and within:
+    if within:
         what = f"{name}, {frames}: memory a frame, within each kind of step"
         figures.append(below(what, max(within), SLOPE_BYTES, "bytes"))
     paces: list[tuple[str, list[tuple[int, int | None]]]] = [("end over start", [(0, None)])]
