@@ -9,7 +9,7 @@ import pytest
 
 import gl_devices
 from gl_devices import BACKENDS
-from posing_test import BROKEN, _scene, broken_scene
+from posing_test import BROKEN, posing_scene, broken_scene
 from raster_scenes import off_centre_camera, random_scene
 from rnd_runtime._raster_project import pinhole
 from rnd_runtime.camera import Camera
@@ -65,7 +65,7 @@ def _unposed(rest, inputs):
     ("joints", "harmonics", "count"), [(24, 16, 3000), (2, 1, 1), (16, 9, 1025), (55, 16, 300), (33, 4, 257)]
 )
 def test_posing_is_the_float64_formula(device, joints, harmonics, count, template_only):
-    rest, inputs = _scene(joints, harmonics=harmonics, count=count, nodes=500)
+    rest, inputs = posing_scene(joints, harmonics=harmonics, count=count, nodes=500)
     if template_only:
         inputs = (None, *inputs[1:])
     unposed = _unposed(rest, inputs)
@@ -104,7 +104,7 @@ def test_what_is_no_number_is_not_drawn(device, field, value):
 
 
 def test_another_avatar_takes_the_place_of_the_last(device):
-    scenes = [_scene(joints, count=count) for joints, count in ((24, 300), (16, 2000), (24, 40))]
+    scenes = [posing_scene(joints, count=count) for joints, count in ((24, 300), (16, 2000), (24, 40))]
     for rest, inputs in (*scenes, *scenes[::-1]):
         surfaces = device.posing.pose(_unposed(rest, inputs))
         means = pose_reference(rest, *inputs)[0]
@@ -114,7 +114,7 @@ def test_another_avatar_takes_the_place_of_the_last(device):
 
 
 def test_more_joints_than_a_texture_holds_are_refused():
-    rest, inputs = _scene(55)
+    rest, inputs = posing_scene(55)
     small = SimpleNamespace(info={"GL_MAX_TEXTURE_SIZE": 4096})
     with pytest.raises(InputError, match="joints: expected at most 32 with this OpenGL, got 55"):
         GlPosing(small).pose(_unposed(rest, inputs))

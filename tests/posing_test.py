@@ -13,7 +13,7 @@ from rnd_runtime.posing_reference import pose_reference
 ROUNDING = 3e-6  # float32 against float64, relative to the largest entry: products of three 3×3 matrices
 
 
-def _scene(joints: int, *, count: int = 300, nodes: int = 40, harmonics: int = 16):
+def posing_scene(joints: int, *, count: int = 300, nodes: int = 40, harmonics: int = 16):
     rng = np.random.default_rng(joints)
     weights = rng.uniform(0.1, 1, (count, 4))
     normals = rng.normal(size=(count, 3))
@@ -47,14 +47,14 @@ def _scene(joints: int, *, count: int = 300, nodes: int = 40, harmonics: int = 1
 
 @pytest.mark.parametrize(("joints", "harmonics"), [(24, 16), (2, 1), (16, 9), (55, 16), (33, 4)])
 def test_posing_is_the_float64_formula(joints, harmonics):
-    rest, inputs = _scene(joints, harmonics=harmonics)
+    rest, inputs = posing_scene(joints, harmonics=harmonics)
     for ours, exact in zip(rest.pose(*inputs), pose_reference(rest, *inputs)):
         assert ours.shape == exact.shape
         assert np.abs(ours - exact).max() < ROUNDING * np.abs(exact).max()
 
 
 def test_without_logits_the_template_decides():
-    rest, (_, *inputs) = _scene(24)
+    rest, (_, *inputs) = posing_scene(24)
     for ours, exact in zip(rest.pose(None, *inputs), pose_reference(rest, None, *inputs)):
         assert np.abs(ours - exact).max() < ROUNDING * np.abs(exact).max()
 
@@ -68,7 +68,7 @@ BROKEN = [
 
 def broken_scene(field, value):
     """A scene of 24 joints with one number of Gaussian 0's that is not finite."""
-    rest, (logits, offsets, visibility, bones) = _scene(24)
+    rest, (logits, offsets, visibility, bones) = posing_scene(24)
     changed = {"log_template": rest.log_template.copy(), "points": rest.points.copy()}
     places = {
         "logits": (logits, (rest.neighbours[0, 0], 2)),

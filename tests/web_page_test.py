@@ -33,15 +33,12 @@ from rnd_viewer.cli import main as play
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene
 from rnd_viewer.view_state import ViewState
-from ties import assert_only_ties
 
 ROOT = Path(__file__).parent.parent
 ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
 SIZE, FRAME = 192, 20
 
 TOLERANCE = 3  # of 255; measured 1
-TIES = 4  # pixels of a state that may be off by more: the last bit of a place decides which of two Gaussians at one
-# depth is in front, or which texel of the sun's map a disc covers; measured 3 in two of 17 states
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
 pytestmark = [
@@ -267,8 +264,7 @@ def loaded(page, site) -> Page:
 def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
     assert got.shape == expected.shape
     error = np.abs(got.astype(int) - expected)
-    off = int((error.max(-1) > TOLERANCE).sum())
-    assert off <= TIES and error.mean() < MEAN_TOLERANCE, (off, error.max(), error.mean())
+    assert error.max() <= TOLERANCE and error.mean() < MEAN_TOLERANCE, (error.max(), error.mean())
 
 
 def _scene(site: Path, motion: str = "walk.npz") -> Scene:
@@ -282,15 +278,8 @@ def _python_picture(page: Page, scene: Scene) -> np.ndarray:
 
 
 def _assert_agreed(page: Page, got: np.ndarray, scene: Scene) -> None:
-    """The page's picture ``got`` is rnd-view's, and what is off is shown to be a tie."""
-    expected = _python_picture(page, scene)
-
-    def again() -> np.ndarray:
-        scene._posed = None  # which it would keep from the picture before
-        return _python_picture(page, scene)
-
-    _assert_close(got, expected)
-    assert_only_ties(got, expected, again, TOLERANCE)
+    """The page's picture ``got`` is rnd-view's."""
+    _assert_close(got, _python_picture(page, scene))
 
 
 def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
@@ -600,7 +589,7 @@ def test_a_motion_that_does_not_fit_keeps_the_avatar_out_until_another_comes(fre
     assert "drop an avatar" in _drop(fresh, "nobodys.npz")
     assert "expected some of the avatar's" in _drop(fresh, "avatar.onnx") and _is_refusal(fresh)
     assert "drop an avatar" in _drop(fresh, "window.hdr") and not _is_refusal(fresh)
-    fresh.wait("sessions.opened === 1 && sessions.released === 1")
+    fresh.wait("sessions.opened > 0 && sessions.opened === sessions.released")
     assert _drop(fresh, "avatar.onnx", "walk.npz") == ""
     assert fresh.run("rnd.scene().lights") == ["the avatar's own", "window.hdr"]
     assert _picture(fresh, width=SIZE, height=SIZE).any()
@@ -644,7 +633,7 @@ def test_a_refused_drop_changes_nothing(fresh):
 def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released(fresh, site):
     _drop(fresh, "avatar.onnx", "amass.npz")
     _drop(fresh, "other.onnx")
-    fresh.wait("sessions.opened === 2 && sessions.released === 1")
+    fresh.wait("sessions.opened > 3 && sessions.opened === sessions.released + 1")
     assert fresh.run("[rnd.scene().avatar, rnd.scene().motion.name]") == ["other.onnx", "amass.npz"]
     scene = Scene(ViewOptions(site / "other.onnx", site / "amass.npz", size=SIZE, raster="cpu"))
     got = _picture(fresh, width=SIZE, height=SIZE, light=0, time=0.1)
@@ -653,4 +642,4 @@ def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released
     _drop(
         fresh, "avatar.onnx", "other.onnx", "stranger.onnx", "nobodys.npz", "avatar.onnx"
     )  # the last one counts
-    fresh.wait("sessions.opened > 2 && sessions.opened === sessions.released + 1")
+    fresh.wait("sessions.opened > 6 && sessions.opened === sessions.released + 1")

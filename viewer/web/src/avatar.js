@@ -4,11 +4,17 @@ import * as ort from "./ort/ort.wasm.min.mjs";
 import { LARGEST_ALBEDO } from "./brdf.js";
 import { refusal } from "./errors.js";
 import { motionWindow, poseAt } from "./motion.js";
+import { OnnxFile } from "./onnx.js";
+import { RestPose } from "./posing.js";
 import { multiply, rotate } from "./rotations.js";
 
-const METADATA_PROPS = 14;  // field of onnx.ModelProto: repeated {1: key, 2: value}
 const SCHEMA = "rnd-avatar/1";
 const POSED = ["means", "covariances", "normals", "visibility"], CONSTANT = ["opacities", "albedo", "roughness"];
+// Outputs of a file that lets us pose without the graph; node_logits is missing where skinning is the template's.
+const NODES = ["node_offsets", "node_visibility"], LOGITS = "node_logits";
+const REST = [
+  "neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs", "posing_limits",
+];
 
 // What the metadata may say (AvatarMetadata of rnd_runtime/avatar_file.py): true for a value, an object for one inside.
 const FIELDS = {
@@ -22,7 +28,7 @@ const DEFAULTED = ["variant", ...Object.keys(FIELDS.variant)];
 export class Avatar {
   /** Read the file; throws with a reason when it is no avatar of ours. */
   static async load(bytes, name) {
-    const text = metadata(bytes).get("rnd_avatar");
+    const file = new OnnxFile(bytes), text = file.metadata.get("rnd_avatar");
     if (!text) throw new Error(`${name} is not an RnD avatar`);
     const about = JSON.parse(text);
     if (about.schema !== SCHEMA) throw new Error(`${name}: schema ${about.schema}, expected ${SCHEMA}`);
@@ -38,38 +44,20 @@ export class Avatar {
     const { names, parents, rest_joints: rest } = about.skeleton;
     avatar.skeleton = { names, parents, rest: Float64Array.from(rest.flat()) };
     avatar.trainedLight = new Float32Array(Uint8Array.from(atob(about.trained_light), (c) => c.charCodeAt(0)).buffer);
-    avatar.session = await ort.InferenceSession.create(bytes, { executionProviders: ["wasm"], graphOptimizationLevel: "all" });
-    await avatar.readConstants().catch(async (error) => {
-      await avatar.release();
-      throw error;
-    });
+    [avatar.opacities, avatar.albedo, avatar.roughness] = await constants(file, CONSTANT);
+    avatar.albedo.forEach((value, k) => { avatar.albedo[k] = Math.min(value, LARGEST_ALBEDO); });
+    const posesItself = [...NODES, ...REST].every((name) => file.outputs.has(name));
+    avatar.outputs = posesItself ? [...NODES, LOGITS].filter((name) => file.outputs.has(name)) : POSED;
+    if (posesItself) avatar.rest = new RestPose(about.gaussians, await constants(file, REST));
+    [avatar.session, avatar.inputs] = await sessionOf(file, avatar.outputs);
     return avatar;
   }
 
   /** Give onnxruntime's memory back; the avatar cannot pose any more. */
   release() { return this.session.release(); }
 
-  async readConstants() {
-    const joints = this.skeleton.names.length, others = joints - 1;
-    const window = Float32Array.from({ length: this.windowPoses * others * 6 }, (_, k) => (k % 6 === 0 || k % 6 === 4 ? 1 : 0));
-    const bones = Float32Array.from({ length: joints * 12 }, (_, k) => (k % 12 % 5 === 0 ? 1 : 0));
-    const still = await this.run(window, new Float32Array(3 * others), bones, CONSTANT);
-    [this.opacities, this.albedo, this.roughness] = CONSTANT.map((name) => still[name].data.slice());
-    this.albedo.forEach((value, k) => { this.albedo[k] = Math.min(value, LARGEST_ALBEDO); });
-  }
-
-  async run(window, velocity, bones, outputs) {
-    const joints = this.skeleton.names.length, others = joints - 1;
-    return this.session.run({
-      pose_window: new ort.Tensor("float32", window, [this.windowPoses, others, 6]),
-      joint_velocity: new ort.Tensor("float32", velocity, [others, 3]),
-      bone_transforms: new ort.Tensor("float32", bones, [joints, 3, 4]),
-    }, outputs);
-  }
-
-  /** The Gaussians at `time` of `motion`, as rnd_runtime/gaussians.py has them, in the frame of the `root`: {rotation [9],
-   *  translation [3]} → world; and joints [J·3] m in the world. */
-  async pose(motion, time) {
+  /** What the networks say at `time` of `motion`, for `posed`. */
+  async encode(motion, time) {
     const { window, velocity } = motionWindow(motion, time, this.windowPoses, this.windowSeconds);
     const now = poseAt(motion, time);
     const joints = boneTransforms(this.skeleton, now.rotations, now.translation).joints;
@@ -77,10 +65,39 @@ export class Avatar {
     const root = { rotation, translation: turned.map((value, k) => place[k] + now.translation[k] - value) };
     now.rotations.set([1, 0, 0, 0, 1, 0, 0, 0, 1]);
     const { bones } = boneTransforms(this.skeleton, now.rotations, [0, 0, 0]);
-    const posed = await this.run(window, velocity, bones, POSED);
-    const [means, covariances, normals, visibility] = POSED.map((name) => posed[name].data);
-    const { opacities, albedo, roughness } = this;
-    return { count: this.gaussians, means, covariances, normals, visibility, opacities, albedo, roughness, root, joints };
+    const count = this.skeleton.names.length, others = count - 1;
+    const given = {
+      pose_window: new ort.Tensor("float32", window, [this.windowPoses, others, 6]),
+      joint_velocity: new ort.Tensor("float32", velocity, [others, 3]),
+      bone_transforms: new ort.Tensor("float32", bones, [count, 3, 4]),
+    };
+    const taken = Object.fromEntries(this.inputs.map((name) => [name, given[name]]));
+    const made = await this.session.run(taken, this.outputs);
+    return { values: this.outputs.map((name) => made[name].data), bones, root, joints };
+  }
+
+  /** The Gaussians of what was encoded, as rnd_runtime/gaussians.py has them, in the frame of the `root`: {rotation [9],
+   *  translation [3]} → world; and joints [J·3] m in the world. */
+  posed({ values, bones, root, joints }) {
+    const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
+    return { count, ...Object.fromEntries(POSED.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, joints };
+  }
+}
+
+/** A session that makes `outputs` of `file` and no more, and the names of its inputs. */
+async function sessionOf(file, outputs) {
+  const { model, inputs } = file.cut(outputs);
+  return [await ort.InferenceSession.create(model, { executionProviders: ["wasm"], graphOptimizationLevel: "all" }), inputs];
+}
+
+/** Values of `file` that need no inputs. */
+async function constants(file, names) {
+  const [session] = await sessionOf(file, names);
+  try {
+    const values = await session.run({}, names);
+    return names.map((name) => values[name].data.slice());
+  } finally {
+    await session.release();
   }
 }
 
@@ -128,44 +145,4 @@ function boneTransforms(skeleton, rotations, translation) {
 export function jointsAt(skeleton, motion, time) {
   const now = poseAt(motion, time);
   return boneTransforms(skeleton, now.rotations, now.translation).joints;
-}
-
-/** The strings in a model's metadata_props: one walk over the fields of its protocol buffer. */
-function metadata(bytes) {
-  const found = new Map();
-  for (const [field, value] of fields(bytes)) {
-    if (field !== METADATA_PROPS || !value) continue;
-    const entry = new Map(fields(value));
-    const decoder = new TextDecoder();
-    if (entry.get(1)) found.set(decoder.decode(entry.get(1)), decoder.decode(entry.get(2) ?? new Uint8Array()));
-  }
-  return found;
-}
-
-/** [field, bytes or null] of a protocol buffer message; null where the field is a number. */
-function* fields(bytes) {
-  let at = 0;
-  const varint = () => {
-    let value = 0;
-    for (let shift = 1; ; shift *= 128) {
-      if (at >= bytes.length) throw new Error("the .onnx file is cut short");
-      const byte = bytes[at++];
-      value += (byte & 127) * shift;
-      if (byte < 128) return value;
-    }
-  };
-  while (at < bytes.length) {
-    const tag = varint(), wire = tag % 8, field = Math.floor(tag / 8);
-    if (wire === 2) {
-      const length = varint();
-      if (at + length > bytes.length) throw new Error("the .onnx file is cut short");
-      yield [field, bytes.subarray(at, at += length)];
-    } else {
-      if (wire === 0) varint();
-      else if (wire === 1) at += 8;
-      else if (wire === 5) at += 4;
-      else throw new Error("not an .onnx file");
-      yield [field, null];
-    }
-  }
 }

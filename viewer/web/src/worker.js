@@ -73,8 +73,12 @@ function description({ avatar, motion, lights }, lit) {
 
 async function render({ number, state }) {
   const clock = lap(), { avatar, motion } = scene;
-  if (!posed || posed.time !== state.time) posed = { time: state.time, gaussians: await avatar.pose(motion, state.time) };
-  clock("encoders");
+  if (!posed || posed.time !== state.time) {
+    const encoded = await avatar.encode(motion, state.time);
+    clock("encoders");
+    posed = { time: state.time, gaussians: avatar.posed(encoded) };
+    clock("posing");
+  }
   const camera = cameraOf(state), count = Math.min(state.gaussians ?? avatar.gaussians, avatar.gaussians);
   const grown = avatar.gaussians / count, gaussians = fewer(posed.gaussians, count), beside = inFrame(camera, gaussians.root);
   const features = state.output === "lit" || state.output === "light"
