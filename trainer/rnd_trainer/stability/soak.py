@@ -12,7 +12,6 @@ import contextlib
 import ctypes
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -36,7 +35,7 @@ EVERY = 20
 """frames or steps between two readings"""
 TOO_SHORT = "too few in one go"
 PACE = 1.2
-"""median of the last tenth over that of the first, of all and among steps of one kind"""
+"""median of the last tenth over that of the first, among frames or steps of one kind"""
 
 
 def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
@@ -55,15 +54,20 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
 
 
 def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
-    """Train for ``steps`` steps in one go (a resumed training is R11's), after a rehearsal as every training has.
+    """Train in one go (a resumed training is R11's), after a rehearsal as every training has.
 
-    Steps are of three kinds: plain colours, drawn texels, the whole light. The last does several times the first's
-    work by design, so the pace is looked at within each kind too. The third stage, whose steps have no picture and
-    take an eighth of the time, is left out: it would make the end look fast.
+    Steps are of three kinds: plain colours, drawn texels, the whole light. The last does twice the first's work by
+    design, so each kind gets ``steps`` steps, and its end is compared with its own start. The third stage, whose steps
+    have no picture, is left out.
     """
     from rnd_trainer.train import Training
 
-    config = tiny_config(steps=steps + 1, gaussians=subject.few(400, 4000))
+    borders = [steps, 2 * steps, 3 * steps]
+    config = replace(
+        tiny_config(steps=3 * steps, gaussians=subject.few(400, 4000)),
+        stage1_fraction=1 / 3,
+        full_light_fraction=1 / 3,
+    )
     training = Training(studio(subject), config)
     training.rehearse()
 
@@ -71,12 +75,7 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
         training.step()
         return ""
 
-    borders = [
-        training.schedule.first_stage,
-        math.ceil(config.steps * (1 - config.full_light_fraction)),
-        steps,
-    ]
-    return _soak("training", step, _fixed_load(subject), steps, state, same=0, borders=borders)
+    return _soak("training", step, _fixed_load(subject), 3 * steps, state, same=0, borders=borders)
 
 
 def _fixed_load(subject: Subject) -> Callable[[], object]:
@@ -143,17 +142,15 @@ def _figures(name: str, segments: list[dict[str, Any]], same: bool, borders: Seq
     if within:
         what = f"{name}, {frames}: memory a frame, within each kind of step"
         figures.append(below(what, max(within), SLOPE_BYTES, "bytes"))
-    paces: list[tuple[str, list[tuple[int, int | None]]]] = [("end over start", [(0, None)])]
-    if borders:
-        paces.append(("of each kind of step, end over start", list(pairwise((0, *borders)))))
-    for what, parts in paces if long else ():
-        slowest = max(_pace(seconds[start:end]) for seconds, _ in long for start, end in parts)
-        figures.append(replace(below(f"{name}, {frames}: pace {what}", slowest, PACE, "×"), timing=True))
+    parts = list(pairwise((0, *borders))) if borders else [(0, None)]
+    pace = f"{name}, {frames}: pace {'of each kind of step, ' if borders else ''}end over start"
     if long:
+        slowest = max(_pace(seconds[start:end]) for seconds, _ in long for start, end in parts)
+        figures.append(replace(below(pace, slowest, PACE, "×"), timing=True))
         by_load = [[taken / beside for taken, beside in zip(*times)] for times in long]
-        slowest = max(_pace(ratios[start:end]) for ratios in by_load for start, end in paces[-1][1])
-        what = f"{name}, {frames}: pace {paces[-1][0]}, over that of a fixed load beside it"
-        figures.append(replace(below(what, slowest, PACE, "×"), timing=True))
+        slowest = max(_pace(ratios[start:end]) for ratios in by_load for start, end in parts)
+        over = f"{pace}, over that of a fixed load beside it"
+        figures.append(replace(below(over, slowest, PACE, "×"), timing=True))
     if same:
         wrong = sum(segment["wrong"] for segment in segments)
         figures.append(at_most(f"{name}, {frames}: frames whose bits changed at the same pose", wrong, 0))
