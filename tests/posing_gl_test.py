@@ -9,7 +9,7 @@ import pytest
 
 import gl_devices
 from gl_devices import BACKENDS
-from posing_test import BROKEN, posing_scene, broken_scene
+from posing_test import BROKEN, broken_scene, posing_scene
 from raster_scenes import off_centre_camera, random_scene
 from rnd_runtime._raster_project import pinhole
 from rnd_runtime.camera import Camera
