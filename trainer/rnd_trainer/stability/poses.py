@@ -29,6 +29,10 @@ RING_M = 0.02
 """length of a slice of a limb whose radius is measured"""
 RING_COUNT = 8
 """Gaussians that a slice needs to have a radius"""
+NEIGHBOURS = 12
+"""that tell how the surface around a Gaussian lies and moves"""
+FEWER_OR_MORE = (9, 16)
+"""neighbours: how well a twisted surface's normals are known at all"""
 HOLE_MARGIN = 0.006
 """of the picture's side: silhouettes are eroded by it, since an edge is soft"""
 
@@ -112,7 +116,7 @@ def _held_out(subject: Subject) -> tuple[Figure, tuple[NDArray[np.uint8], NDArra
 
 def candy_wrapper(subject: Subject) -> Result:
     """P2: the forearm twisted at either end, 0 to 180° by 10°."""
-    ratios, by_template, errors, plain_errors, finite = [], [], [], [], True
+    ratios, by_template, errors, plain_errors, spread, finite = [], [], [], [], [], True
     for joint, end in (("left_elbow", "left_wrist"), ("left_wrist", "left_wrist")):
         names, joints = subject.avatar.skeleton.names, subject.avatar.skeleton.rest_joints
         elbow = joints[names.index("left_elbow")]
@@ -129,6 +133,7 @@ def candy_wrapper(subject: Subject) -> Result:
                 by_template.append(limb.ratio(subject.by_template(motion, 0.0)))
             if degrees == 120:
                 errors.append(limb.normal_error(posed, posed.normals))
+                spread.append(limb.surface_spread(posed))
                 linear = subject.blend(motion, 0.0, subject.weights(motion, 0.0))[:, :, :3]
                 plain_errors.append(
                     limb.normal_error(posed, np.einsum("nrc,nc->nr", linear, subject.rest.normals))
@@ -141,6 +146,8 @@ def candy_wrapper(subject: Subject) -> Result:
               baseline=("A_R n", max(e.max() for e in plain_errors))),
         stated("the same, mean of all slices", max(e.mean() for e in errors), "°",
                baseline=("A_R n", max(e.mean() for e in plain_errors))),
+        stated(f"the surface's own normals, by {FEWER_OR_MORE[0]} and by {FEWER_OR_MORE[1]} neighbours, worst slice",
+               max(e.max() for e in spread), "°"),
     )  # fmt: skip
     return Result(figures)
 
@@ -154,7 +161,6 @@ class _Limb:
         self.around = (along > -0.5 * length) & (along < 1.5 * length) & (self.radii < 0.12)
         width = max(RING_M, RING_COUNT * 2.0 * length / max(1, int(self.around.sum())))
         self.slice = np.floor(along / width).astype(int)
-        self.near = cKDTree(self.rest.means).query(self.rest.means[self.around], k=12)[1]
 
     def _radii(self, means: NDArray[np.float32]) -> tuple[Floats, Floats]:
         offset = means.astype(np.float64) - self.origin
@@ -172,14 +178,32 @@ class _Limb:
         return [s for s in slices if s.sum() >= RING_COUNT]
 
     def normal_error(self, posed: Gaussians, normals: NDArray[np.floating]) -> Floats:
-        """Mean angle of each slice [S], degrees, to the rest normals as the surface around them moved, known from
-        places alone.
+        """Mean angle of each slice [S], degrees, to the rest normals as the surface around them moved."""
+        return self._angles(self._surface_normals(posed, NEIGHBOURS), normals[self.around])
 
-        Planes through twelve neighbours, at rest and posed, give a map F of tangents and normal; the normal to be is
-        F's inverse transpose times the one at rest.
-        """
+    def surface_spread(self, posed: Gaussians) -> Floats:
+        """How far the normals of that surface are apart, [S] degrees, if told by fewer or by more neighbours."""
+        fewer, more = (self._surface_normals(posed, count) for count in FEWER_OR_MORE)
+        return self._angles(fewer, more)
+
+    def _angles(self, first: NDArray[np.floating], second: NDArray[np.floating]) -> Floats:
+        """Mean angle of each slice [S], degrees, between normals [M, 3] around the bone."""
+        cosines = (first * second).sum(1) / np.maximum(
+            np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1), 1e-12
+        )
         error = np.zeros(len(self.around))
-        for index, near in zip(np.flatnonzero(self.around), self.near):
+        error[self.around] = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+        return np.array([error[s].mean() for s in self._slices()])
+
+    def _surface_normals(self, posed: Gaussians, neighbours: int) -> Floats:
+        """The rest normals [M, 3] of the Gaussians around the bone as the surface moved, known from places alone.
+
+        Planes through that many neighbours, at rest and posed, give a map F of tangents and normal; the normal to be
+        is F's inverse transpose times the one at rest.
+        """
+        found = np.zeros((int(self.around.sum()), 3))
+        nearest = cKDTree(self.rest.means).query(self.rest.means[self.around], k=neighbours)[1]
+        for row, (index, near) in enumerate(zip(np.flatnonzero(self.around), nearest)):
             normal = self.rest.normals[index].astype(np.float64)
             first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
             first /= np.linalg.norm(first)
@@ -188,11 +212,8 @@ class _Limb:
             before = _frame(flat, offsets)
             after = _frame(flat, (posed.means[near] - posed.means[index]).astype(np.float64))
             true = after @ np.linalg.inv(before)  # columns: two tangents and the unit normal
-            true = np.linalg.inv(true).T @ normal
-            ours = normals[index].astype(np.float64)
-            cosine = true @ ours / max(np.linalg.norm(true) * np.linalg.norm(ours), 1e-12)
-            error[index] = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        return np.array([error[s].mean() for s in self._slices()])
+            found[row] = np.linalg.inv(true).T @ normal
+        return found
 
 
 def _frame(flat: Floats, offsets: Floats) -> Floats:
