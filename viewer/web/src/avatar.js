@@ -1,4 +1,4 @@
-// avatar.onnx: its metadata, its skeleton, and posing it with onnxruntime (rnd_runtime/avatar_file.py, avatar.py, skeleton.py).
+// avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar_file.py, avatar.py, skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { LARGEST_ALBEDO } from "./brdf.js";
