@@ -45,30 +45,34 @@ def chart(files: Sequence[Path], size: tuple[float, float]) -> Iterator[Any]:
         plt.close(figure)
 
 
+MARKERS = "osD^v*"
+"""of trainings of one kind, in the order in which they come"""
+
+
 def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
     """PSNR of every split against minutes of training, of ``rnd-eval --ablate --study lengths``.
 
-    A point is a training of its own, with its own schedule; the mean over seeds, with their range. The title names
-    every machine that any of them was trained on.
+    A point is a training of its own, with its own schedule; the mean over seeds, with their range. A line joins
+    trainings that differ in their length alone, those whose names (``1/4``, ``5, as it was``) end alike after the
+    comma. The title names every machine that any of them was trained on.
     """
-    with chart(files, (7.5, 4.2)) as figure:
+    kinds = list(dict.fromkeys(_kind(row) for row in rows))
+    with chart(files, (7.5, 4.4)) as figure:
         from matplotlib.ticker import LogLocator, NullFormatter  # here, as of an extra
 
         axes = figure.add_subplot()
-        for split in dict.fromkeys(row["split"] for row in rows):
-            points = []
-            for method in dict.fromkeys(row["method"] for row in rows):
-                of = [row for row in rows if row["split"] == split and row["method"] == method]
-                figures = [row["psnr"] for row in of]
-                points.append((sum(row["minutes"] for row in of) / len(of), sum(figures) / len(of), figures))
-            minutes, means, spreads = zip(*sorted(points))
-            low = [mean - min(figures) for mean, figures in zip(means, spreads)]
-            high = [max(figures) - mean for mean, figures in zip(means, spreads)]
-            axes.errorbar(minutes, means, yerr=(low, high), marker="o", ms=4, lw=1, capsize=2, label=split)
+        for colour, split in enumerate(dict.fromkeys(row["split"] for row in rows)):
+            for marker, kind in zip(MARKERS, kinds):
+                own = [row for row in rows if row["split"] == split and _kind(row) == kind]
+                if own:
+                    _draw_line(axes, own, f"C{colour}", marker, label=split if kind == kinds[0] else "")
+        if len(kinds) > 1:
+            for marker, kind in zip(MARKERS, kinds):
+                axes.plot([], [], marker, color="#666", ms=4, label=kind or "the others")
         first = rows[0]
         what = f"{first['gaussians']:,} Gaussians".replace(",", " ")
         machines = sorted({row.get("train_machine") or row["machine"] for row in rows})
-        axes.set_title(f"Held-out PSNR against training time: {what}, {'; '.join(machines)}", loc="left")
+        axes.set_title(f"Held-out PSNR against training time: {what}\n{'; '.join(machines)}", loc="left")
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.xaxis.set_major_formatter("{x:g}")
@@ -76,4 +80,22 @@ def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
         axes.set_xlabel("minutes of training")
         axes.set_ylabel("dB")
         axes.grid(True, color="#eee", lw=0.6)
-        axes.legend(frameon=False, fontsize=8)
+        axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+
+
+def _kind(row: Row) -> str:
+    """What a training is beside its length."""
+    return str(row["method"].partition(", ")[2])
+
+
+def _draw_line(axes: Any, rows: Sequence[Row], colour: str, marker: str, *, label: str) -> None:
+    points = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        of = [row for row in rows if row["method"] == method]
+        figures = [row["psnr"] for row in of]
+        points.append((sum(row["minutes"] for row in of) / len(of), sum(figures) / len(of), figures))
+    minutes, means, spreads = zip(*sorted(points))
+    low = [mean - min(figures) for mean, figures in zip(means, spreads)]
+    high = [max(figures) - mean for mean, figures in zip(means, spreads)]
+    style = {"color": colour, "marker": marker, "ms": 4, "lw": 1, "capsize": 2}
+    axes.errorbar(minutes, means, yerr=(low, high), label=label, **style)

@@ -168,8 +168,10 @@ def preset(name: str) -> TrainConfig:
     standard = TrainConfig()
     if name == "standard":
         return standard
-    if name == "full":
-        return dataclasses.replace(standard, steps=5 * standard.steps)
+    if (
+        name == "full"
+    ):  # high rates gain nothing in so many steps: 34.67 dB and LPIPS .0156 with the standard's
+        return dataclasses.replace(standard, steps=5 * standard.steps, rate_kept=0.1, rate_cooled=1.0)
     if name == "quick":
         quick = resized(standard, 12_000, 2_000)
         return dataclasses.replace(quick, unseen_fraction=0.5, preview_every=250, save_every=250)
