@@ -25,7 +25,7 @@ function exp(x) {
   value = fused(value, rest, E2);
   value = fused(value, rest, E1);
   value = fused(value, rest, E0);
-  return value * POWERS[whole + 127];
+  return value * POWERS[(whole | 0) + 127];
 }
 
 const tanh = (x) => f32(1 - f32(2 / f32(exp(f32(2 * Math.min(Math.max(x, -LARGEST_TANH), LARGEST_TANH))) + 1)));
@@ -44,21 +44,22 @@ export class RestPose {
    *  `normals` [N·3], `factors` [N·9], `limbs` [N·7]; `limits` [3]: the largest offset m, the floor m², the fallback. */
   constructor(count, [neighbours, weights, template, points, factors, normals, limbs, limits]) {
     Object.assign(this, { count, neighbours, weights, template, points, factors, normals, limbs, limits });
+    this.posed = [3, 6, 3, HARMONICS].map((width) => new Float32Array(width * count));
     this.factor = new Float32Array(9);  // for one Gaussian at a time
     this.posedFactor = new Float32Array(9);
   }
 
   /** Means, covariances, normals and visibility of node fields offsets [M·6], visibility [M·S] and logits [M·J], which may
-   *  be missing, under `bones` [J·12]. */
+   *  be missing, under `bones` [J·12]; in arrays that the next call fills anew. */
   pose([offsets, visibility, logits], bones) {
     const { count, limbs } = this, terms = 6 * visibility.length / offsets.length;
-    const posed = [3, 6, 3, HARMONICS].map((width) => new Float32Array(width * count)), [means, covariances, normals, harmonics] = posed;
+    const [means, covariances, normals, harmonics] = this.posed;
     const shares = new Float32Array(bones.length / 12), blend = new Float32Array(12), moved = new Float32Array(6);
     const a = new Float32Array(9), cofactors = new Float32Array(9);
     for (let i = 0; i < count; i++) {
       this.#shares(i, logits, shares);
       blended(shares, bones, blend);
-      for (let k = 0; k < 3; k++) a.set(blend.subarray(4 * k, 4 * k + 3), 3 * k);
+      for (let k = 0; k < 9; k++) a[k] = blend[k + (k > 5 ? 2 : k > 2 ? 1 : 0)];
       cofactorsOf(a, cofactors);
       this.#between(offsets, 6, i, moved, 0);
       for (let k = 0; k < 6; k++) moved[k] = tanh(moved[k]);
@@ -68,7 +69,7 @@ export class RestPose {
       this.#covariance(i, a, moved, kappa, covariances);
       this.#normal(i, a, cofactors, kappa, normals);
     }
-    return posed;
+    return this.posed;
   }
 
   #mean(i, a, blend, moved, kappa, means) {
@@ -132,8 +133,9 @@ export class RestPose {
     else shares.fill(0);
     let greatest = -Infinity;
     for (let j = 0; j < joints; j++) {
-      shares[j] = template[from + j] + shares[j];
-      greatest = Math.max(greatest, shares[j]);
+      const logit = f32(template[from + j] + shares[j]);
+      shares[j] = logit;
+      greatest = logit > greatest || logit !== logit ? logit : greatest;
     }
     for (let j = 0; j < joints; j++) shares[j] = exp(f32(shares[j] - greatest));
   }
@@ -142,23 +144,36 @@ export class RestPose {
 /** [A_R | A_T] [12] of shares [J] that have yet to be divided by their sum. */
 function blended(shares, bones, blend) {
   const joints = shares.length;
-  let sum = 0;
-  for (let j = 0; j < joints; j++) sum = f32(sum + shares[j]);
-  const scale = f32(1 / sum);
-  for (let k = 0; k < 12; k += 4) {
-    let x = 0, y = 0, z = 0, shift = 0;
-    for (let j = 0, at = k; j < joints; j++, at += 12) {
-      const share = shares[j];
-      x = fused(share, bones[at], x);
-      y = fused(share, bones[at + 1], y);
-      z = fused(share, bones[at + 2], z);
-      shift = fused(share, bones[at + 3], shift);
-    }
-    blend[k] = x * scale;
-    blend[k + 1] = y * scale;
-    blend[k + 2] = z * scale;
-    blend[k + 3] = shift * scale;
+  let sum = 0, xx = 0, xy = 0, xz = 0, x = 0, yx = 0, yy = 0, yz = 0, y = 0, zx = 0, zy = 0, zz = 0, z = 0;
+  for (let j = 0, at = 0; j < joints; j++, at += 12) {
+    const share = shares[j];
+    sum = f32(sum + share);
+    xx = fused(share, bones[at], xx);
+    xy = fused(share, bones[at + 1], xy);
+    xz = fused(share, bones[at + 2], xz);
+    x = fused(share, bones[at + 3], x);
+    yx = fused(share, bones[at + 4], yx);
+    yy = fused(share, bones[at + 5], yy);
+    yz = fused(share, bones[at + 6], yz);
+    y = fused(share, bones[at + 7], y);
+    zx = fused(share, bones[at + 8], zx);
+    zy = fused(share, bones[at + 9], zy);
+    zz = fused(share, bones[at + 10], zz);
+    z = fused(share, bones[at + 11], z);
   }
+  const scale = f32(1 / sum);
+  blend[0] = xx * scale;
+  blend[1] = xy * scale;
+  blend[2] = xz * scale;
+  blend[3] = x * scale;
+  blend[4] = yx * scale;
+  blend[5] = yy * scale;
+  blend[6] = yz * scale;
+  blend[7] = y * scale;
+  blend[8] = zx * scale;
+  blend[9] = zy * scale;
+  blend[10] = zz * scale;
+  blend[11] = z * scale;
 }
 
 /** det(A) A⁻ᵀ. */
