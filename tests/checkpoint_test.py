@@ -91,5 +91,6 @@ def test_configuration_goes_through_json_and_refuses_what_it_does_not_know() -> 
 
 def test_presets_differ_in_schedule_only() -> None:
     standard, full = preset("standard"), preset("full")
-    assert dataclasses.replace(full, steps=standard.steps) == standard == TrainConfig()
+    schedule = {name: getattr(standard, name) for name in ("steps", "rate_kept", "rate_cooled")}
+    assert dataclasses.replace(full, **schedule) == standard == TrainConfig()
     assert full.steps == 5 * standard.steps

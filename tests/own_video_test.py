@@ -83,7 +83,7 @@ def test_every_command_of_the_readme_runs(place, monkeypatch, capsys) -> None:
     for words in block.commands():
         more = SHORT if words[0] == "rnd-train" else ()
         assert exit_code([*words, *more], monkeypatch) == 0, (words, capsys.readouterr())
-    assert (place / "runs" / "me" / "avatar.ckpt").is_file()
+    assert (place / "runs" / "video" / "avatar.ckpt").is_file()
 
 
 def test_a_capture_is_not_overwritten(place, monkeypatch, capsys) -> None:
