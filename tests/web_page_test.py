@@ -612,7 +612,7 @@ def test_a_motion_that_does_not_fit_keeps_the_avatar_out_until_another_comes(fre
     assert "drop an avatar" in _drop(fresh, "nobodys.npz")
     assert "expected some of the avatar's" in _drop(fresh, "avatar.onnx") and _is_refusal(fresh)
     assert "drop an avatar" in _drop(fresh, "window.hdr") and not _is_refusal(fresh)
-    fresh.wait("sessions.opened > 0 && sessions.opened === sessions.released")
+    fresh.wait("sessions.opened === 3 && sessions.released === 3")
     assert _drop(fresh, "avatar.onnx", "walk.npz") == ""
     assert fresh.run("rnd.scene().lights") == ["the avatar's own", "window.hdr"]
     assert _picture(fresh, width=SIZE, height=SIZE).any()
@@ -656,7 +656,7 @@ def test_a_refused_drop_changes_nothing(fresh):
 def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released(fresh, site):
     _drop(fresh, "avatar.onnx", "amass.npz")
     _drop(fresh, "other.onnx")
-    fresh.wait("sessions.opened > 3 && sessions.opened === sessions.released + 1")
+    fresh.wait("sessions.opened === 6 && sessions.released === 5")
     assert fresh.run("[rnd.scene().avatar, rnd.scene().motion.name]") == ["other.onnx", "amass.npz"]
     scene = Scene(ViewOptions(site / "other.onnx", site / "amass.npz", size=SIZE, raster="cpu"))
     got = _picture(fresh, width=SIZE, height=SIZE, light=0, time=0.1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +63,13 @@ def draw_lengths(rows: Sequence[Row], files: Sequence[Path]) -> None:
 
         axes = figure.add_subplot()
         for colour, split in enumerate(dict.fromkeys(row["split"] for row in rows)):
-            for marker, kind in zip(MARKERS, kinds):
+            axes.plot([], [], color=f"C{colour}", lw=1, label=split)
+            for marker, kind in zip(cycle(MARKERS), kinds):
                 own = [row for row in rows if row["split"] == split and _kind(row) == kind]
                 if own:
-                    _draw_line(axes, own, f"C{colour}", marker, label=split if kind == kinds[0] else "")
+                    _draw_line(axes, own, f"C{colour}", marker)
         if len(kinds) > 1:
-            for marker, kind in zip(MARKERS, kinds):
+            for marker, kind in zip(cycle(MARKERS), kinds):
                 axes.plot([], [], marker, color="#666", ms=4, label=kind or "the others")
         first = rows[0]
         what = f"{first['gaussians']:,} Gaussians".replace(",", " ")
@@ -88,7 +90,7 @@ def _kind(row: Row) -> str:
     return str(row["method"].partition(", ")[2])
 
 
-def _draw_line(axes: Any, rows: Sequence[Row], colour: str, marker: str, *, label: str) -> None:
+def _draw_line(axes: Any, rows: Sequence[Row], colour: str, marker: str) -> None:
     points = []
     for method in dict.fromkeys(row["method"] for row in rows):
         of = [row for row in rows if row["method"] == method]
@@ -98,4 +100,4 @@ def _draw_line(axes: Any, rows: Sequence[Row], colour: str, marker: str, *, labe
     low = [mean - min(figures) for mean, figures in zip(means, spreads)]
     high = [max(figures) - mean for mean, figures in zip(means, spreads)]
     style = {"color": colour, "marker": marker, "ms": 4, "lw": 1, "capsize": 2}
-    axes.errorbar(minutes, means, yerr=(low, high), label=label, **style)
+    axes.errorbar(minutes, means, yerr=(low, high), **style)

@@ -168,9 +168,8 @@ def preset(name: str) -> TrainConfig:
     standard = TrainConfig()
     if name == "standard":
         return standard
-    if (
-        name == "full"
-    ):  # high rates gain nothing in so many steps: 34.67 dB and LPIPS .0156 with the standard's
+    if name == "full":
+        # over so many steps the standard's high rates are worse: 34.67 dB and LPIPS .0156, not 34.77 and .0147
         return dataclasses.replace(standard, steps=5 * standard.steps, rate_kept=0.1, rate_cooled=1.0)
     if name == "quick":
         quick = resized(standard, 12_000, 2_000)

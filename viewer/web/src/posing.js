@@ -13,6 +13,10 @@ const E0 = 1.0000001192092896, E1 = 0.6931471824645996, E2 = 0.2402210682630539,
 const E4 = 0.009676031768321991, E5 = 0.0013390863314270973;
 const POWERS = Float32Array.from({ length: 255 }, (_, k) => 2 ** (k - 127));
 
+// Of one Gaussian at a time
+const blend = new Float32Array(12), moved = new Float32Array(6), linear = new Float32Array(9), cofactors = new Float32Array(9);
+const factor = new Float32Array(9), posedFactor = new Float32Array(9);
+
 /** a·b + c of float32, rounded once. */
 const fused = (a, b, c) => f32(a * b + c);
 
@@ -25,7 +29,7 @@ function exp(x) {
   value = fused(value, rest, E2);
   value = fused(value, rest, E1);
   value = fused(value, rest, E0);
-  return value * POWERS[(whole | 0) + 127];
+  return value * POWERS[whole + 127];
 }
 
 const tanh = (x) => f32(1 - f32(2 / f32(exp(f32(2 * Math.min(Math.max(x, -LARGEST_TANH), LARGEST_TANH))) + 1)));
@@ -45,8 +49,6 @@ export class RestPose {
   constructor(count, [neighbours, weights, template, points, factors, normals, limbs, limits]) {
     Object.assign(this, { count, neighbours, weights, template, points, factors, normals, limbs, limits });
     this.posed = [3, 6, 3, HARMONICS].map((width) => new Float32Array(width * count));
-    this.factor = new Float32Array(9);  // for one Gaussian at a time
-    this.posedFactor = new Float32Array(9);
   }
 
   /** Means, covariances, normals and visibility of node fields offsets [M·6], visibility [M·S] and logits [M·J], which may
@@ -54,20 +56,19 @@ export class RestPose {
   pose([offsets, visibility, logits], bones) {
     const { count, limbs } = this, terms = 6 * visibility.length / offsets.length;
     const [means, covariances, normals, harmonics] = this.posed;
-    const shares = new Float32Array(bones.length / 12), blend = new Float32Array(12), moved = new Float32Array(6);
-    const a = new Float32Array(9), cofactors = new Float32Array(9);
+    const shares = new Float32Array(bones.length / 12);
     for (let i = 0; i < count; i++) {
       this.#shares(i, logits, shares);
       blended(shares, bones, blend);
-      for (let k = 0; k < 9; k++) a[k] = blend[k + (k > 5 ? 2 : k > 2 ? 1 : 0)];
-      cofactorsOf(a, cofactors);
+      for (let k = 0; k < 9; k++) linear[k] = blend[k + (k > 5 ? 2 : k > 2 ? 1 : 0)];
+      cofactorsOf(linear, cofactors);
       this.#between(offsets, 6, i, moved, 0);
       for (let k = 0; k < 6; k++) moved[k] = tanh(moved[k]);
       this.#between(visibility, terms, i, harmonics, HARMONICS * i);
-      const at = 7 * i, kappa = f32(limbs[at + 6] * widening(a, cofactors, limbs[at], limbs[at + 1], limbs[at + 2]));
-      this.#mean(i, a, blend, moved, kappa, means);
-      this.#covariance(i, a, moved, kappa, covariances);
-      this.#normal(i, a, cofactors, kappa, normals);
+      const at = 7 * i, kappa = f32(limbs[at + 6] * widening(linear, cofactors, limbs[at], limbs[at + 1], limbs[at + 2]));
+      this.#mean(i, linear, blend, moved, kappa, means);
+      this.#covariance(i, linear, moved, kappa, covariances);
+      this.#normal(i, linear, cofactors, kappa, normals);
     }
     return this.posed;
   }
@@ -82,7 +83,7 @@ export class RestPose {
 
   #covariance(i, a, moved, kappa, covariances) {
     const { limbs } = this, floor = this.limits[1], at = 7 * i, ux = limbs[at], uy = limbs[at + 1], uz = limbs[at + 2];
-    const factor = this.factor, f = this.posedFactor, wide = f32(1 + kappa);
+    const f = posedFactor, wide = f32(1 + kappa);
     turned(moved, this.factors, 9 * i, factor);
     for (let c = 0; c < 3; c++) {
       const along = column(f32(kappa * ux), f32(kappa * uy), f32(kappa * uz), factor, c);
@@ -133,15 +134,14 @@ export class RestPose {
     else shares.fill(0);
     let greatest = -Infinity;
     for (let j = 0; j < joints; j++) {
-      const logit = f32(template[from + j] + shares[j]);
-      shares[j] = logit;
-      greatest = logit > greatest || logit !== logit ? logit : greatest;
+      shares[j] += template[from + j];
+      greatest = Math.max(greatest, shares[j]);
     }
     for (let j = 0; j < joints; j++) shares[j] = exp(f32(shares[j] - greatest));
   }
 }
 
-/** [A_R | A_T] [12] of shares [J] that have yet to be divided by their sum. */
+/** [A_R | A_T] [12] of shares [J] that have yet to be divided by their sum: twelve sums side by side, none waits for another. */
 function blended(shares, bones, blend) {
   const joints = shares.length;
   let sum = 0, xx = 0, xy = 0, xz = 0, x = 0, yx = 0, yy = 0, yz = 0, y = 0, zx = 0, zy = 0, zz = 0, z = 0;
