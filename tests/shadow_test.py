@@ -6,6 +6,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.shadow import directional_visibility
 
 SPACING = 0.015  # m between sampled points
+HAIR = 0.5e-6  # m; a float32 of half a metre is known to 0.03e-6
 
 
 def fibonacci_sphere(count):
@@ -104,6 +105,21 @@ def test_a_ball_shadows_its_cross_section_on_a_plane(tilt):
     distance = np.hypot((x - centre) * np.cos(tilt), z)
     assert (visibility[distance < 0.9 * radius] == 0).all()
     assert (visibility[distance > 1.1 * radius] == 1).all()
+
+
+def test_no_hairs_breadth_of_motion_switches_a_texel():
+    grid = np.arange(-0.4, 0.4, SPACING)
+    x, z = (g.ravel() for g in np.meshgrid(grid, grid))
+    plane = np.stack([x, 0 * x, z], -1)
+    ball = fibonacci_sphere(int(4 * np.pi * 0.25**2 / SPACING**2))
+    normals = np.concatenate([np.tile([0.0, 1, 0], (len(plane), 1)), ball])
+    seen = []
+    for step in range(800):
+        moved = [step * HAIR, 0.4, 0.5 * step * HAIR] + 0.25 * ball
+        points = np.concatenate([plane, moved])
+        seen.append(directional_visibility(points, normals, [[0.1, 1, 0]], radii=SPACING)[: len(plane), 0])
+    assert np.abs(seen[-1] - seen[0]).max() > 0.2  # some texels left the shadow, or came into it ...
+    assert np.abs(np.diff(seen, axis=0)).max() < 0.1  # ... by and by
 
 
 def test_a_person_of_capsules_agrees_with_exact_tracing():

@@ -21,7 +21,7 @@ from .shading_ambient import AmbientLight
 from .shading_lookup import DIFFUSE_SIZE, SPECULAR_SIZE
 from .shading_sum import DistantLights
 from .shading_tables import SkyTables
-from .shadow import CLEARANCE, CLEARANCE_TEXELS, SLOPE_FLOOR, axes_towards
+from .shadow import CLEARANCE, CLEARANCE_TEXELS, SLOPE_FLOOR, SOFTNESS, axes_towards
 from .shadow_gl import SunMaps
 from .specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
 from .surfaces_gl import Surfaces
@@ -160,7 +160,7 @@ class GlShading:
                 macros["SUNS"] = len(shader.suns)
                 macros |= {"TURNED_AWAY": float(TURNED_AWAY), "AT_SILHOUETTE": float(AT_SILHOUETTE)}
                 macros |= {"CLEARANCE": float(CLEARANCE), "CLEARANCE_TEXELS": float(CLEARANCE_TEXELS)}
-                macros["SLOPE_FLOOR"] = float(SLOPE_FLOOR)
+                macros |= {"SLOPE_FLOOR": float(SLOPE_FLOOR), "SOFTNESS": float(SOFTNESS)}
                 parts = (*parts, "shadow_map.glsl", "suns.glsl")
             fragment = ("sh.glsl", "ggx.glsl", "surface.glsl", *parts, "shade.frag")
             self._passes[key] = Pass(self._context, ("fill.vert",), fragment, macros)

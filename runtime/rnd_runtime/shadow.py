@@ -4,7 +4,8 @@ No mesh and no capsules: any cloud of points with normals on closed surfaces wil
 skeletons need nothing of their own. Per direction, every point that faces the light is drawn as a small disc
 in its tangent plane into an orthographic map that keeps what lies nearest to the light; then every point
 looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its
-own tangent plane, so that a slope casts no shadow on itself.
+own tangent plane, so that a slope casts no shadow on itself. Visibility is a continuous function of the places, if a
+steep one.
 
 Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). Threads share the work of
 each direction; their number changes no bit.
@@ -16,6 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._lanes import WIDTH, aligned_floats, block_x, block_y, lanes, larger, load, store
 from ._raster_input import floats, mask
 from .errors import InputError
 
@@ -27,8 +29,18 @@ Floats32 = NDArray[np.float32]
 CLEARANCE = np.float32(1.0)
 # ... and no less than this many texels, which is what rounding to the map's grid costs on curved surfaces.
 CLEARANCE_TEXELS = np.float32(0.35)
+# Nothing here is a step, else the rounding of a place, or a hair's motion, would switch a texel. A plane falls by DROP
+# metres, which no body rises, over RIM_TEXELS beyond its disc; it sinks by as much while the cosine of its normal goes
+# from EDGE_ON to 0; and light fades while what rises above a point's plane does so by from 1 − SOFTNESS to 1 + SOFTNESS
+# clearances.
+DROP, RIM_TEXELS = np.float32(2), np.float32(0.5)
+EDGE_ON = np.float32(0.02)
+SOFTNESS = np.float32(0.25)
 SLOPE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
 _EMPTY = np.float32(-np.inf)
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+BLOCK_SHIFT = 2
+BLOCK = 1 << BLOCK_SHIFT  # texels; a block is one value of sixteen lanes
 _CHUNK = 1024  # points turned at a time
 
 
@@ -98,24 +110,27 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
     extent = max(right - left, top - bottom)
     if not extent > 0:  # a single point, or none: nothing to cast
         extent = np.float32(1)
-    # texel centres lie at integers; one empty row all around serves the lookup of the outermost points
+    # texel centres lie at integers; empty rows around serve the lookup of the outermost points, a last one in case that
+    # rounding puts them on the next integer
     texel = extent / np.float32(resolution - 3)
-    width = int((right - left) / texel) + 3 if right >= left else 3
-    height = int((top - bottom) / texel) + 3 if right >= left else 3
-    depth = np.full((height, width), _EMPTY, np.float32)
+    width = int((right - left) / texel) + 4 if right >= left else 4
+    height = int((top - bottom) / texel) + 4 if right >= left else 4
+    across, down = (width + BLOCK - 1) // BLOCK, (height + BLOCK - 1) // BLOCK
+    depth = aligned_floats(across * down * WIDTH)  # block by block
+    depth[:] = _EMPTY
     for i in range(count):
         if normal[i, 2] > 0:
             position[i, 0] = (position[i, 0] - left) / texel + 1
             position[i, 1] = (position[i, 1] - bottom) / texel + 1
     # each thread draws rows of its own, and about as many discs as the others
-    edges = _bands(position, normal, height, threads)
+    edges = _bands(position, normal, down, threads)
     for band in numba.prange(len(edges) - 1):
         for i in range(count):
             if normal[i, 2] > 0 and radii[i] > 0:
-                _draw_disc(depth, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
+                _draw_disc(depth, across, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
     for i in numba.prange(count):
         if normal[i, 2] > 0 and receivers[i]:
-            visibility[i] = _look_up(depth, position, normal, i, radii[i], texel)
+            visibility[i] = _look_up(depth, across, position, normal, i, radii[i], texel)
 
 
 @numba.njit(error_model="numpy")
@@ -140,11 +155,11 @@ def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore
 
 @numba.njit(error_model="numpy")
 def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
-    """Rows [bands + 1] that cut a map into bands which hold about equally many of the points that face the light."""
+    """Rows of blocks [bands + 1] that cut a map into bands with about equally many points that face the light."""
     points = np.zeros(height + 1, np.int64)
     for i in range(len(position)):
         if normal[i, 2] > 0:
-            points[int(position[i, 1]) + 1] += 1
+            points[(int(position[i, 1]) >> BLOCK_SHIFT) + 1] += 1
     for row in range(height):
         points[row + 1] += points[row]
     edges = np.empty(bands + 1, np.int64)
@@ -176,32 +191,48 @@ def _slopes(normal, i, texel):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy")
-def _draw_disc(depth, position, normal, i, radius, texel, low, high):  # type: ignore[no-untyped-def]
-    """Keep the disc's plane where it is nearer to the light than what rows ``low`` … ``high`` − 1 of the map hold."""
-    width = depth.shape[1]
-    x, y, z = position[i, 0], position[i, 1], position[i, 2]
+def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  # type: ignore[no-untyped-def]
+    """Keep the disc's plane, and its fall around, where nearer to the light, in rows of blocks ``low`` … ``high``."""
+    x, y = position[i, 0], position[i, 1]
+    z = position[i, 2] - DROP * max(_ONE - normal[i, 2] / EDGE_ON, _ZERO)
     slope_x, slope_y = _slopes(normal, i, texel)
-    reach = radius / texel
-    for row in range(max(int(np.ceil(y - reach)), low), min(int(np.floor(y + reach)) + 1, high)):
-        for column in range(max(int(np.ceil(x - reach)), 0), min(int(np.floor(x + reach)) + 1, width)):
-            dx, dy = np.float32(column) - x, np.float32(row) - y
+    reach = radius / texel + RIM_TEXELS
+    square, cosine = radius * radius, max(normal[i, 2], SLOPE_FLOOR)
+    fall = DROP / (reach * reach * texel * texel - square)
+    left, right = max(int(x - reach), 0) >> BLOCK_SHIFT, min((int(x + reach) >> BLOCK_SHIFT) + 1, across)
+    top, bottom = max(int(y - reach), 0) >> BLOCK_SHIFT, (int(y + reach) >> BLOCK_SHIFT) + 1
+    for row in range(max(top, low), min(bottom, high)):
+        dy = block_y() + (np.float32(row * BLOCK) - y)
+        for column in range(left, right):
+            dx = block_x() + (np.float32(column * BLOCK) - x)
             rise = slope_x * dx + slope_y * dy
-            # no branch: which texels of a small box lie inside is what no processor can predict
-            inside = (dx * dx + dy * dy) * texel * texel + rise * rise <= radius * radius
-            depth[row, column] = max(depth[row, column], z + rise if inside else _EMPTY)
+            # beyond the circle, and beyond the ellipse that one sees of it
+            beyond = (dx * dx + dy * dy) * (texel * texel) - square
+            outside = larger(beyond, lanes(_ZERO)) + cosine * larger(beyond + rise * rise, lanes(_ZERO))
+            plane = z + rise - fall * outside
+            at = (row * across + column) * WIDTH
+            store(depth, at, larger(plane, load(depth, at)))
+
+
+@numba.njit(inline="always")
+def _place(row, column, across):  # type: ignore[no-untyped-def]
+    """Of a texel in a map that is kept as rows of ``across`` blocks of 4×4."""
+    block = (row >> BLOCK_SHIFT) * across + (column >> BLOCK_SHIFT)
+    return block * WIDTH + (row & BLOCK - 1) * BLOCK + (column & BLOCK - 1)
 
 
 @numba.njit(error_model="numpy")
-def _look_up(depth, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
-    """Bilinear share of the four texels around a point in which nothing rises above its plane."""
+def _look_up(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
+    """Bilinear share of the four texels around a point that lies open: what rises above its plane hides it."""
     x, y, z = position[i, 0], position[i, 1], position[i, 2]
     slope_x, slope_y = _slopes(normal, i, texel)
     clearance = max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
+    top, span = (_ONE + SOFTNESS) * clearance, _ONE / (_TWO * SOFTNESS * clearance)
     column, row = int(x), int(y)  # positive, and one texel short of the far edge
     lit = np.float32(0)
     for corner in range(4):
         c, r = column + (corner & 1), row + (corner >> 1)
         dx, dy = np.float32(c) - x, np.float32(r) - y
-        if not depth[r, c] > z + slope_x * dx + slope_y * dy + clearance:
-            lit += (1 - abs(dx)) * (1 - abs(dy))
+        open_share = (z + slope_x * dx + slope_y * dy + top - depth[_place(r, c, across)]) * span
+        lit += (1 - abs(dx)) * (1 - abs(dy)) * min(max(open_share, _ZERO), _ONE)
     return min(lit, np.float32(1))

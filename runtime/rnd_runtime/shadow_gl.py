@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .gl_passes import Pass
 from .shading import SHADOW_RESOLUTION
-from .shadow import SLOPE_FLOOR
+from .shadow import DROP, EDGE_ON, RIM_TEXELS, SLOPE_FLOOR
 
 Floats32 = NDArray[np.float32]
 
@@ -82,6 +82,9 @@ class _Made:
             "MAP_SIZE": SHADOW_RESOLUTION,
             "BLOCK": _BLOCK,
             "SLOPE_FLOOR": float(SLOPE_FLOOR),
+            "DROP": float(DROP),
+            "EDGE_ON": float(EDGE_ON),
+            "RIM_TEXELS": float(RIM_TEXELS),
         }
         self.surround = Pass(context, ("sun_bounds.vert",), ("sun_bounds.frag",), macros)
         self.discs = Pass(context, ("shadow_map.glsl", "sun_discs.vert"), ("sun_discs.frag",), macros)

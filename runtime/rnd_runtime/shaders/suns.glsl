@@ -6,7 +6,7 @@ uniform vec3 sun_directions[SUNS];  // unit, in the light's frame
 uniform vec3 sun_irradiances[SUNS];
 uniform float sun_blurs[SUNS];  // mean square angle
 
-// Bilinear share of the four texels around the Gaussian in which nothing rises above its tangent plane.
+// Bilinear share of the four texels around the Gaussian that lies open: what rises above its tangent plane hides it.
 float reached_by(int sun) {
     MapPoint here = in_map(sun, mean_world, normal_world);
     if (!(here.cosine > 0.0) || !usable(mean_world, normal_world, disc_radius)) return 0.0;
@@ -18,7 +18,8 @@ float reached_by(int sun) {
         vec2 d = vec2(texel) - here.position.xy;
         float plane = here.position.z + dot(here.slope, d);
         float depth = texelFetch(depths, texel + ivec2(0, sun * MAP_SIZE), 0).r;
-        if (!(depth > plane + clearance)) lit += (1.0 - abs(d.x)) * (1.0 - abs(d.y));
+        float open_share = (plane + (1.0 + SOFTNESS) * clearance - depth) / (2.0 * SOFTNESS * clearance);
+        lit += (1.0 - abs(d.x)) * (1.0 - abs(d.y)) * clamp(open_share, 0.0, 1.0);
     }
     return min(lit, 1.0);
 }

@@ -43,10 +43,20 @@ export function project({ means, covariances, opacities }, count, features, came
     if (!(left < width && top < height && right >= 0 && bottom >= 0)) continue;
     if (Math.floor(left) > Math.floor(right) || Math.floor(top) > Math.floor(bottom)) continue;
     if (!Number.isFinite(features[3 * i] + features[3 * i + 1] + features[3 * i + 2])) continue;
-    boxes.set([left / TILE, top / TILE, right / TILE, bottom / TILE], 4 * i);  // whole tiles: what is stored is cut off
-    const column = Math.floor(centerX - 0.5), row = Math.floor(centerY - 0.5);
-    records.set([column, row, centerX - 0.5 - column, centerY - 0.5 - row, shear, HALF_LOG2_E / pyy, HALF_LOG2_E / conditional,
-      peak, features[3 * i], features[3 * i + 1], features[3 * i + 2]], 4 * TEXELS * i);
+    boxes[4 * i] = left / TILE;  // whole tiles: what is stored is cut off
+    boxes[4 * i + 1] = top / TILE;
+    boxes[4 * i + 2] = right / TILE;
+    boxes[4 * i + 3] = bottom / TILE;
+    const column = Math.floor(centerX - 0.5), row = Math.floor(centerY - 0.5), at = 4 * TEXELS * i;
+    records[at] = column;
+    records[at + 1] = row;
+    records[at + 2] = centerX - 0.5 - column;
+    records[at + 3] = centerY - 0.5 - row;
+    records[at + 4] = shear;
+    records[at + 5] = HALF_LOG2_E / pyy;
+    records[at + 6] = HALF_LOG2_E / conditional;
+    records[at + 7] = peak;
+    for (let c = 0; c < 3; c++) records[at + 8 + c] = features[3 * i + c];
     depths[i] = z;
     drawn[visible++] = i;
   }
@@ -59,35 +69,33 @@ function sortIntoTiles(order, boxes, records, width, height) {
   let total = 0, most = 0;
   for (const i of order) most += (boxes[4 * i + 2] - boxes[4 * i] + 1) * (boxes[4 * i + 3] - boxes[4 * i + 1] + 1);
   const reached = new Uint32Array(most), counts = new Uint32Array(order.length);
-  order.forEach((i, place) => {
-    const before = total;
-    for (let row = boxes[4 * i + 1]; row <= boxes[4 * i + 3]; row++)
-      for (let column = boxes[4 * i]; column <= boxes[4 * i + 2]; column++)
-        if (reaches(records, 4 * TEXELS * i, TILE * column, TILE * row)) {
-          reached[total++] = row * columns + column;
-          tiles[2 * (row * columns + column) + 1]++;
+  for (let place = 0; place < order.length; place++) {
+    const i = order[place], at = 4 * TEXELS * i, before = total, shear = records[at + 4], peak = records[at + 7];
+    const x = records[at] + records[at + 2] - HALF, y = records[at + 1] + records[at + 3] - HALF;
+    const fallY = records[at + 5], fallX = records[at + 6], slack = HALF * (1 + Math.abs(shear));
+    const left = boxes[4 * i], right = boxes[4 * i + 2], last = boxes[4 * i + 3];
+    for (let row = boxes[4 * i + 1]; row <= last; row++) {
+      // whether α may come to 1/255 in the tile: pixels are within HALF of its middle
+      const dy = TILE * row - y, v = Math.max(Math.abs(dy) - HALF, 0), lost = fallY * v * v, middle = x + shear * dy;
+      for (let column = left, tile = row * columns + left; column <= right; column++, tile++) {
+        const u = Math.max(Math.abs(TILE * column - middle) - slack, 0);
+        if (peak - lost - fallX * u * u >= LEAST) {
+          reached[total++] = tile;
+          tiles[2 * tile + 1]++;
         }
+      }
+    }
     counts[place] = total - before;
-  });
+  }
   for (let tile = 0, start = 0; tile < tiles.length; tile += 2) {
     const count = tiles[tile + 1];
     tiles[tile] = tiles[tile + 1] = start;
     start += count;
   }
   const pairs = new Uint32Array(wholeRows(total, ROW_PAIRS));
-  let pair = 0;
-  order.forEach((i, place) => {
-    for (const last = pair + counts[place]; pair < last; pair++) pairs[tiles[2 * reached[pair] + 1]++] = i;
-  });
+  for (let place = 0, pair = 0; place < order.length; place++)
+    for (const last = pair + counts[place]; pair < last; pair++) pairs[tiles[2 * reached[pair] + 1]++] = order[place];
   return { pairs, tiles, columns };
-}
-
-/** Whether α may come to 1/255 in the tile that starts at pixel (x, y): pixels are within HALF of its middle. */
-function reaches(records, at, x, y) {
-  const shear = records[at + 4], dy = y + HALF - records[at + 1] - records[at + 3];
-  const across = Math.abs(x + HALF - records[at] - records[at + 2] - shear * dy) - HALF * (1 + Math.abs(shear));
-  const v = Math.max(Math.abs(dy) - HALF, 0), u = Math.max(across, 0);
-  return records[at + 7] - records[at + 5] * v * v - records[at + 6] * u * u >= LEAST;
 }
 
 const wholeRows = (count, row) => Math.max(Math.ceil(count / row), 1) * row;
@@ -101,7 +109,8 @@ function frontToBack(depths, drawn) {
   }
   const scale = far > near ? 4294967295 / (far - near) : 0;
   let order = drawn, other = new Int32Array(drawn.length);
-  let keys = Uint32Array.from(drawn, (i) => (depths[i] - near) * scale), otherKeys = new Uint32Array(drawn.length);
+  let keys = new Uint32Array(drawn.length), otherKeys = new Uint32Array(drawn.length);
+  for (let k = 0; k < drawn.length; k++) keys[k] = (depths[drawn[k]] - near) * scale;
   for (let shift = 0; shift < 32; shift += RADIX) {
     const starts = new Int32Array(DIGITS + 1);
     for (const key of keys) starts[((key >>> shift) & (DIGITS - 1)) + 1]++;

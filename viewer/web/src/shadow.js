@@ -4,7 +4,8 @@ import { clampRoughness, ggx } from "./brdf.js";
 
 const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
 const TURNED_AWAY = -0.2, AT_SILHOUETTE = 0;  // n·v over which suns fade out on what faces away (shading.py)
-const CLEARANCE_TEXELS = Math.fround(0.35), COSINE_FLOOR = Math.fround(0.1);  // and of a disc's radius, once
+const CLEARANCE_TEXELS = 0.35, COSINE_FLOOR = 0.1;  // and of a disc's radius, once
+const DROP = 2, RIM_TEXELS = 0.5, EDGE_ON = 0.02, SOFTNESS = 0.25;
 
 /** Add to `radiance` [count·3] what `suns` ({direction in the root's frame, irradiance, spread}) lay on the Gaussians. */
 export function addSuns(suns, gaussians, count, eye, grown, radiance) {
@@ -12,42 +13,45 @@ export function addSuns(suns, gaussians, count, eye, grown, radiance) {
   for (const sun of suns) shadeSun(sun, gaussians, count, eye, sunVisibility(sun.direction, gaussians, count, radii), radiance);
 }
 
-// Whether a texel lies inside a disc, and whether something rises above a plane, are yes or no: every step that leads to
-// such an answer is rounded to 32 bits where rnd_runtime rounds it, else some answers differ, and a pixel with them.
-const f = Math.fround, sum3 = (a, b, c) => f(f(a + b) + c);
-
 /** Disc radius [count] m of each Gaussian in a depth map; `grown`: by how much its covariance is multiplied. */
 function discRadii({ covariances, opacities }, count, grown) {
-  const factor = f(grown), variance = (k) => f(factor * covariances[k]);
-  return Float32Array.from({ length: count }, (_, i) => opacities[i] > CASTING_OPACITY
-    ? DISC_SIGMAS * Math.sqrt(sum3(variance(6 * i), variance(6 * i + 3), variance(6 * i + 5)) / 2) : 0);
+  const radii = new Float32Array(count);
+  for (let i = 0; i < count; i++) {
+    const trace = grown * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5]);
+    if (opacities[i] > CASTING_OPACITY) radii[i] = DISC_SIGMAS * Math.sqrt(trace / 2);
+  }
+  return radii;
 }
 
 /** Visibility [count]; a Gaussian with a number that is not finite neither casts nor receives. */
 function sunVisibility(direction, { means, normals }, count, radii) {
-  const frame = frameOf(direction), position = new Float32Array(3 * count), normal = new Float32Array(3 * count);
-  const visibility = new Float32Array(count), lower = [Infinity, Infinity], upper = [-Infinity, -Infinity];
+  const [x, y, z] = frameOf(direction), position = new Float32Array(3 * count), normal = new Float32Array(3 * count);
+  const visibility = new Float32Array(count);
+  let left = Infinity, right = -Infinity, low = Infinity, high = -Infinity;
   for (let i = 0; i < count; i++) {
     const mx = means[3 * i], my = means[3 * i + 1], mz = means[3 * i + 2];
     const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];
     if (!Number.isFinite(mx + my + mz + nx + ny + nz + radii[i])) continue;  // its normal stays 0, which faces no light
-    for (let axis = 0; axis < 3; axis++) {
-      const [fx, fy, fz] = frame[axis], k = 3 * i + axis;
-      position[k] = sum3(f(fx * mx), f(fy * my), f(fz * mz));
-      normal[k] = sum3(f(fx * nx), f(fy * ny), f(fz * nz));
-      if (axis < 2) {
-        lower[axis] = Math.min(lower[axis], position[k]);
-        upper[axis] = Math.max(upper[axis], position[k]);
-      }
-    }
+    const across = x[0] * mx + x[1] * my + x[2] * mz, up = y[0] * mx + y[1] * my + y[2] * mz;
+    position[3 * i] = across;
+    position[3 * i + 1] = up;
+    position[3 * i + 2] = z[0] * mx + z[1] * my + z[2] * mz;
+    normal[3 * i] = x[0] * nx + x[1] * ny + x[2] * nz;
+    normal[3 * i + 1] = y[0] * nx + y[1] * ny + y[2] * nz;
+    normal[3 * i + 2] = z[0] * nx + z[1] * ny + z[2] * nz;
+    left = Math.min(left, across);
+    right = Math.max(right, across);
+    low = Math.min(low, up);
+    high = Math.max(high, up);
   }
-  const spans = [0, 1].map((axis) => f(Math.max(upper[axis] - lower[axis], 0))), extent = Math.max(...spans);
-  const texel = f((extent > 0 ? extent : 1) / (RESOLUTION - 3));  // centres at integers, one empty row all around
-  const [width, height] = spans.map((span) => Math.floor(f(span / texel)) + 3);
+  const spans = [right - left, high - low].map((span) => Math.max(span, 0)), extent = Math.max(...spans);
+  const texel = (extent > 0 ? extent : 1) / (RESOLUTION - 3);  // centres at integers, empty rows around, one for rounding
+  const [width, height] = spans.map((span) => Math.floor(span / texel) + 4);
   const map = { depth: new Float32Array(width * height).fill(-Infinity), width, height, texel };
   for (let i = 0; i < count; i++) {
     if (!(normal[3 * i + 2] > 0)) continue;
-    for (let axis = 0; axis < 2; axis++) position[3 * i + axis] = f(f(position[3 * i + axis] - lower[axis]) / texel) + 1;
+    position[3 * i] = (position[3 * i] - left) / texel + 1;
+    position[3 * i + 1] = (position[3 * i + 1] - low) / texel + 1;
     if (radii[i] > 0) drawDisc(map, position, normal, 3 * i, radii[i]);
   }
   for (let i = 0; i < count; i++) if (normal[3 * i + 2] > 0) visibility[i] = lookUp(map, position, normal, 3 * i, radii[i]);
@@ -56,50 +60,55 @@ function sunVisibility(direction, { means, normals }, count, radii) {
 
 /** Two axes across `direction` and the direction itself. */
 function frameOf(direction) {
-  const z = unit(direction.map(f)), sizes = z.map(Math.abs), helper = [0, 0, 0];
+  const z = unit(direction), sizes = z.map((part) => Math.abs(Math.fround(part))), helper = [0, 0, 0];
   helper[sizes.indexOf(Math.min(...sizes))] = 1;
   const x = unit(cross(helper, z));
   return [x, cross(z, x), z];
 }
 
 function unit(v) {
-  const length = f(Math.sqrt(sum3(f(v[0] * v[0]), f(v[1] * v[1]), f(v[2] * v[2]))));
-  return v.map((value) => f(value / length));
+  const length = Math.hypot(...v);
+  return v.map((value) => value / length);
 }
 
 function cross(a, b) {
-  const minor = (i, j) => f(f(a[i] * b[j]) - f(a[j] * b[i]));
-  return [minor(1, 2), minor(2, 0), minor(0, 1)];
+  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 }
 
 /** Rise of a point's tangent plane towards the light, in metres a texel, along x and y. */
 function slopes(normal, k, texel) {
-  const scale = f(-texel / Math.max(normal[k + 2], COSINE_FLOOR));
-  return [f(normal[k] * scale), f(normal[k + 1] * scale)];
+  const scale = -texel / Math.max(normal[k + 2], COSINE_FLOOR);
+  return [normal[k] * scale, normal[k + 1] * scale];
 }
 
 function drawDisc({ depth, width, height, texel }, position, normal, k, radius) {
-  const x = position[k], y = position[k + 1], z = position[k + 2], reach = f(radius / texel), square = f(radius * radius);
-  const [slopeX, slopeY] = slopes(normal, k, texel);
-  const right = Math.min(Math.floor(f(x + reach)) + 1, width), bottom = Math.min(Math.floor(f(y + reach)) + 1, height);
-  for (let row = Math.max(Math.ceil(f(y - reach)), 0); row < bottom; row++)
-    for (let column = Math.max(Math.ceil(f(x - reach)), 0); column < right; column++) {
-      const dx = f(column - x), dy = f(row - y), rise = f(f(slopeX * dx) + f(slopeY * dy)), at = row * width + column;
-      const across = f(f(f(f(dx * dx) + f(dy * dy)) * texel) * texel);
-      if (f(across + f(rise * rise)) <= square && f(z + rise) > depth[at]) depth[at] = z + rise;
+  const x = position[k], y = position[k + 1], z = position[k + 2] - DROP * Math.max(1 - normal[k + 2] / EDGE_ON, 0);
+  const reach = radius / texel, square = radius * radius;
+  const cosine = Math.max(normal[k + 2], COSINE_FLOOR), box = reach + RIM_TEXELS, area = texel * texel;
+  const fall = DROP / (box * box * area - square), [slopeX, slopeY] = slopes(normal, k, texel);
+  const left = Math.max(Math.ceil(x - box), 0), right = Math.min(Math.floor(x + box) + 1, width);
+  const bottom = Math.min(Math.floor(y + box) + 1, height);
+  for (let row = Math.max(Math.ceil(y - box), 0); row < bottom; row++) {
+    const dy = row - y, along = slopeY * dy, above = dy * dy * area - square;
+    for (let column = left, at = row * width + left; column < right; column++, at++) {
+      const dx = column - x, rise = slopeX * dx + along, beyond = dx * dx * area + above, outside = beyond + rise * rise;
+      const plane = z + rise - fall * ((beyond > 0 ? beyond : 0) + (outside > 0 ? cosine * outside : 0));
+      if (plane > depth[at]) depth[at] = plane;
     }
+  }
 }
 
-/** Bilinear share of the four texels around a point in which nothing rises above its plane. */
+/** Bilinear share of the four texels around a point that lies open: what rises above its plane hides it. */
 function lookUp({ depth, width, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
-  const clearance = f(Math.max(radius, f(CLEARANCE_TEXELS * texel)) / Math.max(normal[k + 2], COSINE_FLOOR));
+  const clearance = Math.max(radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], COSINE_FLOOR);
+  const top = z + (1 + SOFTNESS) * clearance, span = 1 / (2 * SOFTNESS * clearance);
   const column = Math.floor(x), row = Math.floor(y);
   let lit = 0;
   for (let corner = 0; corner < 4; corner++) {
-    const c = column + (corner & 1), r = row + (corner >> 1), dx = f(c - x), dy = f(r - y);
-    const plane = f(sum3(z, f(slopeX * dx), f(slopeY * dy)) + clearance);
-    if (!(depth[r * width + c] > plane)) lit += (1 - Math.abs(dx)) * (1 - Math.abs(dy));
+    const c = column + (corner & 1), r = row + (corner >> 1), dx = c - x, dy = r - y;
+    const open = (top + slopeX * dx + slopeY * dy - depth[r * width + c]) * span;
+    lit += (1 - Math.abs(dx)) * (1 - Math.abs(dy)) * Math.min(Math.max(open, 0), 1);
   }
   return Math.min(lit, 1);
 }
