@@ -43,8 +43,11 @@ SIZE, FRAME = 192, 20
 TOLERANCE = 3  # of 255; measured 1
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
-RANDOM_STATES = int(os.environ.get("RND_RANDOM_STATES", 25))  # of 3000: 2 of 255 at most
+RANDOM_STATES = int(os.environ.get("RND_RANDOM_STATES", 25))
 RANDOM_SEED = 11
+# Of all pixels; none of 25 states. What covers less than 1/255 of a pixel is left out, and the last bits of networks,
+# which are other ones in every build of onnxruntime, may decide on that.
+RARE = 1e-7
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
@@ -350,7 +353,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
 
 
 def test_states_drawn_at_random_have_rnd_views_pixels(loaded, site):
-    scene, rng = _scene(site), np.random.default_rng(RANDOM_SEED)
+    scene, rng, wrong = _scene(site), np.random.default_rng(RANDOM_SEED), []
     for _ in range(RANDOM_STATES):
         state = {
             "light": int(rng.integers(0, 3)),
@@ -366,8 +369,9 @@ def test_states_drawn_at_random_have_rnd_views_pixels(loaded, site):
             "fov": rng.uniform(0.3, 1),
         }
         got = _picture(loaded, background="none", width=SIZE, height=SIZE, **state)
-        error = np.abs(got.astype(int) - _python_picture(loaded, scene))
-        assert error.max() <= TOLERANCE, (error.max(), state)
+        error = np.abs(got.astype(int) - _python_picture(loaded, scene)).max(-1)
+        wrong += [(int(pixel), state) for pixel in error[error > TOLERANCE]]
+    assert len(wrong) <= RARE * RANDOM_STATES * SIZE**2, wrong
     scene.close()
 
 

@@ -1,8 +1,8 @@
 // From what the networks say at the nodes to posed Gaussians (rnd_runtime/posing.py, which has the formulas).
 //
 // Everything is summed in float32 and in the order in which the compiled pass sums it on a machine that multiplies and
-// adds at once, rounding once. The bits are the same then, and so is which of two Gaussians at one depth is in front, and
-// which texels of a sun's map a disc covers; what the page draws differs from the player's picture where they do.
+// adds at once, rounding once. The bits are the same then, and so is which of two Gaussians at one depth is in front; what
+// the page draws differs from the player's picture where that does.
 
 const f32 = Math.fround;
 const LOG2_E = f32(Math.LOG2E), SMALLEST_POWER = -126, LARGEST_TANH = 9, SHORTEST = f32(1e-9), SMALLEST_SQUARE = f32(1e-6);
