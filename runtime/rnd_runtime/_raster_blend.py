@@ -29,6 +29,7 @@ from ._lanes import (
     total,
 )
 from ._raster_project import TILE
+from .outline import steepening
 
 BLOCK = 4
 HALF_BLOCK = np.float32(1.5)  # from a block's centre to its outer pixel centres
@@ -195,8 +196,8 @@ def _fullest_first(starts):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
-def blend(splats, width, height, threads):  # type: ignore[no-untyped-def]
-    """Pictures [H, W, K] of the attributes and [H, W] of alpha."""
+def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-def]
+    """Pictures [H, W, K] of the attributes and [H, W] of alpha; with ``outlines`` as :mod:`.outline` sharpens them."""
     channels = splats.attributes.shape[1]
     columns = channels // 4 * 4 + 4  # and alpha, up to whole fours
     image, coverage = np.zeros((height, width, channels), np.float32), np.zeros((height, width), np.float32)
@@ -224,9 +225,11 @@ def blend(splats, width, height, threads):  # type: ignore[no-untyped-def]
                 for x in range(min(TILE, width - tile_x)):
                     block, lane = y // BLOCK * BLOCKS + x // BLOCK, y % BLOCK * BLOCK + x % BLOCK
                     at = block * columns * WIDTH + lane
+                    covered = sums[at + channels * WIDTH]
+                    factor = steepening(covered) if outlines else ONE
                     for c in range(channels):
-                        image[tile_y + y, tile_x + x, c] = sums[at + c * WIDTH]
-                    coverage[tile_y + y, tile_x + x] = sums[at + channels * WIDTH]
+                        image[tile_y + y, tile_x + x, c] = sums[at + c * WIDTH] * factor
+                    coverage[tile_y + y, tile_x + x] = covered * factor
     return image, coverage
 
 

@@ -167,8 +167,8 @@ def draw(
     seen = perf_counter()
     radiance = _shade(gaussians, shader, camera, projected.drawn, kept)
     seconds = {"projection": seen - started, "shading": perf_counter() - seen}
-    raster = projected.draw(radiance)
-    return sharpened(replace(raster, seconds={**seconds, **raster.seconds}))
+    raster = projected.draw(radiance, outlines=True)
+    return replace(raster, seconds={**seconds, **raster.seconds})
 
 
 class KeptRadiance:

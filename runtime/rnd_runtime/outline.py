@@ -34,6 +34,12 @@ def sharpened(raster: Raster) -> Raster:
     return replace(raster, image=image, alpha=alpha, depth=depth, seconds=seconds)
 
 
+@njit(inline="always")
+def steepening(covered):  # type: ignore[no-untyped-def]
+    """What the coverage and the features of a pixel are multiplied with, of which ``covered`` is covered."""
+    return covered * (_THREE - _TWO * covered) if _ZERO < covered < _ONE else _ONE
+
+
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _sharpen(image: Floats32, alpha: Floats32, depth: Floats32) -> None:
     height, width, channels = image.shape
@@ -42,7 +48,7 @@ def _sharpen(image: Floats32, alpha: Floats32, depth: Floats32) -> None:
             covered = alpha[y, x]
             if not _ZERO < covered < _ONE:
                 continue
-            factor = covered * (_THREE - _TWO * covered)
+            factor = steepening(covered)
             alpha[y, x] = covered * factor
             depth[y, x] *= factor
             for c in range(channels):

@@ -22,6 +22,7 @@ from ._raster_project import Pinhole, pinhole, project, project_backward
 from ._raster_tiles import Splats, sort_into_tiles
 from .camera import Camera
 from .gaussians import Floats32, Raster
+from .outline import sharpened
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +59,23 @@ class Projected:
         )
         self.drawn: NDArray[np.bool_] = np.diff(self._slot_starts) > 0
 
-    def draw(self, features: Floats32) -> Raster:
-        """The picture of ``features`` [N, C], of which only rows of ``drawn`` Gaussians matter; no depth."""
+    def draw(self, features: Floats32, *, outlines: bool = False) -> Raster:
+        """The picture of ``features`` [N, C], of which only rows of ``drawn`` Gaussians matter; no depth.
+
+        With ``outlines`` they are sharp, see :mod:`.outline`.
+        """
         features = floats(features)
         means, covariances, opacities, camera = self._arrays
         check_shape("features", features, (len(means), features.shape[-1]))
         if not np.isfinite(features).all():  # then who is drawn depends on it
-            return rasterize(means, covariances, opacities, features, camera, depth=False)
+            raster = rasterize(means, covariances, opacities, features, camera, depth=False)
+            return sharpened(raster) if outlines else raster
         started = perf_counter()
         size, threads = (camera.width, camera.height), get_num_threads()
         pairs = sort_into_tiles(self._boxes, self._depths, self._slot_starts, size, threads, False)
         splats = Splats(self._centers, self._shapes, features, self._slot_starts, *pairs)
         sorted_at = perf_counter()
-        image, coverage = blend(splats, camera.width, camera.height, threads)
+        image, coverage = blend(splats, camera.width, camera.height, threads, outlines)
         seconds = {"sort": sorted_at - started, "raster": perf_counter() - sorted_at}
         return Raster(image, coverage, np.zeros_like(coverage), seconds)
 
@@ -123,7 +128,7 @@ def forward(
     pairs = sort_into_tiles(boxes, depths, slot_starts, size, threads, True)
     splats = Splats(centers, shapes, attributes, slot_starts, *pairs)
     sorted_at = perf_counter()
-    image, coverage = blend(splats, camera.width, camera.height, threads)
+    image, coverage = blend(splats, camera.width, camera.height, threads, False)
     seconds = {"projection+sort": sorted_at - started, "raster": perf_counter() - sorted_at}
     channels = features.shape[1]
     far = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)

@@ -28,7 +28,7 @@ def _splat(means, covariances, opacities, features, view, threads):
         boxes, depths, starts, (view.width, view.height), threads, False
     )
     splats = Splats(centers, shapes, attributes, starts, tile_starts, gaussians, slots)
-    return blend(splats, view.width, view.height, threads)
+    return blend(splats, view.width, view.height, threads, False)
 
 
 def three_calls(*arguments: Any) -> tuple[Tensor, Tensor, None]:
@@ -38,7 +38,7 @@ def three_calls(*arguments: Any) -> tuple[Tensor, Tensor, None]:
     centers, shapes, boxes, attributes, depths, starts = project(*arrays, view, False)
     pairs = sort_into_tiles(boxes, depths, starts, (camera.width, camera.height), threads, False)
     splats = Splats(centers, shapes, attributes, starts, *pairs)
-    return _pictures(blend(splats, camera.width, camera.height, threads))
+    return _pictures(blend(splats, camera.width, camera.height, threads, False))
 
 
 def one_call(*arguments: Any) -> tuple[Tensor, Tensor, None]:
