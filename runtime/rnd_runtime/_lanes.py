@@ -171,10 +171,10 @@ def lowest_bit(context, value):  # type: ignore[no-untyped-def]
     return types.int64(types.int64), emit
 
 
-def _call(builder: Any, name: str, result: Any, *args: Any) -> Any:
+def _call(builder: Any, name: str, result: Any, *args: Any, flags: tuple[str, ...] = ()) -> Any:
     kind = ir.FunctionType(result, [arg.type for arg in args])
     function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    return builder.call(function, args)
+    return builder.call(function, args, fastmath=flags)
 
 
 @intrinsic
@@ -184,14 +184,9 @@ def larger(context, a, b):  # type: ignore[no-untyped-def]
     Written as :func:`select` and stored where one of the two came from, it becomes a masked store, which some
     processors take twenty times as long over.
     """
-
-    def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS])
-        name = "llvm.maxnum.v16f32"
-        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-        return builder.call(function, args, fastmath=("nnan", "nsz"))
-
-    return LANES(a, b), emit
+    return LANES(a, b), lambda ctx, builder, sig, args: _call(
+        builder, "llvm.maxnum.v16f32", _FLOATS, *args, flags=("nnan", "nsz")
+    )
 
 
 @intrinsic

@@ -2,7 +2,7 @@
 
 flat in vec4 disc;
 flat in vec4 plane;
-flat in float cosine;  // of the normal with the sun's direction, SLOPE_FLOOR at least
+flat in vec2 rim;
 out float depth;
 
 void main() {
@@ -10,8 +10,6 @@ void main() {
     vec2 d = texel - disc.xy;
     float rise = dot(plane.xy, d);
     if (texel.y < 0.0 || texel.y >= float(MAP_SIZE)) discard;
-    float square = disc.w * disc.w, box = disc.w / plane.z + RIM_TEXELS;
-    float fall = DROP / (box * box * plane.z * plane.z - square);
-    float beyond = dot(d, d) * plane.z * plane.z - square;  // the circle, of which one sees an ellipse
-    depth = disc.z + rise - fall * (max(beyond, 0.0) + cosine * max(beyond + rise * rise, 0.0));
+    float beyond = dot(d, d) * plane.z * plane.z - disc.w * disc.w;  // the circle, of which one sees an ellipse
+    depth = disc.z + rise - rim.x * (max(beyond, 0.0) + rim.y * max(beyond + rise * rise, 0.0));
 }

@@ -5,8 +5,8 @@ uniform sampler2D normals;
 uniform int count;
 
 flat out vec4 disc;    // x, y texels; z m; radius m
-flat out float cosine;
 flat out vec4 plane;   // rise along x, along y, m a texel; m a texel; the first row of the sun's map
+flat out vec2 rim;     // fall beyond the disc, m a m²; cosine of the normal with the sun's direction, SLOPE_FLOOR at least
 
 const vec2 CORNERS[6] = vec2[6](
     vec2(-1.0, -1.0), vec2(1.0, -1.0), vec2(-1.0, 1.0), vec2(-1.0, 1.0), vec2(1.0, -1.0), vec2(1.0, 1.0)
@@ -20,11 +20,12 @@ void main() {
     MapPoint here = in_map(sun, point.xyz, normal_world);
     disc = vec4(here.position, point.w);
     disc.z -= DROP * max(1.0 - here.cosine / EDGE_ON, 0.0);
-    cosine = max(here.cosine, SLOPE_FLOOR);
+    float box = point.w / here.texel + RIM_TEXELS;
+    rim = vec2(DROP / (box * box * here.texel * here.texel - point.w * point.w), max(here.cosine, SLOPE_FLOOR));
     plane = vec4(here.slope, here.texel, float(sun * MAP_SIZE));
     gl_Position = vec4(-2.0, -2.0, 0.0, 1.0);
     if (here.cosine > 0.0 && point.w > 0.0 && usable(point.xyz, normal_world, point.w)) {
-        vec2 corner_at = here.position.xy + (point.w / here.texel + RIM_TEXELS) * CORNERS[corner] + 0.5;
+        vec2 corner_at = here.position.xy + box * CORNERS[corner] + 0.5;
         corner_at.y += plane.w;
         gl_Position.xy = 2.0 * corner_at / vec2(float(MAP_SIZE), float(SUNS * MAP_SIZE)) - 1.0;
     }

@@ -83,8 +83,8 @@ function slopes(normal, k, texel) {
 
 function drawDisc({ depth, width, height, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2] - DROP * Math.max(1 - normal[k + 2] / EDGE_ON, 0);
-  const reach = radius / texel, square = radius * radius;
-  const cosine = Math.max(normal[k + 2], COSINE_FLOOR), box = reach + RIM_TEXELS, area = texel * texel;
+  const cosine = Math.max(normal[k + 2], COSINE_FLOOR), box = radius / texel + RIM_TEXELS;
+  const area = texel * texel, square = radius * radius;
   const fall = DROP / (box * box * area - square), [slopeX, slopeY] = slopes(normal, k, texel);
   const left = Math.max(Math.ceil(x - box), 0), right = Math.min(Math.floor(x + box) + 1, width);
   const bottom = Math.min(Math.floor(y + box) + 1, height);
