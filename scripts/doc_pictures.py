@@ -75,12 +75,12 @@ def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
 
 def _weights(avatar: Avatar, motion: Motion, time_s: float, camera) -> np.ndarray:
     """Skinning weights as colours: each joint has its own, a Gaussian the mixture of its joints'."""
-    from rnd_runtime.skeleton import bone_transforms
+    from rnd_runtime.forearm import skinning_bones
     from rnd_runtime.window import motion_window
 
     gaussians = avatar.pose(motion, time_s)
     now = motion.at([time_s])
-    bones = bone_transforms(avatar.skeleton, now.rotations[0], now.translations[0])
+    bones = skinning_bones(avatar.skeleton, now.rotations[0], now.translations[0])
     window = motion_window(motion, time_s, poses=avatar.window_poses, seconds=avatar.window_seconds)
     (weights,) = avatar.run((*window, bones), ["skinning_weights"])
     joints = weights.shape[1]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_runtime.skeleton import bone_transforms
 from rnd_trainer.pose_refinement import (
     FADE_SECONDS,
     ROTATION_BOUND,
@@ -23,10 +24,14 @@ from tiny import body, motion
 FLOAT32 = 2e-6  # metres and matrix entries near 1, a chain of ten products
 
 
-def test_uncorrected_bones_are_the_runtimes() -> None:
+@pytest.mark.parametrize("twist", [0, 100])
+def test_uncorrected_bones_are_the_runtimes(twist: float) -> None:
     skeleton, moves = body().skeleton, motion(body())
+    ends = [skeleton.names.index(f"left_{end}") for end in ("elbow", "wrist")]
+    bone = np.diff(skeleton.rest_joints[ends], axis=0)[0]
+    moves.rotations[3, ends[1]] = axis_angle_to_matrix(np.radians(twist) * bone / np.linalg.norm(bone))
     refinement = PoseRefinement(moves, skeleton, [0, 3])
-    expected = bone_transforms(skeleton, moves.rotations[3], moves.translations[3])
+    expected = skinning_bones(skeleton, moves.rotations[3], moves.translations[3])
     assert np.abs(refinement.bones(3).detach().numpy() - expected).max() < FLOAT32
 
 
@@ -40,7 +45,7 @@ def test_the_corrected_motion_has_the_corrected_bones_and_stays_within_bounds() 
     turn, shift = refinement.bounded(4)
     assert turn.abs().max() <= ROTATION_BOUND and shift.abs().max() <= TRANSLATION_BOUND
     corrected = refinement.apply_to(moves)
-    expected = bone_transforms(skeleton, corrected.rotations[4], corrected.translations[4])
+    expected = skinning_bones(skeleton, corrected.rotations[4], corrected.translations[4])
     assert np.abs(refinement.bones(4).detach().numpy() - expected).max() < FLOAT32
 
 

@@ -31,6 +31,7 @@ from rnd_runtime.avatar_file import CONSTANT_OUTPUTS, POSED_OUTPUTS
 from rnd_runtime.images import read_image, write_image
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
+from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_viewer.cli import main as play
 from rnd_viewer.view_options import ViewOptions
 from rnd_viewer.view_scene import Scene
@@ -114,6 +115,11 @@ def site(tmp_path_factory) -> Path:
     _write_avatar(folder / "joined.onnx", lambda about: about["skeleton"].pop("parents"))
     _write_broken_avatar(folder / "holes.onnx")
     _write_avatar_of_a_graph(folder / "graph.onnx")
+    ends = {"left_elbow": 1.6, "right_wrist": -1.9}  # radians about what is nearly the forearm's axis
+    twisted = first.rotations.copy()
+    for joint, angle in ends.items():
+        twisted[:, avatar.skeleton.names.index(joint)] @= axis_angle_to_matrix([angle, 0, 0])
+    save_motion(folder / "twisted.npz", replace(first, rotations=twisted))
     broken_trans = first.translations.copy()
     broken_trans[7, 1] = np.nan
     np.savez(folder / "nan.npz", poses=np.zeros((31, 72)), trans=broken_trans)
@@ -434,6 +440,13 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
     _assert_agreed(loaded, got, scene)
     scene.close()
     _drop(loaded, "walk.npz")
+
+
+def test_twisted_forearms(fresh, site):
+    _drop(fresh, "avatar.onnx", "twisted.npz", "sky.exr")
+    scene = _scene(site, "twisted.npz")
+    _assert_agreed(fresh, _picture(fresh, time=0.4, azimuth=0.5), scene)
+    scene.close()
 
 
 def test_the_time_slider_reaches_the_last_frame_and_is_off_without_a_motion(fresh):

@@ -26,11 +26,12 @@ from .avatar_file import (
 from .brdf import LARGEST_ALBEDO
 from .errors import InputError
 from .files import existing_file
+from .forearm import skinning_bones
 from .gaussians import Gaussians
 from .motion import Motion
 from .onnx_parts import OnnxFile
 from .posing import RestPose, Unposed
-from .skeleton import Skeleton, bone_transforms, taken_along
+from .skeleton import Skeleton, taken_along
 from .window import described, recent_poses
 
 
@@ -186,7 +187,7 @@ class Avatar:
         root[:3, :3] = rotations[0]
         root[:3, 3] = place + translation - rotations[0] @ place
         local = np.concatenate([np.eye(3)[None], rotations[1:]])
-        return bone_transforms(self.skeleton, local, np.zeros(3)), root
+        return skinning_bones(self.skeleton, local, np.zeros(3)), root
 
     def _rest_pose(self) -> RestPose:
         neighbours, weights, log_template, *rest, limits = self._constants(REST_OUTPUTS)

@@ -17,6 +17,7 @@ from rnd_runtime import raster_oracle
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.avatar_file import NODE_LOGITS, NODE_OUTPUTS, REST_OUTPUTS
 from rnd_runtime.files import atomic_path
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.images import linear_to_srgb
 from rnd_runtime.light import load_light
@@ -24,7 +25,6 @@ from rnd_runtime.motion import load_motion
 from rnd_runtime.posing import RestPose
 from rnd_runtime.posing_reference import pose_reference
 from rnd_runtime.shading_reference import shade_reference
-from rnd_runtime.skeleton import bone_transforms
 from rnd_runtime.window import motion_window
 
 from .bench_avatars import content_key, sources
@@ -87,7 +87,7 @@ def posed_reference(avatar: Avatar, motion: Any, time: float) -> Gaussians:
     names = [*NODE_OUTPUTS, NODE_LOGITS]
     window, velocity = motion_window(motion, time, poses=avatar.window_poses, seconds=avatar.window_seconds)
     now = motion.at(np.array([time]))
-    bones = bone_transforms(avatar.skeleton, now.rotations[0], now.translations[0])
+    bones = skinning_bones(avatar.skeleton, now.rotations[0], now.translations[0])
     inputs = (window, velocity, bones)
     offsets, visibility, logits = avatar.run(inputs, names)
     *rest, limits = avatar.run(inputs, REST_OUTPUTS)

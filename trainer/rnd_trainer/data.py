@@ -14,10 +14,11 @@ from torch import Tensor
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture, Frame, Split
 from rnd_runtime.errors import InputError
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.images import srgb_to_linear
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
-from rnd_runtime.skeleton import Skeleton, bone_transforms
+from rnd_runtime.skeleton import Skeleton
 from rnd_runtime.window import motion_window
 
 from .config import ModelConfig
@@ -187,7 +188,7 @@ def pose_input(motion: Motion, skeleton: Skeleton, time: float, config: ModelCon
     """Window, velocities and bone transforms of ``motion`` at ``time`` seconds, as tensors."""
     window, velocity = motion_window(motion, time, poses=config.window_poses, seconds=config.window_seconds)
     now = motion.at(np.array([time]))
-    bones = bone_transforms(skeleton, now.rotations[0], now.translations[0])
+    bones = skinning_bones(skeleton, now.rotations[0], now.translations[0])
     return PoseInput(
         *(torch.as_tensor(np.asarray(x), dtype=torch.float32) for x in (window, velocity, bones))
     )

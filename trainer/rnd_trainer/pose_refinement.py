@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rnd_runtime.forearm import twist_turns
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.skeleton import Skeleton
@@ -45,6 +46,7 @@ class PoseRefinement(nn.Module):
         super().__init__()
         self.frames = sorted(set(frames))
         self.row = {frame: k for k, frame in enumerate(self.frames)}
+        self.skeleton = skeleton
         self.parents = [int(p) for p in skeleton.parents]
         arrays = {
             "rotations": motion.rotations[self.frames],
@@ -67,6 +69,7 @@ class PoseRefinement(nn.Module):
         turn, shift = self.bounded(frame)
         row = self.row[frame]
         local = self.rotations[row] @ torch.linalg.matrix_exp(_cross_matrices(turn))
+        local = self._shared(local)
         rotation: list[Tensor] = []
         position: list[Tensor] = []
         for k, parent in enumerate(self.parents):
@@ -79,6 +82,15 @@ class PoseRefinement(nn.Module):
                 position.append(position[parent] + rotation[parent] @ lever)
         turned, moved = torch.stack(rotation), torch.stack(position)
         return torch.cat([turned, (moved - (turned @ self.rest_joints[..., None])[..., 0])[..., None]], dim=2)
+
+    def _shared(self, local: Tensor) -> Tensor:
+        """Local rotations [J, 3, 3] as :func:`.forearm.share_twists` has them; by how much is taken as given."""
+        shared = list(local)
+        given = local.detach().double().cpu().numpy()
+        for elbow, wrist, axis, angle in twist_turns(self.skeleton, given):
+            turn = torch.as_tensor(axis_angle_to_matrix(angle * axis)).to(local)
+            shared[elbow], shared[wrist] = shared[elbow] @ turn.T, turn @ shared[wrist]
+        return torch.stack(shared)
 
     def prior(self, frame: int) -> Tensor:
         """Mean square of a frame's correction in units of its bounds."""

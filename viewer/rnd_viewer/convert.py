@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.body import Body, posed_vertices
 from rnd_runtime.errors import InputError, check_option, refuse_outside
 from rnd_runtime.files import existing_file, output_folder, refuse_input
+from rnd_runtime.forearm import share_twists
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, light_notes
 from rnd_runtime.motion import Motion, motion_inputs
@@ -146,6 +148,8 @@ def _mesh(options: MeshOptions) -> Iterator[str]:
     body = Body.load(options.body)
     motion = options.read_motion(options.motion, body.skeleton)
     yield from _notes(motion.notes)
+    shared = share_twists(body.skeleton, motion.rotations)  # as in pictures of an avatar
+    motion = replace(motion, rotations=shared)
     frames = parse_frames(options.frames, motion.frame_count)
     out = output_folder(options.out)
     if "glb" in formats:

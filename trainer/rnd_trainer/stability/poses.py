@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from rnd_runtime.avatar_file import POSED_OUTPUTS
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light, texel_directions
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
 from rnd_runtime.shading import Shader
-from rnd_runtime.skeleton import bone_transforms
 from rnd_trainer.data import usable
 from rnd_trainer.metrics import mask_box
 
@@ -134,7 +134,7 @@ def candy_wrapper(subject: Subject) -> Result:
             if degrees == 120:
                 errors.append(limb.normal_error(posed, posed.normals))
                 spread.append(limb.surface_spread(posed))
-                linear = subject.blend(motion, 0.0, subject.weights(motion, 0.0))[:, :, :3]
+                linear = subject.blend(motion, 0.0)[:, :, :3]
                 plain_errors.append(
                     limb.normal_error(posed, np.einsum("nrc,nc->nr", linear, subject.rest.normals))
                 )
@@ -271,7 +271,7 @@ def _by_axis_angle_difference(subject: Subject, before: Angles, now: Angles) -> 
     for name in now:
         velocity[names.index(name) - 1] = (np.array(now[name]) - np.array(before[name])) * 1000.0
     window = rotation_6d(np.repeat(motion.rotations[1:, 1:], avatar.window_poses, axis=0))
-    bones = bone_transforms(avatar.skeleton, motion.rotations[1], np.zeros(3))
+    bones = skinning_bones(avatar.skeleton, motion.rotations[1], np.zeros(3))
     return subject.picture(posed_by(subject, window, velocity, bones))
 
 

@@ -14,6 +14,7 @@ from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
 from rnd_runtime.camera import Camera
 from rnd_runtime.capture import Capture
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.images import to_bytes
 from rnd_runtime.light import Light
@@ -146,26 +147,27 @@ class Subject:
         return self.avatar.run((*window, self.bones(motion, time)), (output,))[0]
 
     def bones(self, motion: Motion, time: float) -> Floats32:
-        """Bone transforms [J, 3, 4] at a moment."""
+        """What the avatar is skinned by at a moment [J, 3, 4]."""
         now = motion.at([time])
-        return bone_transforms(self.avatar.skeleton, now.rotations[0], now.translations[0])
+        return skinning_bones(self.avatar.skeleton, now.rotations[0], now.translations[0])
 
-    def blend(self, motion: Motion, time: float, weights: Floats32 | None = None) -> Floats:
-        """Σ_j W_j B_j [N, 3, 4] with the template's weights, or others."""
+    def blend(self, motion: Motion, time: float) -> Floats:
+        """Σ_j W_j B_j [N, 3, 4] as the avatar has it."""
         bones = self.bones(motion, time).astype(np.float64)
-        return np.einsum("nj,jrc->nrc", self.template_weights if weights is None else weights, bones)
+        return np.einsum("nj,jrc->nrc", self.weights(motion, time), bones)
 
     def by_template(self, motion: Motion, time: float) -> Gaussians:
         """The baseline: the rest pose's Gaussians moved by the template's weights, normals by A_R n."""
-        rest, blend = self.rest, self.blend(motion, time)
+        rest, now = self.rest, motion.at([time])
+        bones = bone_transforms(self.avatar.skeleton, now.rotations[0], now.translations[0])
+        blend = np.einsum("nj,jrc->nrc", self.template_weights, bones.astype(np.float64))
         linear = blend[:, :, :3]
         means = np.einsum("nrc,nc->nr", linear, rest.means) + blend[:, :, 3]
         full = symmetric(rest.covariances)
         moved = (linear @ full @ linear.transpose(0, 2, 1)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
         normals = np.einsum("nrc,nc->nr", linear, rest.normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        root = self.bones(motion, time)[0, :, :3]
-        arrays = (np.asarray(a, np.float32) for a in (means, moved, normals, root))
+        arrays = (np.asarray(a, np.float32) for a in (means, moved, normals, bones[0, :, :3]))
         means32, covariances, normals32, root32 = arrays
         return replace(
             rest,

@@ -3,6 +3,7 @@
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { LARGEST_ALBEDO } from "./brdf.js";
 import { refusal } from "./errors.js";
+import { shareTwists } from "./forearm.js";
 import { motionWindow, poseAt } from "./motion.js";
 import { OnnxFile } from "./onnx.js";
 import { RestPose } from "./posing.js";
@@ -64,6 +65,7 @@ export class Avatar {
     const place = this.skeleton.rest.subarray(0, 3), rotation = now.rotations.slice(0, 9), turned = rotate(rotation, place);
     const root = { rotation, translation: turned.map((value, k) => place[k] + now.translation[k] - value) };
     now.rotations.set([1, 0, 0, 0, 1, 0, 0, 0, 1]);
+    shareTwists(this.skeleton, now.rotations);
     const { bones } = boneTransforms(this.skeleton, now.rotations, [0, 0, 0]);
     const count = this.skeleton.names.length, others = count - 1;
     const given = {

@@ -1,0 +1,37 @@
+// Forearms that share a twist between elbow and wrist (rnd_runtime/forearm.py, which has the formulas).
+
+import { axisAngleToMatrix, multiply, transposed } from "./rotations.js";
+
+const FREE = Math.PI / 3, MOST = Math.PI / 3;  // radians
+const SIDES = ["left", "right"];
+
+/** Turn the forearms of local rotations [J·9] about themselves, and their hands back, in place. */
+export function shareTwists({ names, parents, rest }, rotations) {
+  for (const side of SIDES) {
+    const elbow = names.indexOf(`${side}_elbow`), wrist = names.indexOf(`${side}_wrist`);
+    if (elbow < 0 || wrist < 0 || parents[wrist] !== elbow) continue;
+    const bone = [0, 1, 2].map((k) => rest[3 * wrist + k] - rest[3 * elbow + k]), length = Math.hypot(...bone);
+    if (!(length > 0)) continue;
+    const axis = bone.map((value) => value / length);
+    const angle = handedOn(rotations, 9 * elbow, axis) - handedOn(rotations, 9 * wrist, axis);
+    if (angle === 0) continue;
+    const turn = new Float64Array(9), turned = new Float64Array(9);
+    axisAngleToMatrix(...axis.map((value) => value * angle), turn, 0);
+    multiply(rotations, 9 * elbow, transposed(turn), 0, turned, 0);
+    rotations.set(turned, 9 * elbow);
+    multiply(turn, 0, rotations, 9 * wrist, turned, 0);
+    rotations.set(turned, 9 * wrist);
+  }
+}
+
+/** How much of its twist about `axis` the rotation at `at` hands on, radians. */
+function handedOn(m, at, axis) {
+  let along = 0;
+  for (let row = 0; row < 3; row++) for (let k = 0; k < 3; k++) along += axis[row] * m[at + 3 * row + k] * axis[k];
+  const sine = axis[0] * (m[at + 7] - m[at + 5]) + axis[1] * (m[at + 2] - m[at + 6]) + axis[2] * (m[at + 3] - m[at + 1]);
+  const twist = Math.atan2(sine, m[at] + m[at + 4] + m[at + 8] - along);
+  const beyond = (Math.abs(twist) - FREE) / (Math.PI - FREE);
+  if (beyond <= 0) return 0;
+  const share = MOST * Math.sin(Math.PI * beyond) ** 2 * Math.max(Math.min(1, 2 * (1 + along)), 0);
+  return twist > 0 ? share : -share;
+}
