@@ -9,10 +9,6 @@ from rnd_trainer.stability.rows import ROWS
 
 # What the design cannot pass yet: the figures, by how they begin, and why.
 KNOWN: dict[str, tuple[tuple[str, ...], str]] = {
-    "P2": (
-        ("normal error at 120°",),
-        "normals know nothing of how fast weights change along a limb, nor do those of A_R n",
-    ),
     "L8": (
         ("albedo 0:",),
         "what GGX scatters twice is lost, as in the paper",
