@@ -10,11 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from rnd_runtime.avatar import Avatar
+from rnd_runtime.camera import Camera
+from rnd_runtime.frame import draw
 from rnd_runtime.images import write_image
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion, load_motion
+from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.raster_cpu import rasterize
+from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
+from rnd_runtime.skeleton import bone_transforms
+from rnd_runtime.tone import tone_map
 from rnd_viewer.aov import aov_picture
 from rnd_viewer.background import Background
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path, orbit_path
@@ -60,6 +66,7 @@ def main() -> None:
         )
         tiles.append(_weights(avatar, motion, time_s, view(0, 0.0)))
     _write("weights.png", tiles)
+    _forearm(avatar, rest, sky)
 
 
 def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
@@ -89,6 +96,25 @@ def _weights(avatar: Avatar, motion: Motion, time_s: float, camera) -> np.ndarra
     colours = np.ascontiguousarray(weights @ palette * light[:, None], np.float32)
     raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, colours, camera)
     return (255 * raster.image.clip(0, 1)).astype(np.uint8)
+
+
+def _forearm(avatar: Avatar, rest: Motion, sky: Light) -> None:
+    """A hand at rest, turned by 120° with all of it at the wrist, and with the forearm taking half."""
+    elbow, wrist = (avatar.skeleton.names.index(f"left_{end}") for end in ("elbow", "wrist"))
+    ends = avatar.skeleton.rest_joints[[elbow, wrist]]
+    axis, middle = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0]), ends.mean(0)
+    turned = rest.rotations.copy()
+    turned[:, wrist] = axis_angle_to_matrix(math.radians(120) * axis)
+    seen = middle + 0.06 * axis
+    eye = seen + np.array([0, 0.15, 1])
+    camera = Camera.look_at(eye, seen, width=SIDE, height=SIDE // 2, fov_y=0.26)
+    shared = avatar.encode(replace(rest, rotations=turned), 0.0)
+    alone = shared._replace(bones=bone_transforms(avatar.skeleton, turned[0], np.zeros(3)))
+    tiles = []
+    for encoded in (avatar.encode(rest, 0.0), alone, shared):
+        raster = draw(avatar.posed(encoded), Shader(sky), camera, make_rasterizer("cpu"))
+        tiles.append(tone_map(raster.image, raster.alpha))
+    _write("forearm.png", tiles)
 
 
 def _write(name: str, tiles: list[np.ndarray]) -> None:
