@@ -134,18 +134,16 @@ def candy_wrapper(subject: Subject) -> Result:
             if degrees == 120:
                 errors.append(limb.normal_error(posed, posed.normals))
                 spread.append(limb.surface_spread(posed))
-                linear = subject.blend(motion, 0.0)[:, :, :3]
-                plain_errors.append(
-                    limb.normal_error(posed, np.einsum("nrc,nc->nr", linear, subject.rest.normals))
-                )
+                plain = subject.by_template(motion, 0.0)
+                plain_errors.append(limb.normal_error(plain, plain.normals))
     figures = (
         above("cross-section ratio at 150°, thinnest slice", min(ratios), 0.5,
               baseline=("template LBS", min(by_template))),
         below("not finite by 180°", float(not finite), 1, "poses"),
         below("normal error at 120°, mean of the slice that errs most", max(e.max() for e in errors), 15, "°",
-              baseline=("A_R n", max(e.max() for e in plain_errors))),
+              baseline=("template LBS, A_R n", max(e.max() for e in plain_errors))),
         stated("the same, mean of all slices", max(e.mean() for e in errors), "°",
-               baseline=("A_R n", max(e.mean() for e in plain_errors))),
+               baseline=("template LBS, A_R n", max(e.mean() for e in plain_errors))),
         stated(f"the surface's own normals, by {FEWER_OR_MORE[0]} and by {FEWER_OR_MORE[1]} neighbours, worst slice",
                max(e.max() for e in spread), "°"),
     )  # fmt: skip

@@ -151,11 +151,6 @@ class Subject:
         now = motion.at([time])
         return skinning_bones(self.avatar.skeleton, now.rotations[0], now.translations[0])
 
-    def blend(self, motion: Motion, time: float) -> Floats:
-        """Σ_j W_j B_j [N, 3, 4] as the avatar has it."""
-        bones = self.bones(motion, time).astype(np.float64)
-        return np.einsum("nj,jrc->nrc", self.weights(motion, time), bones)
-
     def by_template(self, motion: Motion, time: float) -> Gaussians:
         """The baseline: the rest pose's Gaussians moved by the template's weights, normals by A_R n."""
         rest, now = self.rest, motion.at([time])
