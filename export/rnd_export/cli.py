@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,8 @@ class Options:
     """avatar.ckpt of rnd-train, or the folder that it is in"""
     out: Path | None = None
     """where to write; by default avatar.onnx beside the checkpoint"""
+    target: Literal["rnd", "visionary"] = "rnd"
+    """visionary: not an avatar but a clip for Visionary's WebGPU renderer, with --motion and a light baked in"""
     motion: Path | None = None
     """check against torch on this motion instead of random frames, on 1000 of its frames at most"""
     frames: int = 120
@@ -52,7 +54,7 @@ class Options:
     size: int = 512
     """picture side of that search"""
     hdr: Path | None = None
-    """light of that search; by default the one that was learned"""
+    """light of that search, or of --target visionary; by default the one that was learned"""
     hdr_up: Up = "y"
     """which axis points up in the light's file"""
     capture: Path | None = None
@@ -106,7 +108,7 @@ def _export(options: Options) -> None:
     file = existing_file(options.checkpoint, what="checkpoint")
     if options.out is None and file.suffix == ".onnx":
         raise InputError("not a checkpoint", expected="an avatar.ckpt of rnd-train", got=".onnx", file=file)
-    out = options.out or file.with_suffix(".onnx")
+    out = options.out or file.with_suffix(".visionary.onnx" if options.target == "visionary" else ".onnx")
     captured = options.capture and capture_file(options.capture)
     for written in filter(None, (out, options.json)):
         refuse_input(written, file, options.motion, options.hdr, captured)
@@ -128,6 +130,14 @@ def _export(options: Options) -> None:
         export_bounded(options, checkpoint, out, motion, given)
         return
     variant = Variant(**{name: getattr(options, name) for name in CHOICES})
+    if options.target == "visionary":
+        from .visionary import export_visionary
+
+        assert options.motion is not None
+        light = options.hdr, options.hdr_up
+        for line in export_visionary(checkpoint, out, motion, options.motion, variant, *light):
+            print(line)  # noqa: T201
+        return
     drift = export(checkpoint, out, motion, variant)
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "
@@ -139,10 +149,15 @@ def _export(options: Options) -> None:
 
 def _refuse_idle(options: Options, *, bounded: bool) -> None:
     """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
+    bounds = " or ".join(map(flag, BOUNDS.values()))
     if bounded:
         refuse_changed(options, CHOICES, "a bound finds this by itself")
+        refuse_changed(options, ("target",), "a bound is for avatars")
+    elif options.target == "visionary":
+        check_option(options.motion is not None, "--target visionary", "a --motion to bake in", "none")
+        refuse_changed(options, [name for name in SEARCHES if not name.startswith("hdr")], f"needs {bounds}")
     else:
-        refuse_changed(options, SEARCHES, f"needs {' or '.join(map(flag, BOUNDS.values()))}")
+        refuse_changed(options, SEARCHES, f"needs {bounds}")
     if options.hdr is None:
         refuse_changed(options, ("hdr_up",), "needs --hdr")
     if options.motion is not None:

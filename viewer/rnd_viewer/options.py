@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.light import Up
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import EDIT_LIMITS, MotionEdits, edit_motion
 from rnd_runtime.motion_files import FPS_LIMITS
@@ -77,7 +78,7 @@ class MotionOptions:
 class LitOptions(MotionOptions):
     """Those of a command that lights what moves by probes, which its ``hdr`` names."""
 
-    hdr_up: Literal["y", "z"] = "y"
+    hdr_up: Up = "y"
     """Which axis points up in the probe's file."""
 
     def __post_init__(self) -> None:
