@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import rnd_runtime
+from rnd_runtime.kernels import kernels_are_cold
 
 KERNEL = """
 from numba import njit
@@ -42,11 +43,13 @@ def clone(tmp_path) -> Path:
     return tmp_path
 
 
-def _run(clone: Path, **changes: str) -> str:
-    """What the kernel gives for 1, in a process of its own."""
+USE = "from rnd_runtime.kernel import outer; print(outer(1))"
+
+
+def _run(clone: Path, code: str = USE, **changes: str) -> str:
+    """What ``code`` prints in a process of its own: what the kernel gives for 1."""
     known = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     environment = known | {"PYTHONPATH": str(clone / "runtime"), **changes}
-    code = "from rnd_runtime.kernel import outer; print(outer(1))"
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
@@ -81,3 +84,29 @@ def test_an_editors_lock_is_no_source(clone):
     inner.write_text(INNER.format(factor=2, added=1))
     inner.with_name(".#inner.py").symlink_to("me@here.1234")
     assert _run(clone) == "4" and (clone / ".cache/kernels").is_dir()
+
+
+def test_kernels_are_cold_until_one_of_ours_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "none"))
+    assert kernels_are_cold()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for folder, cold in (("others_0123", True), ("rnd_runtime_0123", False)):
+        (tmp_path / folder).mkdir()
+        assert kernels_are_cold()
+        (tmp_path / folder / "raster.draw-7.py312.nbi").touch()
+        assert kernels_are_cold() == cold
+
+
+def test_where_numba_keeps_kernels_is_where_they_are_looked_for(clone, tmp_path):
+    """By numba itself: in the folder that it is told, and beside the sources."""
+    inner, package = clone / "runtime/rnd_runtime/inner.py", clone / "runtime/rnd_runtime"
+    inner.write_text(INNER.format(factor=2, added=1))
+    own = Path(rnd_runtime.__file__).parent / "kernels.py"
+    (package / "kernels.py").write_text(own.read_text("utf-8"), "utf-8")
+    (package / "__init__.py").write_text("")
+    code = "from rnd_runtime.kernels import kernels_are_cold; print(kernels_are_cold())"
+    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    for places in (home | {"NUMBA_CACHE_DIR": str(tmp_path / "kept")}, home):
+        assert _run(clone, code, **places) == "True"
+        _run(clone, **places)
+        assert _run(clone, code, **places) == "False"

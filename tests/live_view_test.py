@@ -7,23 +7,43 @@ import shutil
 import socket
 import struct
 import subprocess
+import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from browser import CHROMIUM, chromium
 from rnd_runtime.files import atomic_path
 from rnd_runtime.images import read_image, write_image
 from rnd_trainer import cli
 from rnd_trainer.config import TrainConfig
-from rnd_trainer.live_view import POINTS, Metrics, live_view, state
+from rnd_trainer.live_view import GOODBYE_S, POINTS, Metrics, live_view, state
+from rnd_trainer.preview import CAPTION, TILES, contact_sheet
 from rnd_trainer.schedule import UNSEEN_COST, Schedule
 
 TOTAL = 1000
 SCHEDULE = Schedule(TrainConfig(steps=800, unseen_fraction=0.25))
+
+PICTURE = "document.getElementById('picture')"
+END = "document.getElementById('end').textContent"
+SERVING = """
+import sys, time
+from pathlib import Path
+from rnd_trainer.config import TrainConfig
+from rnd_trainer.live_view import live_view
+from rnd_trainer.schedule import Schedule
+with live_view(Path(sys.argv[1]), Schedule(TrainConfig(steps=800, unseen_fraction=0.25)), port=0) as page:
+    print(page, flush=True)
+    time.sleep(600)
+"""
 
 
 def _row(step: int, **more: object) -> dict[str, object]:
@@ -49,6 +69,17 @@ def _get(url: str, host: str | None = None) -> tuple[int, bytes]:
     except urllib.error.HTTPError as error:
         with error:
             return error.code, b""
+
+
+@contextmanager
+def _served_by_another_process(folder: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    command = [sys.executable, "-c", SERVING, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout
+            yield process.stdout.readline().strip(), process
+        finally:
+            process.kill()
 
 
 def test_state_says_how_far_and_how_long_still():
@@ -129,15 +160,99 @@ def test_a_page_that_goes_away_leaves_nothing_on_the_terminal(tmp_path, capfd):
     assert "Traceback" not in capfd.readouterr().err
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_the_page_shows_the_training(tmp_path):
+def _last_state(folder: Path, end: type[BaseException] | None) -> dict[str, object]:
+    """What a page that waits for the end of a run is told."""
+    told = []
+    with suppress(RuntimeError), live_view(folder, SCHEDULE, port=0) as page:
+        waiting = threading.Thread(target=lambda: told.append(_get(page + "end.json")[1]))
+        waiting.start()
+        waiting.join(0.3)
+        assert waiting.is_alive() and json.loads(_get(page + "state.json")[1])["ended"] is None
+        if end:
+            raise end
+    waiting.join()
+    return json.loads(told[0])
+
+
+def test_whoever_waits_for_the_end_is_told_how_it_came(tmp_path):
+    folder = _write_run(tmp_path, 300)
+    now = _last_state(folder, RuntimeError)
+    assert (now["ended"], now["done"], now["scores"]) == ("stopped", 300, None)
+    _write_run(folder, TOTAL)
+    now = _last_state(folder, None)
+    assert (now["ended"], now["done"], now["scores"]) == ("finished", TOTAL, None)
+    (folder / "eval.json").write_text("{}")
+    now = _last_state(folder, None)
+    assert now["scores"] == str(folder / "eval.json") and now["avatar"] == str(folder / "avatar.ckpt")
+
+
+def test_where_no_page_is_open_the_end_comes_at_once(tmp_path):
+    folder = _write_run(tmp_path, 3)
+    with live_view(folder, SCHEDULE, port=0) as page:
+        _get(page + "state.json")
+        started = time.monotonic()
+    assert time.monotonic() - started < GOODBYE_S
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium")
+    with chromium(tmp_path_factory.mktemp("profile")) as browser:
+        yield browser
+
+
+def test_the_page_shows_the_training_and_its_end(tmp_path, browser):
     folder = _write_run(tmp_path, 501)
     with live_view(folder, SCHEDULE, port=0) as page:
-        line = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1500"]
-        line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page]
-        dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert "step 501 of 1000 · stage 2 · 4 min 10 s so far · 2 min 42 s left" in dom
-    assert 'src="/previews/step_000500.png"' in dom and "image (log)" in dom and "<path d=" in dom
+        browser.open(page)
+        browser.wait(f"{PICTURE}?.naturalWidth")
+        dom = browser.run("document.body.innerHTML")
+        assert "step 501 of 1000 · stage 2 · 4 min 10 s so far · 2 min 42 s left" in dom
+        assert 'src="/previews/step_000500.png"' in dom and "image (log)" in dom and "<path d=" in dom
+        assert browser.run(END) == ""
+        _write_run(folder, TOTAL)
+        shutil.copy(folder / "previews/step_000500.png", folder / "previews/step_001000.png")
+        (folder / "eval.json").write_text("{}")
+    assert browser.run(END) == (
+        f"Finished, all 1000 steps. The avatar: {folder}/avatar.ckpt · its scores: {folder}/eval.json"
+    )
+    assert browser.run("document.getElementById('facts').textContent").startswith(
+        "step 1000 of 1000 · stage 2"
+    )
+    assert browser.run(f"{PICTURE}.src").endswith("step_001000.png")
+    assert browser.run(f"{PICTURE}.complete && {PICTURE}.naturalWidth") == 32
+
+
+def test_the_page_tells_a_run_that_was_stopped_from_one_that_was_killed(tmp_path, browser):
+    folder = _write_run(tmp_path, 501)
+    with suppress(RuntimeError), live_view(folder, SCHEDULE, port=0) as page:
+        browser.open(page)
+        browser.wait(f"{PICTURE}?.naturalWidth")
+        raise RuntimeError
+    stopped = "Stopped after step 501 of 1000; rnd-train --resume goes on from what was saved."
+    assert browser.run(END) == stopped
+    with _served_by_another_process(folder) as (page, process):
+        browser.open(page)
+        browser.wait(f"{PICTURE}?.naturalWidth")
+        process.kill()
+        browser.wait(f"{END} !== ''")
+    assert browser.run(END).startswith("No answer any more: the training was killed.")
+
+
+def test_the_page_calls_the_pictures_what_they_are_called_above_them():
+    page = files("rnd_trainer").joinpath("live_view.html").read_text("utf-8")
+    assert f"In each row: {', '.join(TILES)}." in page
+
+
+def test_pictures_of_narrower_rows_stand_in_their_columns(tmp_path):
+    wide, narrow = (np.full((4, len(TILES) * width, 3), 255, np.uint8) for width in (40, 20))
+    contact_sheet(tmp_path / "sheet.png", [wide, narrow])
+    sheet = read_image(tmp_path / "sheet.png")
+    assert sheet.shape == (CAPTION + 8, 40 * len(TILES), 3)
+    assert (sheet[CAPTION:-4] == 255).all()
+    columns = sheet[-4:].reshape(4, len(TILES), 40, 3)
+    assert (columns[:, :, 10:30] == 255).all() and columns.sum() == 255 * columns[:, :, 10:30].size
 
 
 def test_view_is_an_option_of_rnd_train(tiny_capture, tmp_path, monkeypatch, capsys):

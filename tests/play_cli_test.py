@@ -18,6 +18,7 @@ import rnd_viewer.play
 from play_fakes import FakeAvatar, fake_motion
 from rnd_runtime.doctor import Finding
 from rnd_runtime.images import read_image, write_image
+from rnd_runtime.kernels import COMPILING
 from rnd_runtime.motion import save_motion
 from rnd_viewer.cli import main
 from rnd_viewer.governor import Governor
@@ -31,6 +32,7 @@ FRAMES = 6
 def files(tmp_path, monkeypatch) -> dict[str, Path]:
     """Input files, and an avatar that needs none."""
     monkeypatch.setattr(rnd_viewer.play.Avatar, "load", lambda path, threads=None: FakeAvatar())
+    monkeypatch.setattr(rnd_viewer.play, "kernels_are_cold", lambda: False)  # whatever ran before
     save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
     rng = np.random.default_rng(0)
     write_image(tmp_path / "sky.exr", rng.uniform(0.2, 1, (16, 32, 3)).astype(np.float32))
@@ -329,6 +331,18 @@ def test_unusable_input_is_one_line_and_exit_2(files, tmp_path, capsys, changes,
     assert printed.err.startswith("rnd-play: ") and message in printed.err
     assert printed.err.count("\n") == 1 and printed.out == ""
     assert not _tree(tmp_path / "out")
+
+
+def test_kernels_that_are_not_compiled_yet_are_said_before_they_are_needed(
+    files, tmp_path, monkeypatch, capsys
+):
+    def compiling(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rnd_viewer.play, "kernels_are_cold", lambda: True)
+    monkeypatch.setattr(rnd_viewer.play, "Shader", compiling)
+    main(_arguments(files, tmp_path / "out"))
+    assert capsys.readouterr().err.splitlines() == [f"rnd-play: {COMPILING}", "rnd-play: interrupted"]
 
 
 def test_avatar_that_is_not_there(tmp_path, capsys):

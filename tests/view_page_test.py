@@ -23,8 +23,9 @@ from rnd_runtime.images import read_image
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_viewer.cli import main as play
 from rnd_viewer.view_options import SIZES, ViewOptions
-from rnd_viewer.view_scene import Scene
+from rnd_viewer.view_scene import Picture, Scene
 from rnd_viewer.view_server import serve
+from rnd_viewer.view_state import ViewState
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 
@@ -148,6 +149,39 @@ def test_the_canvas_shows_rnd_plays_frame_and_relights(page, played):
     assert (_picture(page) == read_image(played["straight"])).all()
 
 
+@contextmanager
+def _held(scene: Scene, monkeypatch) -> Iterator[None]:
+    """Pictures are not drawn before the block ends."""
+    go, render = threading.Event(), scene.render
+
+    def later(state: ViewState) -> Picture:
+        go.wait(60)
+        return render(state)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scene, "render", later)
+        try:
+            yield
+        finally:
+            go.set()
+
+
+def test_it_is_loading_until_its_first_picture_and_drawing_while_one_takes_long(page, scene, monkeypatch):
+    back = page.run("location.href")
+    with _held(scene, monkeypatch):
+        page.open(f"{back}?again")
+        page.wait("location.search && window.rnd && rnd.scene()")
+        assert page.run(f"new Promise((done) => setTimeout(done, 1500)).then(() => {MESSAGE})") == "loading …"
+    page.wait(f"!{MESSAGE}")
+    with _held(scene, monkeypatch):
+        page.run("rnd.redraw()")
+        assert page.run(f"new Promise((done) => setTimeout(done, 500)).then(() => {MESSAGE})") == ""
+        page.wait(f"{MESSAGE} === 'drawing …'")
+    page.wait(f"!{MESSAGE}")
+    page.open(back)
+    page.wait("!location.search && window.rnd && rnd.scene()")
+
+
 def test_it_plays_and_stops(page):
     page.run("rnd.state.time = 0; rnd.play(true)")
     page.wait("rnd.state.time > 0.3")
@@ -167,8 +201,9 @@ def test_drag_turns_and_reset_comes_back(page):
     page.drag((300, 300), (80, 30))
     turned = _picture(page)
     assert (turned != before).any() and page.run("rnd.state.elevation") > 0.3
+    page.run("Object.assign(rnd.state, { yaw: 1, exposure: 2 })")
     page.press("KeyR")
-    assert (_picture(page) == before).all()
+    assert (_picture(page) == before).all() and page.run("[rnd.state.yaw, rnd.state.exposure]") == [0, 0]
 
 
 def test_keys_are_the_pages_where_they_are_nobody_elses(page):
@@ -231,6 +266,13 @@ def test_ground_truth_stands_beside(page):
     )
     for control in ("clip", "play", "time"):  # they would film or move something else
         assert page.run(f"document.getElementById('{control}').disabled"), control
+    frame = capture.frames[index]
+    seen = "(id) => document.getElementById(id).textContent"
+    assert page.run(f"['clock', 'truth-name'].map({seen})") == [
+        f"{frame.frame / capture.fps:.2f} s",
+        page.run(f"rnd.scene().truths[{index}].label"),
+    ]
+    assert page.run("document.getElementById('hint').hidden")
     name = re.sub(r"[ ·]+", "_", page.run(f"rnd.scene().truths[{index}].label"))
     assert _screenshot_name(page) == f"avatar_{name}.png"
     # the avatar was trained on this capture: 20 dB over the whole picture is far from what another pose gives
@@ -240,7 +282,8 @@ def test_ground_truth_stands_beside(page):
     for control in ("clip", "play", "time", "exposure"):
         assert not page.run(f"document.getElementById('{control}').disabled"), control
     page.press("KeyR")
-    page.run("Object.assign(rnd.state, { yaw: 0, exposure: 0 })")
+    assert not page.run("document.getElementById('hint').hidden")
+    assert "of" in page.run("rnd.picture().then(() => document.getElementById('clock').textContent)")
     _set(page, "size", str(SIZE))
 
 

@@ -26,12 +26,14 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+import rnd_viewer.view_cli
 import rnd_viewer.view_scene
 from play_fakes import FakeAvatar, fake_motion
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.images import write_image
+from rnd_runtime.kernels import COMPILING
 from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.motion_edit import MotionEdits, edit_motion
@@ -480,14 +482,23 @@ def test_options_and_refusals(options, capsys, tmp_path, monkeypatch):
     assert not ViewOptions(Path("a"), host="example.org").local
     assert main(["avatar.onnx", "--motion", str(tmp_path / "none.npz")]) == 2
     assert main(["avatar.onnx", "--port", "99999"]) == 2
+    monkeypatch.setattr(rnd_viewer.view_cli, "kernels_are_cold", lambda: True)
     with _serving(options) as (port, _):
         arguments = ["avatar.onnx", "--port", str(port), "--no-browser"]
         assert main(arguments) == 2
     errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 3 and "--port" in errors[1] and "cannot listen" in errors[2]
+    assert len(errors) == 4 and "--port" in errors[1] and errors[2] == f"rnd-view: {COMPILING}"
+    assert "cannot listen" in errors[3] and errors[3].endswith("(--port picks another)")
     monkeypatch.setitem(__import__("sys").modules, "websockets.sync.server", None)
     assert main(["avatar.onnx"]) == 2
     assert "rnd-avatar[view]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "2001:db8::1", "nobody.invalid"])
+def test_an_address_of_another_machine_is_not_blamed_on_the_port(options, host):
+    hint = r"\(--host takes an address of this machine\)$"
+    with pytest.raises(InputError, match=hint), serve(Scene(options), host, 0, "token"):
+        pass
 
 
 def test_without_motion_or_light_the_avatar_stands_in_its_own(options):

@@ -492,6 +492,7 @@ def test_addresses_name_files_of_any_name(address, tmp_path):
         browser.wait("window.rnd && rnd.scene()")
         assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
         assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
+        assert browser.run("rnd.state.light") == 1  # the first that is named, as in rnd-view
         browser.open(f"{address}?avatar=avatar.onnx&motion={quote('what? 1:2.npz')}")
         browser.wait("window.rnd && rnd.scene()")
         assert browser.run("rnd.scene().motion.name") == "what? 1:2.npz"

@@ -124,12 +124,12 @@ def _train(options: TrainOptions) -> None:
             _say(page)
         with _memory_runs_out():
             interrupted = _run_with_progress(training, folder)
-    print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
-    if interrupted:
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        _say(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
-        raise KeyboardInterrupt
-    _score_after_training(training, folder, options)
+        print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
+        if interrupted:
+            words = [word for word in sys.argv[1:] if word != "--resume"]
+            _say(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
+            raise KeyboardInterrupt
+        _score_after_training(training, folder, options)
 
 
 def _say(what: str) -> None:

@@ -1,7 +1,8 @@
 """``rnd-train --view``: a page on this machine that shows a training while it runs.
 
 A thread serves what the run folder holds anyway, ``metrics.jsonl`` and ``previews/``; the training knows nothing
-of it. It answers to 127.0.0.1 alone, and only when asked by that name, so that no page of the web can read it.
+of it. When the training ends, a page that is open is told how, and shown the last preview, before the thread ends.
+It answers to 127.0.0.1 alone, and only when asked by that name, so that no page of the web can read it.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import os
 import re
 import sys
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from .metrics_log import row_of
 from .schedule import Schedule
@@ -28,6 +30,11 @@ POINTS = 300
 """of a curve: more than the page has pixels for helps nobody"""
 RECENT = 200
 """steps whose speed gives the time left"""
+WATCH_S = 30.0
+"""after which a page that waits for the end is answered and asks anew: browsers give up in the end"""
+GOODBYE_S = 2.0
+"""in which a page that was told of the end fetches the last preview"""
+Ending = Literal["finished", "stopped"]
 _PREVIEW = re.compile(r"step_\d+\.png")
 
 
@@ -99,17 +106,25 @@ def _binned(points: list[tuple[int, float]], width: int) -> list[list[float]]:
 
 @contextmanager
 def live_view(folder: Path, schedule: Schedule, port: int = PORT) -> Iterator[str]:
-    """Serve the run in ``folder`` while the block runs; yields the page's address."""
+    """Serve the run in ``folder`` while the block runs; yields the page's address.
+
+    A page that is open then learns of the end: "finished", or "stopped" where the block raised something.
+    """
     try:
         server = _Server(("127.0.0.1", port), _Handler)
     except OSError:  # somebody else's, perhaps another training's
         server = _Server(("127.0.0.1", 0), _Handler)
-    server.folder, server.schedule = folder, schedule
+    server.folder, server.schedule, server.over = folder, schedule, threading.Event()
     server.metrics = Metrics(folder / "metrics.jsonl")
     thread = threading.Thread(target=server.serve_forever, name="live view", daemon=True)
     thread.start()
     try:
-        yield f"http://127.0.0.1:{server.server_port}/"
+        try:
+            yield f"http://127.0.0.1:{server.server_port}/"
+        except BaseException:
+            server.end("stopped")
+            raise
+        server.end("finished")
     finally:
         server.shutdown()
         server.server_close()
@@ -121,6 +136,32 @@ class _Server(ThreadingHTTPServer):
     folder: Path
     schedule: Schedule
     metrics: Metrics
+    ended: Ending | None = None
+    over: threading.Event
+    watched = -WATCH_S  # when a page last asked for the end, on the monotonic clock
+
+    def end(self, how: Ending) -> None:
+        """Tell the pages that are open; where none is, nobody is waited for."""
+        self.ended = how
+        self.over.set()
+        if time.monotonic() - self.watched <= WATCH_S:
+            with suppress(KeyboardInterrupt):  # it has ended anyway
+                time.sleep(GOODBYE_S)
+
+    def state(self) -> dict[str, Any]:
+        """:func:`state` of the run as it is now, and how it ended."""
+        return state(self.metrics.read(), self.schedule, self.previews()) | self.ending()
+
+    def previews(self) -> list[str]:
+        """Names of the preview pictures, the first one first."""
+        folder = self.folder / "previews"
+        return sorted(p.name for p in folder.glob("step_*.png")) if folder.is_dir() else []
+
+    def ending(self) -> dict[str, Any]:
+        """What the page says of the end: how, and where things lie; ``scores`` is None where there are none."""
+        avatar, scores = self.folder / "avatar.ckpt", self.folder / "eval.json"
+        scored = self.ended == "finished" and scores.exists()
+        return {"ended": self.ended, "avatar": str(avatar), "scores": str(scores) if scored else None}
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A page that was closed or reloaded breaks its connection: nobody needs to read of it."""
@@ -137,17 +178,19 @@ class _Handler(BaseHTTPRequestHandler):
         }:
             self.send_error(HTTPStatus.FORBIDDEN)
             return
-        previews = self.server.folder / "previews"
-        names = sorted(p.name for p in previews.glob("step_*.png")) if previews.is_dir() else []
         name = self.path.removeprefix("/previews/")
         if self.path == "/":
             page = files("rnd_trainer").joinpath("live_view.html").read_bytes()
             self._answer(page, "text/html; charset=utf-8")
-        elif self.path == "/state.json":
-            now = state(self.server.metrics.read(), self.server.schedule, names)
-            self._answer(json.dumps(now).encode(), "application/json")
-        elif name in names and _PREVIEW.fullmatch(name):
-            self._answer((previews / name).read_bytes(), "image/png")
+        elif self.path in ("/state.json", "/end.json"):
+            if (
+                self.path == "/end.json"
+            ):  # by asking every now and then a page in the background would miss it
+                self.server.watched = time.monotonic()
+                self.server.over.wait(WATCH_S)
+            self._answer(json.dumps(self.server.state()).encode(), "application/json")
+        elif _PREVIEW.fullmatch(name) and name in self.server.previews():
+            self._answer((self.server.folder / "previews" / name).read_bytes(), "image/png")
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
 

@@ -72,7 +72,14 @@ def captions(tile: int, strips: int = 1) -> np.ndarray:
 
 
 def _write_sheet(path: Path, strips: list[np.ndarray]) -> None:
-    """Strips under one another, narrower ones with black beside them, and words above."""
-    width = max(strip.shape[1] for strip in strips)
-    padded = [np.pad(strip, ((0, 0), (0, width - strip.shape[1]), (0, 0))) for strip in strips]
-    write_image(path, np.concatenate([captions(width // len(TILES)), *padded], axis=0))
+    """Strips under one another, and words above; narrower pictures stand in their columns, black on both sides."""
+    tile = max(strip.shape[1] for strip in strips) // len(TILES)
+    columns = [_in_columns(strip, tile) for strip in strips]
+    write_image(path, np.concatenate([captions(tile), *columns], axis=0))
+
+
+def _in_columns(strip: np.ndarray, tile: int) -> np.ndarray:
+    """The strip [H, 5·W, 3] with each picture in the middle of ``tile`` ≥ W pixels: [H, 5·tile, 3]."""
+    pictures = strip.reshape(len(strip), len(TILES), -1, 3)
+    left, right = (tile - pictures.shape[2]) // 2, (tile - pictures.shape[2] + 1) // 2
+    return np.pad(pictures, ((0, 0), (0, 0), (left, right), (0, 0))).reshape(len(strip), -1, 3)

@@ -47,7 +47,8 @@ class SplatOptions(LitOptions):
     coding: Literal["srgb", "linear"] = "srgb"
     """srgb: what viewers show as it is. linear: radiance, for renderers that code the blended picture"""
     ply_axes: Literal["3dgs", "y-up"] = "3dgs"
-    """3dgs: Y down, as viewers of .ply, .spz and .sog expect. The .glb is always Y up"""
+    """3dgs: turned by 180° about Z, (x, y, z) to (-x, -y, z), so Y down, as viewers of .ply, .spz and .sog expect. The
+    .glb is always Y up"""
 
     def refuse_unfit(self, formats: Sequence[str]) -> None:
         """Refuse options that files in ``formats`` cannot follow.

@@ -16,6 +16,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import is_folder, output_folder
+from rnd_runtime.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.light import light_notes
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
@@ -39,7 +40,7 @@ from .lights import chosen_light
 from .options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
 from .pipeline import run
 from .player import Frame, Player
-from .report import FRAME, LATENCY, print_summary, warn, with_progress
+from .report import FRAME, LATENCY, print_summary, tell, warn, with_progress
 from .run_folder import claim, is_of_a_run, part_name
 from .timing import StageTimes
 from .video import clip_notes
@@ -122,6 +123,8 @@ class _Run:
             light = chosen_light(
                 avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure
             )
+            if kernels_are_cold():
+                tell(COMPILING)
             shader = Shader(light, mode=options.shade)
             rasterizer = make_rasterizer(options.raster)
         for path in _inputs(options):

@@ -26,6 +26,11 @@ def warn(message: str) -> None:
     print_plain(_stderr, f"rnd-play: warning: {message}")
 
 
+def tell(line: str) -> None:
+    """One line on stderr that is no warning."""
+    print_plain(_stderr, f"rnd-play: {line}")
+
+
 def with_progress(frames: range, done: Iterable[int]) -> Iterable[int]:
     """``done``, numbers out of ``frames``, with a bar and the time left on stderr where that is a terminal."""
     with Progress(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import sys
 import webbrowser
 from collections.abc import Sequence
 from threading import Thread
@@ -11,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.plain import print_plain
 from rnd_runtime.threads import set_threads
 
@@ -39,8 +41,11 @@ def view(options: ViewOptions) -> int:
     load_websockets()
     set_threads(options.threads)
     console = Console(highlight=False)
-    with console.status("loading; the first run compiles, up to a minute"):
+    cold = kernels_are_cold()
+    with console.status("loading"):
         scene = Scene(options)
+        if cold:
+            print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
         scene.warm_up()
     try:
         token = None if options.local else secrets.token_urlsafe(16)

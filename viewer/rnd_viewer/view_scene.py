@@ -106,7 +106,7 @@ class Scene:
         }
 
     def warm_up(self) -> None:
-        """Draw the first view once: a first run compiles the kernels, up to a minute."""
+        """Draw the first view once: a first run compiles the kernels, up to two minutes."""
         about = self.description()
         self.render(
             ViewState(time=0.0, width=self.size, height=self.size, light=about["light"], **about["view"])
@@ -168,7 +168,10 @@ class Scene:
             return []
         return [
             {
-                "label": f"{frame.split} · {frame.camera} · frame {frame.frame} · {frame.light or 'own light'}",
+                "label": " · ".join(
+                    filter(None, [frame.split, frame.camera, f"frame {frame.frame}", frame.light])
+                ),
+                "time": frame.frame / self.capture.fps,
                 "width": self.capture.cameras[frame.camera].width,
                 "height": self.capture.cameras[frame.camera].height,
             }

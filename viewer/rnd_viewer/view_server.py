@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from errno import EACCES, EADDRINUSE
 from http import HTTPStatus
 from importlib import resources
 from io import BytesIO
@@ -152,9 +153,9 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
             family=AF_INET6 if ":" in host else AF_INET,
         )
     except OSError as error:
-        raise InputError(
-            "cannot listen", got=f"{error.strerror} on {host}:{port}", hint="--port picks another"
-        ) from error
+        taken = error.errno in (EADDRINUSE, EACCES)
+        hint = "--port picks another" if taken else "--host takes an address of this machine"
+        raise InputError("cannot listen", got=f"{error.strerror} on {host}:{port}", hint=hint) from error
     try:
         port = server.socket.getsockname()[1]
         access.append(Access(token, None) if token else Access.local(host, port))

@@ -4,6 +4,7 @@ import { connect } from "./engine.js";
 import { orbit, wrapped } from "./orbit.js";
 
 const IN_FLIGHT = 2;  // one picture is drawn while the next is made
+const LONG_MS = 1000;  // after which a picture that is not there yet is said to be drawn
 const MOST_CLIP_FPS = 60;  // what most screens show; motions have 120
 const RADIANS = Math.PI / 180;
 const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
@@ -17,7 +18,7 @@ let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
 let waiting = [];  // {number, done, failed} of those who want a picture for themselves
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
-let times = {}, rates = [];
+let times = {}, rates = [], shownAt = 0;
 let passing = true;  // the message goes when a picture comes
 
 function redraw() { wanted = true; }
@@ -58,12 +59,19 @@ function show(picture) {
   drawSkeleton(picture);
   showNotes(picture.notes);
   const now = performance.now();
+  shownAt = now;
   rates = [...rates.filter((at) => now - at < 1000), now];
   times = picture.times;
   times["to the page and back"] = Math.max(now - sent - Object.values(times).reduce((a, b) => a + b, 0), 0);
   for (const one of waiting) if (one.number <= picture.number) one.done(picture);
   waiting = waiting.filter((one) => one.number > picture.number);
   if ($("message").textContent && passing) say("");
+}
+
+/** Say so where a picture takes long; the picture takes the message away. */
+function sayWhatTakesLong() {
+  const since = Math.max(Math.min(...flying.values()), shownAt);  // infinite where nothing is asked for
+  if (!$("message").textContent && performance.now() - since > LONG_MS) say("drawing …", { untilPicture: true });
 }
 
 /** What is to be said of the scene, and of the light of a picture. */
@@ -111,9 +119,10 @@ function showTimes() {
 }
 
 function showState() {
-  $("time").value = state.time;
-  $("clock").textContent = `${state.time.toFixed(2)} of ${scene.motion.duration.toFixed(2)} s`;
-  const { yaw, exposure } = state.truth === null ? state : { yaw: 0, exposure: 0 };
+  const truth = state.truth === null ? null : scene.truths[state.truth];  // of another motion, perhaps
+  $("time").value = truth?.time ?? state.time;
+  $("clock").textContent = truth ? `${truth.time.toFixed(2)} s` : `${state.time.toFixed(2)} of ${scene.motion.duration.toFixed(2)} s`;
+  const { yaw, exposure } = truth ? { yaw: 0, exposure: 0 } : state;
   $("yaw").value = yaw / RADIANS;
   $("yaw").nextElementSibling.textContent = `${Math.round(yaw / RADIANS)}°`;
   $("exposure").value = exposure;
@@ -148,6 +157,12 @@ function home() {
   redraw();
 }
 
+/** The camera where it was at first, and the light neither turned nor exposed; which light it is stays. */
+function reset() {
+  Object.assign(state, { yaw: 0, exposure: 0 });
+  home();
+}
+
 function setScene(description) {
   const first = scene === null;
   const moved = first || JSON.stringify(scene.view) !== JSON.stringify(description.view);
@@ -169,7 +184,7 @@ function setScene(description) {
   if (first) Object.assign(state, { width: scene.size, height: scene.size });
   if (moved) home();
   showNotes();
-  say("");
+  say(first ? "loading …" : "", { untilPicture: true });
   redraw();
 }
 
@@ -183,6 +198,7 @@ async function setTruth() {
   const on = $("truth-on").checked, index = Number($("truth-index").value);
   state.truth = on ? index : null;
   $("truth-pane").hidden = !on;
+  $("truth-name").textContent = on ? scene.truths[index].label : "";
   for (const name of ["light", "yaw", "exposure"]) $(name).disabled = on;  // the picture's own shines, as it is
   say("");  // what was said of another picture
   freeMotion();
@@ -250,6 +266,7 @@ function freeMotion() {
   const compared = state.truth !== null, still = !scene?.motion.duration;
   $("play").disabled = $("time").disabled = compared || still;
   $("clip").disabled = clipMade !== null || compared || still;
+  $("hint").hidden = compared;
   $("clip").title = compared ? "a clip films the motion: switch “ground truth beside” off" : "";
 }
 
@@ -284,7 +301,7 @@ function bind() {
       if (event.target.matches("button, [type=checkbox], [type=file]")) return;  // which it presses
       event.preventDefault();
       play(!playing);
-    } else if (event.code === "KeyR") home();
+    } else if (event.code === "KeyR") reset();
     else if (event.code === "Comma" || event.code === "Period") {
       const frames = event.code === "Comma" ? -1 : 1;
       state.time = Math.min(Math.max(state.time + frames / scene.motion.fps, 0), scene.motion.duration);
@@ -342,5 +359,8 @@ bind();
 engine = await connect(handlers);
 if (engine.load) bindFiles();
 requestAnimationFrame(step);
-setInterval(() => scene && showTimes(), 250);
+setInterval(() => {
+  if (scene) showTimes();
+  sayWhatTakesLong();
+}, 250);
 window.rnd = { state, redraw, picture, play, scene: () => scene, times: () => times, rate: () => rates.length };

@@ -32,9 +32,11 @@ async function load(files) {
     if (next.avatar) {
       const { skeleton } = next.avatar;
       next.motion = next.record ? fitMotion(next.record, skeleton) : restMotion(skeleton);
-      const waited = !before.avatar && next.lights.length > 1;  // lights for their avatar
-      const lit = waited || files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
-      answer = { kind: "scene", scene: description(next, lit) };
+      const count = next.lights.length, dropped = files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
+      let light;  // stays
+      if (!before.avatar && count > 1) light = 1;  // as in rnd-view: the first beside the avatar's own
+      else if (dropped) light = count - 1;
+      answer = { kind: "scene", scene: description(next, light) };
     }
     scene = next;
     posed = null;
@@ -60,12 +62,12 @@ async function take({ name, bytes }, next, opened) {
 
 const lightEntry = (name, light) => ({ name, light, notes: lightNotes(light), shaders: new Map() });
 
-/** What the page needs to know; where the scene is `lit` anew, by the last of its lights. */
-function description({ avatar, motion, lights }, lit) {
+/** What the page needs to know; `light` is the number of the one that is to shine, undefined where it stays. */
+function description({ avatar, motion, lights }, light) {
   return {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
-    lights: lights.map(({ name }) => name), light: lit ? lights.length - 1 : undefined,
+    lights: lights.map(({ name }) => name), light,
     size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
     truths: [], notes: motion.notes,
   };
