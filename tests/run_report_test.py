@@ -15,6 +15,7 @@ import numpy as np
 import onnx
 import pytest
 
+from browser import CHROMIUM, chromium
 from rnd_runtime.files import sha256_of
 from rnd_runtime.images import read_image, write_image
 from rnd_trainer.config import TrainConfig, to_dict
@@ -25,9 +26,11 @@ from tiny import ASSETS
 
 VOID = {"meta", "img", "input", "link", "br"}
 ROW = {"split": "novel_view", "frames": 2, "psnr": 27.3456, "ssim": 0.95, "psnr_box": 22.0, "ssim_box": 0.8,
-       "normal_deg": 10.0, "lpips": None, "psnr_n": 19.0,
+       "normal_deg": 10.0, "lpips": None, "psnr_n": 19.0, "flicker": 24.087,
        "minutes": 6.5, "capture": "me & <you>", "steps": 100, "seed": 0,
        "gaussians": 800, "machine": "a test"}  # fmt: skip
+OTHER = "0123456789abcdef" * 4  # the checkpoint of somebody else's avatar
+SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>'
 
 
 class _Page(HTMLParser):
@@ -67,7 +70,8 @@ def _strip() -> np.ndarray:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Path:
-    """The folder of a training, as far as the report reads it; small pictures of the avatar."""
+    """The folder of a training, as far as the report reads it; small pictures of the avatar; no assets here."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(report_shots, "SIDE", 64)
     monkeypatch.setattr(report_shots, "SECONDS", 0.1)
     folder = tmp_path / "run"
@@ -99,12 +103,7 @@ def _pictures(page: _Page, tmp_path: Path) -> dict[str, np.ndarray]:
 
 
 def test_a_whole_run_is_on_the_page(run, tmp_path):
-    bench = tmp_path / "bench"
-    bench.mkdir()
-    (bench / "speed.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>')
-    (bench / "stability.json").write_text(
-        json.dumps([{"id": "P2", "what": "edges, <worst>", "measured": 0.61}])
-    )
+    bench = _bench(tmp_path / "bench", {"id": "P2", "what": "edges, <worst>", "measured": 0.61}, "grid")
     sky = str(ASSETS / "sky.exr")
     text, page = _write(run, "--hdr", sky, "--bench", str(bench), "--motion", str(ASSETS / "walk.npz"))
     for tag, attributes in page.tags:  # nothing is fetched from anywhere
@@ -116,7 +115,7 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     assert "LPIPS" not in page.text  # a column nobody measured is no column
     assert "1 steps were not finite" in page.text
     assert "P2" in page.text and "edges, <worst>" in page.text and "0.61" in page.text
-    (chart,) = [attributes["src"] for _, attributes in page.tags if attributes.get("alt") == "speed"]
+    (chart,) = [attributes["src"] for _, attributes in page.tags if attributes.get("alt") == "grid"]
     assert base64.b64decode(chart.removeprefix("data:image/svg+xml;base64,")).startswith(b"<svg")
     assert "weight_normal" in page.text and "model.gaussians" in page.text
     pictures = _pictures(page, tmp_path)
@@ -131,13 +130,139 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
 
 
+def _bench(folder: Path, row: dict[str, object] | None = None, *charts: str) -> Path:
+    folder.mkdir(parents=True)
+    if row is not None:
+        (folder / "stability.json").write_text(json.dumps([row]))
+    for name in charts:
+        (folder / f"{name}.svg").write_text(SVG)
+    return folder
+
+
+def test_charts_come_from_the_run_or_else_from_a_checkout(run, tmp_path):
+    words = f"neither {run / 'bench'} nor assets/bench is there: --bench FOLDER"
+    assert words in _write(run)[1].text
+    _bench(tmp_path / "assets/bench", {"id": "P1", "what": "of the checkout"}, "crossed")
+    _, page = _write(run)
+    assert "of the checkout" in page.text
+    assert "From assets/bench/crossed.svg" in page.text and "From assets/bench/stability.json" in page.text
+    own = _bench(run / "bench", {"id": "P1", "what": "of the run"})
+    _, page = _write(run)
+    assert "of the run" in page.text and "of the checkout" not in page.text
+    assert f"From {own / 'stability.json'}" in page.text
+    named = _bench(tmp_path / "named", {"id": "P1", "what": "of another"})
+    assert "of another" in _write(run, "--bench", str(named))[1].text
+
+
+@pytest.mark.parametrize("shown", ["crossed", "grid"])
+def test_one_chart_of_speed_is_shown_and_no_other(run, shown):
+    folder = _bench(run / "bench", None, "grid", "lengths", "speed", *{shown} - {"grid"})
+    (folder / f"{shown}.json").write_text(json.dumps([{"machine": "a"}, {"machine": "b"}, {"machine": "a"}]))
+    _, page = _write(run)
+    charts = [attributes["alt"] for _, attributes in page.tags if attributes.get("class") == "chart"]
+    assert charts == [shown]
+    assert f"{shown}.svg, measured on a; b. On which avatar is not said" in page.text
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "words"),
+    [
+        (("own",), "Measured on this run's avatar. ✓"),
+        ((OTHER,), "Measured on another avatar, not on this run's (its checkpoint: 0123456789ab). ✓"),
+        (("own", OTHER, OTHER), "1 rows measured on this run's avatar, 2 on another"),
+        (("own", None), "Measured on this run's avatar. 1 of 2 rows name no avatar."),
+        ((None,), "On which avatar is not said"),
+    ],
+)
+def test_the_stability_table_says_on_whose_avatar_it_was_measured(run, checkpoints, words):
+    (run / "avatar.onnx").unlink()
+    (run / "avatar.ckpt").write_bytes(b"trained")
+    own = sha256_of(run / "avatar.ckpt")
+    rows = [
+        {"id": "P1", "what": "edges"} | ({} if name is None else {"checkpoint_sha256": name})
+        for name in (own if name == "own" else name for name in checkpoints)
+    ]
+    (_bench(run / "bench") / "stability.json").write_text(json.dumps(rows))
+    assert words in _write(run)[1].text
+
+
+def test_a_run_without_a_checkpoint_claims_no_measurement(run):
+    _bench(run / "bench", {"id": "P1", "what": "edges", "checkpoint_sha256": OTHER})
+    assert "checkpoint 0123456789ab; this run has no avatar.ckpt to compare" in _write(run)[1].text
+
+
+def _table(page_text: str, title: str) -> list[list[tuple[str, str]]]:
+    """Rows of (class, text) of the table below ``title``, the headings first."""
+    body = page_text.partition(title)[2].partition("</table>")[0]
+    cells = re.compile(r'<t[hd](?: class="(\w+)")?>([^<]*)</t[hd]>')
+    return [cells.findall(line) for line in body.split("<tr>")[1:]]
+
+
+def test_tables_have_the_columns_that_matter_below_headings_that_stand_as_they_do(run):
+    more = {"ssim_n": 0.9, "lpips": 0.0123, "lpips_inner": 0.1, "psnr_albedo": 24.5, "outline_px": 0.25}
+    (run / "eval.json").write_text(json.dumps([ROW | more]))
+    row = {
+        "id": "P1", "failure": "a squat", "what": "edges", "measured": 2.77897, "unit": "×", "line": "< 3",
+        "verdict": "fail", "baseline": 3.89788, "baseline_name": "LBS", "machine": "a", "threads": 2, "size": 512,
+    }  # fmt: skip
+    _bench(run / "bench", row)
+    text, _ = _write(run)
+    scores, stability = _table(text, "Held-out quality"), _table(text, "Stability</h3>")
+    assert [cell for _, cell in scores[0]] == [
+        "split", "frames", "PSNR, dB", "SSIM", "LPIPS", "PSNR in the box, dB", "PSNR of normals, dB",
+        "normals off by, °", "PSNR of albedo, dB", "outline off by, px",
+    ]  # fmt: skip
+    assert [cell for _, cell in scores[1]] == [
+        "novel_view", "2", "27.35", "0.9500", "0.0123", "22.00", "19.00", "10.0", "24.50", "0.25"
+    ]  # fmt: skip
+    assert [cell for _, cell in stability[0]] == [
+        "id", "failure", "what was measured", "measured", "limit", "verdict", "the plain method"
+    ]  # fmt: skip
+    cells = [cell.replace("\N{NO-BREAK SPACE}", " ") for _, cell in stability[1]]
+    assert cells == ["P1", "a squat", "edges", "2.779 ×", "&lt; 3", "✗", "LBS: 3.898 ×"]
+    for head, *lines in (scores, stability):
+        assert all([kind for kind, _ in line] == [kind for kind, _ in head] for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ({"steps": 240, "step": 360}, "· 360 steps, 240 of them with a picture ·"),
+        ({"steps": 240, "step": 240}, "· 240 steps ·"),
+        ({"steps": 240, "step": 100}, "· 100 of 240 steps ·"),
+        ({"steps": 240, "step": None}, "· 240 steps ·"),
+        ({"steps": None, "step": 240}, "800 Gaussians · 6.5 minutes"),
+    ],
+)
+def test_the_facts_count_steps_with_and_without_a_picture(run, counts, words):
+    (run / "eval.json").write_text(json.dumps([ROW | counts | {"capture": "capture"}]))
+    _, page = _write(run)
+    assert words in page.text
+    assert "trained on capture ·" in page.text and "capture capture" not in page.text
+    assert "flicker 24.09 of 255 (what jumps from frame to frame" in page.text
+
+
+def test_pictures_of_a_split_that_are_those_of_another_are_left_out(run, tmp_path):
+    (run / "avatar.onnx").unlink()
+    (run / "eval/novel_view").rename(run / "eval/relight")
+    scaled = run / "eval/relight_albedo_scaled"
+    shutil.copytree(run / "eval/relight", scaled)
+    _, page = _write(run)
+    assert "relight" in page.text and "The same frames" not in page.text
+    assert sum(tag == "img" for tag, _ in page.tags) == 5 * 3
+    write_image(scaled / "a.png", _strip() // 2)
+    _, page = _write(run)
+    assert "The same frames, with the learned albedo brought to the scale of the true one" in page.text
+    assert sum(tag == "img" for tag, _ in page.tags) == 5 * 6
+
+
 def test_a_name_that_is_not_utf8_and_a_folder_called_as_a_chart_are_no_mistake(run, tmp_path):
     shutil.rmtree(run / "eval")
     (run / "avatar.onnx").unlink()
     renamed = run.rename(tmp_path / os.fsdecode(b"r\xe9n"))
-    (tmp_path / "bench" / "x.svg").mkdir(parents=True)
+    (tmp_path / "bench" / "grid.svg").mkdir(parents=True)
     _, page = _write(renamed, "--bench", str(tmp_path / "bench"))
-    assert "r\\udce9n" in page.text and "neither *.svg nor stability.json" in page.text
+    assert "r\\udce9n" in page.text and "neither crossed.svg nor grid.svg nor stability.json" in page.text
 
 
 def test_what_a_run_lacks_is_named(run):
@@ -280,10 +405,14 @@ def test_a_curve_goes_through_the_points():
             '{"summary": [], "rows": []}',
             "eval.json: expected rows of rnd-eval",
         ),  # of an ablation
+        ("bench/stability.json", "{", "stability.json: not JSON"),
+        ("bench/stability.json", '[{"id": "P1"}]', "stability.json: expected rows of rnd-bench --stability"),
+        ("bench/grid.json", "3", "grid.json: expected rows of rnd-bench"),
         ("avatar.onnx", "onnx", "avatar.onnx: not a readable ONNX model"),
     ],
 )
 def test_a_damaged_run_is_one_line_and_exit_2(run, name, content, message, capsys):
+    _bench(run / "bench", None, "grid")
     (run / name).unlink() if content is None else (run / name).write_text(content)
     assert main([str(run)]) == 2
     error = capsys.readouterr().err
@@ -349,3 +478,26 @@ def test_the_slider_moves_in_a_browser(run, tmp_path):
     line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
     dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
     assert "<title>true inset(0px 0px 0px 20%)</title>" in dom
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_tables_fit_a_window_and_what_does_not_scrolls_in_its_own_box(run, tmp_path):
+    (run / "avatar.onnx").unlink()
+    scores = json.loads((ASSETS / "bench/capture.json").read_text())
+    (run / "eval.json").write_text(json.dumps(scores))
+    (run / "config.json").write_text(json.dumps(to_dict(TrainConfig(steps=100)) | {"x" * 400: 1}))
+    write_image(run / "eval/novel_view/a.png", np.full((30, 5 * 500, 3), 99, np.uint8))
+    _write(run, "--bench", str(ASSETS / "bench"))
+    with chromium(tmp_path / "profile", size=(1200, 900)) as page:
+        page.open((run / "report.html").as_uri())
+        page.wait("document.readyState === 'complete' && document.querySelector('table')")
+        page.run("document.querySelector('details').open = true")
+        boxes = (
+            "[...document.querySelectorAll('table')].map((t) => [t.offsetWidth, t.parentElement.clientWidth])"
+        )
+        (quality, box), (stability, _), (options, _) = page.run(boxes)
+        assert max(quality, stability, box) <= 1150 < options
+        assert page.run("document.documentElement.scrollWidth") <= 1200
+        cut = """[...document.querySelectorAll("*")].filter((e) => e.scrollWidth > e.clientWidth + 1
+            && getComputedStyle(e).overflowX === "hidden").length"""
+        assert page.run(cut) == 0

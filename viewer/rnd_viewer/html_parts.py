@@ -5,10 +5,9 @@ from __future__ import annotations
 import base64
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +20,16 @@ POINTS = 300  # of a curve
 LARGEST = 1e300  # value of a curve: its ticks and margins are floats too
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table of anything; numbers are shown as :func:`number` does."""
-    titles = "".join(f"<th>{escape(cell)}</th>" for cell in head)
-    lines = ["".join(_cell(cell) for cell in row) for row in rows]
-    body = "".join(f"<tr>{line}</tr>" for line in lines)
+def table(head: Sequence[str], rows: Sequence[Sequence[object]], words: Collection[int] = (0,)) -> str:
+    """A table of anything; numbers are shown as :func:`number` does. The columns ``words`` stand to the left."""
+    titles = _cells("th", head, words)
+    body = "".join(f"<tr>{_cells('td', row, words)}</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _cell(value: object) -> str:
-    kind = ' class="words"' if isinstance(value, str) and " " in value else ""
-    return f"<td{kind}>{escape(number(value))}</td>"
+def _cells(tag: str, row: Sequence[object], words: Collection[int]) -> str:
+    kinds = (' class="words"' if k in words else "" for k in range(len(row)))
+    return "".join(f"<{tag}{kind}>{escape(number(value))}</{tag}>" for kind, value in zip(kinds, row))
 
 
 def number(value: object) -> str:
@@ -59,6 +57,11 @@ def data_uri(content: bytes, kind: str) -> str:
 def figure(content: str, caption: str) -> str:
     """``content`` with ``caption`` below it."""
     return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def missing(title: str, reason: str) -> str:
+    """A section that is not there, and why."""
+    return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
 
 
 def compare(left: str, right: str, label: str) -> str:
@@ -115,11 +118,3 @@ def _ticks(low: float, high: float) -> list[float]:
         if len(ticks) >= 2:
             break
     return ticks[:: math.ceil(len(ticks) / 6)] if ticks else []
-
-
-def rows_table(rows: Sequence[dict[str, Any]]) -> str:
-    """Rows of JSON as a table with the union of their keys; nested values are left out."""
-    names = dict.fromkeys(
-        name for row in rows for name, value in row.items() if not isinstance(value, dict | list)
-    )
-    return table(tuple(names), [[row.get(name) for name in names] for row in rows])

@@ -31,7 +31,7 @@ class ReportOptions(LitOptions):
     hdr: tuple[Path, ...] = ()
     """light probes to show the avatar under, beside the learned light"""
     bench: Annotated[Path | None, _NO_HINT] = None
-    """folder with charts (*.svg) and stability.json, such as assets/bench"""
+    """folder with crossed.svg or grid.svg, and stability.json. Default: RUN/bench, else assets/bench if it is there"""
     pictures: int = 3
     """pictures of each held-out split"""
 
@@ -48,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.bench is not None and not is_folder(options.bench):
             raise InputError("folder of --bench not found", file=options.bench)
         from .report import say
+        from .report_bench import find_bench
         from .run_files import read_config
         from .run_report import why_no_avatar, write_run_report
 
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             motion=motion,
             hdrs=options.hdr,
             hdr_up=options.hdr_up,
-            bench=options.bench,
+            bench=options.bench or find_bench(options.run),
             pictures=options.pictures,
         )
         for note in notes:

@@ -21,9 +21,10 @@ from rnd_runtime.light import Up
 from rnd_runtime.motion import Motion
 from rnd_runtime.skeleton import Skeleton
 
-from .html_parts import compare, curve, data_uri, figure, png, rows_table, table
+from .html_parts import compare, curve, data_uri, figure, missing, png, table
+from .report_bench import bench_section
 from .report_shots import Shots
-from .run_files import read_config, read_losses, read_rows, read_scores
+from .run_files import read_config, read_losses, read_scores
 from .video import INSTALL
 
 Bytes = NDArray[np.uint8]
@@ -32,19 +33,18 @@ MARGIN = 8  # pixels kept around the person
 DARK = 8  # of 255; what is brighter in any tile is the person
 # Columns of rnd-eval's rows, and what else a row says of the run as a whole.
 METRICS = {
-    "split": ("split", "{}"), "frames": ("pictures", "{}"),
-    "psnr": ("PSNR dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}"),
-    "psnr_box": ("PSNR in the box", "{:.2f}"), "ssim_box": ("SSIM in the box", "{:.4f}"),
-    "lpips_box": ("LPIPS in the box", "{:.4f}"), "lpips_inner": ("LPIPS but for the outline", "{:.4f}"),
-    "psnr_n": ("PSNR of normals", "{:.2f}"),
-    "ssim_n": ("SSIM of normals", "{:.4f}"), "normal_deg": ("normals °", "{:.1f}"),
-    "psnr_albedo": ("PSNR of albedo", "{:.2f}"), "outline_px": ("outline off by px", "{:.2f}"),
+    "split": ("split", "{}"), "frames": ("frames", "{}"),
+    "psnr": ("PSNR, dB", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_box": ("PSNR in the box, dB", "{:.2f}"), "psnr_n": ("PSNR of normals, dB", "{:.2f}"),
+    "normal_deg": ("normals off by, °", "{:.1f}"), "psnr_albedo": ("PSNR of albedo, dB", "{:.2f}"),
+    "outline_px": ("outline off by, px", "{:.2f}"),
 }  # fmt: skip
 FACTS = {
-    "capture": "capture {}", "gaussians": "{} Gaussians", "steps": "{} steps", "minutes": "{:.1f} minutes",
+    "capture": "trained on {}", "gaussians": "{} Gaussians", "steps": "{}", "minutes": "{:.1f} minutes",
     "seed": "seed {}", "file_mb": "avatar.onnx {:.1f} MB", "fps": "plays at {:.0f} frames a second",
-    "flicker": "flicker {:.2f} of 255", "machine": "{}",
+    "flicker": "flicker {:.2f} of 255 (what jumps from frame to frame; most of it is moving texture)", "machine": "{}",
 }  # fmt: skip
+SCALED = "relight_albedo_scaled"  # rnd-eval's folder of relight once more
 WORDS = ("split", "capture", "machine")  # of these, those that are no numbers
 
 
@@ -65,20 +65,20 @@ def write_run_report(
     Args:
         motion: played in the turntable, read for the avatar's skeleton.
         hdrs, hdr_up: relit under these; which axis points up in their files.
-        bench: a folder with charts (``*.svg``) and ``stability.json``.
+        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; see :func:`.find_bench`.
         pictures: shown of each held-out split.
 
     Raises:
         InputError: ``run`` holds no training, or a file of it is damaged.
     """
     config = read_config(run)
-    rows = read_scores(run, WORDS, (METRICS.keys() | FACTS.keys()) - {*WORDS})
+    rows = read_scores(run, WORDS, ({"step"} | METRICS.keys() | FACTS.keys()) - {*WORDS})
     name = run.resolve().name
     # before the avatar is filmed: what is damaged is found at once
     read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run))]
-    read += [_bench(bench), _configuration(config)]
+    read += [bench_section(bench, run), _configuration(config)]
     if why_not := why_no_avatar(run, config):
-        avatar, notes = _missing("The avatar", why_not), [why_not]
+        avatar, notes = missing("The avatar", why_not), [why_not]
     else:
         shots = Shots(run / "avatar.onnx", motion)
         avatar, notes = _turntable_and_relights(shots, hdrs, hdr_up), shots.notes
@@ -91,9 +91,17 @@ def write_run_report(
 
 
 def _facts(rows: Sequence[dict[str, Any]]) -> str:
-    row = rows[0] if rows else {}
+    row = rows[0] | {"steps": _steps(rows[0])} if rows else {}
     facts = [form.format(row[key]) for key, form in FACTS.items() if row.get(key) is not None]
     return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
+
+
+def _steps(row: dict[str, Any]) -> str | None:
+    """Steps with a picture are what is asked for; ``step`` counts those without one too, where it is known."""
+    asked, taken = row.get("steps"), row.get("step")
+    if asked is None or taken in (None, asked):
+        return None if asked is None else f"{asked} steps"
+    return f"{taken} of {asked} steps" if taken < asked else f"{taken} steps, {asked} of them with a picture"
 
 
 def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
@@ -127,7 +135,7 @@ def _turntable_and_relights(shots: Shots, hdrs: tuple[Path, ...], hdr_up: Up) ->
 
 def _metrics(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
-        return _missing(
+        return missing(
             "Held-out quality", "no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json"
         )
     names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
@@ -135,7 +143,8 @@ def _metrics(rows: Sequence[dict[str, Any]]) -> str:
         ["" if row.get(name) is None else METRICS[name][1].format(row[name]) for name in names]
         for row in rows
     ]
-    return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells)
+    box = "<p>In the box: in the rectangle around the person alone.</p>" if "psnr_box" in names else ""
+    return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells) + box
 
 
 def _comparisons(folder: Path, count: int) -> str:
@@ -143,15 +152,24 @@ def _comparisons(folder: Path, count: int) -> str:
         return ""
     splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not splits:
-        return _missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
+        return missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
     how = "Drag across a picture: truth to the left, render to the right; then normals, albedo, error × 4."
     parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
+    seen = set()
     for split in splits:
         strips = sorted(split.glob("*.png"))
         shown = min(count, len(strips))
         chosen = [strips[k * len(strips) // shown] for k in range(shown)]
+        pictures = tuple((strip.name, sha256_of(strip)) for strip in chosen)
+        if pictures in seen:
+            continue
+        seen.add(pictures)
+        title, note = split.name.replace("_", " "), ""
+        if split.name == SCALED:
+            title = "relight, albedo scaled"
+            note = "<p>The same frames, with the learned albedo brought to the scale of the true one.</p>"
         shots = "".join(_shot(strip) for strip in chosen)
-        parts.append(f'<h3>{escape(split.name.replace("_", " "))}</h3><div class="grid shots">{shots}</div>')
+        parts.append(f'<h3>{escape(title)}</h3>{note}<div class="grid shots">{shots}</div>')
     return "".join(parts)
 
 
@@ -175,7 +193,7 @@ def _shot(strip: Path) -> str:
 
 def _curves(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
-        return _missing("Losses", "no metrics.jsonl in the run")
+        return missing("Losses", "no metrics.jsonl in the run")
     terms = dict.fromkeys(name for row in rows for name in row)
     terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
     for name in ("step", "stage", "seconds", "skipped"):
@@ -195,35 +213,10 @@ def _curves(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _bench(folder: Path | None) -> str:
-    """Charts and the stability table of a folder such as ``assets/bench``."""
-    title = "Speed, accuracy, stability"
-    if folder is None:
-        return _missing(title, "no charts and no table of stability: --bench FOLDER brings them")
-    # as pictures, not inline: two charts may use one id for different things
-    charts = [
-        (path.stem, data_uri(path.read_bytes(), "image/svg+xml"))
-        for path in sorted(folder.glob("*.svg"))
-        if path.is_file()
-    ]
-    parts = [f'<img class="chart" alt="{escape(name)}" src="{chart}">' for name, chart in charts]
-    stability = folder / "stability.json"
-    if stability.is_file():
-        rows = read_rows(stability, "rows of rnd-bench --stability", "id", "what")
-        parts.append("<h3>Stability</h3>" + rows_table(rows))
-    if not parts:
-        return _missing(title, f"neither *.svg nor stability.json in {folder}")
-    return f"<h2>{title}</h2>" + "".join(parts)
-
-
 def _configuration(config: dict[str, Any]) -> str:
     flat = {key: value for key, value in config.items() if not isinstance(value, dict)}
     nested = {f"{outer}.{key}": value for outer, inner in config.items() if isinstance(inner, dict)
               for key, value in inner.items()}  # fmt: skip
     rows = [(key, str(value)) for key, value in (flat | nested).items()]
-    content = table(("option", "value"), rows)
+    content = table(("option", "value"), rows, words=(0, 1))
     return f"<h2>Configuration</h2><details><summary>{len(rows)} options</summary>{content}</details>"
-
-
-def _missing(title: str, reason: str) -> str:
-    return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
