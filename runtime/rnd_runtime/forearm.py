@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from .rotations import axis_angle_to_matrix
 from .skeleton import Skeleton, bone_transforms
 
 Floats = NDArray[np.float64]
@@ -47,7 +48,9 @@ def share_twists(skeleton: Skeleton, rotations: ArrayLike) -> Floats:
     for elbow, wrist, axis, turns in twist_turns(skeleton, rotations):
         if shared is rotations:
             shared = rotations.copy()
-        _turn(shared.reshape(-1, *rotations.shape[-3:]), elbow, wrist, axis, turns.reshape(-1))
+        turn = axis_angle_to_matrix(turns[..., None] * axis)
+        shared[..., elbow, :, :] @= np.swapaxes(turn, -1, -2)
+        shared[..., wrist, :, :] = turn @ shared[..., wrist, :, :]
     return shared
 
 
@@ -101,30 +104,3 @@ def _shares(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-de
     """Fill ``turns`` [B] with δ of ``rotations`` [B, J, 3, 3]."""
     for pose in range(len(rotations)):
         turns[pose] = _handed_on(rotations[pose, elbow], axis) - _handed_on(rotations[pose, wrist], axis)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _turn(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-def]
-    """Turn forearms of ``rotations`` [B, J, 3, 3] by ``turns`` [B] about ``axis`` [3], and hands back, in place."""
-    x, y, z = axis
-    for pose in range(len(rotations)):
-        sine, cosine = np.sin(turns[pose]), np.cos(turns[pose])
-        rest = 1 - cosine
-        turn = np.array((
-            (cosine + rest * x * x, rest * x * y - sine * z, rest * x * z + sine * y),
-            (rest * x * y + sine * z, cosine + rest * y * y, rest * y * z - sine * x),
-            (rest * x * z - sine * y, rest * y * z + sine * x, cosine + rest * z * z),
-        ))  # fmt: skip
-        rotations[pose, elbow] = _times(rotations[pose, elbow], turn.T)
-        rotations[pose, wrist] = _times(turn, rotations[pose, wrist])
-
-
-@njit(inline="always")
-def _times(a, b):  # type: ignore[no-untyped-def]
-    """A B [3, 3], without BLAS, whose sums are other ones on every machine."""
-    product = np.zeros((3, 3))
-    for row in range(3):
-        for column in range(3):
-            for k in range(3):
-                product[row, column] += a[row, k] * b[k, column]
-    return product

@@ -183,9 +183,7 @@ class _Handler(BaseHTTPRequestHandler):
             page = files("rnd_trainer").joinpath("live_view.html").read_bytes()
             self._answer(page, "text/html; charset=utf-8")
         elif self.path in ("/state.json", "/end.json"):
-            if (
-                self.path == "/end.json"
-            ):  # by asking every now and then a page in the background would miss it
+            if self.path == "/end.json":  # a page in the background asks too seldom to see the end by itself
                 self.server.watched = time.monotonic()
                 self.server.over.wait(WATCH_S)
             self._answer(json.dumps(self.server.state()).encode(), "application/json")
