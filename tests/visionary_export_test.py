@@ -39,6 +39,18 @@ def test_it_is_what_rnd_convert_makes(tiny_checkpoint, tmp_path, run) -> None:
     assert out.read_bytes() == (tmp_path / "clip/visionary.onnx").read_bytes()
 
 
+def test_a_motion_too_long_for_a_clip_is_refused_by_its_own_name(
+    tiny_checkpoint, tmp_path, run, monkeypatch
+) -> None:
+    monkeypatch.setattr("rnd_viewer.visionary.MOST_BYTES", 3 * 40 * 800)
+    save_motion(tmp_path / "moves.npz", motion(body()))
+    words = ["--motion", tmp_path / "moves.npz", "--out", tmp_path / "baked.onnx"]
+    status, printed = run(tiny_checkpoint, "--target", "visionary", *words)
+    assert status == 2 and not (tmp_path / "baked.onnx").exists()
+    assert "frames of --motion: expected at most 3 of this avatar for visionary" in printed
+    assert "rnd-convert splats" in printed
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [

@@ -7,15 +7,20 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from rnd_runtime.avatar_file import read_metadata
 from rnd_runtime.files import atomic_path
 from rnd_runtime.light import Up
 from rnd_runtime.motion import Motion
+from rnd_runtime.onnx_parts import OnnxFile
 from rnd_trainer.checkpoint import Checkpoint
 from rnd_viewer.convert import convert
 from rnd_viewer.convert_cli import SplatOptions
+from rnd_viewer.visionary import check_clip
 
 from .export import export
 from .variant import Variant
+
+PART = "rnd-convert splats --format visionary --frames takes a part of it"
 
 
 def export_visionary(
@@ -40,6 +45,8 @@ def export_visionary(
     with tempfile.TemporaryDirectory() as folder:
         avatar = Path(folder) / "avatar.onnx"
         export(checkpoint, avatar, motion, variant)
+        gaussians = read_metadata(OnnxFile(avatar.read_bytes())).gaussians
+        check_clip(motion.frame_count, gaussians, "frames of --motion", PART)
         inputs = {"avatar": avatar, "motion": motion_file, "hdr": hdr, "hdr_up": hdr_up}
         options = SplatOptions(out=Path(folder), format="visionary", frames=":", **inputs)  # type: ignore[arg-type]
         *notes, _ = convert(options)

@@ -57,11 +57,11 @@ def packed(splats: Splats) -> tuple[Floats32, Floats32]:
     )
 
 
-def check_clip(frames: int, gaussians: int) -> None:
-    """Refuse a clip that no WebGPU buffer holds."""
+def check_clip(frames: int, gaussians: int, what: str = "--frames", hint: str | None = None) -> None:
+    """Refuse a clip that no WebGPU buffer holds; ``what`` says where its frames come from, ``hint`` what to do."""
     most = MOST_BYTES // (gaussians * ROW_BYTES)
     if frames > most:
-        raise InputError("--frames", expected=f"at most {most} of this avatar for visionary", got=frames)
+        raise InputError(what, expected=f"at most {most} of this avatar for visionary", got=frames, hint=hint)
 
 
 def write_visionary(path: Path, frames: Sequence[tuple[Floats32, Floats32]], fps: float) -> None:
