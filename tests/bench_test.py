@@ -38,7 +38,7 @@ from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point
 from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
-from rnd_trainer.bench_pass import one_call, showing, three_calls
+from rnd_trainer.bench_hidden import showing
 from rnd_trainer.bench_raster import body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.bench_scenes import HARDEST, INSIDE, SQUAT, SUN, USUAL, Scene, bench_camera, scene
@@ -121,17 +121,6 @@ def test_the_hardest_scenes_are_what_they_say(tiny_avatar, tmp_path) -> None:
     for hard in scenes.values():
         truth = reference(tiny_avatar, hard, 32, tmp_path)
         assert np.isfinite(truth.radiance).all() and (truth.radiance > 0.01).mean() > 0.05
-
-
-def test_one_compiled_function_draws_what_three_kernels_draw() -> None:
-    """And what the rasteriser draws: what their times are compared for is the same work."""
-    scene, camera = body_scene(400), bench_camera(64)
-    arrays = [torch.from_numpy(array) for array in scene]
-    truth = raster_cpu.rasterize(*scene, camera, depth=False)
-    for draws in (three_calls, one_call):
-        image, alpha, _ = draws(*arrays, camera)
-        np.testing.assert_array_equal(image.numpy(), truth.image)
-        np.testing.assert_array_equal(alpha.numpy(), truth.alpha)
 
 
 def test_those_that_show_nearly_make_the_picture_alone() -> None:

@@ -88,6 +88,7 @@ def _with(matrix: np.ndarray, row: int, column: int, value: float) -> np.ndarray
         ((640, 480, K, np.diag([2.0, 2, 2, 1])), "4 x 4 rigid"),
         ((640, 480, K, np.diag([1.0, 1, -1, 1])), "4 x 4 rigid"),
         ((640, 480, K, _with(np.eye(4), 0, 3, np.inf)), "4 x 4 rigid"),
+        ((640, 480, K, _with(np.eye(4), 0, 0, 1e300)), "4 x 4 rigid"),
         ((640, 480, K, _with(np.eye(4), 3, 2, 1.5)), "4 x 4 rigid"),
         ((640, 480, K, _with(np.eye(4), 3, 3, 2.0)), "4 x 4 rigid"),
     ],

@@ -10,12 +10,14 @@ import pytest
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import FrameRenderer, as_seen_from, facing
+from rnd_runtime.frame import FrameRenderer, as_seen_from, draw, facing
 from rnd_runtime.images import linear_to_srgb, to_bytes
+from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light, load_light
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.outline import sharpened
-from rnd_runtime.raster_cpu import Projected, rasterize
+from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
 
@@ -114,25 +116,16 @@ def test_only_what_is_seen_is_shaded(avatar, motion, sky):
     """A camera close to the head leaves most of the body unshaded, and the picture is the same."""
     gaussians = avatar.pose(motion, 0.3)
     close = Camera.look_at([0.2, 1.6, 1.2], [0, 1.5, 0], width=64, height=64, fov_y=0.4)
-    projected = Projected(gaussians.means, gaussians.covariances, gaussians.opacities, close)
-    assert 0.05 < projected.drawn.mean() < 0.5
+    scene = gaussians.means, gaussians.covariances, gaussians.opacities
+    seen = in_view(*scene, close)
+    assert 0.05 < seen.mean() < 0.5
     shader = Shader(sky)
-    everything, seen = (shader.shade(gaussians, close.position, who) for who in (None, projected.drawn))
-    np.testing.assert_array_equal(seen[projected.drawn], everything[projected.drawn])
-    assert not seen[~projected.drawn].any()
-    expected = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, everything, close)
-    np.testing.assert_array_equal(projected.draw(seen).image, expected.image)
-
-
-def test_a_radiance_that_is_no_number_is_not_drawn(avatar, motion):
-    gaussians = avatar.pose(motion, 0.3)
-    radiance = np.ones((len(gaussians.means), 3), np.float32)
-    radiance[::3] = np.nan
-    scene = (gaussians.means, gaussians.covariances, gaussians.opacities)
-    expected = rasterize(*scene, radiance, CAMERA)
-    ours = Projected(*scene, CAMERA).draw(radiance)
-    np.testing.assert_array_equal(ours.image, expected.image)
-    assert np.isfinite(ours.image).all() and ours.alpha.max() > 0.5
+    everything, some = (shader.shade(gaussians, close.position, who) for who in (None, seen))
+    np.testing.assert_array_equal(some[seen], everything[seen])
+    assert not some[~seen].any()
+    expected = rasterize(*scene, everything, close, depth=False, outlines=True)
+    with make_rasterizer("cpu") as cpu:
+        np.testing.assert_array_equal(draw(gaussians, shader, close, cpu).image, expected.image)
 
 
 def test_culling_keeps_what_faces_the_camera_and_the_picture(avatar, motion, sky):

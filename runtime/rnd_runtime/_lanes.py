@@ -272,6 +272,38 @@ def spread(context, array, index):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
+def load_points(context, array, index):  # type: ignore[no-untyped-def]
+    """x, y, z of sixteen rows of three from ``array[index]`` on (flat, contiguous, float32); no bounds are checked."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        ahead = [builder.add(args[1], ir.Constant(args[1].type, WIDTH * k)) for k in range(3)]
+        a, b, c = (builder.load(_address(ctx, builder, sig.args[0], args[0], at), align=4) for at in ahead)
+        values = []
+        for axis in range(3):
+            places = range(axis, 3 * WIDTH, 3)
+            of_two = [at if at < 2 * WIDTH else 0 for at in places]
+            of_all = [k if at < 2 * WIDTH else at - WIDTH for k, at in enumerate(places)]
+            two = builder.shuffle_vector(a, b, _constant(of_two, _INT, _INTS))
+            values.append(builder.shuffle_vector(two, c, _constant(of_all, _INT, _INTS)))
+        return ctx.make_tuple(builder, sig.return_type, values)
+
+    return types.UniTuple(LANES, 3)(array, types.intp), emit
+
+
+@intrinsic
+def store_mask(context, array, index, mask):  # type: ignore[no-untyped-def]
+    """``array[index : index + 16] = mask`` of a flat contiguous array of booleans; no bounds are checked."""
+
+    def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bytes_ = ir.VectorType(ir.IntType(8), WIDTH)
+        place = builder.gep(ctx.make_array(sig.args[0])(ctx, builder, args[0]).data, [args[1]])
+        builder.store(builder.zext(args[2], bytes_), builder.bitcast(place, bytes_.as_pointer()), align=1)
+        return ctx.get_dummy_value()
+
+    return types.void(array, types.intp, mask), emit
+
+
+@intrinsic
 def transpose(context, source, target):  # type: ignore[no-untyped-def]
     """The 16 × 16 numbers of ``source`` into ``target``, rows as columns; both flat, contiguous and float32."""
 

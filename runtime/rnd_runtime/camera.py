@@ -45,13 +45,7 @@ class Camera:
         focal = max(self.K[0, 0], self.K[1, 1])
         if max(abs(self.K[0, 1]), abs(self.K[1, 0])) > _NO_SKEW * focal or not _ends(self.K, [0, 0, 1]):
             raise InputError("camera K", expected="fx 0 cx, 0 fy cy, 0 0 1", got=self.K.tolist())
-        rotation = self.world_to_camera[:3, :3] if self.world_to_camera.shape == (4, 4) else np.zeros((3, 3))
-        if (
-            not np.isfinite(self.world_to_camera).all()
-            or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-            or np.linalg.det(rotation) < 0
-            or not _ends(self.world_to_camera, [0, 0, 0, 1])
-        ):
+        if not _rigid(self.world_to_camera):
             raise InputError(
                 "camera world_to_camera",
                 expected="a 4 x 4 rigid transform",
@@ -101,6 +95,15 @@ class Camera:
         focal = 0.5 * height / np.tan(0.5 * fov_y)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return cls(width, height, K, world_to_camera)
+
+
+def _rigid(matrix: Floats) -> bool:
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not _ends(matrix, [0, 0, 0, 1]):
+        return False
+    rotation = matrix[:3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300
+        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    return turns and bool(np.linalg.det(rotation) > 0)
 
 
 def _ends(matrix: Floats, row: list[int]) -> bool:

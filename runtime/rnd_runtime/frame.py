@@ -21,14 +21,13 @@ from ._raster_input import floats
 from .avatar import Avatar, Encoded
 from .camera import Camera, Floats
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
+from .in_view import in_view
 from .light import Light
 from .motion import Motion
 from .outline import sharpened
 from .raster import ChosenRasterizer, Kind, make_rasterizer
 from .shading import Shader
 from .tone import tone_map
-
-_LEAST_OPACITY = np.float32(1 / 255)  # below it nothing is drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,16 +157,14 @@ def draw(
     opacities = gaussians.opacities
     if cull is not None:
         opacities = facing(gaussians, camera.position, cull)
-    if getattr(rasterizer, "name", "") != "cpu":
-        radiance = _shade(gaussians, shader, camera, opacities >= _LEAST_OPACITY, kept)
-        shaded = perf_counter()
-        raster = rasterizer(gaussians.means, gaussians.covariances, opacities, radiance, camera, depth=False)
-        return sharpened(replace(raster, seconds={"shading": shaded - started, **raster.seconds}))
-    projected = raster_cpu.Projected(gaussians.means, gaussians.covariances, opacities, camera)
-    seen = perf_counter()
-    radiance = _shade(gaussians, shader, camera, projected.drawn, kept)
-    seconds = {"projection": seen - started, "shading": perf_counter() - seen}
-    raster = projected.draw(radiance, outlines=True)
+    seen = in_view(gaussians.means, gaussians.covariances, opacities, camera)
+    radiance = _shade(gaussians, shader, camera, seen, kept)
+    seconds = {"shading": perf_counter() - started}
+    arrays = gaussians.means, gaussians.covariances, opacities, radiance
+    if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
+        raster = raster_cpu.rasterize(*arrays, camera, depth=False, outlines=True)
+    else:
+        raster = sharpened(rasterizer(*arrays, camera, depth=False))
     return replace(raster, seconds={**seconds, **raster.seconds})
 
 

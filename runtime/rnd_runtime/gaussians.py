@@ -53,8 +53,8 @@ class Raster:
         image: [H, W, C], Σ w_i feature_i.
         alpha: [H, W], Σ w_i.
         depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
-        seconds: how long each stage took, by its name: "projection+sort", "raster" and, from a GL target, "read-back";
-            who draws whole frames adds what comes before, and on the CPU tells "projection" and "sort" apart.
+        seconds: how long each stage took, by its name: "projection", "sort" and "raster" from the CPU, from a GL target
+            "projection+sort", "raster" and "read-back"; who draws whole frames adds what comes before.
         srgb: [H, W, 3] 8-bit over black, the bytes of :func:`rnd_runtime.tone.tone_map`, where a device made them.
     """
 

@@ -14,15 +14,15 @@ from time import perf_counter
 
 import numpy as np
 from numba import get_num_threads
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ._raster_blend import blend, blend_backward
+from ._raster_blend import blend_backward
 from ._raster_input import check_shape, checked, floats
-from ._raster_project import Pinhole, pinhole, project, project_backward
-from ._raster_tiles import Splats, sort_into_tiles
+from ._raster_pass import splat
+from ._raster_project import Pinhole, pinhole, project_backward
+from ._raster_tiles import Splats
 from .camera import Camera
 from .gaussians import Floats32, Raster
-from .outline import sharpened
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,47 +39,6 @@ class State:
     channels: int
 
 
-class Projected:
-    """N Gaussians as a camera sees them, before anyone knows their features: which of them have to be shaded.
-
-    Arguments as of :func:`rasterize`.
-
-    Attributes:
-        drawn: [N] the Gaussians that reach a tile of the picture; the others add nothing to it.
-    """
-
-    def __init__(
-        self, means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, camera: Camera
-    ) -> None:
-        nothing = np.empty((len(np.asarray(means)), 0), np.float32)
-        means, covariances, opacities, nothing = checked(means, covariances, opacities, nothing)
-        self._arrays = means, covariances, opacities, camera
-        self._centers, self._shapes, self._boxes, _, self._depths, self._slot_starts = project(
-            means, covariances, opacities, nothing, pinhole(camera), False
-        )
-        self.drawn: NDArray[np.bool_] = np.diff(self._slot_starts) > 0
-
-    def draw(self, features: Floats32, *, outlines: bool = False) -> Raster:
-        """The picture of ``features`` [N, C], of which only rows of ``drawn`` Gaussians matter; no depth.
-
-        With ``outlines`` they are sharp, see :mod:`.outline`.
-        """
-        features = floats(features)
-        means, covariances, opacities, camera = self._arrays
-        check_shape("features", features, (len(means), features.shape[-1]))
-        if not np.isfinite(features).all():  # then who is drawn depends on it
-            raster = rasterize(means, covariances, opacities, features, camera, depth=False)
-            return sharpened(raster) if outlines else raster
-        started = perf_counter()
-        size, threads = (camera.width, camera.height), get_num_threads()
-        pairs = sort_into_tiles(self._boxes, self._depths, self._slot_starts, size, threads, False)
-        splats = Splats(self._centers, self._shapes, features, self._slot_starts, *pairs)
-        sorted_at = perf_counter()
-        image, coverage = blend(splats, camera.width, camera.height, threads, outlines)
-        seconds = {"sort": sorted_at - started, "raster": perf_counter() - sorted_at}
-        return Raster(image, coverage, np.zeros_like(coverage), seconds)
-
-
 def rasterize(
     means: Floats32,
     covariances: Floats32,
@@ -88,8 +47,9 @@ def rasterize(
     camera: Camera,
     *,
     depth: bool = True,
+    outlines: bool = False,
 ) -> Raster:
-    """Splat N Gaussians.
+    """Splat N Gaussians: projection, culling, sorting and blending in one compiled pass.
 
     Args:
         means: [N, 3] m, world.
@@ -98,11 +58,13 @@ def rasterize(
         features: [N, C], any C.
         camera: the view.
         depth: False leaves the depth picture all zero and saves its time.
+        outlines: they are sharp, see :mod:`.outline`.
 
     Raises:
         InputError: an array has the wrong shape.
     """
-    return forward(means, covariances, opacities, features, camera, depth=depth)[0]
+    arrays = checked(means, covariances, opacities, features)
+    return _splat(arrays, pinhole(camera), depth, False, outlines)[0]
 
 
 def forward(
@@ -118,22 +80,29 @@ def forward(
 
     Without ``depth`` the depth picture is all zero and costs nothing.
     """
-    means, covariances, opacities, features = checked(means, covariances, opacities, features)
-    started = perf_counter()
+    arrays = checked(means, covariances, opacities, features)
     view = pinhole(camera)
-    centers, shapes, boxes, attributes, depths, slot_starts = project(
-        means, covariances, opacities, features, view, depth
+    raster, splats, image = _splat(arrays, view, depth, True, False)
+    return raster, State(*arrays[:3], view, splats, image, raster.alpha, arrays[3].shape[1])
+
+
+def _splat(
+    arrays: tuple[Floats32, Floats32, Floats32, Floats32],
+    view: Pinhole,
+    depth: bool,
+    differentiable: bool,
+    outlines: bool,
+) -> tuple[Raster, Splats, Floats32]:
+    """The pictures, what :func:`backward` needs of their making, and features and depth in one picture [H, W, K]."""
+    started = perf_counter()
+    splats, image, coverage, (projection, sort) = splat(
+        arrays, view, get_num_threads(), depth, differentiable, outlines
     )
-    size, threads = (camera.width, camera.height), get_num_threads()
-    pairs = sort_into_tiles(boxes, depths, slot_starts, size, threads, True)
-    splats = Splats(centers, shapes, attributes, slot_starts, *pairs)
-    sorted_at = perf_counter()
-    image, coverage = blend(splats, camera.width, camera.height, threads, False)
-    seconds = {"projection+sort": sorted_at - started, "raster": perf_counter() - sorted_at}
-    channels = features.shape[1]
-    far = image[..., channels] if depth else np.zeros((camera.height, camera.width), np.float32)
-    raster = Raster(image[..., :channels], coverage, far, seconds)
-    return raster, State(means, covariances, opacities, view, splats, image, coverage, channels)
+    blending = perf_counter() - started - projection - sort
+    channels = arrays[3].shape[1]
+    far = image[..., channels] if depth else np.zeros_like(coverage)
+    seconds = {"projection": projection, "sort": sort, "raster": blending}
+    return Raster(image[..., :channels], coverage, far, seconds), splats, image
 
 
 def backward(

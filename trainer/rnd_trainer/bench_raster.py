@@ -30,7 +30,7 @@ from rnd_runtime.raster_gl import GlRasterizer
 from rnd_trainer import raster, raster_reference
 
 from .bench_clock import summary
-from .bench_pass import one_call, showing, three_calls
+from .bench_hidden import as_played, showing
 from .bench_scenes import bench_camera
 
 Array = NDArray[np.float64]
@@ -153,9 +153,8 @@ def measure(
         kept = showing(*scene, camera)
         shown = [torch.from_numpy(array[kept]) for array in scene]
         alone = [
-            ("numba, three calls", three_calls),
-            ("numba, one call", one_call),
-            ("numba, three calls, none hidden", lambda *_: three_calls(*shown, camera)),
+            ("numba, as played", as_played),
+            ("numba, as played, none hidden", lambda *_: as_played(*shown, camera)),
             *_gl_rasterizers(),
         ]
         cases += [(name, draws, warmup, repeats, None) for name, draws in alone]

@@ -1,0 +1,113 @@
+"""Which Gaussians a camera may see: what has to be shaded before anything is drawn (numba)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from ._lanes import WIDTH, load, load_points, store_mask
+from ._raster_input import check_shape, floats
+from ._raster_project import Pinhole, pinhole
+from .camera import Camera
+from .raster_oracle import ALPHA_MIN, DILATION, NEAR
+
+# Of α = 1/255 at opacity 1, in standard deviations, and a hundredth for a camera's rotation that is one to 1e-4 only
+REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
+LEAST_OPACITY = np.float32(ALPHA_MIN)
+ZERO = np.float32(0)
+
+
+def in_view(
+    means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, camera: Camera
+) -> NDArray[np.bool_]:
+    """[N] all that reach the picture of :func:`rnd_runtime.raster_cpu.rasterize`, and few others.
+
+    Cheaper than projecting them, since a Gaussian counts as the ball that holds it: one whose σ is √‖Σ‖, Frobenius'
+    norm, which no direction exceeds. Arguments as of :func:`rasterize`.
+
+    Raises:
+        InputError: an array has the wrong shape.
+    """
+    means, covariances, opacities = floats(means), floats(covariances), floats(opacities)
+    count = len(means)
+    check_shape("means", means, (count, 3))
+    check_shape("covariances", covariances, (count, 6))
+    check_shape("opacities", opacities, (count,))
+    seen = np.empty(count, np.bool_)
+    _in_view(means, covariances, opacities, pinhole(camera), seen)
+    return seen
+
+
+@njit(inline="always")
+def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, high: float):  # type: ignore[no-untyped-def]
+    """A picture's side as a plane: x, y, z, constant, and how far a ball of σ = 1 m reaches beyond it.
+
+    A point of the camera's frame is projected to u = f x/z + c, and its ball reaches REACH·√(|m|² σ² + DILATION) px
+    from there, where |m|² = (f/z)² (1 + s²) and s is the slope that :class:`Pinhole` bounds. It may touch the pixels
+    u ≥ 0 if z u + REACH (f √(1 + s²) σ + z √DILATION) ≥ 0, which is linear in the point.
+    """
+    r, t = view.rotation, view.translation
+    ahead = centre + REACH * math.sqrt(DILATION)
+    slope = max(abs(low), abs(high))
+    return (
+        focal * r[axis, 0] + ahead * r[2, 0],
+        focal * r[axis, 1] + ahead * r[2, 1],
+        focal * r[axis, 2] + ahead * r[2, 2],
+        focal * t[axis] + ahead * t[2],
+        REACH * abs(focal) * math.sqrt(1.0 + slope * slope),
+    )
+
+
+@njit(inline="always")
+def _ahead(view):  # type: ignore[no-untyped-def]
+    """What is nearer than NEAR as a plane, which a ball's middle must pass."""
+    r, t = view.rotation, view.translation
+    return r[2, 0], r[2, 1], r[2, 2], t[2] - 0.999 * NEAR, 0.0
+
+
+@njit(inline="always")
+def _sigma(covariances, i):  # type: ignore[no-untyped-def]
+    squares = 0.0
+    for k in range(6):
+        squares += (1.0 if k in (0, 3, 5) else 2.0) * np.float64(covariances[i, k]) ** 2
+    return math.sqrt(math.sqrt(squares))
+
+
+@njit(inline="always")
+def _distance(side, x, y, z, reach):  # type: ignore[no-untyped-def]
+    return side[0] * x + side[1] * y + side[2] * z + side[3] + side[4] * reach
+
+
+@njit(inline="always")
+def _rounded(side):  # type: ignore[no-untyped-def]
+    return (np.float32(side[0]), np.float32(side[1]), np.float32(side[2]), np.float32(side[3]), ZERO)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _in_view(means, covariances, opacities, view, seen):  # type: ignore[no-untyped-def]
+    left = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
+    right = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
+    top = _side(view, 1, view.fy, view.cy, view.low_y, view.high_y)
+    bottom = _side(view, 1, -view.fy, view.height - view.cy, view.low_y, view.high_y)
+    ahead = _ahead(view)
+    # Of most the middle is in the picture: seen sixteen at a time, and rounding may err, for the others are looked at
+    a, b, c, d, e = _rounded(left), _rounded(right), _rounded(top), _rounded(bottom), _rounded(ahead)
+    sixteens = len(seen) // WIDTH * WIDTH
+    for i in range(0, sixteens, WIDTH):
+        x, y, z = load_points(means, 3 * i)
+        inside = (_distance(a, x, y, z, ZERO) >= ZERO) & (_distance(b, x, y, z, ZERO) >= ZERO)
+        inside = inside & (_distance(c, x, y, z, ZERO) >= ZERO) & (_distance(d, x, y, z, ZERO) >= ZERO)
+        inside = inside & (_distance(e, x, y, z, ZERO) >= ZERO) & (load(opacities, i) >= LEAST_OPACITY)
+        store_mask(seen, i, inside)
+    seen[sixteens:] = False
+    for i in range(len(seen)):
+        if seen[i] or not opacities[i] >= LEAST_OPACITY:
+            continue
+        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        sigma = _sigma(covariances, i)
+        across = _distance(left, x, y, z, sigma) >= 0.0 and _distance(right, x, y, z, sigma) >= 0.0
+        down = _distance(top, x, y, z, sigma) >= 0.0 and _distance(bottom, x, y, z, sigma) >= 0.0
+        seen[i] = across and down and _distance(ahead, x, y, z, sigma) >= 0.0
