@@ -230,6 +230,8 @@ def _line(row: dict[str, Any]) -> str:
     words += f"{row['peak_mb']:.0f} MB, file {row['file_mb']:.1f} MB"
     if "psnr_db" in row:
         words += f", {row['psnr_db']:.1f} dB (worst {row['psnr_db_worst']:.1f})"
+    if "psnr_suns_db" in row:
+        words += f", behind the same shadows {row['psnr_suns_db']:.1f} ({row['psnr_suns_db_worst']:.1f})"
     return words
 
 

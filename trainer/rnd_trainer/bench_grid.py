@@ -182,7 +182,8 @@ def measured(
     """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
 
     ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
-    ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost.
+    ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost. Of ``table+sun``,
+    ``psnr_suns_db`` and ``psnr_suns_db_worst`` compare with the reference whose suns cast the same shadows.
     """
     encoders = Encoders(setting.encoder, setting.precision, setting.window)
     file, which = inputs.avatar(setting.n, encoders)
@@ -198,6 +199,9 @@ def measured(
     if compare:
         whole, _ = inputs.avatar(setting.n, Encoders())
         row |= errors(drawn, reference(whole, filmed, setting.size, inputs.work))
+        if setting.shade == "table+sun":
+            with_suns = errors(drawn, reference(whole, filmed, setting.size, inputs.work, with_suns=True))
+            row |= {f"psnr_suns_db{part}": with_suns[f"psnr_db{part}"] for part in ("", "_worst")}
         largest, kind = inputs.avatar(full_n or setting.n, Encoders())
         if kind == which:
             truth = reference(largest, filmed, setting.size, inputs.work)

@@ -59,8 +59,9 @@ class Frame:
     """Gaussians"""
     size: int = 512
     """picture side in pixels"""
-    shade: str = "table+sun"
-    """ao, table, table+sun, lights:K or brute"""
+    shade: str = "table"
+    """ao, table, table+sun, lights:K or brute. The error is that to the sum over all texels with the avatar's own
+    visibility; suns of table+sun cast other shadows, and its error behind the same ones is told besides"""
     encoder: Literal["full", "rates", "coarse", "static"] = "full"
     """as of rnd-export; 'rates': skinning at a quarter of the nodes, offsets at an eighth, the rest in full"""
     precision: Literal["f32", "f16", "int8"] = "f32"

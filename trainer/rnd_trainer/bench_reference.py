@@ -1,7 +1,9 @@
 """What a frame would be without any approximation, and how far another one is from it.
 
 The networks of the whole avatar (float32, its only concession), skinning and posing in float64, the sum over all
-2 048 texels of the light with the avatar's own visibility, and the oracle rasteriser.
+2 048 texels of the light with the avatar's own visibility, and the oracle rasteriser. There is a second one for
+``table+sun``, whose suns cast shadows by depth maps and not by the avatar's visibility: with the suns' texels summed
+behind the same shadows, it tells the approximation from the other visibility.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from rnd_runtime.light import load_light
 from rnd_runtime.motion import load_motion
 from rnd_runtime.posing import RestPose
 from rnd_runtime.posing_reference import pose_reference
-from rnd_runtime.shading_reference import shade_reference
+from rnd_runtime.shading_reference import shade_reference, shade_reference_with_suns
 from rnd_runtime.window import motion_window
 
 from .bench_avatars import content_key, sources
@@ -42,15 +44,18 @@ class Reference(NamedTuple):
     means: Floats
 
 
-def reference(avatar_file: Path, scene: Scene, size: int, folder: Path) -> Reference:
+def reference(
+    avatar_file: Path, scene: Scene, size: int, folder: Path, *, with_suns: bool = False
+) -> Reference:
     """The reference of a whole avatar in ``scene``; what is slow of it is kept in ``folder``, by what the files hold.
 
-    And by the camera, the frames and the sources of the runtime: another formula is another reference.
+    And by the camera, the frames and the sources of the runtime: another formula is another reference. ``with_suns``
+    makes it that of :func:`shade_reference_with_suns`.
     """
     asked = f"{bench_camera(size, scene.view).world_to_camera.tolist()} {COMPARED} {STEP_S} {TURN}"
     inputs = (avatar_file, scene.motion, scene.hdr, asked)
-    stem = f"reference_{content_key(*inputs, *sources('rnd_runtime'))}"
-    lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, scene))
+    stem = f"reference_{content_key(*inputs, *sources('rnd_runtime'))}{'_suns' if with_suns else ''}"
+    lit = _kept(folder / f"{stem}_lit.npz", lambda: _lit(avatar_file, scene, with_suns))
 
     def drawn() -> dict[str, Any]:
         camera, pictures = bench_camera(size, scene.view), []
@@ -97,7 +102,8 @@ def posed_reference(avatar: Avatar, motion: Any, time: float) -> Gaussians:
     return replace(static, means=means, covariances=covariances, normals=normals, visibility=harmonics)  # type: ignore[arg-type]
 
 
-def _lit(avatar_file: Path, scene: Scene) -> dict[str, Any]:
+def _lit(avatar_file: Path, scene: Scene, with_suns: bool) -> dict[str, Any]:
+    shade = shade_reference_with_suns if with_suns else shade_reference
     avatar = Avatar.load(avatar_file)
     motion = load_motion(scene.motion, avatar.skeleton)
     light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position
@@ -106,7 +112,7 @@ def _lit(avatar_file: Path, scene: Scene) -> dict[str, Any]:
         posed = posed_reference(avatar, motion, STEP_S * number)
         values["means"].append(posed.means)
         values["covariances"].append(posed.covariances)
-        values["radiance"].append(shade_reference(posed, light.turned(TURN * number), eye))
+        values["radiance"].append(shade(posed, light.turned(TURN * number), eye))
     return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
 
 
