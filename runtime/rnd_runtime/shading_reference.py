@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from operator import getitem
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,14 +72,9 @@ def shade_reference_with_suns(
     reached = _reached_by_suns(gaussians, middles @ light.rotation.T, camera_position)
     for sun in range(len(suns)):
         own = nearest == sun
-        open_to_it = reached[:, sun : sun + 1]
-        radiance += _sum_over_texels(
-            gaussians,
-            local[own] @ light.rotation.T,
-            flux[own],
-            lambda part: open_to_it[part],
-            camera_position,
-        )
+        visibility = partial(getitem, reached[:, sun : sun + 1])
+        directions = local[own] @ light.rotation.T
+        radiance += _sum_over_texels(gaussians, directions, flux[own], visibility, camera_position)
     return radiance
 
 
