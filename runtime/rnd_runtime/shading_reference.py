@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
-from operator import getitem
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,7 +70,7 @@ def shade_reference_with_suns(
     reached = _reached_by_suns(gaussians, middles @ light.rotation.T, camera_position)
     for sun in range(len(suns)):
         own = nearest == sun
-        visibility = partial(getitem, reached[:, sun : sun + 1])
+        visibility = reached[:, sun : sun + 1].__getitem__
         directions = local[own] @ light.rotation.T
         radiance += _sum_over_texels(gaussians, directions, flux[own], visibility, camera_position)
     return radiance
@@ -88,7 +86,7 @@ def _reached_by_suns(gaussians: Gaussians, directions: Floats, camera_position: 
         np.asarray(gaussians.normals, np.float64) * _to_camera(gaussians, camera_position), axis=-1
     )
     fades = np.clip((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), 0, 1)
-    return np.asarray(shadows, np.float64) * fades[:, None]
+    return np.asarray(shadows * fades[:, None], np.float64)
 
 
 def _to_camera(gaussians: Gaussians, camera_position: ArrayLike) -> Floats:
