@@ -200,7 +200,7 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
     """Pictures [H, W, K] of the attributes and [H, W] of alpha; with ``outlines`` as :mod:`.outline` sharpens them."""
     channels = splats.attributes.shape[1]
     columns = channels // 4 * 4 + 4  # and alpha, up to whole fours
-    image, coverage = np.zeros((height, width, channels), np.float32), np.zeros((height, width), np.float32)
+    image, coverage = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
     tiles_x = (width + TILE - 1) // TILE
     starts = splats.tile_starts
     tiles = _fullest_first(starts)
@@ -214,10 +214,14 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
         buffers = (transmittance, sums, shapes, colours, weights)
         while True:
             n = fetch_add(counter)
-            if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
+            if n >= tiles.size:
                 break
             tile = tiles[n]
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
+            if starts[tile] == starts[tile + 1]:
+                image[tile_y : tile_y + TILE, tile_x : tile_x + TILE] = ZERO
+                coverage[tile_y : tile_y + TILE, tile_x : tile_x + TILE] = ZERO
+                continue
             _start_tile(tile_x, tile_y, width, height, transmittance)
             sums[:] = ZERO
             _blend_tile(tile_x, tile_y, starts[tile], starts[tile + 1], splats, buffers)

@@ -42,7 +42,6 @@ Floats32 = NDArray[np.float32]
 
 _HARMONICS = 16
 _CHUNK = 256  # Gaussians handed to a thread at a time
-_NEVER = -1e30  # log weight of the joints that fill up the last register
 _LOG2_E = np.float32(np.log2(np.e))
 _SMALLEST_POWER = np.float32(-126)  # of two in float32
 _LARGEST_TANH = np.float32(9)  # beyond it tanh is 1 in float32
@@ -111,7 +110,7 @@ class RestPose:
         rows = np.zeros((self.log_template.shape[1], WIDTH), np.float32)
         rows[:, :12] = np.asarray(bones, np.float32).reshape(len(rows), 12)
         fields = self.fields(logits, offsets, visibility)
-        count = len(rest.log_template)
+        count = len(rest.neighbours)
         posed = Posed(*(np.empty((count, width), np.float32) for width in (3, 6, 3, _HARMONICS)))
         limits = tuple(np.float32(x) for x in (self.max_offset, self.floor, self.fallback))
         _pose(fields, rest, rows, limits, posed)
@@ -122,37 +121,45 @@ class RestPose:
         offsets, of which six are used, and 16 harmonics; zeros between."""
         logits = np.zeros((len(np.asarray(offsets)), 0)) if logits is None else logits
         nodes = (np.require(values, np.float32, ["C", "W"]) for values in (logits, offsets, visibility))
-        packed: Floats32 = _pack(*nodes, self.arrays.log_template.shape[1])
+        packed: Floats32 = _pack(*nodes, -(-self.log_template.shape[1] // WIDTH) * WIDTH)
         return packed
 
     @cached_property
     def arrays(self) -> RestArrays:
         """As the kernel wants them."""
-        count, joints = self.log_template.shape
+        count = len(self.points)
         whole = -(-count // WIDTH) * WIDTH
-        log_template = np.full((whole, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
-        log_template[:count, :joints] = self.log_template
-        own = np.zeros((_OWN, whole), np.float32)
+        own = np.zeros((whole, _OWN), np.float32)
         for first, values in (
             (_POINTS, self.points),
             (_FACTORS, self.factors),
             (_NORMALS, self.normals),
             (_LIMBS, self.limbs),
         ):
-            own[first : first + values.shape[1], :count] = values.T
+            own[:count, first : first + values.shape[1]] = values
         neighbours = np.zeros((whole, self.neighbours.shape[1]), np.int32)
         weights = np.zeros(neighbours.shape, np.float32)
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
-        return RestArrays(neighbours, weights, log_template, own)
+        gaussians, joints = np.nonzero(self.log_template)
+        starts = np.searchsorted(gaussians, np.arange(whole + 1)).astype(np.int32)
+        logs = self.log_template[gaussians, joints].astype(np.float32)
+        by_sixteens = own.reshape(-1, WIDTH, _OWN).transpose(0, 2, 1)
+        return RestArrays(neighbours, weights, starts, joints.astype(np.int32), logs, by_sixteens.ravel())
 
 
 class RestArrays(NamedTuple):
-    """Constants of a :class:`RestPose`; N and the joints' C are here whole numbers of registers of 16."""
+    """Constants of a :class:`RestPose` in the order in which they are read; N is a whole number of registers of 16.
+
+    A frame reads them all, and caches that others share do not keep them: every number less and every stream less of
+    them counts. So of the template only what is not 0 is here, two joints of 24 with the avatars of rnd-export.
+    """
 
     neighbours: NDArray[np.int32]  # [N, K]
     weights: Floats32  # [N, K]
-    log_template: Floats32  # [N, C]
-    own: Floats32  # [22, N] points, factors, normals and limbs by component
+    log_starts: NDArray[np.int32]  # [N + 1]: logs of Gaussian i are log_starts[i] : log_starts[i + 1]
+    log_joints: NDArray[np.int32]  # [L]
+    logs: Floats32  # [L] of the template's weights, those that are not 0
+    own: Floats32  # [N/16 · 22 · 16] points, factors, normals and limbs by component, sixteen Gaussians after the other
 
 
 class Unposed(NamedTuple):
@@ -211,13 +218,17 @@ def _tanh(x):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _logits_in_lanes(first, fields, rest, rows, logits):  # type: ignore[no-untyped-def]
-    """Logits [C, lanes] of the Gaussians first … first + 15."""
-    columns = rest.log_template.shape[1]
-    for column in range(0, columns, WIDTH):
-        for i in range(first, first + WIDTH):
-            template = load(rest.log_template, i * columns + column)
-            store(rows, (i - first) * WIDTH, template + _interpolated(fields, rest, i, column))
-        transpose(rows, logits[column * WIDTH : (column + WIDTH) * WIDTH])
+    """Logits [C, lanes] of the Gaussians first … first + 15; ``rows`` as long."""
+    block = WIDTH * WIDTH
+    for i in range(first, first + WIDTH):
+        at = (i - first) * WIDTH
+        for column in range(0, len(rows) // WIDTH, WIDTH):
+            store(rows, column * WIDTH + at, _interpolated(fields, rest, i, column))
+        for k in range(rest.log_starts[i], rest.log_starts[i + 1]):
+            joint = rest.log_joints[k]
+            rows[joint // WIDTH * block + at + joint % WIDTH] += rest.logs[k]
+    for column in range(0, len(rows), block):
+        transpose(rows[column : column + block], logits[column : column + block])
 
 
 @njit(error_model="numpy")
@@ -302,7 +313,7 @@ def _widening(a, cofactors, axis, share):  # type: ignore[no-untyped-def]
 
 @njit
 def _three(array, first, i, stride):  # type: ignore[no-untyped-def]
-    """Components ``first`` … ``first + 2`` of the sixteen Gaussians from i on; arrays are laid out by component."""
+    """Components ``first`` … ``first + 2`` of sixteen Gaussians, which begin at ``i`` and lie ``stride`` apart."""
     at = first * stride + i
     return load(array, at), load(array, at + stride), load(array, at + 2 * stride)
 
@@ -314,16 +325,16 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     ``blend`` has their A and ``offset`` their bounded offsets and turns, both by component.
     """
     max_offset, floor, fallback = limits
-    stride = rest.own.shape[1]
+    at, stride = i * _OWN, WIDTH
     first, second, third = (
         _three(blend, 0, 0, WIDTH), _three(blend, 4, 0, WIDTH), _three(blend, 8, 0, WIDTH),
     )  # fmt: skip
     a = first + second + third
     cofactors = _cofactors(a)
-    axis, lever = _three(rest.own, _LIMBS, i, stride), _three(rest.own, _LIMBS + 3, i, stride)
-    kappa = _widening(a, cofactors, axis, load(rest.own, (_LIMBS + 6) * stride + i))
+    axis, lever = _three(rest.own, _LIMBS, at, stride), _three(rest.own, _LIMBS + 3, at, stride)
+    kappa = _widening(a, cofactors, axis, load(rest.own, (_LIMBS + 6) * stride + at))
 
-    point, moved = _three(rest.own, _POINTS, i, stride), _three(offset, 0, 0, WIDTH)
+    point, moved = _three(rest.own, _POINTS, at, stride), _three(offset, 0, 0, WIDTH)
     x = point[0] + max_offset * moved[0] + kappa * lever[0]
     y = point[1] + max_offset * moved[1] + kappa * lever[1]
     z = point[2] + max_offset * moved[2] + kappa * lever[2]
@@ -333,9 +344,9 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     store(out, 2 * WIDTH, z + load(blend, 11 * WIDTH))
 
     f = (
-        _three(rest.own, _FACTORS, i, stride)
-        + _three(rest.own, _FACTORS + 3, i, stride)
-        + _three(rest.own, _FACTORS + 6, i, stride)
+        _three(rest.own, _FACTORS, at, stride)
+        + _three(rest.own, _FACTORS + 3, at, stride)
+        + _three(rest.own, _FACTORS + 6, at, stride)
     )
     turn = _three(offset, 3, 0, WIDTH)
     f = _turned(turn[0], turn[1], turn[2], f)
@@ -356,7 +367,7 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     store(out, 7 * WIDTH, f3 * f6 + f4 * f7 + f5 * f8)
     store(out, 8 * WIDTH, f6 * f6 + f7 * f7 + f8 * f8 + floor)
 
-    normal = _three(rest.own, _NORMALS, i, stride)
+    normal = _three(rest.own, _NORMALS, at, stride)
     along = kappa * (axis[0] * normal[0] + axis[1] * normal[1] + axis[2] * normal[2])
     nx, ny, nz = normal[0] + axis[0] * along, normal[1] + axis[1] * along, normal[2] + axis[2] * along
     x, y, z = _apply(cofactors, nx, ny, nz)
@@ -372,15 +383,16 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
     """All Gaussians, whose arrays are as long as a whole number of registers."""
-    count, columns = rest.log_template.shape
+    count, columns = len(rest.neighbours), fields.shape[1] - 2 * WIDTH
     means, covariances, normals = posed.means, posed.covariances, posed.normals
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        logits, rows = aligned_floats(columns * WIDTH), aligned_floats(WIDTH * WIDTH)
+        logits, by_gaussian = aligned_floats(columns * WIDTH), aligned_floats(columns * WIDTH)
+        rows = aligned_floats(WIDTH * WIDTH)
         blend, offset = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         out = aligned_floats(WIDTH * WIDTH)
         out[:] = _ZERO
         for first in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), WIDTH):
-            _logits_in_lanes(first, fields, rest, rows, logits)
+            _logits_in_lanes(first, fields, rest, by_gaussian, logits)
             _blend_sixteen(logits, bones, blend)
             for i in range(first, first + WIDTH):
                 store(rows, (i - first) * WIDTH, _interpolated(fields, rest, i, columns))

@@ -11,6 +11,7 @@ import numpy as np
 
 from ._lanes import WIDTH
 from .errors import InputError
+from .gaussians import Floats32
 from .gl_passes import ROW_WIDE, GaussianTargets, GaussianTexture, Pass
 from .posing import TWIST_STEPS, RestPose, Unposed
 from .shading import CASTING_OPACITY, DISC_SIGMAS
@@ -19,6 +20,7 @@ from .surfaces_gl import Surfaces
 _REST_TEXELS = 6  # points 3, factors 9, normals 3, limbs 7, opacity, –
 _HARMONIC_TEXELS = 4
 _FIELD_TEXELS = 8  # of a node behind its joints': four for offsets, four for harmonics
+_NEVER = -1e30  # log weight of the joints that fill up the last texels
 
 
 class GlPosing:
@@ -61,7 +63,8 @@ class _OnDevice:
 
     def __init__(self, context: moderngl.Context, unposed: Unposed) -> None:
         self.rest: RestPose = unposed.rest
-        count, columns = unposed.rest.arrays.log_template.shape
+        template = _padded_template(unposed.rest)
+        count, columns = template.shape
         neighbours, quads = unposed.rest.neighbours.shape[1], columns // 4
         _check_limits(context, count, len(unposed.bones))
         macros = {
@@ -82,7 +85,7 @@ class _OnDevice:
         self._template = GaussianTexture(context, 4, texels=quads, row=ROW_WIDE)
         self._rest = GaussianTexture(context, 4, texels=_REST_TEXELS, row=ROW_WIDE)
         self._materials = GaussianTexture(context, 4)
-        self._constants = self._upload(unposed)
+        self._constants = self._upload(unposed, template)
         self.materials = self._constants["materials"]
 
     def write(self, unposed: Unposed) -> None:
@@ -107,7 +110,7 @@ class _OnDevice:
         ):  # fmt: skip
             part.release()
 
-    def _upload(self, unposed: Unposed) -> dict[str, moderngl.Texture]:
+    def _upload(self, unposed: Unposed, template: Floats32) -> dict[str, moderngl.Texture]:
         rest = self.rest
         mixing = np.stack([rest.neighbours.astype(np.float32), rest.neighbour_weights], axis=-1)
         own = np.zeros((len(rest.points), 4 * _REST_TEXELS), np.float32)
@@ -116,10 +119,18 @@ class _OnDevice:
         materials = np.concatenate([unposed.albedo, unposed.roughness[:, None]], axis=1)
         return {
             "mixing": self._mixing.write(np.ascontiguousarray(mixing, np.float32)),
-            "log_template": self._template.write(rest.arrays.log_template),
+            "log_template": self._template.write(template),
             "rest": self._rest.write(own),
             "materials": self._materials.write(np.ascontiguousarray(materials, np.float32)),
         }
+
+
+def _padded_template(rest: RestPose) -> Floats32:
+    """Log weights [N, C] with both up to whole numbers of sixteen; joints that there are not have none."""
+    count, joints = rest.log_template.shape
+    padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
+    padded[:count, :joints] = rest.log_template
+    return padded
 
 
 def _check_limits(context: moderngl.Context, count: int, joints: int) -> None:

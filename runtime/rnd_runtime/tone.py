@@ -98,17 +98,17 @@ _START = int(_LOWEST.view(np.int32)) >> _SHIFT
 def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape
     one_colour = len(behind) == 1
-    red, green, blue = (
-        _code(behind[0, 0], steps, first),
-        _code(behind[0, 1], steps, first),
-        _code(behind[0, 2], steps, first),
-    )
+    empty = np.empty(3 * width, np.uint8)  # a row of nothing but the one colour
+    for c in range(3):
+        empty[c::3] = _code(behind[0, c], steps, first)
+    rows = image.reshape(height, 3 * width)
     for y in prange(height):
+        if one_colour:
+            rows[y, :] = empty
         for x in range(width):
             left = _ONE - alpha[y, x]
             at = 0 if one_colour else y * width + x
             if one_colour and left == _ONE:
-                image[y, x, 0], image[y, x, 1], image[y, x, 2] = red, green, blue
                 continue
             for c in range(3):
                 image[y, x, c] = _code(radiance[y, x, c] + left * behind[at, c], steps, first)
