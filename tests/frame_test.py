@@ -10,7 +10,7 @@ import pytest
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import FrameRenderer, as_seen_from, draw, facing
+from rnd_runtime.frame import FrameRenderer, as_seen_from, draw
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light, load_light
@@ -132,9 +132,13 @@ def test_culling_keeps_what_faces_the_camera_and_the_picture(avatar, motion, sky
     gaussians = avatar.pose(motion, 0.3)
     to_eye = CAMERA.position - gaussians.means
     cosines = (gaussians.normals * to_eye).sum(1) / np.linalg.norm(to_eye, axis=1)
-    kept = facing(gaussians, CAMERA.position, LEAST)
+    scene = gaussians.means, gaussians.covariances, gaussians.opacities
+    everything, kept = (
+        in_view(*scene, CAMERA, normals=gaussians.normals, cull=least) for least in (None, LEAST)
+    )
     sure = np.abs(cosines - LEAST) > 1e-5
-    np.testing.assert_array_equal(kept[sure], np.where(cosines >= LEAST, gaussians.opacities, 0)[sure])
+    np.testing.assert_array_equal(kept[sure], (everything & (cosines >= LEAST))[sure])
+    assert 0.5 * everything.sum() < kept.sum() < 0.9 * everything.sum()
     whole = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3).image.astype(float)
     culled = FrameRenderer(avatar, sky, CAMERA, cull=LEAST).render(motion, 0.3).image
     assert 10 * np.log10(255**2 / np.mean((whole - culled) ** 2)) > CULLED

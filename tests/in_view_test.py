@@ -75,6 +75,28 @@ def test_nothing_behind_or_too_near_is_seen():
     assert in_view(means, round_, np.ones(4, np.float32), camera).tolist() == [False, False, True, True]
 
 
+def test_what_faces_away_is_left_out_wherever_it_stands():
+    """Side by side in sixteens, alone at the end, and half outside the picture."""
+    means, covariances, opacities, _ = random_scene(6, 4007, spread=1.5)
+    camera = off_centre_camera(80, 60)
+    normals = np.random.default_rng(6).normal(size=means.shape).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    to_eye = camera.position - means
+    cosines = (normals * to_eye).sum(1) / np.linalg.norm(to_eye, axis=1)
+    whole = in_view(means, covariances, opacities, camera)
+    for least in (-0.5, 0.0, 0.7):
+        kept = in_view(means, covariances, opacities, camera, normals=normals, cull=least)
+        sure = np.abs(cosines - least) > 1e-5
+        np.testing.assert_array_equal(kept[sure], (whole & (cosines >= least))[sure])
+        assert 0 < kept.sum() < whole.sum()
+
+
+def test_normals_of_other_gaussians_are_refused():
+    means, covariances, opacities, _ = random_scene(6, 40)
+    with pytest.raises(InputError, match=r"^normals: expected shape"):
+        in_view(means, covariances, opacities, off_centre_camera(8, 8), normals=means[:-1], cull=0.0)
+
+
 @pytest.mark.parametrize(("wrong", "name"), [(0, "means"), (1, "covariances"), (2, "opacities")])
 def test_wrong_shapes_are_refused(wrong, name):
     scene = list(random_scene(0, 10)[:3])

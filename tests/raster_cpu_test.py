@@ -187,6 +187,15 @@ def test_outlines_are_sharp_where_asked_for():
     assert ((ours.alpha > 0.1) & (ours.alpha < 0.9)).any()
 
 
+def test_only_those_seen_are_drawn():
+    scene, camera = random_scene(2), off_centre_camera(40, 30)
+    seen = np.arange(len(scene[0])) % 3 > 0
+    expected = raster_cpu.rasterize(*(array[seen] for array in scene), camera)
+    np.testing.assert_array_equal(raster_cpu.rasterize(*scene, camera, seen=seen).image, expected.image)
+    with pytest.raises(InputError, match="chosen Gaussians: expected shape"):
+        raster_cpu.rasterize(*scene, camera, seen=seen[1:])
+
+
 def test_stages_of_the_one_pass_add_up_to_it():
     scene, camera = random_scene(2, 20_000), off_centre_camera(400, 300)
     raster_cpu.rasterize(*scene, camera)

@@ -11,11 +11,12 @@ from ._raster_tiles import Splats, sort_into_tiles
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def splat(arrays, view, threads, with_depth, with_slots, outlines):  # type: ignore[no-untyped-def]
+def splat(arrays, seen, view, threads, with_depth, with_slots, outlines):  # type: ignore[no-untyped-def]
     """Project, cull, sort and blend N Gaussians.
 
     Args:
         arrays: means [N, 3], covariances [N, 6], opacities [N] and features [N, C], float32 and contiguous.
+        seen: [N] those to be drawn; all where it is empty.
         view: a :class:`._raster_project.Pinhole`.
         threads: how many of numba's share the work; changes no bit.
         with_depth: depths are blended after the features.
@@ -31,7 +32,7 @@ def splat(arrays, view, threads, with_depth, with_slots, outlines):  # type: ign
     means, covariances, opacities, features = arrays
     started = now()
     centers, shapes, boxes, attributes, depths, slot_starts = project(
-        means, covariances, opacities, features, view, with_depth
+        means, covariances, opacities, features, seen, view, with_depth
     )
     projected = now()
     tile_starts, pair_gaussians, pair_slots = sort_into_tiles(

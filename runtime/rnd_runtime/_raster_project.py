@@ -117,15 +117,17 @@ def tile_range(boxes, i):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _project_range(first, last, means, covariances, opacities, features, view, outputs):  # type: ignore[no-untyped-def]
+def _project_range(first, last, means, covariances, opacities, features, seen, view, outputs):  # type: ignore[no-untyped-def]
     """Fill rows first … last − 1; ``tiles`` counts the tiles each reaches, 0 if it is not drawn.
 
-    NaN fails every guard.
+    ``seen`` are those to look at, all where it is empty. NaN fails every guard.
     """
     centers, shapes, boxes, attributes, depths, tiles = outputs
     channels = features.shape[1]
     for i in range(first, last):
         tiles[i] = 0
+        if len(seen) > 0 and not seen[i]:
+            continue
         opacity = np.float64(opacities[i])
         x, y, z = _camera_point(view, means, i)
         trace = np.float64(covariances[i, 0]) + np.float64(covariances[i, 3]) + np.float64(covariances[i, 5])
@@ -175,8 +177,8 @@ def _project_range(first, last, means, covariances, opacities, features, view, o
 
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
-def project(means, covariances, opacities, features, view, with_depth):  # type: ignore[no-untyped-def]
-    """Project N Gaussians; arrays are float32 and contiguous.
+def project(means, covariances, opacities, features, seen, view, with_depth):  # type: ignore[no-untyped-def]
+    """Project N Gaussians, or those ``seen`` [N] where that is not empty; arrays are float32 and contiguous.
 
     Returns:
         centers: [N, 2] px, float64.
@@ -196,7 +198,7 @@ def project(means, covariances, opacities, features, view, with_depth):  # type:
     outputs = (centers, shapes, boxes, attributes, depths, slot_starts[1:])
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         last = min((chunk + 1) * CHUNK, count)
-        _project_range(chunk * CHUNK, last, means, covariances, opacities, features, view, outputs)
+        _project_range(chunk * CHUNK, last, means, covariances, opacities, features, seen, view, outputs)
     for i in range(count):
         slot_starts[i + 1] += slot_starts[i]
     return centers, shapes, boxes, attributes, depths, slot_starts

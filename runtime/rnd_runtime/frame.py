@@ -13,11 +13,9 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
-from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from . import raster_cpu
-from ._raster_input import floats
 from .avatar import Avatar, Encoded
 from .camera import Camera, Floats
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
@@ -60,7 +58,7 @@ class FrameRenderer:
         shade: one of :data:`rnd_runtime.shading.SHADE_MODES`.
         raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see :func:`rnd_runtime.raster.make_rasterizer`.
         cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5. What that costs
-            stands in :func:`facing`; by default all are drawn.
+            stands in :func:`rnd_runtime.in_view.in_view`; by default all are drawn.
     """
 
     def __init__(
@@ -154,17 +152,16 @@ def draw(
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
-    opacities = gaussians.opacities
-    if cull is not None:
-        opacities = facing(gaussians, camera.position, cull)
-    seen = in_view(gaussians.means, gaussians.covariances, opacities, camera)
+    means, covariances, opacities = gaussians.means, gaussians.covariances, gaussians.opacities
+    seen = in_view(means, covariances, opacities, camera, normals=gaussians.normals, cull=cull)
     radiance = _shade(gaussians, shader, camera, seen, kept)
     seconds = {"shading": perf_counter() - started}
-    arrays = gaussians.means, gaussians.covariances, opacities, radiance
     if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
-        raster = raster_cpu.rasterize(*arrays, camera, depth=False, outlines=True)
+        arrays = means, covariances, opacities, radiance
+        raster = raster_cpu.rasterize(*arrays, camera, depth=False, outlines=True, seen=seen)
     else:
-        raster = sharpened(rasterizer(*arrays, camera, depth=False))
+        opacities = np.where(seen, opacities, np.float32(0))
+        raster = sharpened(rasterizer(means, covariances, opacities, radiance, camera, depth=False))
     return replace(raster, seconds={**seconds, **raster.seconds})
 
 
@@ -186,24 +183,3 @@ def _shade(
         kept.radiance[fresh] = shader.shade(gaussians, camera.position, fresh)[fresh]
         kept.known |= fresh
     return kept.radiance
-
-
-def facing(gaussians: Gaussians, eye: ArrayLike, least: float) -> Floats32:
-    """Opacities [N], 0 where the angle between normal and view is so large that n·v < ``least``.
-
-    What faces away from the camera at ``eye`` [3] m lies behind what faces it, if the body is closed and opaque. A
-    little below 0 the silhouette's own Gaussians are kept, which are seen from their edge. No trained avatar is quite
-    that; what it costs one of 30 000 stands in docs/performance.md (``rnd-bench frame --cull``).
-    """
-    opacities = np.empty(len(gaussians.means), np.float32)
-    arrays = (floats(gaussians.means), floats(gaussians.normals), floats(gaussians.opacities))
-    _facing(*arrays, floats(eye), np.float32(least), opacities)
-    return opacities
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _facing(means, normals, opacities, eye, least, kept):  # type: ignore[no-untyped-def]
-    for i in range(len(means)):
-        x, y, z = eye[0] - means[i, 0], eye[1] - means[i, 1], eye[2] - means[i, 2]
-        along = x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2]
-        kept[i] = opacities[i] if along >= least * np.sqrt(x * x + y * y + z * z) else 0

@@ -14,15 +14,17 @@ from time import perf_counter
 
 import numpy as np
 from numba import get_num_threads
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ._raster_blend import blend_backward
-from ._raster_input import check_shape, checked, floats
+from ._raster_input import check_shape, checked, floats, mask
 from ._raster_pass import splat
 from ._raster_project import Pinhole, pinhole, project_backward
 from ._raster_tiles import Splats
 from .camera import Camera
 from .gaussians import Floats32, Raster
+
+_EVERYTHING = np.empty(0, np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ def rasterize(
     *,
     depth: bool = True,
     outlines: bool = False,
+    seen: ArrayLike | None = None,
 ) -> Raster:
     """Splat N Gaussians: projection, culling, sorting and blending in one compiled pass.
 
@@ -59,12 +62,14 @@ def rasterize(
         camera: the view.
         depth: False leaves the depth picture all zero and saves its time.
         outlines: they are sharp, see :mod:`.outline`.
+        seen: [N] the Gaussians to be drawn, as :func:`rnd_runtime.in_view.in_view` tells them; by default all.
 
     Raises:
         InputError: an array has the wrong shape.
     """
     arrays = checked(means, covariances, opacities, features)
-    return _splat(arrays, pinhole(camera), depth, False, outlines)[0]
+    chosen = _EVERYTHING if seen is None else mask(seen, len(arrays[0]))
+    return _splat(arrays, chosen, pinhole(camera), depth, False, outlines)[0]
 
 
 def forward(
@@ -82,12 +87,13 @@ def forward(
     """
     arrays = checked(means, covariances, opacities, features)
     view = pinhole(camera)
-    raster, splats, image = _splat(arrays, view, depth, True, False)
+    raster, splats, image = _splat(arrays, _EVERYTHING, view, depth, True, False)
     return raster, State(*arrays[:3], view, splats, image, raster.alpha, arrays[3].shape[1])
 
 
 def _splat(
     arrays: tuple[Floats32, Floats32, Floats32, Floats32],
+    seen: NDArray[np.bool_],
     view: Pinhole,
     depth: bool,
     differentiable: bool,
@@ -96,7 +102,7 @@ def _splat(
     """The pictures, what :func:`backward` needs of their making, and features and depth in one picture [H, W, K]."""
     started = perf_counter()
     splats, image, coverage, (projection, sort) = splat(
-        arrays, view, get_num_threads(), depth, differentiable, outlines
+        arrays, seen, view, get_num_threads(), depth, differentiable, outlines
     )
     blending = perf_counter() - started - projection - sort
     channels = arrays[3].shape[1]

@@ -235,7 +235,8 @@ def _project_and_sort(means, covariances, opacities, features, view):  # type: i
     depths, starts = np.empty(count, np.float64), np.empty(count + 1, np.int64)
     starts[0] = 0
     outputs = (centers, shapes, boxes, attributes, depths, starts[1:])
-    _project_range(0, count, means, covariances, opacities, features, view, outputs)
+    everything = np.empty(0, np.bool_)
+    _project_range(0, count, means, covariances, opacities, features, everything, view, outputs)
     for i in range(count):
         starts[i + 1] += starts[i]
     return _front_to_back(depths, starts), centers, shapes, attributes

@@ -71,7 +71,7 @@ def look_up(surfaces, camera, rotations, tables, seen, radiance):  # type: ignor
     Args:
         surfaces: means [N, 3] m, normals [N, 3], albedo [N, 3], roughness [N] and visibility [N, 16].
         camera: [3] m. rotations: light → world and root → light, [3, 3] each.
-        tables: diffuse [33·33, 3·16] for visibility in the root's frame; specular [7, 49·49, 16] of cells; lobes
+        tables: diffuse [33·33, 3·16] for visibility in the root's frame; specular [49·49, 7, 16] of cells; lobes
             [16, 49, 16].
     """
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
@@ -103,16 +103,16 @@ def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):
     energy = energy * at_least(_open_share(root_to_light, mean, shrink, columns), ZERO)
 
     _place_in_square(mean[0], mean[1], mean[2], SPECULAR_SIZE, room)
-    level = whole(clamped(place, np.float32(len(specular) - 2)))
+    levels = specular.shape[1]
+    level = whole(clamped(place, np.float32(levels - 2)))
     store(room, _LEVEL, level)
     store(room, _UP, place - level)
     s_slope, s_constant = load(_S_SLOPE, 0), load(_S_CONSTANT, 0)
     t_slope, t_constant = load(_T_SLOPE, 0), load(_T_CONSTANT, 0)
-    stride = SPECULAR_SIZE * SPECULAR_SIZE * WIDTH  # of a level
     for k in range(WIDTH):
-        at = int(room[_LEVEL + k]) * stride
-        at += (int(room[ROW + k]) * SPECULAR_SIZE + int(room[COLUMN + k])) * WIDTH
-        lower, upper = load(specular, at), load(specular, at + stride)
+        cell = int(room[ROW + k]) * SPECULAR_SIZE + int(room[COLUMN + k])
+        at = (cell * levels + int(room[_LEVEL + k])) * WIDTH
+        lower, upper = load(specular, at), load(specular, at + WIDTH)
         share = (s_constant + s_slope * room[S + k]) * (t_constant + t_slope * room[T + k])
         store(rows, k * WIDTH, share * (lower + room[_UP + k] * (upper - lower)))
     transpose(rows, columns)

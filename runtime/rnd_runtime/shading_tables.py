@@ -91,14 +91,17 @@ class SkyTables:
 
     @cached_property
     def specular_cells(self) -> Floats32:
-        """[7, 49·49, 16]: RGB and nothing of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1), by its first."""
+        """[49·49, 7, 16]: RGB and nothing of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1), by its first.
+
+        The levels of a cell, of which a look-up takes two, lie side by side.
+        """
         nodes = self.specular.reshape(len(self.specular), SPECULAR_SIZE, SPECULAR_SIZE, 3)
-        cells = np.zeros((*nodes.shape[:3], 4, 4), np.float32)
+        cells = np.zeros((SPECULAR_SIZE, SPECULAR_SIZE, len(nodes), 4, 4), np.float32)
         for corner in range(4):
             down, right = divmod(corner, 2)
-            moved = nodes[:, down:, right:]
-            cells[:, : moved.shape[1], : moved.shape[2], corner, :3] = moved
-        return cells.reshape(len(nodes), SPECULAR_SIZE * SPECULAR_SIZE, WIDTH)
+            moved = nodes[:, down:, right:].transpose(1, 2, 0, 3)
+            cells[: moved.shape[0], : moved.shape[1], :, corner, :3] = moved
+        return cells.reshape(SPECULAR_SIZE * SPECULAR_SIZE, len(nodes), WIDTH)
 
 
 @cache
