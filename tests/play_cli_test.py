@@ -229,6 +229,22 @@ def test_a_floor_is_refused_beside_aovs_which_it_cannot_make_cheaper(files, tmp_
     assert "--fps-floor: expected no --aov beside it, got depth" in capsys.readouterr().err
 
 
+def test_what_faces_away_is_left_out_on_every_path(files, tmp_path, capsys):
+    """By the CPU, by OpenGL, and beside AOVs, which are drawn another way."""
+    pictures = {}
+    for name, changes in {
+        "whole": {"cull": None}, "cpu": {}, "gl": {"raster": "gl"}, "aov": {"aov": "normal", "format": "png,exr"},
+    }.items():  # fmt: skip
+        options = {"shade": "table", "frames": "0:1", "cull": 0.3} | changes
+        assert main(_arguments(files, tmp_path / name, **options)) == 0
+        pictures[name] = read_image(tmp_path / name / "frames/000000.png").astype(int)
+    assert np.abs(pictures["cpu"] - pictures["whole"]).max() > 20
+    assert np.abs(pictures["cpu"] - pictures["gl"]).max() <= 2
+    np.testing.assert_array_equal(pictures["aov"], pictures["cpu"])
+    assert main(_arguments(files, tmp_path / "no", cull=2)) == 2
+    assert "--cull: expected -1 to 1, got 2" in capsys.readouterr().err
+
+
 def test_the_same_run_again_takes_nothing_away(files, tmp_path):
     assert main(_arguments(files, tmp_path / "out", frames=":2")) == 0
     assert main(_arguments(files, tmp_path / "out", frames="4:")) == 0

@@ -138,7 +138,7 @@ class _Run:
             options=options,
             out=out,
             formats=formats,
-            player=Player(avatar, light, shader, rasterizer, background, aovs, times),
+            player=Player(avatar, light, shader, rasterizer, background, aovs, times, options.cull),
             rasterizer=rasterizer,
             motion=motion,
             fps=fps,

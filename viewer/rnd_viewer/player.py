@@ -12,6 +12,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.frame import KeptRadiance, as_seen_from, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
+from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.outline import sharpened
@@ -74,7 +75,7 @@ class Player:
     """An avatar under a light, ready to be rendered at any time of any motion from any camera.
 
     Frames depend on nothing but the arguments of :meth:`render` and on :meth:`turn`. ``times`` collects how long each
-    stage took.
+    stage took; ``cull`` is that of :class:`rnd_runtime.frame.FrameRenderer`.
     """
 
     avatar: Avatar
@@ -84,6 +85,7 @@ class Player:
     background: Background = field(default_factory=Background)
     aovs: tuple[str, ...] = ()
     times: StageTimes = field(default_factory=StageTimes)
+    cull: float | None = None
     _behind: tuple[Camera, Floats32] | None = field(default=None, init=False, repr=False)
     _kept: tuple[KeptRadiance, int] | None = field(default=None, init=False, repr=False)  # and its frames
 
@@ -104,7 +106,7 @@ class Player:
     def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
         """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
         if quality == FULL and not self.aovs:
-            raster = draw_encoded(self.avatar, encoded, self.shader, camera, self.rasterizer)
+            raster = draw_encoded(self.avatar, encoded, self.shader, camera, self.rasterizer, cull=self.cull)
             self._kept = None  # by the next frame of less quality it would be out of date
         else:
             with self.times.stage("posing"):
@@ -137,7 +139,8 @@ class Player:
         kept, age = self._kept
         self._kept = kept, age + 1
         sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
-        raster = draw(gaussians, shader, camera.resized(*sides), self.rasterizer, kept=kept)
+        resized = camera.resized(*sides)
+        raster = draw(gaussians, shader, resized, self.rasterizer, cull=self.cull, kept=kept)
         if quality.scale == 1:
             return raster
         with self.times.stage("enlarging"):
@@ -149,12 +152,16 @@ class Player:
     def _raster_with_aovs(self, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
         """Radiance, then the AOVs' features, splatted; both are the CPU's."""
         with self.times.stage("shading"):
-            radiance = shader.shade(gaussians, camera.position)
+            seen = in_view(
+                gaussians.means, gaussians.covariances, gaussians.opacities, camera,
+                normals=gaussians.normals, cull=self.cull,
+            )  # fmt: skip
+            radiance = shader.shade(gaussians, camera.position, seen)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
         raster = self.rasterizer(
             gaussians.means,
             gaussians.covariances,
-            gaussians.opacities,
+            np.where(seen, gaussians.opacities, np.float32(0)),
             features.astype(np.float32),
             camera,
             depth="depth" in self.aovs,
