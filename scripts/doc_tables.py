@@ -1,8 +1,8 @@
 """Fills the tables of README.md and docs from assets/bench/*.json: python scripts/doc_tables.py
 
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
-the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, and ``FILE.json of A; B`` shows
-those of the methods A and B alone. ``<!-- chart: FILE.svg -->`` …
+the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, A.json+B.json has those of both,
+and ``FILE.json of A; B`` shows those of the methods A and B alone. ``<!-- chart: FILE.svg -->`` …
 ``<!-- end -->`` holds a picture. What was not measured yet leaves its place empty.
 """
 
@@ -36,12 +36,14 @@ def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
         return found[1] + (picture if (bench / found[2]).is_file() else "") + found[3]
 
     def table(found: re.Match[str]) -> str:
-        name, _, key = found[2].partition("#")
-        if not (bench / name).is_file():
+        files, _, key = found[2].partition("#")
+        if not all((bench / name).is_file() for name in files.split("+")):
             return found[1] + found[5]
-        rows = json.loads((bench / name).read_text(encoding="utf-8"))
-        rows = rows[key] if key else rows
-        rows = rows if isinstance(rows, list) else [rows]
+        rows = []
+        for name in files.split("+"):
+            whole = json.loads((bench / name).read_text(encoding="utf-8"))
+            some = whole[key] if key else whole
+            rows += some if isinstance(some, list) else [some]
         methods = found[3].split("; ") if found[3] else None
         rows = [row for row in rows if methods is None or row["method"] in methods]
         columns = [column.strip().partition(" ")[::2] for column in found[4].split(",")]

@@ -77,7 +77,7 @@ def report() -> list[Finding]:
 def machine() -> str:
     """CPU model, its microarchitecture as LLVM calls it, and cores, for the record beside a measured figure.
 
-    A cloud's model names tell little: of two machines that both call themselves AMD EPYC, one had AVX-512 and one not.
+    A cloud's model names tell little: what calls itself AMD EPYC has AVX-512 or has not.
     """
     return f"{_cpu_model()} ({_microarchitecture()}), {_cores()} cores"
 

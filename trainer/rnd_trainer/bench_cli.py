@@ -70,8 +70,8 @@ def _raster(options: Raster) -> None:
             row["kernel"], row["pass"], f"{row['ms_median']:.2f}", f"{row['ms_p95']:.2f}", f"{row['psnr_db']:.1f}",
             "" if gradient is None else f"{gradient:.1e}",
         )  # fmt: skip
-    Console().print(table)
     _write(options.json, rows)
+    Console().print(table)
 
 
 def _frame(options: Frame) -> None:
@@ -91,11 +91,11 @@ def _frame(options: Frame) -> None:
         options.raster, options.threads, options.cull, options.scene,
     )  # fmt: skip
     row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
+    _write(options.json, row)  # before anything is printed: who reads it may stop reading
     console = Console()
     print_plain(console, _line(row))
     for name, milliseconds in row["stages"].items():
         console.print(f"  {name:16} {milliseconds:6.2f} ms")
-    _write(options.json, row)
 
 
 def _grid(options: Grid) -> None:
@@ -185,8 +185,8 @@ def _shards(options: Shards) -> None:
     for row in rows:
         cells = (f"{row['seconds']:.2f}", f"{row['fps']:.1f}", f"{row['speed_up']:.2f}")
         table.add_row(str(row["processes"]), str(row["threads"]), *cells)
-    Console().print(table)
     _write(options.json, rows)
+    Console().print(table)
 
 
 def _step(options: Step) -> None:
@@ -211,8 +211,8 @@ def _step(options: Step) -> None:
     table = Table("what", "ms", "share", title=f"{rows[0]['gaussians']} Gaussians")
     for row in rows:
         table.add_row(row["what"], f"{row['ms']:.1f}", f"{row['share']:.0%}")
-    Console().print(table)
     _write(options.json, rows)
+    Console().print(table)
 
 
 def _line(row: dict[str, Any]) -> str:
