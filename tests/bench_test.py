@@ -362,7 +362,7 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
 
     lit: list[Path] = []
 
-    def shine(avatar: Path, scene: Scene) -> dict[str, np.ndarray]:
+    def shine(avatar: Path, scene: Scene, with_suns: bool) -> dict[str, np.ndarray]:
         lit.append(scene.motion)
         return {"means": np.zeros((0, 0, 3))}
 
@@ -383,6 +383,8 @@ def test_what_is_kept_is_kept_by_what_its_sources_hold(tiny_avatar, tmp_path, mo
     monkeypatch.setattr(bench_reference, "TURN", 0.5)
     reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path)
     assert len(lit) == 5  # from another place, and under a light that turns otherwise
+    reference(tiny_avatar, Scene(tmp_path / "a" / "walk.npz", SKY, USUAL), 8, tmp_path, with_suns=True)
+    assert len(lit) == 6
 
 
 def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:
