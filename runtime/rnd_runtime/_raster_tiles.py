@@ -89,9 +89,9 @@ def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # t
     for part in prange(threads):
         own = places[part]
         for g in order[part * stretch : (part + 1) * stretch]:
-            x0, y0, x1, y1 = tile_range(boxes, g)
+            x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
-            for _ in range((x1 - x0 + 1) * (y1 - y0 + 1)):
+            for _ in range(slot_starts[g], slot_starts[g + 1]):
                 own[tile] += 1
                 tile, x = _next_tile(tile, x, x0, x1, tiles_x)
     starts = _starts(places)
@@ -100,14 +100,14 @@ def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # t
     for part in prange(threads):
         own = places[part]
         for g in order[part * stretch : (part + 1) * stretch]:
-            x0, y0, x1, y1 = tile_range(boxes, g)
+            x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
-            for k in range((x1 - x0 + 1) * (y1 - y0 + 1)):
+            for slot in range(slot_starts[g], slot_starts[g + 1]):
                 place = own[tile]
                 own[tile] = place + 1
                 pair_gaussians[place] = g
                 if with_slots:
-                    pair_slots[place] = slot_starts[g] + k
+                    pair_slots[place] = slot
                 tile, x = _next_tile(tile, x, x0, x1, tiles_x)
     return starts, pair_gaussians, pair_slots
 
