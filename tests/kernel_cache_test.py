@@ -11,6 +11,7 @@ import pytest
 
 import rnd_runtime
 from rnd_runtime.kernels import kernels_are_cold
+from tiny import ASSETS
 
 KERNEL = """
 from numba import njit
@@ -110,3 +111,18 @@ def test_where_numba_keeps_kernels_is_where_they_are_looked_for(clone, tmp_path)
         assert _run(clone, code, **places) == "True"
         _run(clone, **places)
         assert _run(clone, code, **places) == "False"
+
+
+def test_a_players_start_loads_neither_scipy_nor_opengl_nor_other_readers(tiny_avatar, tmp_path):
+    code = f"""
+import sys
+from rnd_viewer.cli import main
+assert main([{str(tiny_avatar)!r}, "--motion", {str(ASSETS / "walk.npz")!r}, "--hdr", {str(ASSETS / "sky.exr")!r},
+             "--size", "16", "--frames", "0:1", "--raster", "cpu", "--out", {str(tmp_path / "out")!r}]) == 0
+unneeded = ["scipy.linalg", "rnd_runtime.frame_gl", "rnd_runtime.mocap", "rnd_runtime.unpickle", "torch"]
+print([name for name in unneeded if sys.modules.get(name)])
+import scipy.linalg, numba, numpy
+print(scipy.linalg.norm([3, 4]), numba.njit(lambda a: a.sum())(numpy.ones(3)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-2:] == ["[]", "5.0 3.0"]

@@ -793,7 +793,7 @@ def test_what_retargeting_makes_no_numbers_of_is_refused(tmp_path, monkeypatch):
         moved.rotations[3, 0] = np.nan
         return moved
 
-    monkeypatch.setattr("rnd_runtime.motion.retarget", torn)
+    monkeypatch.setattr("rnd_runtime.retarget.retarget", torn)
     with pytest.raises(InputError, match=r"a\.bvh: frame 3: motion: expected finite numbers"):
         load_motion(_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), SKELETON)
 

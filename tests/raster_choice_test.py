@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rnd_runtime import gl_context, raster
+from rnd_runtime import gl_context
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.raster import make_rasterizer
@@ -33,12 +33,12 @@ def test_auto_takes_gl_on_a_gpu_and_the_kernel_on_a_cpu(monkeypatch, renderer, s
 
 
 def test_auto_takes_the_kernel_where_no_context_can_be_made(monkeypatch):
-    monkeypatch.setattr(raster, "create_context", _no_context)
+    monkeypatch.setattr(gl_context, "create_context", _no_context)
     assert make_rasterizer("auto").name == "cpu"
 
 
 def test_gl_is_refused_where_no_context_can_be_made(monkeypatch):
-    monkeypatch.setattr(raster, "create_context", _no_context)
+    monkeypatch.setattr(gl_context, "create_context", _no_context)
     with pytest.raises(InputError, match="no OpenGL"):
         make_rasterizer("gl")
 

@@ -4,6 +4,9 @@ What depends on a node's place alone is written as an expression of constants, w
 when it loads the file. Of the skinning's two cross-attentions that leaves two matrix products over all heads of
 both at once: f_x [M, width] times the joints' keys [width, 2·heads·(J−1)], which stand block by block and have
 the query's projection in them, and the shares times values that have everything up to the next layer in them.
+
+Each head's joints are filled up to a multiple of eight with joints that get no share: a softmax of 24 takes a fifth
+less than one of 23, whose last seven onnxruntime does one by one.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from .bake import BakedAttention, BakedSkinning
 from .graph_builder import GraphBuilder, Storage
 
 LAYER_NORM_EPSILON = 1e-5
+LANES = 8
+NO_SHARE = -1e9
+"""a score beside which no other leaves a share"""
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,7 @@ class Networks:
         """Δ logits [M, J] from the window [d, J−1, 6] and the velocities [J−1, 3] rad/s."""
         graph, w = self.graph, baked.module
         others, heads = len(baked.temporal.module["joint"]), baked.heads
+        filled = others + -others % LANES
         f_x = self._position(encoded, w)
         with graph.scope("temporal"):
             tokens = graph.op("Transpose", window, name="by_joint", perm=[1, 0, 2])
@@ -64,10 +71,10 @@ class Networks:
         values = graph.op("Concat", values_t, values_s, name="values", axis=0)
         scores = graph.op("MatMul", f_x, keys, name="scores_product")
         bias = graph.op("Concat", bias_t, bias_s, name="scores_bias", axis=0)
-        scores = graph.op("Add", scores, bias, name="cross_scores")  # [M, 2·heads·(J−1)]
-        shares = graph.reshape(scores, (-1, 2 * heads, others), "scores_by_head")
+        scores = graph.op("Add", scores, bias, name="cross_scores")  # [M, 2·heads·filled]
+        shares = graph.reshape(scores, (-1, 2 * heads, filled), "scores_by_head")
         shares = graph.op("Softmax", shares, name="shares", axis=-1)
-        shares = graph.reshape(shares, (-1, 2 * heads * others), "shares_flat")
+        shares = graph.reshape(shares, (-1, 2 * heads * filled), "shares_flat")
         attended = graph.op("MatMul", shares, values, name="attended")
         position_part = self._linear(f_x, baked.merge, baked.merge_bias, "position_part")
         merged = graph.op("Relu", graph.op("Add", attended, position_part, name="merge"), name="merged")
@@ -91,10 +98,12 @@ class Networks:
     def _joints(self, baked: BakedAttention, tokens: str, heads: int) -> tuple[str, str, str]:
         """Self-attention of the joint tokens [J−1, inputs]; keys, scores' bias and values for the nodes.
 
-        Shapes [heads·(J−1), width], [heads·(J−1)] and [heads·(J−1), O]; rows head by head.
+        Shapes [heads·filled, width], [heads·filled] and [heads·filled, O]; rows head by head, each head's J−1 joints
+        and then those that fill it up.
         """
         graph, w = self.graph, baked.module
         others, width = w["joint"].shape
+        filling = -others % LANES
         embedded = self._layer(tokens, w, "embed")
         embedded = graph.op("Add", embedded, graph.constant("joint_embedding", w["joint"]), name="with_joint")
         normed = graph.op(
@@ -115,14 +124,21 @@ class Networks:
         mixed = graph.op("MatMul", shares, self._by_head(value, heads, others, width), name="self_attended")
         mixed = graph.op("Add", embedded, self._layer(mixed, w, "self_out"), name="mixed")
         key, value = graph.split(self._layer(mixed, w, "key_value"), {"key": width, "value": width}, axis=1)
-        keys = self._by_head(key, heads, others, width)
-        values = self._product(self._by_head(value, heads, others, width), baked.out, "values_out")
+        if filling:
+            zeros = graph.filled("filling", (filling, width), 0.0)
+            key = graph.op("Concat", key, zeros, name="filled_key", axis=0)
+            value = graph.op("Concat", value, zeros, name="filled_value", axis=0)
+        keys = self._by_head(key, heads, others + filling, width)
+        values = self._product(self._by_head(value, heads, others + filling, width), baked.out, "values_out")
         bias = graph.op("MatMul", keys, graph.constant("query_bias", baked.query_bias), name="keys_bias")
+        if filling:
+            unshared = np.tile(np.repeat([0.0, NO_SHARE], [others, filling]), heads)
+            bias = graph.op("Add", bias, graph.constant("unshared", unshared), name="filled_bias")
         query = self.graph.stored("query", baked.query, self.storage)
         return graph.op("MatMul", keys, query, name="keys_in"), bias, values
 
     def _by_head(self, tokens: str, heads: int, others: int, width: int) -> str:
-        """[J−1, width] → [heads·(J−1), width]: once for each head, zero in the columns of the other heads."""
+        """[others, width] → [heads·others, width]: once for each head, zero in the columns of the other heads."""
         head_of_row = np.repeat(np.arange(heads), others)
         head_of_column = np.repeat(np.arange(heads), width // heads)
         mask = self.graph.constant("heads", (head_of_row[:, None] == head_of_column).astype(np.float32))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -79,15 +80,15 @@ class Avatar:
         )
         self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
-        self._rest: RestPose | None = None
-        self._opacities, albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
-        self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
-        if not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys():
-            self._rest = self._rest_pose()
-            self._node_outputs = (*NODE_OUTPUTS, *({NODE_LOGITS} & file.outputs.keys()))
-            self._session(self._node_outputs)  # now, and not in the first frame
-        else:
-            self._session(POSED_OUTPUTS)
+        posed_here = not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys()
+        self._node_outputs = (*NODE_OUTPUTS, *({NODE_LOGITS} & file.outputs.keys()))
+        with ThreadPoolExecutor(1) as other:
+            wanted = self._node_outputs if posed_here else POSED_OUTPUTS
+            session = other.submit(self._session, wanted)  # now, and not in the first frame
+            self._opacities, albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
+            self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
+            self._rest = self._rest_pose() if posed_here else None
+            session.result()
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int | None = None) -> Avatar:

@@ -16,13 +16,10 @@ from .errors import InputError
 from .files import is_folder
 from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import load_joint_map, match_joints
-from .mocap import asf_beside, read_acclaim, read_bvh
 from .motion_files import SMPL_REST_ROOT, check_translations, read_motion_file
 from .npz import save_npz
-from .retarget import retarget
 from .rotations import matrix_to_axis_angle
 from .skeleton import Skeleton
-from .video_fits import easymocap_files
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +32,7 @@ STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 _PART_OF_A_FRAME = 1e-4  # less than which the rounding of a duration, or of a rate in words, may add or take
 _TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
 
-_MOCAP_READERS = {".bvh": read_bvh, ".amc": read_acclaim}
+_MOCAP = (".bvh", ".amc")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +149,7 @@ def load_motion(
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise InputError("fps", expected="a positive number", got=fps)
     try:
-        if Path(path).suffix.lower() in _MOCAP_READERS:
+        if Path(path).suffix.lower() in _MOCAP:
             motion = _load_mocap(path, skeleton, up, joint_map)
         else:
             motion = _load_arrays(path, skeleton, up, joint_names, joint_map)
@@ -172,8 +169,14 @@ def motion_inputs(path: str | Path) -> list[Path]:
     """
     path = Path(path)
     if is_folder(path):
+        from .video_fits import easymocap_files
+
         return easymocap_files(path)
-    return [path, asf_beside(path)] if path.suffix.lower() == ".amc" else [path]
+    if path.suffix.lower() != ".amc":
+        return [path]
+    from .mocap import asf_beside
+
+    return [path, asf_beside(path)]
 
 
 def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | None) -> dict[str, int]:
@@ -182,7 +185,10 @@ def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | N
 
 
 def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
-    tree = _MOCAP_READERS[Path(path).suffix.lower()](path)
+    from .mocap import read_acclaim, read_bvh  # not before there is one: readers take part in every start
+    from .retarget import retarget
+
+    tree = read_bvh(path) if Path(path).suffix.lower() == ".bvh" else read_acclaim(path)
     moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
     first = len(tree.rotations) - len(moved.rotations)
     finite = np.isfinite(moved.rotations).all((1, 2, 3)) & np.isfinite(moved.translations).all(1)

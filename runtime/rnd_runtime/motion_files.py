@@ -15,7 +15,6 @@ from .motion_names import SMPL_REST_ROOT as SMPL_REST_ROOT
 from .motion_names import SMPLH_NAMES as SMPLH_NAMES
 from .motion_names import SMPLX_NAMES as SMPLX_NAMES
 from .motion_names import SMPLX_REST_ROOT as SMPLX_REST_ROOT
-from .motion_pickles import PICKLE_SUFFIXES, read_track
 from .npz import Members, Npz
 from .rotations import axis_angle_to_matrix
 
@@ -28,6 +27,7 @@ _MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and
 _MANY_BEYOND_A_TURN = 0.2
 _MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
 _DEFAULT_FPS = 60.0
+PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 FPS_LIMITS = (1e-3, 1e4)  # of a recording, least and most frames per second
 
 
@@ -82,6 +82,8 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
     if is_folder(path) or Path(path).suffix.lower() in PICKLE_SUFFIXES:
+        from .motion_pickles import read_track  # its readers need not take part in every start
+
         track = read_track(path)
         return _read(track.members, joint_names, track.rest_root, list(track.notes))
     with Npz(path, what="motion") as archive:

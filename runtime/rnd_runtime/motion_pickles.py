@@ -20,8 +20,6 @@ from .video_fits import PHALP_FOCAL, VideoFits, in_order, is_phalp, read_easymoc
 
 Floats = NDArray[np.float64]
 
-PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
-
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
 _PHONE_FOCAL = 1.2  # of the picture's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
 _MOST_FILLED = 18_000  # frames, ten minutes: more of a person who is away are a mistake in the numbers

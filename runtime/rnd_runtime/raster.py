@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 from . import raster_cpu
 from .camera import Camera
 from .errors import InputError
-from .frame_gl import GlRenderer
 from .gaussians import Floats32, Raster
-from .gl_context import Backend, create_context, is_software, renderer
-from .raster_gl import GlRasterizer
+
+if TYPE_CHECKING:  # OpenGL is loaded where it draws: a twentieth of a start
+    from .frame_gl import GlRenderer
+    from .gl_context import Backend
+    from .raster_gl import GlRasterizer
 
 Kind = Literal["auto", "gl", "gl-egl", "gl-osmesa", "cpu"]
 
@@ -28,7 +30,11 @@ class ChosenRasterizer:
         self.name = name
         self._gl = gl
         self._rasterize = raster_cpu.rasterize if gl is None else gl
-        self.renderer = None if gl is None else GlRenderer(gl)
+        self.renderer: GlRenderer | None = None
+        if gl is not None:
+            from .frame_gl import GlRenderer
+
+            self.renderer = GlRenderer(gl)
 
     def __call__(
         self,
@@ -70,6 +76,9 @@ def make_rasterizer(kind: Kind = "auto") -> ChosenRasterizer:
         raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))
     if kind == "cpu":
         return ChosenRasterizer("cpu")
+    from .gl_context import create_context, is_software, renderer
+    from .raster_gl import GlRasterizer
+
     backends: dict[str, Backend] = {"gl-egl": "egl", "gl-osmesa": "osmesa"}
     try:
         context = create_context(backends.get(kind, "auto"))

@@ -17,7 +17,7 @@ from .sun import extract_suns
 
 Floats = NDArray[np.float64]
 
-_AT_A_TIME = 2**19  # pairs of a Gaussian and a texel: some arrays of float64, 4 MB each
+_AT_A_TIME = 2**14  # pairs of a Gaussian and a texel: arrays of 128 kB, which a core's own cache holds
 
 
 def shade_reference(
@@ -115,8 +115,7 @@ def _sum_over_texels(
         n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
         arriving = visibility(part) * np.maximum(n_dot_l, 0)
-        for channel in range(3):
-            albedo = np.asarray(gaussians.albedo[part, channel], np.float64)[:, None]
-            reflectance = brdf(albedo, roughness, n_dot_l, n_dot_v, l_dot_v)
-            radiance[part, channel] = (arriving * reflectance) @ flux[:, channel]
+        # brdf is albedo/π and what is left of it without an albedo, which three channels share
+        shine = arriving * brdf(0.0, roughness, n_dot_l, n_dot_v, l_dot_v)
+        radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + shine @ flux
     return radiance

@@ -97,6 +97,9 @@ def draw(folder: str, spawned: float) -> None:
 
     ``spawned`` is the parent's monotonic clock, which processes share, when it started this one.
     """
+    from rnd_runtime.kernels import load_numba_without_scipy
+
+    load_numba_without_scipy()  # as rnd-play does
     from rnd_runtime.avatar import Avatar
     from rnd_runtime.frame import FrameRenderer
     from rnd_runtime.light import load_light

@@ -8,6 +8,7 @@ code, are not measured again: an interrupted run goes on where it stopped.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import islice, product
 from pathlib import Path
@@ -30,7 +31,7 @@ from .bench_avatars import (
     sources,
 )
 from .bench_frame import Point, measure
-from .bench_reference import errors, reference
+from .bench_reference import Reference, errors, reference
 from .bench_scenes import HARDEST, USUAL, Scene, scene
 
 FULL_N = 30_000
@@ -177,13 +178,20 @@ def _of(usual: Setting, names: Sequence[str], values: Sequence[Any]) -> Setting:
 
 
 def measured(
-    setting: Setting, inputs: Inputs, *, seconds: float = 4.0, compare: bool = True, full_n: int | None = None
+    setting: Setting,
+    inputs: Inputs,
+    *,
+    seconds: float = 4.0,
+    compare: bool = True,
+    with_suns: bool = True,
+    full_n: int | None = None,
 ) -> Row:
     """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
 
     ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
     ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost. Of ``table+sun``,
-    ``psnr_suns_db`` and ``psnr_suns_db_worst`` compare with the reference whose suns cast the same shadows.
+    ``psnr_suns_db`` and ``psnr_suns_db_worst`` compare with the reference whose suns cast the same shadows; that
+    reference takes twice as long as the other and is left out without ``with_suns``.
     """
     encoders = Encoders(setting.encoder, setting.precision, setting.window)
     file, which = inputs.avatar(setting.n, encoders)
@@ -192,20 +200,28 @@ def measured(
         str(file), str(filmed.motion), str(filmed.hdr), setting.size, setting.shade, setting.raster,
         setting.threads, seconds=seconds, cull=setting.cull, view=filmed.view,
     )  # fmt: skip
-    # a cold start is one of a machine whose numba cache has the kernels: compile what it lacks
-    measure(replace(point, frames=1))
+    truths: dict[str, Reference] = {}
+    with ThreadPoolExecutor(1) as other:
+        # a cold start is one of a machine whose numba cache has the kernels: what it lacks is compiled meanwhile
+        compiled = other.submit(measure, replace(point, frames=1))
+        if compare:
+            whole, _ = inputs.avatar(setting.n, Encoders())
+            truths[""] = reference(whole, filmed, setting.size, inputs.work)
+            if setting.shade == "table+sun" and with_suns:
+                truths["suns"] = reference(whole, filmed, setting.size, inputs.work, with_suns=True)
+            largest, kind = inputs.avatar(full_n or setting.n, Encoders())
+            if kind == which:
+                truths["full"] = reference(largest, filmed, setting.size, inputs.work)
+        compiled.result()
     drawn = measure(point)
     row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
     if compare:
-        whole, _ = inputs.avatar(setting.n, Encoders())
-        row |= errors(drawn, reference(whole, filmed, setting.size, inputs.work))
-        if setting.shade == "table+sun":
-            with_suns = errors(drawn, reference(whole, filmed, setting.size, inputs.work, with_suns=True))
-            row |= {f"psnr_suns_db{part}": with_suns[f"psnr_db{part}"] for part in ("", "_worst")}
-        largest, kind = inputs.avatar(full_n or setting.n, Encoders())
-        if kind == which:
-            truth = reference(largest, filmed, setting.size, inputs.work)
-            row["psnr_full_db"], row["full_n"] = errors(drawn, truth)["psnr_db"], full_n or setting.n
+        row |= errors(drawn, truths[""])
+    if "suns" in truths:
+        off = errors(drawn, truths["suns"])
+        row |= {f"psnr_suns_db{part}": off[f"psnr_db{part}"] for part in ("", "_worst")}
+    if "full" in truths:
+        row["psnr_full_db"], row["full_n"] = errors(drawn, truths["full"])["psnr_db"], full_n or setting.n
     return row
 
 
@@ -240,7 +256,9 @@ def grid(
         new = row is None
         if row is None:
             try:
-                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, full_n=wanted[0].n)
+                row = measured(
+                    setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick, full_n=wanted[0].n
+                )
             except InputError as error:  # no such rasteriser here: say so and go on
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
             row["inputs"], left = key, left - 1

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-SceneName = Literal["usual", "inside the body", "squat", "sun of 1e6"]
+from .bench_scenes import SceneName
 
 
 def _two_at_most() -> int:

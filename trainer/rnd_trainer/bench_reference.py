@@ -8,6 +8,7 @@ behind the same shadows, it tells the approximation from the other visibility.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -107,13 +108,16 @@ def _lit(avatar_file: Path, scene: Scene, with_suns: bool) -> dict[str, Any]:
     avatar = Avatar.load(avatar_file)
     motion = load_motion(scene.motion, avatar.skeleton)
     light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position
-    values: dict[str, list[Any]] = {"means": [], "covariances": [], "radiance": []}
-    for number in COMPARED:
+
+    def frame(number: int) -> tuple[Any, ...]:
         posed = posed_reference(avatar, motion, STEP_S * number)
-        values["means"].append(posed.means)
-        values["covariances"].append(posed.covariances)
-        values["radiance"].append(shade(posed, light.turned(TURN * number), eye))
-    return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
+        radiance = shade(posed, light.turned(TURN * number), eye)
+        return posed.means, posed.covariances, radiance, posed.opacities
+
+    with ThreadPoolExecutor(2) as threads:  # numpy lets others run while it computes
+        means, covariances, radiance, opacities = zip(*threads.map(frame, COMPARED))
+    values = {"means": means, "covariances": covariances, "radiance": radiance}
+    return {name: np.array(value) for name, value in values.items()} | {"opacities": opacities[0]}
 
 
 def _kept(file: Path, make: Any) -> dict[str, Any]:

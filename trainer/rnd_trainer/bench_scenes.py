@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from rnd_runtime.images import write_image
 from rnd_runtime.motion import load_motion, save_motion
 from rnd_runtime.rotations import axis_angle_to_matrix
 
-from .bench_options import SceneName
-
+SceneName = Literal["usual", "inside the body", "squat", "sun of 1e6"]
 USUAL, INSIDE, SQUAT, SUN = get_args(SceneName)
 HARDEST = (INSIDE, SQUAT, SUN)
 SUN_RADIANCE = 1e6

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 from rnd_runtime.errors import parse_options, run_command
+from rnd_runtime.kernels import load_numba_without_scipy
 
 from .options import PlayOptions
 
@@ -21,6 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
         if options.doctor:
             return _doctor()
+        load_numba_without_scipy()
         from .play import play  # here, so that --help and --doctor work where a library does not load
 
         return play(options)

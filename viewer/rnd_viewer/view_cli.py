@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from rnd_runtime.errors import parse_options, run_command
-from rnd_runtime.kernels import COMPILING, kernels_are_cold
+from rnd_runtime.kernels import COMPILING, kernels_are_cold, load_numba_without_scipy
 from rnd_runtime.plain import print_plain
 from rnd_runtime.threads import set_threads
 
@@ -35,6 +35,7 @@ def view(options: ViewOptions) -> int:
     Raises:
         InputError: for whatever cannot be used.
     """
+    load_numba_without_scipy()
     from .view_scene import Scene  # here, so that --help works where a library does not load
     from .view_server import load_websockets, serve
 
