@@ -14,7 +14,7 @@ from pathlib import Path
 from rnd_runtime.errors import InputError, run_command
 from rnd_runtime.files import write_json
 from rnd_runtime.gl_context import create_context, is_software, renderer
-from rnd_trainer.bench_grid import Inputs, Setting, measured
+from rnd_trainer.bench_point import Inputs, Setting, measured
 
 ROOT = Path(__file__).parent.parent
 SIZES = (512, 1080)

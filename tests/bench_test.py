@@ -14,7 +14,9 @@ import onnx
 import pytest
 import torch
 
+from rnd_export.export import export
 from rnd_export.graph_networks import LANES
+from rnd_export.variant import Variant
 from rnd_runtime import raster_cpu
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.body import Body
@@ -32,14 +34,16 @@ from rnd_trainer import (
     bench_grid,
     bench_growth,
     bench_peers,
+    bench_point,
     bench_reference,
     bench_shards,
 )
 from rnd_trainer.bench_avatars import Encoders, exported, seeded_checkpoint
 from rnd_trainer.bench_chart import draw_chart
 from rnd_trainer.bench_frame import COMPARED, STEP_S, TURN, Drawn, Point
-from rnd_trainer.bench_grid import Inputs, Setting, grid, pareto, settings
+from rnd_trainer.bench_grid import grid, pareto, settings
 from rnd_trainer.bench_hidden import showing
+from rnd_trainer.bench_point import Inputs, Setting, measured
 from rnd_trainer.bench_raster import body_scene
 from rnd_trainer.bench_reference import MOST_DB, Reference, errors, reference
 from rnd_trainer.bench_scenes import HARDEST, INSIDE, SQUAT, SUN, USUAL, Scene, bench_camera, scene
@@ -319,7 +323,7 @@ def test_rows_of_other_files_are_measured_again(tmp_path, monkeypatch) -> None:
     assert [new_rows(), new_rows()] == [{True}, {False}]
     body.write_bytes(b"another")
     assert [new_rows(), new_rows()] == [{True}, {False}]
-    monkeypatch.setattr(bench_grid, "checkpoint_model", lambda file: {"gaussians": len(file.read_bytes())})
+    monkeypatch.setattr(bench_point, "checkpoint_model", lambda file: {"gaussians": len(file.read_bytes())})
     (tmp_path / "avatar.ckpt").write_bytes(b"trained")
     trained = dataclasses.replace(inputs, checkpoints=(tmp_path / "avatar.ckpt",))
     assert [new_rows(trained), new_rows(trained)] == [{True}, {False}]
@@ -332,7 +336,7 @@ def test_rows_of_other_files_are_measured_again(tmp_path, monkeypatch) -> None:
     (tmp_path / "other.ckpt").write_bytes(b"a smaller one")
     assert both.source(7)[0].name == "avatar.ckpt" and both.source(13) == (tmp_path / "other.ckpt", "trained")
     assert [new_rows(both), new_rows(both)] == [{True}, {False}]
-    monkeypatch.setattr(bench_grid, "sources", lambda package: [body])  # other code is measured again
+    monkeypatch.setattr(bench_point, "sources", lambda package: [body])  # other code is measured again
     assert [new_rows(both), new_rows(both)] == [{True}, {False}]
 
 
@@ -563,6 +567,21 @@ def test_the_floor_counts_the_products_of_the_exported_networks(tiny_checkpoint,
     assert filled % LANES == 0 and filled - others < LANES
     unneeded = 2 * nodes * 2 * model.config.width * 2 * model.config.heads * (filled - others)
     assert bench_growth.encoder_operations(model) == counted - unneeded
+
+
+def test_a_file_is_measured_beside_its_own_checkpoints_whole_avatar(tiny_checkpoint, tiny_avatar, tmp_path):
+    merged = tmp_path / "merged.onnx"
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    export(checkpoint, merged, variant=Variant(encoder="coarse", nodes=40, window_poses=3))
+    inputs = Inputs(ASSETS / "body.npz", WALK, SKY, tmp_path / "work", (tiny_checkpoint,)).checked()
+    usual = Setting(size=32, shade="table", threads=1)
+    rows = [measured(usual, inputs, seconds=0.1, file=file) for file in (tiny_avatar, merged)]
+    for row, encoder, window in zip(rows, ("full", "coarse"), (None, 3)):
+        assert (row["encoder"], row["window"], row["avatar"]) == (encoder, window, "exported")
+        assert row["n"] == checkpoint.config.model.gaussians and "psnr_full_db" not in row
+    assert rows[0]["psnr_db"] > rows[1]["psnr_db"] + 1
+    with pytest.raises(InputError, match="--checkpoint: expected the one that"):
+        measured(usual, dataclasses.replace(inputs, checkpoints=()), file=merged)
 
 
 def test_a_clip_is_spread_over_processes(tiny_avatar, monkeypatch) -> None:

@@ -120,10 +120,10 @@ def read_metadata(file: OnnxFile) -> AvatarMetadata:
     return metadata
 
 
-def checkpoint_of(avatar_file: Path) -> str:
-    """The SHA-256 of the checkpoint that ``avatar_file`` was made of. Raises :class:`InputError` naming the file."""
+def metadata_of(avatar_file: Path) -> AvatarMetadata:
+    """What ``avatar_file`` says of itself. Raises :class:`InputError` naming the file."""
     try:
-        return read_metadata(OnnxFile(avatar_file.read_bytes())).checkpoint_sha256
+        return read_metadata(OnnxFile(avatar_file.read_bytes()))
     except InputError as error:
         raise error.at(file=avatar_file) from error
 

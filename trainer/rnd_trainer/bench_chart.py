@@ -11,7 +11,8 @@ from typing import Any
 
 from rnd_runtime.errors import InputError
 
-from .bench_grid import Row, pareto
+from .bench_grid import pareto
+from .bench_point import Row
 from .bench_scenes import USUAL as USUAL_SCENE
 from .charts import chart
 

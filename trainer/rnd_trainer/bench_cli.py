@@ -83,14 +83,14 @@ def _frame(options: Frame) -> None:
 
     from rnd_runtime.shading import check_mode
 
-    from .bench_grid import Setting, measured
+    from .bench_point import Setting, measured
 
     check_mode(options.shade)
     setting = Setting(
         options.n, options.size, options.shade, options.encoder, options.window, options.precision,
         options.raster, options.threads, options.cull, options.scene,
     )  # fmt: skip
-    row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare)
+    row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare, file=options.avatar)
     _write(options.json, row)  # before anything is printed: who reads it may stop reading
     console = Console()
     print_plain(console, _line(row))
@@ -248,7 +248,7 @@ def _prepare(options: Any, *counts: str) -> None:
 
 
 def _inputs(files: Files) -> Any:
-    from .bench_grid import Inputs
+    from .bench_point import Inputs
 
     return Inputs(files.body, files.motion, files.hdr, files.work, files.checkpoint).checked()
 

@@ -8,99 +8,23 @@ code, are not measured again: an interrupted run goes on where it stopped.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rnd_runtime import __version__
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option
-from rnd_runtime.files import earlier_rows, existing_file, output_folder, write_json
+from rnd_runtime.files import earlier_rows, write_json
 
-from .bench_avatars import (
-    Encoders,
-    checkpoint_model,
-    content_key,
-    exported,
-    forget,
-    seeded_checkpoint,
-    sources,
-)
-from .bench_frame import Point, measure
-from .bench_reference import Reference, errors, reference
-from .bench_scenes import HARDEST, USUAL, Scene, scene
+from .bench_avatars import forget
+from .bench_point import FULL_N, Inputs, Row, Setting, measured
+from .bench_scenes import HARDEST
 
-FULL_N = 30_000
 CULLS = (-0.2, -0.5)
 """cosines below which n·v is left out"""
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Setting:
-    """One point: everything that is varied."""
-
-    n: int = FULL_N
-    size: int = 512
-    shade: str = "table+sun"
-    encoder: str = "full"
-    window: int | None = None
-    precision: str = "f32"
-    raster: str = "cpu"
-    threads: int = 2
-    cull: float | None = None
-    scene: str = USUAL
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Files that the points share. Of ``checkpoints`` each stands in for the seeded avatar where N is its own."""
-
-    body: Path
-    motion: Path
-    hdr: Path
-    work: Path
-    checkpoints: tuple[Path, ...] = ()
-
-    def checked(self) -> Inputs:
-        """Refuse missing files, and two checkpoints for one N, before minutes are spent."""
-        for what, file in (("body", self.body), ("motion", self.motion), ("light", self.hdr)):
-            existing_file(file, what=what)
-        by_size: dict[int, Path] = {}
-        for file in self.checkpoints:
-            n = checkpoint_model(existing_file(file, what="checkpoint"))["gaussians"]
-            check_option(
-                n not in by_size, "--checkpoint", f"one avatar of {n} Gaussians", f"{by_size.get(n)}, {file}"
-            )
-            by_size[n] = file
-        output_folder(self.work)
-        return self
-
-    def key(self) -> str:
-        """What tells rows of these files, by this code, from rows of others."""
-        code = (*sources("rnd_runtime"), *sources("rnd_export"))
-        return content_key(self.body, self.motion, self.hdr, *(self.checkpoints or ("none",)), *code)
-
-    def scene(self, name: str) -> Scene:
-        """The scene ``name`` of :mod:`bench_scenes`."""
-        key = content_key(self.body, self.motion, *sources("rnd_trainer"))
-        return scene(name, self.body, self.motion, self.hdr, self.work, key)
-
-    def source(self, n: int) -> tuple[Path, str]:
-        """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
-        for file in self.checkpoints:
-            if checkpoint_model(file)["gaussians"] == n:
-                return file, "trained"
-        return seeded_checkpoint(n, self.body, self.work), "seeded"
-
-    def avatar(self, n: int, encoders: Encoders) -> tuple[Path, str]:
-        """The file, and which avatar it is."""
-        checkpoint, which = self.source(n)
-        return exported(checkpoint, encoders, self.work), which
 
 
 FACTORS: dict[str, tuple[Any, ...]] = {
@@ -175,54 +99,6 @@ def drawn(names: Sequence[str], usual: Setting, seed: int = 0) -> Iterator[Setti
 def _of(usual: Setting, names: Sequence[str], values: Sequence[Any]) -> Setting:
     point = replace(usual, **dict(zip(names, values)))
     return replace(point, window=None) if point.encoder == "static" else point  # which looks at no window
-
-
-def measured(
-    setting: Setting,
-    inputs: Inputs,
-    *,
-    seconds: float = 4.0,
-    compare: bool = True,
-    with_suns: bool = True,
-    full_n: int | None = None,
-) -> Row:
-    """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
-
-    ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
-    ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost. Of ``table+sun``,
-    ``psnr_suns_db`` and ``psnr_suns_db_worst`` compare with the reference whose suns cast the same shadows; that
-    reference takes twice as long as the other and is left out without ``with_suns``.
-    """
-    encoders = Encoders(setting.encoder, setting.precision, setting.window)
-    file, which = inputs.avatar(setting.n, encoders)
-    filmed = inputs.scene(setting.scene)
-    point = Point(
-        str(file), str(filmed.motion), str(filmed.hdr), setting.size, setting.shade, setting.raster,
-        setting.threads, seconds=seconds, cull=setting.cull, view=filmed.view,
-    )  # fmt: skip
-    truths: dict[str, Reference] = {}
-    with ThreadPoolExecutor(1) as other:
-        # a cold start is one of a machine whose numba cache has the kernels: what it lacks is compiled meanwhile
-        compiled = other.submit(measure, replace(point, frames=1))
-        if compare:
-            whole, _ = inputs.avatar(setting.n, Encoders())
-            truths[""] = reference(whole, filmed, setting.size, inputs.work)
-            if setting.shade == "table+sun" and with_suns:
-                truths["suns"] = reference(whole, filmed, setting.size, inputs.work, with_suns=True)
-            largest, kind = inputs.avatar(full_n or setting.n, Encoders())
-            if kind == which:
-                truths["full"] = reference(largest, filmed, setting.size, inputs.work)
-        compiled.result()
-    drawn = measure(point)
-    row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
-    if compare:
-        row |= errors(drawn, truths[""])
-    if "suns" in truths:
-        off = errors(drawn, truths["suns"])
-        row |= {f"psnr_suns_db{part}": off[f"psnr_db{part}"] for part in ("", "_worst")}
-    if "full" in truths:
-        row["psnr_full_db"], row["full_n"] = errors(drawn, truths["full"])["psnr_db"], full_n or setting.n
-    return row
 
 
 def grid(

@@ -21,8 +21,7 @@ from rnd_runtime.doctor import machine
 from rnd_runtime.posing import RestPose
 
 from .bench_clock import times
-from .bench_grid import Inputs, Setting, measured
-from .bench_raster import Row
+from .bench_point import Inputs, Row, Setting, measured
 from .checkpoint import load_checkpoint
 from .config import NODE_SHARE
 from .model import AvatarModel
@@ -59,8 +58,8 @@ class Rates:
 def growth(inputs: Inputs, amounts: Amounts, size: int, threads: int) -> list[Row]:
     """A row for each stage and amount: ``exponent``, ``ms`` at each of ``amounts``, ``floor_ms`` at the last.
 
-    Frames are the grid's (:func:`rnd_trainer.bench_grid.measured`), of seeded avatars. Joints are varied in a rest pose
-    made up for it: an avatar has those of its body.
+    Frames are the grid's (:func:`rnd_trainer.bench_point.measured`), of seeded avatars. Joints are varied in a rest
+    pose made up for it: an avatar has those of its body.
     """
     rates = measured_rates(threads)
     known = {

@@ -78,6 +78,9 @@ class Frame:
     """the walk under the light of --hdr, or what is hardest"""
     compare: bool = True
     """measure the error too: the reference takes half a minute the first time"""
+    avatar: Path | None = None
+    """a file that rnd-export wrote, of one of --checkpoint, instead of what --n, --encoder, --precision and --window
+    describe; its error is that against the whole avatar"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
 
 

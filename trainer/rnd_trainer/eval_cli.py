@@ -195,12 +195,12 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
 
 def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
     """Whether ``exported`` is there and was made of that checkpoint; says where only the first holds."""
-    from rnd_runtime.avatar_file import checkpoint_of
+    from rnd_runtime.avatar_file import metadata_of
 
     if not exported.is_file():
         return False
     try:
-        made_of = checkpoint_of(exported)
+        made_of = metadata_of(exported).checkpoint_sha256
     except InputError as error:
         print(f"{error}: its size and speed are left out", file=sys.stderr)  # noqa: T201
         return False

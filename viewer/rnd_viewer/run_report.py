@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.avatar_file import checkpoint_of
+from rnd_runtime.avatar_file import metadata_of
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import atomic_path, sha256_of
 from rnd_runtime.images import read_image
@@ -111,7 +111,7 @@ def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
         ablated = config.get("light") == "none"
         how = "--light none is not exported" if ablated else f"rnd-export {checkpoint} makes it"
         return f"no avatar.onnx in the run: {how}"
-    if checkpoint.is_file() and checkpoint_of(avatar) != sha256_of(checkpoint):
+    if checkpoint.is_file() and metadata_of(avatar).checkpoint_sha256 != sha256_of(checkpoint):
         return f"avatar.onnx is of another checkpoint than avatar.ckpt: rnd-export {checkpoint} makes it anew"
     return ""
 
