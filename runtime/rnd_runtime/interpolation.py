@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+# Arrays are copied number by number in these kernels: of ``a[:] = b`` numba compiles the words of its errors too, ten
+# seconds' work.
+
 LARGEST_STEP = 1.0
 """rad: past such a turn within one frame, a cut or a broken pose, the path is the geodesic (slerp)"""
 LARGEST_MOVE = 1.0
@@ -33,12 +36,15 @@ def interpolate_rotations(rotations: Floats, place: Floats) -> Floats:
         before = min(int(place[time]), frames - 1)
         t = place[time] - before
         for joint in range(joints):
+            a = rotations[before, joint]
             if t == 0.0:
-                result[time, joint] = rotations[before, joint]
+                for k in range(9):
+                    result[time, joint, k // 3, k % 3] = a[k // 3, k % 3]
                 continue
-            a, b = rotations[before, joint], rotations[before + 1, joint]
+            b = rotations[before + 1, joint]
             _step(a, b, step)
-            previous[:], following[:] = step, step
+            for k in range(3):
+                previous[k] = following[k] = step[k]
             if before > 0:
                 _step(rotations[before - 1, joint], a, previous)
             if before + 2 < frames:
@@ -60,11 +66,12 @@ def interpolate_points(points: Floats, place: Floats) -> Floats:
         before = min(int(place[time]), frames - 1)
         t = place[time] - before
         if t == 0.0:
-            result[time] = points[before]
+            for axis in range(3):
+                result[time, axis] = points[before, axis]
             continue
-        step = points[before + 1] - points[before]
-        previous = points[before] - points[before - 1] if before > 0 else step
-        following = points[before + 2] - points[before + 1] if before + 2 < frames else step
+        step = _move(points, before)
+        previous = _move(points, before - 1) if before > 0 else step
+        following = _move(points, before + 1) if before + 2 < frames else step
         straight = (
             max(_dot(previous, previous), _dot(step, step), _dot(following, following)) > LARGEST_MOVE**2
         )
@@ -86,6 +93,16 @@ def steps(before: Floats, after: Floats) -> Floats:
 
 
 @njit(inline="always")
+def _move(points, k):  # type: ignore[no-untyped-def]
+    """From point k to the next."""
+    return (
+        points[k + 1, 0] - points[k, 0],
+        points[k + 1, 1] - points[k, 1],
+        points[k + 1, 2] - points[k, 2],
+    )
+
+
+@njit(inline="always")
 def _cubic(step, start, end, t):  # type: ignore[no-untyped-def]
     """The cubic from 0 to ``step`` with slopes ``start`` and ``end``."""
     return t * (start + t * (3.0 * step - 2.0 * start - end + t * (start + end - 2.0 * step)))
@@ -101,7 +118,7 @@ def _end_slopes(step, start, end, inner_start, inner_end):  # type: ignore[no-un
     return start, end
 
 
-@njit(inline="always")
+@njit(error_model="numpy")
 def _hermite(previous, step, following, inner_start, inner_end, t):  # type: ignore[no-untyped-def]
     """φ(t) from the steps [3] rad around it."""
     angle_squared = _dot(step, step)
@@ -135,7 +152,7 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
     return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
 
 
-@njit(inline="always")
+@njit(error_model="numpy")
 def _step(a, b, out):  # type: ignore[no-untyped-def]
     """log(aᵀ b) [3] rad, through the quaternion; see :func:`.rotations.matrix_to_axis_angle`."""
     m00 = a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
@@ -161,7 +178,7 @@ def _step(a, b, out):  # type: ignore[no-untyped-def]
     out[0], out[1], out[2] = scale * x, scale * y, scale * z
 
 
-@njit(inline="always")
+@njit(error_model="numpy")
 def _turned(a, turn, out):  # type: ignore[no-untyped-def]
     """out = a · exp(turn)."""
     x, y, z = turn

@@ -185,9 +185,12 @@ def _pack(logits, offsets, visibility, columns):  # type: ignore[no-untyped-def]
     """[M, columns + 16 + 16] with zeros between: every part starts a register and none reaches past the end."""
     fields = np.zeros((len(offsets), columns + 2 * WIDTH), np.float32)
     for m in prange(len(offsets)):
-        fields[m, : logits.shape[1]] = logits[m]
-        fields[m, columns : columns + offsets.shape[1]] = offsets[m]
-        fields[m, columns + WIDTH : columns + WIDTH + visibility.shape[1]] = visibility[m]
+        for k in range(logits.shape[1]):
+            fields[m, k] = logits[m, k]
+        for k in range(offsets.shape[1]):
+            fields[m, columns + k] = offsets[m, k]
+        for k in range(visibility.shape[1]):
+            fields[m, columns + WIDTH + k] = visibility[m, k]
     return fields
 
 

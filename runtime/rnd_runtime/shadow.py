@@ -172,15 +172,31 @@ def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True)
 def axes_towards(direction):  # type: ignore[no-untyped-def]
     """Rows: two axes across ``direction`` and the direction itself, a right-handed orthonormal frame."""
-    frame = np.empty((3, 3), np.float32)
-    z = direction / np.sqrt((direction * direction).sum())
-    helper = np.zeros(3, np.float32)
-    helper[np.argmin(np.abs(z))] = 1
-    x = np.cross(helper, z)
-    frame[0] = x / np.sqrt((x * x).sum())
-    frame[1] = np.cross(z, frame[0])
-    frame[2] = z
+    frame = np.zeros((3, 3), np.float32)
+    x, y, z = frame[0], frame[1], frame[2]
+    _normalized(direction, z)
+    least = 0
+    for axis in range(1, 3):
+        least = axis if abs(z[axis]) < abs(z[least]) else least
+    y[least] = 1
+    _cross(y, z, x)
+    _normalized(x, x)
+    _cross(z, x, y)
     return frame
+
+
+@numba.njit(inline="always")
+def _normalized(vector, out):  # type: ignore[no-untyped-def]
+    length = np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    for axis in range(3):
+        out[axis] = vector[axis] / length
+
+
+@numba.njit(inline="always")
+def _cross(a, b, out):  # type: ignore[no-untyped-def]
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        out[axis] = a[after] * b[last] - a[last] * b[after]
 
 
 @numba.njit(error_model="numpy")

@@ -134,7 +134,8 @@ def taken_along(bones: ArrayLike, motion: Floats) -> NDArray[np.float32]:
 def _chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
     """Fill ``posed`` [B, J, 4, 4], whose roots' places and last rows are there, from the root outwards."""
     for pose in range(rotations.shape[0]):
-        posed[pose, 0, :3, :3] = rotations[pose, 0]
+        for k in range(9):
+            posed[pose, 0, k // 3, k % 3] = rotations[pose, 0, k // 3, k % 3]
         for joint in range(1, rotations.shape[1]):
             parent = posed[pose, parents[joint]]
             for row in range(3):

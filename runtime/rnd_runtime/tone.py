@@ -104,7 +104,8 @@ def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-
     rows = image.reshape(height, 3 * width)
     for y in prange(height):
         if one_colour:
-            rows[y, :] = empty
+            for k in range(3 * width):
+                rows[y, k] = empty[k]
         for x in range(width):
             left = _ONE - alpha[y, x]
             at = 0 if one_colour else y * width + x
