@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .brdf import brdf
+from .brdf import specular
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
 from .sh import sh_basis
@@ -115,7 +115,7 @@ def _sum_over_texels(
         n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
         arriving = visibility(part) * np.maximum(n_dot_l, 0)
-        # brdf is albedo/π and what is left of it without an albedo, which three channels share
-        shine = arriving * brdf(0.0, roughness, n_dot_l, n_dot_v, l_dot_v)
+        # f is albedo/π and the specular term, which three channels share
+        shine = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
         radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + shine @ flux
     return radiance

@@ -8,7 +8,6 @@ behind the same shadows, it tells the approximation from the other visibility.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -108,16 +107,13 @@ def _lit(avatar_file: Path, scene: Scene, with_suns: bool) -> dict[str, Any]:
     avatar = Avatar.load(avatar_file)
     motion = load_motion(scene.motion, avatar.skeleton)
     light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position
-
-    def frame(number: int) -> tuple[Any, ...]:
+    values: dict[str, list[Any]] = {"means": [], "covariances": [], "radiance": []}
+    for number in COMPARED:
         posed = posed_reference(avatar, motion, STEP_S * number)
-        radiance = shade(posed, light.turned(TURN * number), eye)
-        return posed.means, posed.covariances, radiance, posed.opacities
-
-    with ThreadPoolExecutor(2) as threads:  # numpy lets others run while it computes
-        means, covariances, radiance, opacities = zip(*threads.map(frame, COMPARED))
-    values = {"means": means, "covariances": covariances, "radiance": radiance}
-    return {name: np.array(value) for name, value in values.items()} | {"opacities": opacities[0]}
+        values["means"].append(posed.means)
+        values["covariances"].append(posed.covariances)
+        values["radiance"].append(shade(posed, light.turned(TURN * number), eye))
+    return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
 
 
 def _kept(file: Path, make: Any) -> dict[str, Any]:
