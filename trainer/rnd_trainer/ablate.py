@@ -22,7 +22,7 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import earlier_rows, sha256_of, write_json
 
 from .checkpoint import load_checkpoint
-from .config import NODE_SHARE, TrainConfig
+from .config import TrainConfig, nodes_for
 from .data import check_true_normals, training_light
 from .held_out import score
 from .model import AvatarModel
@@ -106,7 +106,7 @@ VARIANTS = (
 
 
 def _gaussians(count: int) -> StudyRow:
-    model = {"gaussians": count, "nodes": count // NODE_SHARE}
+    model = {"gaussians": count, "nodes": nodes_for(count)}
     return StudyRow(f"N = {count}", f"{count} Gaussians", "ours", model)
 
 

@@ -23,7 +23,7 @@ from rnd_runtime.posing import RestPose
 from .bench_clock import times
 from .bench_point import Inputs, Row, Setting, measured
 from .checkpoint import load_checkpoint
-from .config import NODE_SHARE
+from .config import nodes_for
 from .model import AvatarModel
 
 SECONDS = 3.0  # of frames at each amount
@@ -133,7 +133,7 @@ def encoder_operations(model: AvatarModel) -> float:
 def _joints(amounts: Amounts, threads: int, rates: Rates) -> Row:
     """Posing of the usual number of Gaussians by skeletons of several sizes."""
     n = amounts.gaussians[-2]
-    nodes, before = n // NODE_SHARE, numba.get_num_threads()
+    nodes, before = nodes_for(n), numba.get_num_threads()
     numba.set_num_threads(threads)
     try:
         taken = []

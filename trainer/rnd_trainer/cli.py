@@ -43,7 +43,7 @@ class TrainOptions:
     """with pictures, instead of the preset's 6000 (quick: 2000); the third stage, of unseen poses, adds three eighths
     as many (quick: half), which are short"""
     gaussians: int | None = None
-    """instead of the preset's; an eighth of them are nodes"""
+    """instead of the preset's; an eighth of them, 1875 at most, are nodes"""
     save_every: int | None = None
     """steps between saved states, instead of the preset's; --resume goes on from the last one"""
     image_scale: float | None = None

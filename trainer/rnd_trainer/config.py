@@ -8,8 +8,11 @@ from typing import Any, Literal
 
 from rnd_runtime.errors import InputError, check_option
 
+MOST_NODES = 1_875
+"""3 cm apart on a body: what the networks say is smooth, and with twice as many every figure is the same, while the
+networks take twice as long (docs/tried.md)"""
 NODE_SHARE = 8
-"""Gaussians to each node: at four, every figure is the same and a step takes a fifth longer (docs/tried.md)"""
+"""Gaussians to each node, where that makes fewer"""
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class ModelConfig:
 
     gaussians: int = 30_000
     """Gaussians on the template's surface; fixed, nothing is densified or pruned"""
-    nodes: int = 3_750
+    nodes: int = MOST_NODES
     """points at which the networks are evaluated; the Gaussians interpolate between them (smooth quantities)"""
     window_poses: int = 10
     """d: poses in the motion window (the paper's ablation: 20 gains little over 10)"""
@@ -26,8 +29,8 @@ class ModelConfig:
     """time that the window spans, so that a 120 fps file and its 30 fps copy give the same pose"""
     width: int = 64
     """width of the attention and of the hidden layers; the query side is baked, so it costs little at playback"""
-    heads: int = 4
-    """attention heads"""
+    heads: int = 2
+    """attention heads: with four every figure is the same (docs/tried.md)"""
     frequencies: int = 7
     """bands of the positional encoding; the 8th lies past the Nyquist limit of 8 mm spacing"""
     attribute_width: int = 96
@@ -177,11 +180,16 @@ def preset(name: str) -> TrainConfig:
     raise InputError("preset", expected="quick, standard or full", got=name)
 
 
+def nodes_for(gaussians: int) -> int:
+    """At how many nodes the networks of so many Gaussians are evaluated."""
+    return max(16, min(gaussians // NODE_SHARE, MOST_NODES))
+
+
 def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> TrainConfig:
-    """``config`` with another number of Gaussians (an eighth of them nodes) and of steps, where given."""
+    """``config`` with another number of Gaussians (and the nodes for them) and of steps, where given."""
     model = config.model
     if gaussians is not None:
-        model = dataclasses.replace(model, gaussians=gaussians, nodes=max(16, gaussians // NODE_SHARE))
+        model = dataclasses.replace(model, gaussians=gaussians, nodes=nodes_for(gaussians))
     return dataclasses.replace(config, model=model, steps=config.steps if steps is None else steps)
 
 
