@@ -111,13 +111,16 @@ def _grid(options: Grid) -> None:
     for name in ("json", "chart"):  # theirs are the tables and the chart of the documentation
         own = not (cross or options.sample) or getattr(options, name) != getattr(Grid(), name)
         check_option(own, flag(name), "files of its own beside --cross and --sample", "the usual ones")
-    console, started, measured = Console(), perf_counter(), 0
+    console, done = Console(), list[float]()
+    # when each new point was; the first one's time is no other's: kernels are compiled, references made
 
     def show(row: dict[str, Any], new: bool, left: int) -> None:
-        nonlocal measured
-        measured += new
-        minutes = (perf_counter() - started) / 60 * left / max(measured, 1)
-        state = f"{left} left, about {minutes:.0f} min" if new else "kept"
+        state = f"{left} left" if new else "kept"
+        if new:
+            done.append(perf_counter())
+        if new and len(done) > 1:
+            minutes = (done[-1] - done[0]) / 60 * left / (len(done) - 1)
+            state += f", about {minutes:.0f} min"
         print_plain(console, f"{_line(row)}  ({state})")
 
     rows = grid(
