@@ -180,6 +180,18 @@ def test_a_model_that_learned_without_shadows_is_judged_without(
     assert torch.equal(played, picture()) is not shadows
 
 
+def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_capture) -> None:
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    frame = tiny_capture.split("train")[0]
+    whole, all_of_it, *fewer = (
+        Judge(checkpoint, tiny_capture, cull=cull).render(frame).image
+        for cull in (None, -1.0, -0.5, 0.0, 1.0)
+    )
+    assert torch.equal(whole, all_of_it) and fewer[-1].abs().max() == 0
+    backs, backs_and_sides, everything = (float(torch.mean((image - whole) ** 2)) for image in fewer)
+    assert 0 < backs < backs_and_sides < 0.1 * everything
+
+
 def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
     judge, original = (
         Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture),

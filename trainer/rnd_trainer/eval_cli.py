@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, parse_options, refuse_changed, run_command
+from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
 from rnd_runtime.files import is_folder, output_file, output_folder, refuse_input, write_json
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ COLUMNS = {
     "outline_px": ("outline px", "{:.2f}"),
 }
 """what the terminal's table shows of a row: heading and format"""
-OF_ONE_RUN = ("pictures", "method")
+OF_ONE_RUN = ("pictures", "method", "cull")
 OF_STUDIES = ("study", "variants", "preset", "steps", "gaussians", "image_scale", "chart", "seeds",
               "consistency_weights")  # fmt: skip
 WIDTH = 140
@@ -57,6 +57,8 @@ class EvalOptions:
     """of the studies' trainings, as of rnd-train"""
     shade: str = "table+sun"
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
+    cull: float | None = None
+    """as of rnd-play: leave out what faces away, Gaussians whose n·v is below this cosine (−1 to 1), such as -0.5"""
     motion: str | None = None
     """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones. Default: the
     poses that the training corrected (--refine-poses), else the capture's own. A study trains with it too"""
@@ -125,6 +127,7 @@ def evaluate_run(options: EvalOptions) -> None:
     from .perceptual import load_lpips
 
     check_mode(options.shade)
+    check_option(options.cull is None or -1 <= options.cull <= 1, "--cull", "-1 to 1", options.cull)
     check_outputs(options)
     path = _checkpoint_file(options)
     checkpoint = load_checkpoint(path)
@@ -143,6 +146,7 @@ def evaluate_run(options: EvalOptions) -> None:
         pictures=options.pictures,
         perceptual=load_lpips(options.perceptual_weights),
         avatar=exported if _is_of(exported, checkpoint.sha256) else None,
+        cull=options.cull,
     )
     if options.json is not None:
         write_json(options.json, rows)

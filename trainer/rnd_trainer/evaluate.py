@@ -49,12 +49,18 @@ class Judge:
     Args:
         mode: shading of the runtime.
         motion: poses to render, the capture's own unless given (exact ones for an avatar trained on noisy poses).
+        cull: as of the player.
     """
 
     def __init__(
-        self, checkpoint: Checkpoint, capture: Capture, mode: str = "table+sun", motion: Motion | None = None
+        self,
+        checkpoint: Checkpoint,
+        capture: Capture,
+        mode: str = "table+sun",
+        motion: Motion | None = None,
+        cull: float | None = None,
     ) -> None:
-        self.checkpoint, self.capture, self.mode = checkpoint, capture, mode
+        self.checkpoint, self.capture, self.mode, self.cull = checkpoint, capture, mode, cull
         self.motion = capture.motion_for(checkpoint.skeleton) if motion is None else motion
         self._trained = checkpoint.learned_under(capture)
         self._shaders: dict[str | None, Shader | None] = {}
@@ -69,7 +75,8 @@ class Judge:
         model = self.checkpoint.config.model
         pose = pose_input(self.motion, self.checkpoint.skeleton, index / self.motion.fps, model)
         camera = self.capture.cameras[frame.camera]
-        return render_runtime(self.checkpoint.model, pose, camera, self._shader(frame.light), albedo_scale)
+        shader = self._shader(frame.light)
+        return render_runtime(self.checkpoint.model, pose, camera, shader, albedo_scale, self.cull)
 
     def _shader(self, name: str | None) -> Shader | None:
         if name not in self._shaders:

@@ -39,6 +39,7 @@ def score(
     pictures: Path | None = None,
     perceptual: Perceptual | None = None,
     avatar: Path | None = None,
+    cull: float | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of every held-out split that the capture has, relighting raw and with the albedo scaled.
 
@@ -48,11 +49,12 @@ def score(
         pictures: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
         perceptual: adds LPIPS.
         avatar: the exported file; adds its size and its frames a second.
+        cull: as of the player.
 
     Raises:
         InputError: the capture has no held-out split.
     """
-    judge = Judge(checkpoint, capture, mode)
+    judge = Judge(checkpoint, capture, mode, cull=cull)
     lit = checkpoint.config.light != "none"  # else there is no albedo: colours that no light changes
     scale = albedo_scale(judge) if lit else None
     jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
@@ -64,6 +66,7 @@ def score(
         "flicker": flicker(judge),
         "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
         "shade": mode,
+        "cull": cull,
         "lpips_weights": None if perceptual is None else perceptual.backbone,
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
         **({} if avatar is None else playback(avatar, judge)),
@@ -128,6 +131,7 @@ def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
         Light(judge.checkpoint.probe.numpy()),
         judge.capture.cameras[frame.camera],
         shade=judge.mode,
+        cull=judge.cull,
     )
     seconds = []
     for k in range(PLAYED):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.gaussians import Gaussians
+from rnd_runtime.in_view import in_view
 from rnd_runtime.outline import sharpened
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
@@ -52,8 +53,12 @@ def render_runtime(
     camera: Camera,
     shader: Shader | None,
     albedo_scale: Tensor | None = None,
+    cull: float | None = None,
 ) -> Rendered:
-    """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional."""
+    """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional.
+
+    ``cull`` as of :class:`rnd_runtime.frame.FrameRenderer`.
+    """
     pose, root = _in_root_frame(pose)
     camera = camera.in_frame(root)
     posed = model(pose)
@@ -65,9 +70,11 @@ def render_runtime(
         radiance = _shade(model, gaussians, posed, pose, camera, shader.in_frame(root[:3, :3]))
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
-    raster = sharpened(
-        rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, features, camera)
-    )
+    shapes, opacities = (gaussians.means, gaussians.covariances), gaussians.opacities
+    if cull is not None:
+        seen = in_view(*shapes, opacities, camera, normals=gaussians.normals, cull=cull)
+        opacities = np.where(seen, opacities, np.float32(0))
+    raster = sharpened(rasterize(*shapes, opacities, features, camera))
     image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
 
