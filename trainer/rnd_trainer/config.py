@@ -9,8 +9,8 @@ from typing import Any, Literal
 from rnd_runtime.errors import InputError, check_option
 
 MOST_NODES = 1_875
-"""3 cm apart on a body, over which what the networks say is smooth. Twice as many gain 0.07 dB at most in held-out
-pictures, and networks take twice as long (docs/tried.md)"""
+"""3 cm apart on a body, over which what the networks say is smooth. Twice as many gain less than 0.1 dB in held-out
+pictures, 0.14 at most under other lights, and networks take twice as long (docs/tried.md)"""
 NODE_SHARE = 8
 """Gaussians to each node, where that makes fewer"""
 

@@ -70,11 +70,9 @@ def render_runtime(
         radiance = _shade(model, gaussians, posed, pose, camera, shader.in_frame(root[:3, :3]))
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
-    shapes, opacities = (gaussians.means, gaussians.covariances), gaussians.opacities
-    if cull is not None:
-        seen = in_view(*shapes, opacities, camera, normals=gaussians.normals, cull=cull)
-        opacities = np.where(seen, opacities, np.float32(0))
-    raster = sharpened(rasterize(*shapes, opacities, features, camera))
+    splats = gaussians.means, gaussians.covariances, gaussians.opacities
+    seen = None if cull is None else in_view(*splats, camera, normals=gaussians.normals, cull=cull)
+    raster = sharpened(rasterize(*splats, features, camera, seen=seen))
     image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
 
