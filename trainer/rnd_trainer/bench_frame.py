@@ -97,15 +97,19 @@ def draw(folder: str, spawned: float) -> None:
 
     ``spawned`` is the parent's monotonic clock, which processes share, when it started this one.
     """
-    from rnd_runtime.kernels import load_numba_without_scipy
+    from rnd_runtime.start import quick_start
 
-    load_numba_without_scipy()  # as rnd-play does
+    with quick_start():  # as rnd-play does
+        _draw(Path(folder), spawned)
+
+
+def _draw(out: Path, spawned: float) -> None:
     from rnd_runtime.avatar import Avatar
     from rnd_runtime.frame import FrameRenderer
     from rnd_runtime.light import load_light
     from rnd_runtime.motion import load_motion
+    from rnd_runtime.start import settle
 
-    out = Path(folder)
     point = Point(**json.loads((out / "point.json").read_text("utf-8")))
     avatar = Avatar.load(point.avatar, threads=point.threads)
     motion = load_motion(Path(point.motion), avatar.skeleton)
@@ -120,6 +124,7 @@ def draw(folder: str, spawned: float) -> None:
 
     frame(0)
     cold_ms = 1e3 * (time.monotonic() - spawned)
+    settle()
     for number in range(1, WARMUP):
         frame(number)
     taken: list[float] = []

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import tyro
 
 from rnd_runtime.errors import parse_options, run_command
-from rnd_runtime.kernels import load_numba_without_scipy
+from rnd_runtime.start import quick_start
 
 from .options import PlayOptions
 
@@ -22,10 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
         if options.doctor:
             return _doctor()
-        load_numba_without_scipy()
-        from .play import play  # here, so that --help and --doctor work where a library does not load
+        with quick_start():
+            from .play import play  # here, so that --help and --doctor work where a library does not load
 
-        return play(options)
+            return play(options)
 
     return run_command("rnd-play", command)
 

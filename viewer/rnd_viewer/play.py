@@ -21,6 +21,7 @@ from rnd_runtime.light import light_notes
 from rnd_runtime.motion import Motion, motion_inputs
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
+from rnd_runtime.start import settle
 from rnd_runtime.threads import set_threads
 
 from .aov import parse_aovs
@@ -168,6 +169,7 @@ class _Run:
             started = before = perf_counter()
 
             def put(number: int, drawn: tuple[Frame, Camera]) -> None:
+                settle()
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
             for _ in with_progress(
