@@ -126,3 +126,4 @@ print(scipy.linalg.norm([3, 4]), numba.njit(lambda a: a.sum())(numpy.ones(3)))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-2:] == ["[]", "5.0 3.0"]
+    assert "leaked" not in done.stderr  # as nanobind says of what the interpreter's end did not reach

@@ -23,12 +23,20 @@ def test_nothing_is_collected_until_it_settles():
         assert gc.isenabled()
         assert gc.get_freeze_count() > 1000
     assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
 
 
 def test_collects_again_after_a_failure():
     with pytest.raises(KeyError), quick_start():
         raise KeyError
     assert gc.isenabled()
+
+
+def test_frozen_before_a_failure_is_collected_at_the_end_too():
+    with pytest.raises(KeyError), quick_start():
+        settle()
+        raise KeyError
+    assert gc.get_freeze_count() == 0
 
 
 def test_settling_twice_freezes_once():

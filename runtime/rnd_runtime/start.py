@@ -10,22 +10,22 @@ from contextlib import contextmanager
 
 @contextmanager
 def quick_start() -> Iterator[None]:
-    """For commands, not for libraries: within, numba loads without scipy and no garbage is collected until
-    :func:`settle`.
+    """For commands, not for libraries: numba loads without scipy, and no garbage is collected until :func:`settle`.
 
     Loading makes half a million objects that stay, which Python would look through again and again: a tenth of the
-    time to the first frame.
+    time to the first frame. To be left when the command has ended.
     """
     gc.disable()
     try:
         _load_numba_without_scipy()
         yield
     finally:
-        settle()
+        gc.unfreeze()  # or libraries would report what the interpreter's end does not reach
+        gc.enable()
 
 
 def settle() -> None:
-    """What there is stays: it is never looked through again, and what comes is collected as ever."""
+    """Within :func:`quick_start`: what there is is not looked through any more, what comes is collected as ever."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()

@@ -14,7 +14,7 @@ from rich.console import Console
 from rnd_runtime.errors import parse_options, run_command
 from rnd_runtime.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.plain import print_plain
-from rnd_runtime.start import quick_start
+from rnd_runtime.start import quick_start, settle
 from rnd_runtime.threads import set_threads
 
 from .view_options import ViewOptions
@@ -36,26 +36,27 @@ def view(options: ViewOptions) -> int:
     Raises:
         InputError: for whatever cannot be used.
     """
-    console = Console(highlight=False)
     with quick_start():
         from .view_scene import Scene  # here, so that --help works where a library does not load
         from .view_server import load_websockets, serve
 
         load_websockets()
         set_threads(options.threads)
+        console = Console(highlight=False)
         cold = kernels_are_cold()
         with console.status("loading"):
             scene = Scene(options)
             if cold:
                 print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
             scene.warm_up()
-    try:
-        token = None if options.local else secrets.token_urlsafe(16)
-        with serve(scene, options.host, options.port, token) as (server, url):
-            print_plain(console, f"rnd-view: {url}")
-            if options.browser and options.local:
-                Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
-            server.serve_forever()
-    finally:
-        scene.close()
+            settle()
+        try:
+            token = None if options.local else secrets.token_urlsafe(16)
+            with serve(scene, options.host, options.port, token) as (server, url):
+                print_plain(console, f"rnd-view: {url}")
+                if options.browser and options.local:
+                    Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
+                server.serve_forever()
+        finally:
+            scene.close()
     return 0
