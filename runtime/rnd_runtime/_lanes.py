@@ -260,6 +260,23 @@ def store(context, array, index, value):  # type: ignore[no-untyped-def]
     return types.void(array, types.intp, value), emit
 
 
+def _prefetched(write: int) -> Callable[[Any, Any, Any], Any]:
+    def prefetched(context: Any, array: Any, index: Any) -> Any:
+        def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
+            place = builder.bitcast(_address(ctx, builder, sig.args[0], *args), ir.IntType(8).as_pointer())
+            kept, data = ir.Constant(_INT, 3), ir.Constant(_INT, 1)
+            _call(builder, "llvm.prefetch.p0i8", ir.VoidType(), place, ir.Constant(_INT, write), kept, data)
+            return ctx.get_dummy_value()
+
+        return types.void(array, types.intp), emit
+
+    return prefetched
+
+
+prefetch = intrinsic(_prefetched(0))  # type: ignore[arg-type]  # the cache line of array[index] will be read
+prefetch_to_write = intrinsic(_prefetched(1))  # type: ignore[arg-type]  # or written; past the end does no harm
+
+
 @intrinsic
 def spread(context, array, index):  # type: ignore[no-untyped-def]
     """Sixteen times ``array[index]`` of a flat contiguous float32 array; no bounds are checked."""

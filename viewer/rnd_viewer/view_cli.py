@@ -55,7 +55,9 @@ def view(options: ViewOptions) -> int:
             with serve(scene, options.host, options.port, token) as (server, url):
                 print_plain(console, f"rnd-view: {url}")
                 if options.browser and options.local:
-                    Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
+                    Thread(
+                        target=webbrowser.open, args=(url,), daemon=True
+                    ).start()  # some wait for their page
                 server.serve_forever()
         finally:
             scene.close()
