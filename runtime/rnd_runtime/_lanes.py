@@ -273,8 +273,8 @@ def _prefetched(write: int) -> Callable[[Any, Any, Any], Any]:
     return prefetched
 
 
-prefetch = intrinsic(_prefetched(0))  # type: ignore[arg-type]  # the cache line of array[index] will be read
-prefetch_to_write = intrinsic(_prefetched(1))  # type: ignore[arg-type]  # or written; past the end does no harm
+prefetch = intrinsic(_prefetched(0))  # the cache line of array[index] will be read
+prefetch_to_write = intrinsic(_prefetched(1))  # or written; past the end does no harm
 
 
 @intrinsic
