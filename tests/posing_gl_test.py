@@ -116,7 +116,7 @@ def test_another_avatar_takes_the_place_of_the_last(device):
 def test_more_joints_than_a_texture_holds_are_refused():
     rest, inputs = posing_scene(55)
     small = SimpleNamespace(info={"GL_MAX_TEXTURE_SIZE": 4096})
-    with pytest.raises(InputError, match="joints: expected at most 32 with this OpenGL, got 55"):
+    with pytest.raises(InputError, match="joints: expected at most 16 with this OpenGL, got 55"):
         GlPosing(small).pose(_unposed(rest, inputs))
 
 

@@ -66,7 +66,7 @@ _POINTS, _FACTORS, _NORMALS, _LIMBS, _FLOOR, _OWN = (0, 3, 12, 15, 22, 23)
 _DEEPEST = 60.0  # logarithm below which a floor is 0 beside the greatest weight, and not yet in float32
 # A node's fields: Σ_j e^(Δ_j − c) B_j by rows, the same without B, and c; offsets, visibility, sixteen each; Δ_j
 _SUM, _GREATEST, _OFFSETS, _VISIBILITY, _CHANGES = (12, 13, WIDTH, 2 * WIDTH, 3 * WIDTH)
-_NEVER = np.float32(-1e30)  # log of no weight
+NEVER = np.float32(-1e30)  # log of no weight
 
 
 class Posed(NamedTuple):
@@ -116,26 +116,42 @@ class RestPose:
             visibility: [M, S] harmonics, S ≤ 16; what is missing is 0.
             bones: [J, 3, 4] m, rest pose → posed.
         """
-        rest = self.arrays
-        joints = self.log_template.shape[1]
-        rows = np.zeros((joints, WIDTH), np.float32)
-        rows[:, :_SUM] = np.asarray(bones, np.float32).reshape(joints, _SUM)
-        rows[:, _SUM] = _ONE
-        changes = np.zeros((len(np.asarray(offsets)), joints)) if logits is None else logits
-        fields = _node_fields(_plain(changes), _plain(offsets), _plain(visibility), rows)
+        rest, rows = self.arrays, _bone_rows(bones)
+        fields = self.node_fields(logits, offsets, visibility, bones)
         count = len(rest.neighbours)
         posed = Posed(*(np.empty((count, width), np.float32) for width in (3, 6, 3, _HARMONICS)))
         limits = tuple(np.float32(x) for x in (self.max_offset, self.floor, self.fallback))
         _pose(fields, rest, rows, limits, posed)
         return Posed(*(values[: len(self.points)] for values in posed))
 
-    def fields(self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike) -> Floats32:
-        """What OpenGL interpolates between the nodes, [M, C + 32]: C logits (J up to a whole number of 16), 16 for the
-        offsets, of which six are used, and 16 harmonics; zeros between."""
-        logits = np.zeros((len(np.asarray(offsets)), 0)) if logits is None else logits
-        nodes = (_plain(values) for values in (logits, offsets, visibility))
-        packed: Floats32 = _pack(*nodes, -(-self.log_template.shape[1] // WIDTH) * WIDTH)
-        return packed
+    def node_fields(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
+    ) -> Floats32:
+        """What is interpolated between the nodes, [M, 48 + C].
+
+        Σ_j e^(Δ_j − c) B_j row by row [12], the same without B, c and two zeros; offsets [6] and zeros up to 16;
+        visibility [16]; Δ logits with zeros up to C, a whole number of 16.
+        """
+        nodes = len(np.asarray(offsets))
+        changes = np.zeros((nodes, self.log_template.shape[1])) if logits is None else logits
+        fields: Floats32 = _node_fields(
+            *(np.require(values, np.float32, ["C", "W"]) for values in (changes, offsets, visibility)),
+            _bone_rows(bones),
+        )
+        return fields
+
+    @cached_property
+    def template(self) -> tuple[Floats32, Floats32]:
+        """The floor of the template's weights [N] and the logs of what they have above it [N, J], ``NEVER`` where that
+        is nothing; relative to a Gaussian's greatest weight."""
+        logarithms = np.asarray(self.log_template, np.float64)
+        least = np.where(logarithms > -np.inf, logarithms, np.inf).min(1, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):  # what is no number stays none
+            heights = np.maximum(logarithms, least) - least
+            top = heights.max(1, initial=0.0, keepdims=True)
+            logs = np.where(heights == 0, NEVER, heights + np.log(-np.expm1(-heights)) - top)
+        floors = np.exp(-np.minimum(top[:, 0], _DEEPEST))
+        return floors.astype(np.float32), logs.astype(np.float32)
 
     @cached_property
     def arrays(self) -> RestArrays:
@@ -143,43 +159,40 @@ class RestPose:
         count = len(self.points)
         whole = -(-count // WIDTH) * WIDTH
         own = np.zeros((whole, _OWN), np.float32)
-        heights = self._above_the_floor()
-        top = heights.max(1, initial=0.0, keepdims=True)
+        floors, logs = self.template
         for first, values in (
             (_POINTS, self.points),
             (_FACTORS, self.factors),
             (_NORMALS, self.normals),
             (_LIMBS, self.limbs),
-            (_FLOOR, np.exp(-np.minimum(top, _DEEPEST))),
+            (_FLOOR, floors[:, None]),
         ):
             own[:count, first : first + values.shape[1]] = values
         neighbours = np.zeros((whole, self.neighbours.shape[1]), np.int32)
         weights = np.zeros(neighbours.shape, np.float32)
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
-        with np.errstate(invalid="ignore", divide="ignore"):
-            logs = heights + np.log(-np.expm1(-heights)) - top
         by_sixteens = own.reshape(-1, WIDTH, _OWN).transpose(0, 2, 1)
-        return RestArrays(neighbours, weights, *_slots(heights != 0, logs, whole), by_sixteens.ravel())
-
-    def _above_the_floor(self) -> NDArray[np.float64]:
-        """[N, J] logs of the template's weights over a Gaussian's least one that is not 0."""
-        template = np.asarray(self.log_template, np.float64)
-        least = np.where(template > -np.inf, template, np.inf).min(1, keepdims=True)
-        with np.errstate(invalid="ignore"):  # what is no number stays none
-            return np.asarray(np.maximum(template, least) - least)
+        return RestArrays(neighbours, weights, *_slots(logs, whole), by_sixteens.ravel())
 
 
-def _slots(
-    chosen: NDArray[np.bool_], logs: NDArray[np.float64], whole: int
-) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
-    """``starts``, ``joints`` and ``logs`` of :class:`RestArrays` for the ``chosen`` joints [N, J]."""
+def _bone_rows(bones: ArrayLike) -> Floats32:
+    """[J, 16]: of each joint B row by row, a one and zeros."""
+    given = np.asarray(bones, np.float32).reshape(-1, _SUM)
+    rows = np.zeros((len(given), WIDTH), np.float32)
+    rows[:, :_SUM], rows[:, _SUM] = given, _ONE
+    return rows
+
+
+def _slots(logs: Floats32, whole: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
+    """``starts``, ``joints`` and ``logs`` of :class:`RestArrays`."""
+    chosen = logs != NEVER
     gaussians, joints = np.nonzero(chosen)
     counts = np.zeros(whole, np.intp)
     counts[: len(chosen)] = chosen.sum(1)
     starts = np.concatenate([[0], np.cumsum(counts.reshape(-1, WIDTH).max(1))])
     slots = starts[gaussians // WIDTH] + np.arange(len(joints)) - (np.cumsum(counts) - counts)[gaussians]
     of_slots = np.zeros((starts[-1], WIDTH), np.int32)
-    logs_of_slots = np.full(of_slots.shape, _NEVER, np.float32)
+    logs_of_slots = np.full(of_slots.shape, NEVER, np.float32)
     of_slots[slots, gaussians % WIDTH] = joints
     logs_of_slots[slots, gaussians % WIDTH] = logs[gaussians, joints]
     return starts.astype(np.int32), of_slots.ravel(), logs_of_slots.ravel()
@@ -219,24 +232,6 @@ class Unposed(NamedTuple):
     def root_rotation(self) -> Floats32:
         """[3, 3], root frame → that of the bones."""
         return self.bones[0, :, :3]
-
-
-def _plain(values: ArrayLike) -> Floats32:
-    return np.require(values, np.float32, ["C", "W"])
-
-
-@njit(parallel=True, nogil=True, cache=True)
-def _pack(logits, offsets, visibility, columns):  # type: ignore[no-untyped-def]
-    """[M, columns + 16 + 16] with zeros between: every part starts a register and none reaches past the end."""
-    fields = np.zeros((len(offsets), columns + 2 * WIDTH), np.float32)
-    for m in prange(len(offsets)):
-        for k in range(logits.shape[1]):
-            fields[m, k] = logits[m, k]
-        for k in range(offsets.shape[1]):
-            fields[m, columns + k] = offsets[m, k]
-        for k in range(visibility.shape[1]):
-            fields[m, columns + WIDTH + k] = visibility[m, k]
-    return fields
 
 
 @njit(inline="always")
@@ -312,7 +307,9 @@ def _blend_sixteen(first, rest, bones, rows, changes, shares, blend):  # type: i
     for at in range(start, end, WIDTH):
         for lane in range(WIDTH):
             shares[at - start + lane] = changes[lane * width + rest.joints[at + lane]]
-        store(shares, at - start, _exp(load(shares, at - start) + load(rest.logs, at)))
+        logs = load(rest.logs, at)
+        weights = _exp(load(shares, at - start) + logs)
+        store(shares, at - start, select(logs < _HALF * NEVER, _ZERO, weights))
     for lane in range(WIDTH):
         row = rest.own[first * _OWN + _FLOOR * WIDTH + lane] * load(rows, lane * WIDTH)
         for at in range(start + lane, end, WIDTH):

@@ -13,14 +13,15 @@ from ._lanes import WIDTH
 from .errors import InputError
 from .gaussians import Floats32
 from .gl_passes import ROW_WIDE, GaussianTargets, GaussianTexture, Pass
-from .posing import TWIST_STEPS, RestPose, Unposed
+from .posing import NEVER, TWIST_STEPS, RestPose, Unposed
 from .shading import CASTING_OPACITY, DISC_SIGMAS
 from .surfaces_gl import Surfaces
 
-_REST_TEXELS = 6  # points 3, factors 9, normals 3, limbs 7, opacity, –
+_REST_TEXELS = 6  # points 3, factors 9, normals 3, limbs 7, opacity, floor of the template
 _HARMONIC_TEXELS = 4
-_FIELD_TEXELS = 8  # of a node behind its joints': four for offsets, four for harmonics
-_NEVER = -1e30  # log weight of the joints that fill up the last texels
+_FIELD_TEXELS = (
+    12  # of a node before its joints': four for the floor's blend, four for offsets, four for harmonics
+)
 
 
 class GlPosing:
@@ -63,7 +64,7 @@ class _OnDevice:
 
     def __init__(self, context: moderngl.Context, unposed: Unposed) -> None:
         self.rest: RestPose = unposed.rest
-        template = _padded_template(unposed.rest)
+        template = _padded_template(unposed.rest.template[1])
         count, columns = template.shape
         neighbours, quads = unposed.rest.neighbours.shape[1], columns // 4
         _check_limits(context, count, len(unposed.bones))
@@ -71,6 +72,7 @@ class _OnDevice:
             "GAUSSIANS": count,
             "NEIGHBOURS": neighbours,
             "JOINT_TEXELS": quads,
+            "BEFORE_JOINTS": _FIELD_TEXELS,
             "JOINT_QUADS": -(-len(unposed.bones) // 4),
             "FIELD_TEXELS": quads + _FIELD_TEXELS,
             "TWIST_STEPS": TWIST_STEPS,
@@ -93,7 +95,9 @@ class _OnDevice:
         bones = np.zeros((self._bones.height, 12), np.float32)
         bones[: len(unposed.bones)] = unposed.bones.reshape(-1, 12)
         self._bones.write(bones)
-        fields = self._fields.write(self.rest.fields(unposed.logits, unposed.offsets, unposed.visibility))
+        fields = self._fields.write(
+            self.rest.node_fields(unposed.logits, unposed.offsets, unposed.visibility, unposed.bones)
+        )
         textures = {**self._constants, "fields": fields, "bones": self._bones}
         self.interpolate.bind(textures)
         self.pose.bind(
@@ -114,8 +118,8 @@ class _OnDevice:
         rest = self.rest
         mixing = np.stack([rest.neighbours.astype(np.float32), rest.neighbour_weights], axis=-1)
         own = np.zeros((len(rest.points), 4 * _REST_TEXELS), np.float32)
-        parts = (rest.points, rest.factors, rest.normals, rest.limbs, unposed.opacities[:, None])
-        own[:, :-1] = np.concatenate(parts, axis=1)
+        ends = np.stack([unposed.opacities, rest.template[0]], axis=1)
+        own[:] = np.concatenate([rest.points, rest.factors, rest.normals, rest.limbs, ends], axis=1)
         materials = np.concatenate([unposed.albedo, unposed.roughness[:, None]], axis=1)
         return {
             "mixing": self._mixing.write(np.ascontiguousarray(mixing, np.float32)),
@@ -125,11 +129,11 @@ class _OnDevice:
         }
 
 
-def _padded_template(rest: RestPose) -> Floats32:
+def _padded_template(logs: Floats32) -> Floats32:
     """Log weights [N, C] with both up to whole numbers of sixteen; joints that there are not have none."""
-    count, joints = rest.log_template.shape
-    padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), _NEVER, np.float32)
-    padded[:count, :joints] = rest.log_template
+    count, joints = logs.shape
+    padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), NEVER, np.float32)
+    padded[:count, :joints] = logs
     return padded
 
 

@@ -1,7 +1,7 @@
 // What the networks say at the nodes, interpolated for a Gaussian.
 
 uniform sampler2D mixing;  // NEIGHBOURS texels a Gaussian: a node and its weight
-uniform sampler2D fields;  // FIELD_TEXELS texels a node: joints' logits, offsets and turns, harmonics
+uniform sampler2D fields;  // FIELD_TEXELS texels a node: RestPose.node_fields
 
 vec2 neighbours[NEIGHBOURS];
 

@@ -1,6 +1,6 @@
 // posing.py's formulas for one Gaussian.
 
-uniform sampler2D log_template;  // JOINT_TEXELS texels a Gaussian
+uniform sampler2D log_template;  // JOINT_TEXELS texels a Gaussian: what the template has above its floor
 uniform sampler2D rest;          // six texels a Gaussian: see posing_gl.py
 uniform sampler2D bones;         // three texels a joint, a joint a row: rest pose → posed
 uniform float max_offset;        // m
@@ -38,19 +38,18 @@ void main() {
     if (gaussian >= GAUSSIANS) discard;
     find_neighbours(gaussian);
 
-    ivec2 texel = ivec2(gaussian % ROW_WIDE * JOINT_TEXELS, gaussian / ROW_WIDE);
-    float top = -1e30, sum = 0.0;
-    vec4 row_0 = vec4(0.0), row_1 = vec4(0.0), row_2 = vec4(0.0);  // of A = [A_R | A_T], times sum
+    ivec2 texel = ivec2(gaussian % ROW_WIDE * 6, gaussian / ROW_WIDE);
+    vec4 r0 = texelFetch(rest, texel, 0), r1 = texelFetch(rest, texel + ivec2(1, 0), 0);
+    vec4 r2 = texelFetch(rest, texel + ivec2(2, 0), 0), r3 = texelFetch(rest, texel + ivec2(3, 0), 0);
+    vec4 r4 = texelFetch(rest, texel + ivec2(4, 0), 0), r5 = texelFetch(rest, texel + ivec2(5, 0), 0);
+
+    texel = ivec2(gaussian % ROW_WIDE * JOINT_TEXELS, gaussian / ROW_WIDE);
+    vec2 ends = field(3).xy;  // sum of the floor's shares, and what their logits are relative to
+    float sum = r5.w * ends.x;
+    vec4 row_0 = r5.w * field(0), row_1 = r5.w * field(1), row_2 = r5.w * field(2);  // of [A_R | A_T], times sum
     for (int q = 0; q < JOINT_QUADS; q++) {
-        vec4 logits = texelFetch(log_template, texel + ivec2(q, 0), 0) + field(q);
-        float higher = max(top, max(max(logits.x, logits.y), max(logits.z, logits.w)));
-        float scale = exp(top - higher);  // of what was summed relative to a lower top
-        vec4 share = exp(logits - higher);
-        top = higher;
-        sum = scale * sum + dot(share, vec4(1.0));
-        row_0 *= scale;
-        row_1 *= scale;
-        row_2 *= scale;
+        vec4 share = exp(texelFetch(log_template, texel + ivec2(q, 0), 0) + (field(BEFORE_JOINTS + q) - ends.y));
+        sum += dot(share, vec4(1.0));
         for (int c = 0; c < 4; c++) {
             row_0 += share[c] * texelFetch(bones, ivec2(0, 4 * q + c), 0);
             row_1 += share[c] * texelFetch(bones, ivec2(1, 4 * q + c), 0);
@@ -64,10 +63,6 @@ void main() {
     mat3 cofactors =
         transpose(mat3(cross(row_1.xyz, row_2.xyz), cross(row_2.xyz, row_0.xyz), cross(row_0.xyz, row_1.xyz)));
 
-    texel = ivec2(gaussian % ROW_WIDE * 6, gaussian / ROW_WIDE);
-    vec4 r0 = texelFetch(rest, texel, 0), r1 = texelFetch(rest, texel + ivec2(1, 0), 0);
-    vec4 r2 = texelFetch(rest, texel + ivec2(2, 0), 0), r3 = texelFetch(rest, texel + ivec2(3, 0), 0);
-    vec4 r4 = texelFetch(rest, texel + ivec2(4, 0), 0), r5 = texelFetch(rest, texel + ivec2(5, 0), 0);
     vec3 axis = vec3(r3.w, r4.xy), lever = vec3(r4.zw, r5.x);
 
     vec3 along = a * axis, across = cofactors * axis;
@@ -80,7 +75,7 @@ void main() {
     }
     float kappa = r5.y * (factor - 1.0);
 
-    vec4 first = bounded(field(JOINT_TEXELS)), second = bounded(field(JOINT_TEXELS + 1));
+    vec4 first = bounded(field(4)), second = bounded(field(5));
     vec3 mean = a * (r0.xyz + max_offset * first.xyz + kappa * lever) + vec3(row_0.w, row_1.w, row_2.w);
 
     mat3 f = transpose(mat3(vec3(r0.w, r1.xy), vec3(r1.zw, r2.x), r2.yzw));

@@ -7,5 +7,5 @@ void main() {
     int gaussian = texel.y * ROW_GAUSSIANS + texel.x / 4;
     if (gaussian >= GAUSSIANS) discard;
     find_neighbours(gaussian);
-    harmonics = field(JOINT_TEXELS + 4 + texel.x % 4);
+    harmonics = field(8 + texel.x % 4);
 }

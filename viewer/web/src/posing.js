@@ -6,7 +6,8 @@
 
 const f32 = Math.fround;
 const LOG2_E = f32(Math.LOG2E), SMALLEST_POWER = -126, LARGEST_TANH = 9, SHORTEST = f32(1e-9), SMALLEST_SQUARE = f32(1e-6);
-const HARMONICS = 16;
+const HARMONICS = 16, NEVER = f32(-1e30), DEEPEST = 60;
+const TERMS = 14, SUM = 12, GREATEST = 13;  // of a node's blend: Σ_j e^(Δ_j − c) B_j, the same without B, and c
 const TO_WHOLE = 1.5 * 2 ** 52;  // added and taken away again rounds to whole numbers, halves to even ones
 // 2^x on [−½, ½] (rnd_runtime/_lanes.py)
 const E0 = 1.0000001192092896, E1 = 0.6931471824645996, E2 = 0.2402210682630539, E3 = 0.055503569543361664;
@@ -14,7 +15,7 @@ const E4 = 0.009676031768321991, E5 = 0.0013390863314270973;
 const POWERS = Float32Array.from({ length: 255 }, (_, k) => 2 ** (k - 127));
 
 // Of one Gaussian at a time
-const blend = new Float32Array(12), moved = new Float32Array(6), linear = new Float32Array(9), cofactors = new Float32Array(9);
+const between = new Float32Array(TERMS), blend = new Float32Array(12), moved = new Float32Array(6), linear = new Float32Array(9), cofactors = new Float32Array(9);
 const factor = new Float32Array(9), posedFactor = new Float32Array(9);
 
 /** a·b + c of float32, rounded once. */
@@ -49,6 +50,32 @@ export class RestPose {
   constructor(count, [neighbours, weights, template, points, factors, normals, limbs, limits]) {
     Object.assign(this, { count, neighbours, weights, template, points, factors, normals, limbs, limits });
     this.posed = [3, 6, 3, HARMONICS].map((width) => new Float32Array(width * count));
+    this.#aboveTheFloor();
+  }
+
+  /** The floor of the template's weights [N], and of every Gaussian the joints that have more: from `starts[i]` on, with the
+   *  logs of what is above. */
+  #aboveTheFloor() {
+    const { count, template } = this, width = template.length / count;
+    const joints = [], logs = [];
+    this.floors = new Float32Array(count);
+    this.starts = new Int32Array(count + 1);
+    for (let i = 0; i < count; i++) {
+      const own = template.subarray(width * i, width * (i + 1));
+      let least = Infinity, top = 0;
+      for (const log of own) if (log > -Infinity) least = Math.min(least, log);
+      const heights = Array.from(own, (log) => Math.max(log, least) - least);
+      for (const height of heights) top = Math.max(top, height);
+      heights.forEach((height, joint) => {
+        if (height === 0) return;
+        joints.push(joint);
+        logs.push(height + Math.log(-Math.expm1(-height)) - top);
+      });
+      this.floors[i] = Math.exp(-Math.min(top, DEEPEST));
+      this.starts[i + 1] = joints.length;
+    }
+    this.joints = Int32Array.from(joints);
+    this.logs = Float32Array.from(logs);
   }
 
   /** Means, covariances, normals and visibility of node fields offsets [M·6], visibility [M·S] and logits [M·J], which may
@@ -56,10 +83,10 @@ export class RestPose {
   pose([offsets, visibility, logits], bones) {
     const { count, limbs } = this, terms = 6 * visibility.length / offsets.length;
     const [means, covariances, normals, harmonics] = this.posed;
-    const shares = new Float32Array(bones.length / 12);
+    const nodes = offsets.length / 6, joints = bones.length / 12;
+    const changes = logits ?? new Float32Array(nodes * joints), blends = blendsOf(changes, nodes, joints, bones);
     for (let i = 0; i < count; i++) {
-      this.#shares(i, logits, shares);
-      blended(shares, bones, blend);
+      this.#blend(i, blends, changes, joints, bones);
       for (let k = 0; k < 9; k++) linear[k] = blend[k + (k > 5 ? 2 : k > 2 ? 1 : 0)];
       cofactorsOf(linear, cofactors);
       this.#between(offsets, 6, i, moved, 0);
@@ -127,53 +154,40 @@ export class RestPose {
     }
   }
 
-  /** e^(logit − the greatest) [J] of Gaussian i. */
-  #shares(i, logits, shares) {
-    const { template } = this, joints = shares.length, from = joints * i;
-    if (logits) this.#between(logits, joints, i, shares, 0);
-    else shares.fill(0);
-    let greatest = -Infinity;
-    for (let j = 0; j < joints; j++) {
-      shares[j] += template[from + j];
-      greatest = Math.max(greatest, shares[j]);
+  /** [A_R | A_T] of Gaussian i, to `blend`: the floor's, interpolated between the nodes, and its own joints'. */
+  #blend(i, blends, changes, joints, bones) {
+    const { neighbours, weights, floors } = this, own = neighbours.length / this.count, first = own * i, last = first + own;
+    this.#between(blends, TERMS, i, between, 0);
+    const greatest = between[GREATEST], floor = floors[i];
+    for (let k = 0; k <= SUM; k++) between[k] *= floor;
+    for (let k = this.starts[i], end = this.starts[i + 1]; k < end; k++) {
+      const log = this.logs[k], joint = this.joints[k], bone = 12 * joint;
+      let change = -greatest;
+      for (let near = first; near < last; near++) change = fused(weights[near], changes[joints * neighbours[near] + joint], change);
+      const share = log < 0.5 * NEVER ? 0 : f32(exp(f32(change + log)));
+      for (let c = 0; c < SUM; c++) between[c] = share * bones[bone + c] + between[c];
+      between[SUM] += share;
     }
-    for (let j = 0; j < joints; j++) shares[j] = exp(f32(shares[j] - greatest));
+    const scale = f32(1 / between[SUM]);
+    for (let c = 0; c < SUM; c++) blend[c] = between[c] * scale;
   }
 }
 
-/** [A_R | A_T] [12] of shares [J] that have yet to be divided by their sum: twelve sums side by side, none waits for another. */
-function blended(shares, bones, blend) {
-  const joints = shares.length;
-  let sum = 0, xx = 0, xy = 0, xz = 0, x = 0, yx = 0, yy = 0, yz = 0, y = 0, zx = 0, zy = 0, zz = 0, z = 0;
-  for (let j = 0, at = 0; j < joints; j++, at += 12) {
-    const share = shares[j];
-    sum = f32(sum + share);
-    xx = fused(share, bones[at], xx);
-    xy = fused(share, bones[at + 1], xy);
-    xz = fused(share, bones[at + 2], xz);
-    x = fused(share, bones[at + 3], x);
-    yx = fused(share, bones[at + 4], yx);
-    yy = fused(share, bones[at + 5], yy);
-    yz = fused(share, bones[at + 6], yz);
-    y = fused(share, bones[at + 7], y);
-    zx = fused(share, bones[at + 8], zx);
-    zy = fused(share, bones[at + 9], zy);
-    zz = fused(share, bones[at + 10], zz);
-    z = fused(share, bones[at + 11], z);
+/** Of every node what is interpolated for the floor, [M·14]. */
+function blendsOf(changes, nodes, joints, bones) {
+  const blends = new Float32Array(TERMS * nodes);
+  for (let m = 0; m < nodes; m++) {
+    const from = joints * m, at = TERMS * m;
+    let greatest = changes[from];
+    for (let j = 1; j < joints; j++) greatest = Math.max(greatest, changes[from + j]);
+    for (let j = 0; j < joints; j++) {
+      const share = f32(exp(f32(changes[from + j] - greatest)));
+      for (let c = 0; c < SUM; c++) blends[at + c] = share * bones[12 * j + c] + blends[at + c];
+      blends[at + SUM] += share;
+    }
+    blends[at + GREATEST] = greatest;
   }
-  const scale = f32(1 / sum);
-  blend[0] = xx * scale;
-  blend[1] = xy * scale;
-  blend[2] = xz * scale;
-  blend[3] = x * scale;
-  blend[4] = yx * scale;
-  blend[5] = yy * scale;
-  blend[6] = yz * scale;
-  blend[7] = y * scale;
-  blend[8] = zx * scale;
-  blend[9] = zy * scale;
-  blend[10] = zz * scale;
-  blend[11] = z * scale;
+  return blends;
 }
 
 /** det(A) A⁻ᵀ. */
