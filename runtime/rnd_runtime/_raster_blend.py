@@ -24,6 +24,7 @@ from ._lanes import (
     load,
     lowest_bit,
     magnitude,
+    prefetch,
     select,
     store,
     total,
@@ -106,6 +107,16 @@ def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # t
 
 
 @njit(inline="always")
+def _fetch(first, last, splats):  # type: ignore[no-untyped-def]
+    """Has the pairs of a later batch brought to the caches: they lie anywhere."""
+    for pair in range(first, last):
+        g = splats.pair_gaussians[pair]
+        prefetch(splats.centers, 2 * g)
+        prefetch(splats.shapes, 4 * g)
+        prefetch(splats.attributes, splats.attributes.shape[1] * g)
+
+
+@njit(inline="always")
 def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
     """Which of ``count`` gathered Gaussians may reach a block, one bit each."""
     row = np.float32(block // BLOCKS * BLOCK + 0.5 * BLOCK)
@@ -173,6 +184,7 @@ def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[n
     for start in range(first, last, BATCH):
         count = min(BATCH, last - start)
         _gather(start, start + count, splats, tile_x, tile_y, shapes, colours, columns)
+        _fetch(start + count, min(start + count + BATCH, last), splats)
         blocks = open_blocks
         while blocks != 0:
             block = lowest_bit(blocks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from ._lanes import WIDTH, load, load_points, root, store_mask
@@ -18,6 +18,7 @@ from .raster_oracle import ALPHA_MIN, DILATION, NEAR
 REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
 LEAST_OPACITY = np.float32(ALPHA_MIN)
 ZERO = np.float32(0)
+CHUNK = 128 * WIDTH  # Gaussians looked at by a thread at a time
 
 
 def in_view(
@@ -107,19 +108,35 @@ def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
     return x * normal[0] + y * normal[1] + z * normal[2], x * x + y * y + z * z
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _in_view(means, covariances, opacities, normals, limits, view, seen):  # type: ignore[no-untyped-def]
-    left = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
-    right = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
-    top = _side(view, 1, view.fy, view.cy, view.low_y, view.high_y)
-    bottom = _side(view, 1, -view.fy, view.height - view.cy, view.low_y, view.high_y)
-    ahead = _ahead(view)
+    sides = np.empty((5, 5), np.float64)
+    sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
+    sides[1] = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
+    sides[2] = _side(view, 1, view.fy, view.cy, view.low_y, view.high_y)
+    sides[3] = _side(view, 1, -view.fy, view.height - view.cy, view.low_y, view.high_y)
+    sides[4] = _ahead(view)
+    arrays = (means, covariances, opacities, normals)
+    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+        _look_at(chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen)), arrays, sides, limits, seen)
+
+
+@njit(error_model="numpy")
+def _look_at(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyped-def]
+    """Fill ``seen`` from ``first``, a whole number of sixteen, up to ``last``."""
+    means, covariances, opacities, normals = arrays
     eye, least = limits
     culling = len(normals) > 0
     # Of most the middle is in the picture: seen sixteen at a time, and rounding may err, for the others are looked at
-    a, b, c, d, e = _rounded(left), _rounded(right), _rounded(top), _rounded(bottom), _rounded(ahead)
-    sixteens = len(seen) // WIDTH * WIDTH
-    for i in range(0, sixteens, WIDTH):
+    a, b, c, d, e = (
+        _rounded(sides[0]),
+        _rounded(sides[1]),
+        _rounded(sides[2]),
+        _rounded(sides[3]),
+        _rounded(sides[4]),
+    )
+    sixteens = last // WIDTH * WIDTH
+    for i in range(first, sixteens, WIDTH):
         x, y, z = load_points(means, 3 * i)
         inside = (_distance(a, x, y, z, ZERO) >= ZERO) & (_distance(b, x, y, z, ZERO) >= ZERO)
         inside = inside & (_distance(c, x, y, z, ZERO) >= ZERO) & (_distance(d, x, y, z, ZERO) >= ZERO)
@@ -128,8 +145,8 @@ def _in_view(means, covariances, opacities, normals, limits, view, seen):  # typ
             along, squared = _along(eye, x, y, z, load_points(normals, 3 * i))
             inside = inside & (along - least * root(squared) >= ZERO)
         store_mask(seen, i, inside)
-    seen[sixteens:] = False
-    for i in range(len(seen)):
+    seen[sixteens:last] = False
+    for i in range(first, last):
         if seen[i] or not opacities[i] >= LEAST_OPACITY:
             continue
         if culling:
@@ -138,6 +155,7 @@ def _in_view(means, covariances, opacities, normals, limits, view, seen):  # typ
                 continue
         x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         sigma = _sigma(covariances, i)
-        across = _distance(left, x, y, z, sigma) >= 0.0 and _distance(right, x, y, z, sigma) >= 0.0
-        down = _distance(top, x, y, z, sigma) >= 0.0 and _distance(bottom, x, y, z, sigma) >= 0.0
-        seen[i] = across and down and _distance(ahead, x, y, z, sigma) >= 0.0
+        reached = True
+        for side in sides:
+            reached = reached and _distance(side, x, y, z, sigma) >= 0.0
+        seen[i] = reached
