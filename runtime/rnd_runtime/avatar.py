@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -43,7 +44,9 @@ class Encoded(NamedTuple):
     resolve a body and not its place in the world, and where all three turn together the picture stays.
     """
 
-    values: list[NDArray[np.float32]]
+    values: list[
+        NDArray[np.float32]
+    ]  # node outputs: logits, unless skinning is static, offsets and visibility
     bones: NDArray[np.float32]  # [J, 3, 4] m, rest pose → this frame
     root: NDArray[np.float64]  # [4, 4] m, this frame → world
     seconds: dict[str, float]  # that "motion" and "encoders" took
@@ -81,14 +84,13 @@ class Avatar:
         self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
         posed_here = not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys()
-        self._node_outputs = (*NODE_OUTPUTS, *({NODE_LOGITS} & file.outputs.keys()))
-        with ThreadPoolExecutor(1) as other:
-            wanted = self._node_outputs if posed_here else POSED_OUTPUTS
-            session = other.submit(self._session, wanted)  # now, and not in the first frame
-            self._opacities, albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
-            self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
-            self._rest = self._rest_pose() if posed_here else None
-            session.result()
+        self._aside = ThreadPoolExecutor(1, "networks")
+        self._networks = self._parts() if posed_here else (POSED_OUTPUTS,)
+        sessions = self._aside.submit(lambda: [self._session(part) for part in self._networks])
+        self._opacities, albedo, self._roughness = self._constants(CONSTANT_OUTPUTS)
+        self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
+        self._rest = self._rest_pose() if posed_here else None
+        sessions.result()
 
     @classmethod
     def load(cls, path: str | Path, *, threads: int | None = None) -> Avatar:
@@ -117,8 +119,10 @@ class Avatar:
         window, velocity = described(recent, poses=poses, seconds=seconds)
         bones, root = self._bones(recent.rotations[-1], recent.translations[-1])
         known = perf_counter()
-        outputs = POSED_OUTPUTS if self._rest is None else self._node_outputs
-        values = self.run((window, velocity, bones), outputs)
+        inputs = (window, velocity, bones)
+        own, *others = self._networks
+        aside = [self._aside.submit(self.run, inputs, part) for part in others]
+        values = self.run(inputs, own) + [value for part in aside for value in part.result()]
         return Encoded(values, bones, root, {"motion": known - started, "encoders": perf_counter() - known})
 
     def posed(self, encoded: Encoded) -> Gaussians:
@@ -127,7 +131,7 @@ class Avatar:
         if self._rest is None:
             means, covariances, normals, visibility = values
         else:
-            offsets, harmonics, *logits = values
+            *logits, offsets, harmonics = values
             posed = self._rest.pose(logits[0] if logits else None, offsets, harmonics, bones)
             means, covariances, normals, visibility = posed
         return Gaussians(
@@ -139,7 +143,7 @@ class Avatar:
         """What :meth:`posed` is made of, for those who pose elsewhere; None where the graph has posed already."""
         if self._rest is None:
             return None
-        offsets, visibility, *logits = encoded.values
+        *logits, offsets, visibility = encoded.values
         return Unposed(
             self._rest, logits[0] if logits else None, offsets, visibility, encoded.bones,
             self._opacities, self._albedo, self._roughness,
@@ -214,8 +218,18 @@ class Avatar:
     def _session(self, outputs: tuple[str, ...]) -> ort.InferenceSession:
         """A session that computes ``outputs`` and no more; kept."""
         if outputs not in self._sessions:
-            self._sessions[outputs] = _session(self._file.cut(outputs), self._threads or 0)
+            at_once = len(self._networks) if outputs in self._networks else 1
+            threads = -(-(self._threads or os.cpu_count() or 1) // at_once)
+            self._sessions[outputs] = _session(self._file.cut(outputs), threads)
         return self._sessions[outputs]
+
+    def _parts(self) -> tuple[tuple[str, ...], ...]:
+        """What of the networks is evaluated at once: that of skinning takes as long as the two others. On a core each,
+        none of their hundred operations has to wait for a second thread."""
+        skinning = (NODE_LOGITS,) if NODE_LOGITS in self._file.outputs else ()
+        if skinning and (self._threads or os.cpu_count() or 1) > 1:
+            return skinning, NODE_OUTPUTS
+        return ((*skinning, *NODE_OUTPUTS),)
 
 
 def _session(model: bytes, threads: int) -> ort.InferenceSession:
