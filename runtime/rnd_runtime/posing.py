@@ -78,6 +78,15 @@ class Posed(NamedTuple):
     visibility: Floats32  # [N, 16]
 
 
+class Template(NamedTuple):
+    """The template relative to a Gaussian's greatest weight: its floor, and what some joints have above."""
+
+    floors: Floats32  # [N]
+    gaussians: NDArray[np.intp]  # [L] ascending
+    joints: NDArray[np.intp]  # [L]
+    logs: Floats32  # [L] of the weight less the floor
+
+
 @dataclass(frozen=True, eq=False)
 class RestPose:
     """What of an avatar does not depend on the pose.
@@ -141,17 +150,18 @@ class RestPose:
         return fields
 
     @cached_property
-    def template(self) -> tuple[Floats32, Floats32]:
-        """The floor of the template's weights [N] and the logs of what they have above it [N, J], ``NEVER`` where that
-        is nothing; relative to a Gaussian's greatest weight."""
-        logarithms = np.asarray(self.log_template, np.float64)
-        least = np.where(logarithms > -np.inf, logarithms, np.inf).min(1, keepdims=True)
-        with np.errstate(invalid="ignore", divide="ignore"):  # what is no number stays none
-            heights = np.maximum(logarithms, least) - least
-            top = heights.max(1, initial=0.0, keepdims=True)
-            logs = np.where(heights == 0, NEVER, heights + np.log(-np.expm1(-heights)) - top)
-        floors = np.exp(-np.minimum(top[:, 0], _DEEPEST))
-        return floors.astype(np.float32), logs.astype(np.float32)
+    def template(self) -> Template:
+        """The template as it is summed."""
+        given = np.asarray(self.log_template, np.float32)
+        least = np.where(given > -np.inf, given, np.float32(np.inf)).min(1)
+        gaussians, joints = np.nonzero(~(given <= least[:, None]))  # what is no number stays none
+        heights = given[gaussians, joints].astype(np.float64) - least[gaussians]
+        top = np.zeros(len(given))
+        with np.errstate(invalid="ignore"):
+            np.maximum.at(top, gaussians, heights)
+            logs = heights + np.log(-np.expm1(-heights)) - top[gaussians]
+        floors = np.exp(-np.minimum(top, _DEEPEST))
+        return Template(floors.astype(np.float32), gaussians, joints, logs.astype(np.float32))
 
     @cached_property
     def arrays(self) -> RestArrays:
@@ -159,7 +169,7 @@ class RestPose:
         count = len(self.points)
         whole = -(-count // WIDTH) * WIDTH
         own = np.zeros((whole, _OWN), np.float32)
-        floors, logs = self.template
+        floors = self.template.floors
         for first, values in (
             (_POINTS, self.points),
             (_FACTORS, self.factors),
@@ -172,7 +182,7 @@ class RestPose:
         weights = np.zeros(neighbours.shape, np.float32)
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
         by_sixteens = own.reshape(-1, WIDTH, _OWN).transpose(0, 2, 1)
-        return RestArrays(neighbours, weights, *_slots(logs, whole), by_sixteens.ravel())
+        return RestArrays(neighbours, weights, *_slots(self.template, whole), by_sixteens.ravel())
 
 
 def _bone_rows(bones: ArrayLike) -> Floats32:
@@ -183,18 +193,15 @@ def _bone_rows(bones: ArrayLike) -> Floats32:
     return rows
 
 
-def _slots(logs: Floats32, whole: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
+def _slots(template: Template, whole: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
     """``starts``, ``joints`` and ``logs`` of :class:`RestArrays`."""
-    chosen = logs != NEVER
-    gaussians, joints = np.nonzero(chosen)
-    counts = np.zeros(whole, np.intp)
-    counts[: len(chosen)] = chosen.sum(1)
+    _, gaussians, joints, logs = template
+    counts = np.bincount(gaussians, minlength=whole)
     starts = np.concatenate([[0], np.cumsum(counts.reshape(-1, WIDTH).max(1))])
     slots = starts[gaussians // WIDTH] + np.arange(len(joints)) - (np.cumsum(counts) - counts)[gaussians]
     of_slots = np.zeros((starts[-1], WIDTH), np.int32)
     logs_of_slots = np.full(of_slots.shape, NEVER, np.float32)
-    of_slots[slots, gaussians % WIDTH] = joints
-    logs_of_slots[slots, gaussians % WIDTH] = logs[gaussians, joints]
+    of_slots[slots, gaussians % WIDTH], logs_of_slots[slots, gaussians % WIDTH] = joints, logs
     return starts.astype(np.int32), of_slots.ravel(), logs_of_slots.ravel()
 
 

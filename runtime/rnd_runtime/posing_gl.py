@@ -64,7 +64,7 @@ class _OnDevice:
 
     def __init__(self, context: moderngl.Context, unposed: Unposed) -> None:
         self.rest: RestPose = unposed.rest
-        template = _padded_template(unposed.rest.template[1])
+        template = _padded_template(unposed.rest)
         count, columns = template.shape
         neighbours, quads = unposed.rest.neighbours.shape[1], columns // 4
         _check_limits(context, count, len(unposed.bones))
@@ -118,7 +118,7 @@ class _OnDevice:
         rest = self.rest
         mixing = np.stack([rest.neighbours.astype(np.float32), rest.neighbour_weights], axis=-1)
         own = np.zeros((len(rest.points), 4 * _REST_TEXELS), np.float32)
-        ends = np.stack([unposed.opacities, rest.template[0]], axis=1)
+        ends = np.stack([unposed.opacities, rest.template.floors], axis=1)
         own[:] = np.concatenate([rest.points, rest.factors, rest.normals, rest.limbs, ends], axis=1)
         materials = np.concatenate([unposed.albedo, unposed.roughness[:, None]], axis=1)
         return {
@@ -129,11 +129,11 @@ class _OnDevice:
         }
 
 
-def _padded_template(logs: Floats32) -> Floats32:
-    """Log weights [N, C] with both up to whole numbers of sixteen; joints that there are not have none."""
-    count, joints = logs.shape
+def _padded_template(rest: RestPose) -> Floats32:
+    """Log weights above the floor [N, C] with both up to whole numbers of sixteen."""
+    count, joints = rest.log_template.shape
     padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), NEVER, np.float32)
-    padded[:count, :joints] = logs
+    padded[rest.template.gaussians, rest.template.joints] = rest.template.logs
     return padded
 
 

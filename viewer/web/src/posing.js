@@ -64,12 +64,11 @@ export class RestPose {
       const own = template.subarray(width * i, width * (i + 1));
       let least = Infinity, top = 0;
       for (const log of own) if (log > -Infinity) least = Math.min(least, log);
-      const heights = Array.from(own, (log) => Math.max(log, least) - least);
-      for (const height of heights) top = Math.max(top, height);
-      heights.forEach((height, joint) => {
-        if (height === 0) return;
+      for (const log of own) if (!(log <= least)) top = Math.max(top, log - least);
+      own.forEach((log, joint) => {
+        if (log <= least) return;
         joints.push(joint);
-        logs.push(height + Math.log(-Math.expm1(-height)) - top);
+        logs.push(log - least + Math.log(-Math.expm1(least - log)) - top);
       });
       this.floors[i] = Math.exp(-Math.min(top, DEEPEST));
       this.starts[i + 1] = joints.length;
