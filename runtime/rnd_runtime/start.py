@@ -7,8 +7,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_SCIPY = ("scipy", "scipy.linalg")
-
 
 @contextmanager
 def quick_start() -> Iterator[None]:
@@ -34,17 +32,14 @@ def settle() -> None:
 
 
 def _load_numba_without_scipy() -> None:
-    """Spares a process of ours a fifth of a second: numba loads scipy, where it is installed, for its version and for
-    products of arrays.
+    """Spares a process of ours a fifth of a second: numba loads scipy, where it is installed, for products of arrays.
 
     Our kernels have none. Kernels of others that share the process cannot have any afterwards either.
     """
-    if "scipy" in sys.modules:
+    if "scipy.linalg" in sys.modules:
         return
-    for name in _SCIPY:
-        sys.modules[name] = None  # type: ignore[assignment]  # an import of it fails
+    sys.modules["scipy.linalg"] = None  # type: ignore[assignment]  # an import of it fails
     try:
         import numba.np.arraymath  # noqa: F401
     finally:
-        for name in _SCIPY:
-            del sys.modules[name]
+        del sys.modules["scipy.linalg"]

@@ -60,16 +60,15 @@ export class RestPose {
     const joints = [], logs = [];
     this.floors = new Float32Array(count);
     this.starts = new Int32Array(count + 1);
-    for (let i = 0; i < count; i++) {
-      const own = template.subarray(width * i, width * (i + 1));
+    for (let i = 0, from = 0; i < count; i++, from += width) {
       let least = Infinity, top = 0;
-      for (const log of own) if (log > -Infinity) least = Math.min(least, log);
-      for (const log of own) if (!(log <= least)) top = Math.max(top, log - least);
-      own.forEach((log, joint) => {
-        if (log <= least) return;
-        joints.push(joint);
-        logs.push(log - least + Math.log(-Math.expm1(least - log)) - top);
-      });
+      for (let j = from; j < from + width; j++) if (template[j] > -Infinity) least = Math.min(least, template[j]);
+      for (let j = from; j < from + width; j++) if (!(template[j] <= least)) top = Math.max(top, template[j] - least);
+      for (let j = from; j < from + width; j++) {
+        if (template[j] <= least) continue;
+        joints.push(j - from);
+        logs.push(template[j] - least + Math.log(-Math.expm1(least - template[j])) - top);
+      }
       this.floors[i] = Math.exp(-Math.min(top, DEEPEST));
       this.starts[i + 1] = joints.length;
     }
