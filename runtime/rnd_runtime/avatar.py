@@ -73,7 +73,7 @@ class Avatar:
         threads: int | None = None,
         path: Path | None = None,
     ) -> None:
-        self._file, self._threads, self._path = file, threads, path
+        self._file, self._threads, self._path = file, threads or os.cpu_count() or 1, path
         self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
         self.metadata = metadata
         self.trained_light = trained_light
@@ -219,7 +219,7 @@ class Avatar:
         """A session that computes ``outputs`` and no more; kept."""
         if outputs not in self._sessions:
             at_once = len(self._networks) if outputs in self._networks else 1
-            threads = -(-(self._threads or os.cpu_count() or 1) // at_once)
+            threads = -(-self._threads // at_once)
             self._sessions[outputs] = _session(self._file.cut(outputs), threads)
         return self._sessions[outputs]
 
@@ -227,7 +227,7 @@ class Avatar:
         """What of the networks is evaluated at once: that of skinning takes as long as the two others. On a core each,
         none of their hundred operations has to wait for a second thread."""
         skinning = (NODE_LOGITS,) if NODE_LOGITS in self._file.outputs else ()
-        if skinning and (self._threads or os.cpu_count() or 1) > 1:
+        if skinning and self._threads > 1:
             return skinning, NODE_OUTPUTS
         return ((*skinning, *NODE_OUTPUTS),)
 
