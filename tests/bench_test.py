@@ -572,7 +572,7 @@ def test_the_floor_counts_the_products_of_the_exported_networks(tiny_checkpoint,
 def test_a_file_is_measured_beside_its_own_checkpoints_whole_avatar(tiny_checkpoint, tiny_avatar, tmp_path):
     merged = tmp_path / "merged.onnx"
     checkpoint = load_checkpoint(tiny_checkpoint)
-    export(checkpoint, merged, variant=Variant(encoder="coarse", nodes=40, window_poses=3))
+    export(checkpoint, merged, variant=Variant(encoder="coarse", nodes=40, window_poses=3), cull=-0.6)
     inputs = Inputs(ASSETS / "body.npz", WALK, SKY, tmp_path / "work", (tiny_checkpoint,)).checked()
     usual = Setting(size=32, shade="table", threads=1)
     rows = [measured(usual, inputs, seconds=0.1, file=file) for file in (tiny_avatar, merged)]
@@ -580,8 +580,32 @@ def test_a_file_is_measured_beside_its_own_checkpoints_whole_avatar(tiny_checkpo
         assert (row["encoder"], row["window"], row["avatar"]) == (encoder, window, "exported")
         assert row["n"] == checkpoint.config.model.gaussians and "psnr_full_db" not in row
     assert rows[0]["psnr_db"] > rows[1]["psnr_db"] + 1
+    # what its file advises is drawn, unless the setting says otherwise
+    assert rows[1]["cull"] == -0.6
+    whole = measured(dataclasses.replace(usual, cull=-1.0), inputs, seconds=0.1, file=merged)
+    assert whole["cull"] == -1 and whole["psnr_db"] != rows[1]["psnr_db"]
     with pytest.raises(InputError, match="--checkpoint: expected the one that"):
         measured(usual, dataclasses.replace(inputs, checkpoints=()), file=merged)
+
+
+def test_a_point_may_be_measured_again_and_again(tmp_path, monkeypatch, capsys) -> None:
+    times = iter([9.0, 14.0, 10.0])
+
+    def row(setting: Setting, *_: object, **__: object) -> dict[str, object]:
+        taken = next(times)
+        measures = {"ms_median": taken, "ms_p95": taken + 2, "cold_start_ms": 100 * taken}
+        return dataclasses.asdict(setting) | measures | {"stages": {}, "peak_mb": 1.0, "file_mb": 1.0}
+
+    monkeypatch.setattr(bench_point, "measured", row)
+    out = tmp_path / "runs.json"
+    words = ["rnd-bench", "frame", "--runs", "3", "--json", str(out), "--work", str(tmp_path / "work")]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        bench_cli.main()
+    said = capsys.readouterr().out
+    assert not ended.value.code and [r["ms_median"] for r in json.loads(out.read_text())] == [9, 14, 10]
+    assert "median of 3 runs: 9.0 to 14.0 ms, in the middle 10.0" in said
+    assert "p95 of 3 runs: 11.0 to 16.0 ms" in said and "cold start of 3 runs: 900.0" in said
 
 
 def test_a_clip_is_spread_over_processes(tiny_avatar, monkeypatch) -> None:

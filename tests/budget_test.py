@@ -106,6 +106,7 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
             ["--max-mb", "4", "--precision", "int8"],
             "--precision: expected the default, got int8 (a bound finds",
         ),
+        (["--max-mb", "4", "--cull", "-0.5"], "--cull: expected the default, got -0.5 (a bound finds"),
         (["--target-ms", "0"], "--target-ms: expected more than 0, got 0"),
         (
             ["--max-mb", "4", "--window-poses", "5"],
@@ -126,7 +127,7 @@ def test_options_that_would_do_nothing_are_refused(
 def test_a_bound_is_searched_only_where_the_whole_avatar_is_torchs(
     tiny_checkpoint, tmp_path, monkeypatch, capsys
 ) -> None:
-    def drifts(*_: object) -> None:
+    def drifts(*_: object, **__: object) -> None:
         raise InputError("export refused: places of onnxruntime and torch differ")
 
     out = tmp_path / "small.onnx"

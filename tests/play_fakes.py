@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rnd_runtime.avatar_file import PlayerAdvice
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
@@ -51,6 +52,7 @@ class FakeAvatar:
     skeleton: Skeleton = field(default_factory=fake_skeleton)
     trained_light: np.ndarray = field(default_factory=lambda: np.full((32, 64, 3), 0.5, np.float32))
     spacing: float = 0.02
+    advice: PlayerAdvice = field(default_factory=PlayerAdvice)
 
     def encode(self, motion: Motion, time: float) -> Encoded:
         return Encoded(motion, time, np.eye(4))

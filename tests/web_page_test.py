@@ -109,6 +109,8 @@ def site(tmp_path_factory) -> Path:
     write_image(folder / "broken.exr", broken)
     (folder / "torn.hdr").write_bytes((folder / "window.hdr").read_bytes()[:4000])
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
+    _write_advice(folder / "advised.onnx", '{"cull": -0.2}')
+    _write_advice(folder / "misled.onnx", '{"cull": 3}')
     _write_avatar(folder / "other.onnx", _raise_and_dim)
     _write_avatar(folder / "stranger.onnx", _rename)
     _write_avatar(folder / "later.onnx", lambda about: about.update(hair=1))
@@ -135,6 +137,13 @@ def _write_avatar(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
     about = json.loads(entry.value)
     change(about)
     entry.value = json.dumps(about)
+    onnx.save(model, path)
+
+
+def _write_advice(path: Path, text: str) -> None:
+    """The embedded avatar, whose file tells players what to leave out."""
+    model = onnx.load(ASSETS / "avatar.onnx")
+    model.metadata_props.add(key="rnd_player", value=text)
     onnx.save(model, path)
 
 
@@ -292,9 +301,9 @@ def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
     assert error.max() <= TOLERANCE and error.mean() < MEAN_TOLERANCE, (error.max(), error.mean())
 
 
-def _scene(site: Path, motion: str = "walk.npz") -> Scene:
+def _scene(site: Path, motion: str = "walk.npz", avatar: str = "avatar.onnx") -> Scene:
     lights = (site / "sky.exr", site / "window.hdr", site / "broken.exr")
-    return Scene(ViewOptions(site / "avatar.onnx", site / motion, lights, size=SIZE, raster="cpu"))
+    return Scene(ViewOptions(site / avatar, site / motion, lights, size=SIZE, raster="cpu"))
 
 
 def _python_picture(page: Page, scene: Scene) -> np.ndarray:
@@ -398,6 +407,19 @@ def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receiv
         got = _picture(fresh, **(straight | changes))
         assert got.any()
         _assert_agreed(fresh, got, scene)
+    scene.close()
+
+
+def test_what_the_file_advises_to_leave_out_is_left_out_as_in_rnd_view(fresh, site):
+    _drop(fresh, "avatar.onnx", "walk.npz", "sky.exr")
+    state: dict[str, Any] = {"width": SIZE, "height": SIZE, "time": 0.4, "azimuth": 1.1}
+    whole = {output: _picture(fresh, **state, output=output) for output in ("lit", "normal")}
+    _drop(fresh, "advised.onnx")
+    scene = _scene(site, avatar="advised.onnx")
+    for output, everything in whole.items():
+        got = _picture(fresh, **state, output=output)
+        _assert_agreed(fresh, got, scene)
+        assert (np.abs(got.astype(int) - everything).max(-1) > TOLERANCE).sum() > 100
     scene.close()
 
 
@@ -590,6 +612,7 @@ def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_
     [
         ("torn.onnx", "torn.onnx: the .onnx file is cut short"),
         ("later.onnx", "later.onnx: metadata: got unknown field `hair`"),
+        ("misled.onnx", "misled.onnx: metadata 'rnd_player': expected cull: -1 to 1, got 3"),
         ("joined.onnx", "joined.onnx: metadata.skeleton: got no field `parents`"),
         ("torn.hdr", "torn.hdr: the .hdr file is cut short"),
         ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),

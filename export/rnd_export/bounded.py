@@ -64,7 +64,7 @@ def export_bounded(
         scene = Scene(moves, light, options.size, shots=shots_of(capture, options.size))
     # all that follows is held against the whole avatar: it has to be torch's
     with TemporaryDirectory() as folder:
-        export(checkpoint, Path(folder) / "avatar.onnx", motion)
+        export(checkpoint, Path(folder) / "avatar.onnx", motion, cull=-1)
     bench = Workbench(checkpoint, scene)
     console, steps = Console(), []
 

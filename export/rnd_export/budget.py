@@ -24,6 +24,7 @@ from .variant import OWN_NODES, Variant
 PRECISIONS: tuple[Literal["f32", "f16", "int8"], ...] = ("f32", "f16", "int8")
 LADDERS: dict[str, tuple[float, ...]] = {
     "precision": (1, 2),
+    "cull": (-0.7, -0.5, -0.4, -0.3, -0.2),
     "dynamic_mm": (0.05, 0.2, 0.5, 1.0, 2.0, np.inf),
     "nodes": (0.5, 0.25, 0.125),
     "skinning_nodes": (0.5, 0.25, 0.125),
@@ -59,6 +60,7 @@ class Plan:
     """How many rungs down each of ``LADDERS`` a file is."""
 
     precision: int = 0
+    cull: int = 0
     dynamic_mm: int = 0
     nodes: int = 0
     skinning_nodes: int = 0
@@ -92,7 +94,7 @@ class Plan:
             visibility_degree=3 if degree is None else int(degree),
         )
         count = max(int(gaussians * config.gaussians), most) if gaussians else None  # nodes stay
-        return Recipe(variant, count, rung("dynamic_mm") or 0.0)
+        return Recipe(variant, count, rung("dynamic_mm") or 0.0, rung("cull"))
 
 
 def _nodes(share: float | None, most: int) -> int | None:
@@ -240,6 +242,8 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
     """What a file of ``plan`` leaves out, a line each."""
     recipe, config = plan.recipe(bench.config), bench.config
     lines = []
+    if recipe.cull is not None:
+        lines.append(f"what faces away (n·v < {recipe.cull:g})")
     if recipe.gaussians is not None:
         lines.append(
             f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again"

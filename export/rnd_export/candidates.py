@@ -25,6 +25,7 @@ from rnd_trainer.checkpoint import Checkpoint
 from rnd_trainer.template import node_interpolation
 
 from .bake import BakedAvatar, bake
+from .culling import advise
 from .export import refuse_ablations, written
 from .merge import contributions, fitted_albedo, merged
 from .places import gaussians_by_place
@@ -55,12 +56,13 @@ class Recipe:
     """What a file leaves out, beyond its :class:`Variant`.
 
     ``gaussians``: N, or None for all. ``dynamic_mm``: nodes whose dynamic skinning moves nothing by as much are given
-    the template's.
+    the template's. ``cull``: n·v below which players leave Gaussians out, or None.
     """
 
     variant: Variant = field(default_factory=Variant)
     gaussians: int | None = None
     dynamic_mm: float = 0.0
+    cull: float | None = None
 
 
 class Measured(NamedTuple):
@@ -101,7 +103,9 @@ class Workbench:
             fewer = _loaded(self._written(baked, recipe.variant))
             wanted = [_albedo_picture(*view) for view in self._posed(self._whole)]
             baked = dataclasses.replace(baked, albedo=fitted_albedo(baked.albedo, self._posed(fewer), wanted))
-        return self._written(baked, recipe.variant)
+        model = self._written(baked, recipe.variant)
+        advise(model, recipe.cull)
+        return model
 
     def measure(self, model: onnx.ModelProto, shots: Sequence[Shot]) -> Measured:
         """``model`` in ``shots``."""

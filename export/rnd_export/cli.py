@@ -45,6 +45,9 @@ class Options:
     """poses in the motion window; fewer span the same time"""
     visibility_degree: int = 3
     """of the visibility's spherical harmonics, 0 to 3"""
+    cull: float | None = None
+    """n·v below which players leave Gaussians out, -1 to draw all; by default what is found not to show, in views all
+    around --motion or around random poses"""
     target_ms: float | None = None
     """find the file that looks best among those that take this long a frame on this machine"""
     min_psnr: float | None = None
@@ -69,7 +72,7 @@ SEARCHES = ("size", "hdr", "hdr_up", "capture", "json")
 """options that say how a bound's search goes"""
 CHOICES = (
     "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
-    "visibility_degree",
+    "visibility_degree", "cull",
 )  # fmt: skip
 """options that say what a file leaves out, which a search finds by itself"""
 
@@ -92,13 +95,18 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
+    from rnd_runtime.avatar_file import read_advice
     from rnd_runtime.capture import capture_file
     from rnd_runtime.files import existing_file, output_file, refuse_input
     from rnd_runtime.motion import load_motion
+    from rnd_runtime.onnx_parts import OnnxFile
     from rnd_trainer.checkpoint import load_checkpoint
     from rnd_trainer.notes import say_notes
 
     check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
+    check_option(
+        options.cull is None or -1 <= options.cull <= 1, "--cull", "a cosine, from -1 to 1", options.cull
+    )
     check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}
@@ -129,7 +137,7 @@ def _export(options: Options) -> None:
 
         export_bounded(options, checkpoint, out, motion, given)
         return
-    variant = Variant(**{name: getattr(options, name) for name in CHOICES})
+    variant = Variant(**{name: getattr(options, name) for name in CHOICES if name != "cull"})
     if options.target == "visionary":
         from .visionary import export_visionary
 
@@ -138,12 +146,18 @@ def _export(options: Options) -> None:
         for line in export_visionary(checkpoint, out, motion, options.motion, variant, *light):
             print(line)  # noqa: T201
         return
-    drift = export(checkpoint, out, motion, variant)
+    drift = export(checkpoint, out, motion, variant, cull=options.cull)
+    cull = read_advice(OnnxFile(out.read_bytes())).cull
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "
         f"weights {drift.weights:.1e}, positions {1e3 * drift.position_m:.4f} mm, "
         f"99 % within {1e3 * drift.position_p99_m:.4f} mm, "
-        f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}"
+        f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}; "
+        + (
+            "players draw all of it"
+            if cull is None
+            else f"players leave out what faces away (n·v < {cull:g})"
+        )
     )
 
 
@@ -155,6 +169,7 @@ def _refuse_idle(options: Options, *, bounded: bool) -> None:
         refuse_changed(options, ("target",), "a bound is for avatars")
     elif options.target == "visionary":
         check_option(options.motion is not None, "--target visionary", "a --motion to bake in", "none")
+        refuse_changed(options, ("cull",), "is for avatars: a clip shows all of its Gaussians")
         refuse_changed(options, [name for name in SEARCHES if not name.startswith("hdr")], f"needs {bounds}")
     else:
         refuse_changed(options, SEARCHES, f"needs {bounds}")

@@ -34,6 +34,7 @@ from rnd_trainer.checkpoint import Checkpoint
 from rnd_trainer.data import pose_input
 
 from .bake import BakedAvatar, bake
+from .culling import advise, advised_cull
 from .graph import build_model
 from .places import gaussians_by_place, moving_sites, nodes_by_place
 from .variant import Variant, reduced
@@ -69,9 +70,17 @@ class Drift:
 
 
 def export(
-    checkpoint: Checkpoint, out: Path, motion: Motion | None = None, variant: Variant | None = None
+    checkpoint: Checkpoint,
+    out: Path,
+    motion: Motion | None = None,
+    variant: Variant | None = None,
+    *,
+    cull: float | None = None,
 ) -> Drift:
     """Write ``out``, a name in .onnx; how far it is from torch over ``motion``, by default 120 random frames.
+
+    ``cull`` is what the file tells players to leave out of the back: a cosine, −1 for nothing, by default what is found
+    not to show along ``motion`` (:func:`advised_cull`).
 
     Raises :class:`InputError`, leaving nothing under ``out``, when the difference exceeds what the variant's
     precision allows. What ``coarse``, ``static`` and the like give up is meant: it is measured, not bounded.
@@ -86,7 +95,8 @@ def export(
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
     with atomic_path(out) as temporary:
         onnx.save_model(model, str(temporary))
-        drift = measure_drift(Avatar.load(temporary), checkpoint, motion, baked.rows)
+        avatar = Avatar.load(temporary)
+        drift = measure_drift(avatar, checkpoint, motion, baked.rows)
         if not np.isfinite(dataclasses.astuple(drift)).all():
             raise InputError(
                 "export refused: places", expected="finite numbers", got="NaN or infinity", file=out
@@ -97,6 +107,8 @@ def export(
                     f"export refused: {what} of onnxruntime and torch differ",
                     expected=f"at most {bound:g}", got=f"{got:.3g}", file=out,
                 )  # fmt: skip
+        advise(model, advised_cull(avatar, motion) if cull is None else cull)
+        onnx.save_model(model, str(temporary))
     return drift
 
 

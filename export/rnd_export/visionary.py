@@ -44,7 +44,7 @@ def export_visionary(
     """
     with tempfile.TemporaryDirectory() as folder:
         avatar = Path(folder) / "avatar.onnx"
-        export(checkpoint, avatar, motion, variant)
+        export(checkpoint, avatar, motion, variant, cull=-1)
         gaussians = read_metadata(OnnxFile(avatar.read_bytes())).gaussians
         check_clip(motion.frame_count, gaussians, "frames of --motion", PART)
         inputs = {"avatar": avatar, "motion": motion_file, "hdr": hdr, "hdr_up": hdr_up}

@@ -23,6 +23,7 @@ from .avatar_file import (
     check_shapes,
     decode_light,
     first_line,
+    read_advice,
     read_metadata,
 )
 from .brdf import LARGEST_ALBEDO
@@ -62,7 +63,7 @@ class Avatar:
     Attributes:
         skeleton: its joint tree. window_poses, window_seconds: the motion window. gaussians: N.
         spacing: mean distance between Gaussians, m. trained_light: [32, 64, 3] linear radiance.
-        metadata: everything the file says of itself.
+        metadata: everything the file says of itself. advice: how it may be played.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Avatar:
     ) -> None:
         self._file, self._threads, self._path = file, threads or os.cpu_count() or 1, path
         self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
-        self.metadata = metadata
+        self.metadata, self.advice = metadata, read_advice(file)
         self.trained_light = trained_light
         tree = metadata.skeleton
         self.skeleton = Skeleton(

@@ -14,7 +14,8 @@ input                   shape         meaning
 Outputs are ``means`` [N, 3], ``covariances`` [N, 6], ``normals`` [N, 3], ``visibility`` [N, 16] and
 ``skinning_weights`` [N, J], and the constants ``opacities`` [N], ``albedo`` [N, 3] and ``roughness`` [N]; see
 :class:`rnd_runtime.gaussians.Gaussians` for units and frames. Metadata is JSON under ``rnd_avatar`` in the
-model's ``metadata_props``: :class:`AvatarMetadata`.
+model's ``metadata_props``: :class:`AvatarMetadata`. What a player may do to be faster, JSON under ``rnd_player``, is
+advice: :class:`PlayerAdvice`.
 
 That is the whole avatar for any ONNX runtime. For ours, which poses faster than a graph does, a file also names what
 stands between its networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
@@ -40,6 +41,7 @@ from .onnx_parts import OnnxFile
 
 SCHEMA = "rnd-avatar/1"
 METADATA_KEY = "rnd_avatar"
+ADVICE_KEY = "rnd_player"
 PROBE_SHAPE = (32, 64, 3)
 EncoderKind = Literal["full", "coarse", "static"]
 Precision = Literal["f32", "f16", "int8"]
@@ -101,6 +103,25 @@ class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     conventions: str
     generator: str
     variant: VariantMetadata = VariantMetadata()
+
+
+class PlayerAdvice(msgspec.Struct, frozen=True):
+    """How the exporter found that the avatar may be played. A reader may leave any of it alone, fields it does not know
+    among them.
+
+    ``cull``: n·v below which a Gaussian is not missed, see :func:`rnd_runtime.in_view.in_view`; None where none may be
+    left out.
+    """
+
+    cull: Annotated[float, msgspec.Meta(ge=-1, le=1)] | None = None
+
+
+def read_advice(file: OnnxFile) -> PlayerAdvice:
+    """What ``file`` says of how it may be played; nothing where it is of before there was any."""
+    try:
+        return msgspec.json.decode(file.metadata.get(ADVICE_KEY, "{}").encode(), type=PlayerAdvice)
+    except msgspec.DecodeError as error:
+        raise InputError(f"metadata {ADVICE_KEY!r}", got=first_line(error)) from error
 
 
 def read_metadata(file: OnnxFile) -> AvatarMetadata:

@@ -57,8 +57,8 @@ class FrameRenderer:
         camera: the view; assign ``renderer.camera`` to move it between frames.
         shade: one of :data:`rnd_runtime.shading.SHADE_MODES`.
         raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see :func:`rnd_runtime.raster.make_rasterizer`.
-        cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5. What that costs
-            stands in :func:`rnd_runtime.in_view.in_view`; by default all are drawn.
+        cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5; −1 draws all. What
+            that costs stands in :func:`rnd_runtime.in_view.in_view`. By default as the avatar's file advises.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class FrameRenderer:
         raster: Kind = "cpu",
         cull: float | None = None,
     ) -> None:
-        self.avatar, self.camera, self.cull = avatar, camera, cull
+        self.avatar, self.camera, self.cull = avatar, camera, chosen_cull(avatar, cull)
         self._shader = Shader(light, shade)
         self._rasterizer = make_rasterizer(raster)
 
@@ -102,6 +102,12 @@ class FrameRenderer:
     def close(self) -> None:
         """Release the rasteriser."""
         self._rasterizer.close()
+
+
+def chosen_cull(avatar: Avatar, cull: float | None) -> float | None:
+    """For :func:`draw`, of what a player was asked for: None is what ``avatar``'s file advises, −1 to draw all."""
+    chosen = avatar.advice.cull if cull is None else cull
+    return None if chosen is None or chosen <= -1 else chosen
 
 
 def draw_encoded(
@@ -145,9 +151,9 @@ def draw(
 ) -> Raster:
     """Shade what can be seen, splat it and sharpen outlines: linear radiance [H, W, 3], without depth.
 
-    ``cull`` as of :class:`FrameRenderer`. With ``kept``, only Gaussians are shaded that were not seen since it was
-    made. The raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept``
-    radiance, which is the CPU's.
+    ``cull`` as of :func:`in_view`. With ``kept``, only Gaussians are shaded that were not seen since it was made. The
+    raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept`` radiance,
+    which is the CPU's.
     """
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)

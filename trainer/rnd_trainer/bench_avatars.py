@@ -89,6 +89,8 @@ def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
             str(out),
             "--frames",
             "2",
+            "--cull",
+            "-1",
             *words,
         ]
         done = subprocess.run(line, capture_output=True, text=True, check=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -75,7 +76,7 @@ def _raster(options: Raster) -> None:
 
 
 def _frame(options: Frame) -> None:
-    _prepare(options, "n", "size", "threads")
+    _prepare(options, "n", "size", "threads", "runs")
     check_option(
         options.cull is None or -1 <= options.cull <= 1, "--cull", "a cosine, from -1 to 1", options.cull
     )
@@ -90,12 +91,21 @@ def _frame(options: Frame) -> None:
         options.n, options.size, options.shade, options.encoder, options.window, options.precision,
         options.raster, options.threads, options.cull, options.scene,
     )  # fmt: skip
-    row = measured(setting, _inputs(options.files), seconds=6.0, compare=options.compare, file=options.avatar)
-    _write(options.json, row)  # before anything is printed: who reads it may stop reading
-    console = Console()
-    print_plain(console, _line(row))
-    for name, milliseconds in row["stages"].items():
-        console.print(f"  {name:16} {milliseconds:6.2f} ms")
+    inputs, console, rows = _inputs(options.files), Console(), []
+    for _ in range(options.runs):
+        row = measured(setting, inputs, seconds=6.0, compare=options.compare, file=options.avatar)
+        rows.append(row)
+        # before anything is printed: who reads it may stop reading
+        _write(options.json, rows if options.runs > 1 else row)
+        print_plain(console, _line(row))
+        for name, milliseconds in row["stages"].items():
+            console.print(f"  {name:16} {milliseconds:6.2f} ms")
+    if options.runs > 1:
+        for name, what in {"ms_median": "median", "ms_p95": "p95", "cold_start_ms": "cold start"}.items():
+            values = sorted(row[name] for row in rows)
+            middle = statistics.median(values)
+            spread = f"{values[0]:.1f} to {values[-1]:.1f} ms, in the middle {middle:.1f}"
+            console.print(f"{what} of {len(rows)} runs: {spread}")
 
 
 def _grid(options: Grid) -> None:

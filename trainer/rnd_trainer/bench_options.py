@@ -54,7 +54,9 @@ class Frame:
     """One point: a frame from pose to pixels, all stages, with its error against the full reference."""
 
     json: Path | None = None
-    """write the row here"""
+    """write the row here, a list of them with --runs"""
+    runs: int = 1
+    """measure so many times, each in a process of its own: a shared machine is not as fast in every minute"""
     n: int = 30_000
     """Gaussians"""
     size: int = 512
@@ -73,7 +75,8 @@ class Frame:
     threads: int = field(default_factory=_two_at_most)
     """of onnxruntime and of the kernels; by default two, where there are two cores"""
     cull: float | None = None
-    """leave out Gaussians whose n·v is below this cosine, such as -0.5: the back of the body; by default none"""
+    """leave out Gaussians whose n·v is below this cosine, such as -0.5: the back of the body; by default none, but what
+    --avatar says"""
     scene: SceneName = "usual"
     """the walk under the light of --hdr, or what is hardest"""
     compare: bool = True

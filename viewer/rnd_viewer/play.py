@@ -237,6 +237,7 @@ class _Run:
             "fps": self.fps,
             "size": [camera.width, camera.height],
             "raster": raster,
+            "cull": self.player.cull,
             "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
             "notes": self.notes,
             "times": summary,

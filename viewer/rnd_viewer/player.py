@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import KeptRadiance, as_seen_from, draw, draw_encoded
+from rnd_runtime.frame import KeptRadiance, as_seen_from, chosen_cull, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light
@@ -75,7 +75,7 @@ class Player:
     """An avatar under a light, ready to be rendered at any time of any motion from any camera.
 
     Frames depend on nothing but the arguments of :meth:`render` and on :meth:`turn`. ``times`` collects how long each
-    stage took; ``cull`` is that of :class:`rnd_runtime.frame.FrameRenderer`.
+    stage took; ``cull`` is that of :class:`rnd_runtime.frame.FrameRenderer`, by default the avatar's own.
     """
 
     avatar: Avatar
@@ -88,6 +88,9 @@ class Player:
     cull: float | None = None
     _behind: tuple[Camera, Floats32] | None = field(default=None, init=False, repr=False)
     _kept: tuple[KeptRadiance, int] | None = field(default=None, init=False, repr=False)  # and its frames
+
+    def __post_init__(self) -> None:
+        self.cull = chosen_cull(self.avatar, self.cull)
 
     def turn(self, yaw: float) -> None:
         """Turn the light to ``yaw`` radians (as :class:`Light`) from the next :meth:`draw` on; no table is built."""

@@ -17,8 +17,9 @@ from rnd_runtime.camera import Camera, Floats
 from rnd_runtime.capture import Capture, load_capture
 from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
-from rnd_runtime.frame import as_seen_from, draw
+from rnd_runtime.frame import as_seen_from, chosen_cull, draw
 from rnd_runtime.gaussians import Gaussians, Raster
+from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light, downsize, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.motion_edit import edit_motion
@@ -67,6 +68,7 @@ class Scene:
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
         self.rasterizer = make_rasterizer(options.raster)
+        self._cull = chosen_cull(self.avatar, None)
         self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
@@ -124,9 +126,7 @@ class Scene:
         if state.output in ("lit", "light"):
             raster = self._draw_lit(state, gaussians, shader, beside)
         else:
-            features = splat_features((state.output,), gaussians, beside)[0].astype(np.float32)
-            arrays = gaussians.means, gaussians.covariances, gaussians.opacities
-            raster = sharpened(self.rasterizer(*arrays, features, beside, depth=False))
+            raster = self._draw_material(state.output, gaussians, beside)
         started = perf_counter()
         if state.output in ("lit", "light", "albedo"):
             srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))
@@ -209,10 +209,17 @@ class Scene:
     def _draw_lit(self, state: ViewState, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
         if state.output == "light":
             gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
-        raster = draw(gaussians, shader, camera, self.rasterizer)
+        raster = draw(gaussians, shader, camera, self.rasterizer, cull=self._cull)
         if state.exposure == 0:
             return raster
         return replace(raster, image=raster.image * np.float32(2.0**state.exposure))
+
+    def _draw_material(self, output: str, gaussians: Gaussians, camera: Camera) -> Raster:
+        features = splat_features((output,), gaussians, camera)[0].astype(np.float32)
+        means, covariances, opacities = gaussians.means, gaussians.covariances, gaussians.opacities
+        seen = in_view(means, covariances, opacities, camera, normals=gaussians.normals, cull=self._cull)
+        opacities = np.where(seen, opacities, np.float32(0))
+        return sharpened(self.rasterizer(means, covariances, opacities, features, camera, depth=False))
 
     def _light_name(self, state: ViewState) -> str | Path | None:
         """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""

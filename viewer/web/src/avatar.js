@@ -26,6 +26,8 @@ const FIELDS = {
 };
 const DEFAULTED = ["variant", ...Object.keys(FIELDS.variant)];
 
+const EVERYTHING = -2;  // n·v that nothing is below
+
 export class Avatar {
   /** Read the file; throws with a reason when it is no avatar of ours. */
   static async load(bytes, name) {
@@ -39,6 +41,7 @@ export class Avatar {
     ort.env.wasm.numThreads = globalThis.crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, 4) : 1;
     const avatar = new Avatar();
     avatar.name = name;
+    avatar.cull = advisedCull(file);
     avatar.gaussians = about.gaussians;
     avatar.windowPoses = about.window_poses;
     avatar.windowSeconds = about.window_seconds;
@@ -84,6 +87,14 @@ export class Avatar {
     const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
     return { count, ...Object.fromEntries(POSED.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, joints };
   }
+}
+
+/** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar_file.py). */
+function advisedCull(file) {
+  const cull = JSON.parse(file.metadata.get("rnd_player") ?? "{}").cull ?? -1;
+  if (!(typeof cull === "number" && cull >= -1 && cull <= 1))
+    throw refusal("metadata 'rnd_player'", { expected: "cull: -1 to 1", got: JSON.stringify(cull) });
+  return cull > -1 ? cull : EVERYTHING;
 }
 
 /** A session that makes `outputs` of `file` and no more, and the names of its inputs. */

@@ -10,10 +10,11 @@ const RADIX = 11, DIGITS = 1 << RADIX;
 /**
  * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
  * front to back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
- * A Gaussian with a number that is not finite, or of no extent, is not drawn: NaN fails every guard.
+ * A Gaussian with a number that is not finite, or of no extent, is not drawn: NaN fails every guard. Nor is one whose n·v
+ * is below `cull` (rnd_runtime/in_view.py).
  */
-export function project({ means, covariances, opacities }, count, features, camera, grown) {
-  const { rotation: r, translation: t, focal, width, height } = camera;
+export function project({ means, covariances, opacities, normals }, count, features, camera, grown, cull) {
+  const { rotation: r, translation: t, position: eye, focal, width, height } = camera;
   const limitX = (0.5 + MARGIN * 0.5) * width / focal, limitY = (0.5 + MARGIN * 0.5) * height / focal;
   const records = new Float32Array(wholeRows(count, ROW_GAUSSIANS) * TEXELS * 4);
   const boxes = new Int32Array(4 * count), depths = new Float64Array(count), drawn = new Int32Array(count);
@@ -24,6 +25,9 @@ export function project({ means, covariances, opacities }, count, features, came
     const z = r[6] * mx + r[7] * my + r[8] * mz + t[2];
     const trace = covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5];
     if (!(z >= NEAR && z < Infinity && opacity >= 1 / 255 && opacity < Infinity && trace > 0 && trace < Infinity)) continue;
+    const awayX = eye[0] - mx, awayY = eye[1] - my, awayZ = eye[2] - mz;
+    const along = awayX * normals[3 * i] + awayY * normals[3 * i + 1] + awayZ * normals[3 * i + 2];
+    if (along < cull * Math.sqrt(awayX * awayX + awayY * awayY + awayZ * awayZ)) continue;
     const slopeX = Math.min(Math.max(x / z, -limitX), limitX), slopeY = Math.min(Math.max(y / z, -limitY), limitY);
     const scale = focal / z;
     const a0 = scale * (r[0] - slopeX * r[6]), a1 = scale * (r[1] - slopeX * r[7]), a2 = scale * (r[2] - slopeX * r[8]);

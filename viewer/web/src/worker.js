@@ -86,7 +86,7 @@ async function render({ number, state }) {
   const features = state.output === "lit" || state.output === "light"
     ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
-  const records = project(gaussians, count, features, beside, grown);
+  const records = project(gaussians, count, features, beside, grown, avatar.cull);
   clock("sorting");
   if (splatter.isLost()) {  // the driver was reset; what a canvas without its context shows is blank
     splatter = new Splatter();
