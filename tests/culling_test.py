@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 
+from rnd_export.cli import main
 from rnd_export.culling import COSINES, MOST_DIFFERENT, SIZE, advise, advised_cull
 from rnd_export.export import export, random_motion
 from rnd_export.shots import shots_around
@@ -18,6 +19,7 @@ from rnd_runtime.avatar_file import ADVICE_KEY, PlayerAdvice
 from rnd_runtime.camera import Camera
 from rnd_runtime.errors import InputError
 from rnd_runtime.frame import FrameRenderer
+from rnd_runtime.kernels import COMPILING
 from rnd_runtime.light import Light
 from rnd_runtime.motion import load_motion
 from rnd_runtime.raster import make_rasterizer
@@ -87,6 +89,21 @@ def test_the_exporter_writes_what_it_found_or_what_it_was_told(tiny_checkpoint, 
     assert advice.cull in said or (cull is None and advice.cull is None)
     keys = [entry.key for entry in onnx.load(tmp_path / "a.onnx").metadata_props]
     assert (ADVICE_KEY in keys) == (advice.cull is not None)
+
+
+def test_the_command_says_what_it_writes_and_that_kernels_are_compiled(
+    tiny_checkpoint, tmp_path, monkeypatch, capsys
+) -> None:
+    out = tmp_path / "a.onnx"
+    monkeypatch.setattr("rnd_runtime.kernels.kernels_are_cold", lambda: True)
+    words = ["rnd-export", str(tiny_checkpoint), "--out", str(out), "--frames", "2", "--cull", "-0.3"]
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr()
+    assert not end.value.code and Avatar.load(out).advice.cull == -0.3
+    assert "players leave out what faces away (n·v < -0.3)" in said.out
+    assert said.err.splitlines() == [f"rnd-export: {COMPILING}"]
 
 
 def test_players_follow_it_unless_they_are_told_otherwise(advised) -> None:

@@ -111,6 +111,7 @@ def site(tmp_path_factory) -> Path:
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
     _write_advice(folder / "advised.onnx", '{"cull": -0.2}')
     _write_advice(folder / "misled.onnx", '{"cull": 3}')
+    _write_advice(folder / "nothing.onnx", "null")
     _write_avatar(folder / "other.onnx", _raise_and_dim)
     _write_avatar(folder / "stranger.onnx", _rename)
     _write_avatar(folder / "later.onnx", lambda about: about.update(hair=1))
@@ -612,7 +613,8 @@ def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_
     [
         ("torn.onnx", "torn.onnx: the .onnx file is cut short"),
         ("later.onnx", "later.onnx: metadata: got unknown field `hair`"),
-        ("misled.onnx", "misled.onnx: metadata 'rnd_player': expected cull: -1 to 1, got 3"),
+        ("misled.onnx", "metadata 'rnd_player': expected an object whose cull is -1 to 1, got {"),
+        ("nothing.onnx", "metadata 'rnd_player': expected an object whose cull is -1 to 1, got null"),
         ("joined.onnx", "joined.onnx: metadata.skeleton: got no field `parents`"),
         ("torn.hdr", "torn.hdr: the .hdr file is cut short"),
         ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),

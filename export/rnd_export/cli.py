@@ -98,6 +98,7 @@ def _export(options: Options) -> None:
     from rnd_runtime.avatar_file import read_advice
     from rnd_runtime.capture import capture_file
     from rnd_runtime.files import existing_file, output_file, refuse_input
+    from rnd_runtime.kernels import COMPILING, kernels_are_cold
     from rnd_runtime.motion import load_motion
     from rnd_runtime.onnx_parts import OnnxFile
     from rnd_trainer.checkpoint import load_checkpoint
@@ -127,6 +128,8 @@ def _export(options: Options) -> None:
     checkpoint = load_checkpoint(file)
     if note := checkpoint.note():
         print(f"rnd-export: {note}", file=sys.stderr)  # noqa: T201
+    if kernels_are_cold():
+        print(f"rnd-export: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
     if options.motion is not None:
         motion = load_motion(options.motion, checkpoint.skeleton)
         say_notes("rnd-export", motion.notes)

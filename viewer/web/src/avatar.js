@@ -91,9 +91,9 @@ export class Avatar {
 
 /** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar_file.py). */
 function advisedCull(file) {
-  const cull = JSON.parse(file.metadata.get("rnd_player") ?? "{}").cull ?? -1;
-  if (!(typeof cull === "number" && cull >= -1 && cull <= 1))
-    throw refusal("metadata 'rnd_player'", { expected: "cull: -1 to 1", got: JSON.stringify(cull) });
+  const advice = JSON.parse(file.metadata.get("rnd_player") ?? "{}"), cull = advice?.cull ?? -1;
+  if (advice?.constructor !== Object || !(typeof cull === "number" && cull >= -1 && cull <= 1))
+    throw refusal("metadata 'rnd_player'", { expected: "an object whose cull is -1 to 1", got: JSON.stringify(advice) });
   return cull > -1 ? cull : EVERYTHING;
 }
 
