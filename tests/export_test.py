@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -17,7 +18,6 @@ from rnd_export.export import (
     MAX_P99_M,
     MAX_POSITION_ERROR_M,
     MAX_WEIGHT_ERROR,
-    export,
     measure_drift,
     random_motion,
     written,
@@ -36,6 +36,8 @@ from rnd_trainer.data import pose_input
 from rnd_trainer.model import AvatarModel
 from rnd_trainer.template import along_curve, node_interpolation, sample_template
 from tiny import body, motion
+
+export = functools.partial(exports.export, cull=-1)  # tests/culling_test.py is about the other part
 
 
 def test_onnxruntime_says_what_torch_says(tiny_avatar, tiny_checkpoint) -> None:
@@ -69,7 +71,7 @@ def test_neighbours_on_the_body_are_neighbours_in_the_file(tiny_avatar, tiny_che
 
 
 def test_the_same_checkpoint_gives_the_same_bytes(tiny_avatar, tiny_checkpoint, tmp_path) -> None:
-    export(load_checkpoint(tiny_checkpoint), tmp_path / "again.onnx")
+    exports.export(load_checkpoint(tiny_checkpoint), tmp_path / "again.onnx")
     assert (tmp_path / "again.onnx").read_bytes() == tiny_avatar.read_bytes()
 
 
