@@ -72,7 +72,7 @@ SEARCHES = ("size", "hdr", "hdr_up", "capture", "json")
 """options that say how a bound's search goes"""
 CHOICES = (
     "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
-    "visibility_degree", "cull",
+    "visibility_degree",
 )  # fmt: skip
 """options that say what a file leaves out, which a search finds by itself"""
 
@@ -95,12 +95,11 @@ def _export(options: Options) -> None:
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
-    from rnd_runtime.avatar_file import read_advice
+    from rnd_runtime.avatar_file import advice_of
     from rnd_runtime.capture import capture_file
     from rnd_runtime.files import existing_file, output_file, refuse_input
     from rnd_runtime.kernels import COMPILING, kernels_are_cold
     from rnd_runtime.motion import load_motion
-    from rnd_runtime.onnx_parts import OnnxFile
     from rnd_trainer.checkpoint import load_checkpoint
     from rnd_trainer.notes import say_notes
 
@@ -140,7 +139,7 @@ def _export(options: Options) -> None:
 
         export_bounded(options, checkpoint, out, motion, given)
         return
-    variant = Variant(**{name: getattr(options, name) for name in CHOICES if name != "cull"})
+    variant = Variant(**{name: getattr(options, name) for name in CHOICES})
     if options.target == "visionary":
         from .visionary import export_visionary
 
@@ -150,7 +149,7 @@ def _export(options: Options) -> None:
             print(line)  # noqa: T201
         return
     drift = export(checkpoint, out, motion, variant, cull=options.cull)
-    cull = read_advice(OnnxFile(out.read_bytes())).cull
+    cull = advice_of(out).cull
     print(  # noqa: T201
         f"{out}: {out.stat().st_size / 1e6:.2f} MB; against torch over {drift.frames} frames: "
         f"weights {drift.weights:.1e}, positions {1e3 * drift.position_m:.4f} mm, "
@@ -168,7 +167,7 @@ def _refuse_idle(options: Options, *, bounded: bool) -> None:
     """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
     bounds = " or ".join(map(flag, BOUNDS.values()))
     if bounded:
-        refuse_changed(options, CHOICES, "a bound finds this by itself")
+        refuse_changed(options, (*CHOICES, "cull"), "a bound finds this by itself")
         refuse_changed(options, ("target",), "a bound is for avatars")
     elif options.target == "visionary":
         check_option(options.motion is not None, "--target visionary", "a --motion to bake in", "none")

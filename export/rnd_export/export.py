@@ -91,6 +91,7 @@ def export(
     baked = gaussians_by_place(bake(checkpoint.model))
     baked = reduced(baked, checkpoint.config.model, variant)
     model = written(checkpoint, baked, variant)
+    advise(model, cull)
     if motion is None:
         motion = random_motion(checkpoint.skeleton, frames=120, seed=0)
     with atomic_path(out) as temporary:
@@ -107,8 +108,9 @@ def export(
                     f"export refused: {what} of onnxruntime and torch differ",
                     expected=f"at most {bound:g}", got=f"{got:.3g}", file=out,
                 )  # fmt: skip
-        advise(model, advised_cull(avatar, motion) if cull is None else cull)
-        onnx.save_model(model, str(temporary))
+        if cull is None:
+            advise(model, advised_cull(avatar, motion))
+            onnx.save_model(model, str(temporary))
     return drift
 
 

@@ -149,6 +149,14 @@ def metadata_of(avatar_file: Path) -> AvatarMetadata:
         raise error.at(file=avatar_file) from error
 
 
+def advice_of(avatar_file: Path) -> PlayerAdvice:
+    """What ``avatar_file`` says of how it may be played. Raises :class:`InputError` naming the file."""
+    try:
+        return read_advice(OnnxFile(avatar_file.read_bytes()))
+    except InputError as error:
+        raise error.at(file=avatar_file) from error
+
+
 class _SchemaOnly(msgspec.Struct):
     schema: str
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from rnd_runtime import __version__
-from rnd_runtime.avatar_file import metadata_of, read_advice
+from rnd_runtime.avatar_file import advice_of, metadata_of
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError, check_option
 from rnd_runtime.files import existing_file, output_folder, sha256_of
-from rnd_runtime.onnx_parts import OnnxFile
 
 from .bench_avatars import Encoders, checkpoint_model, content_key, exported, seeded_checkpoint, sources
 from .bench_frame import Point, measure
@@ -89,7 +88,7 @@ class Inputs:
         for checkpoint in self.checkpoints:
             if sha256_of(checkpoint) == about.checkpoint_sha256:
                 variant, poses = about.variant, about.window_poses
-                cull = read_advice(OnnxFile(file.read_bytes())).cull if setting.cull is None else setting.cull
+                cull = advice_of(file).cull if setting.cull is None else setting.cull
                 changed = replace(
                     setting, n=about.gaussians, encoder=variant.encoder, precision=variant.precision,
                     window=None if poses == checkpoint_model(checkpoint)["window_poses"] else poses,
