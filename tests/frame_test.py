@@ -20,6 +20,7 @@ from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.rotations import axis_angle_to_matrix
 from rnd_runtime.shading import Shader
+from rnd_runtime.tone import tone_map
 
 ASSETS = Path(__file__).parent.parent / "assets"
 LEAST = -0.5  # n·v of what is culled in these tests, as the renderer proposes
@@ -75,6 +76,24 @@ def test_a_frame_is_its_parts(avatar, motion, sky):
     np.testing.assert_array_equal(frame.alpha, expected.alpha)
     np.testing.assert_array_equal(frame.image, to_bytes(linear_to_srgb(expected.image)))
     assert frame.image.max() > 100 and min(frame.stage_seconds.values()) > 0
+
+
+@pytest.mark.parametrize("mode", ["table", "table+sun", "ao", "lights:8"])
+@pytest.mark.parametrize("cull", [None, LEAST])
+def test_one_call_draws_what_its_stages_draw(avatar, motion, sky, mode, cull):
+    """Tables are looked up within one compiled call; the other modes go stage by stage and draw alike."""
+    camera = Camera.look_at([0.2, 1.5, 1.4], [0, 1.3, 0], width=70, height=50, fov_y=0.6)
+    renderer = FrameRenderer(avatar, sky, camera, shade=mode, cull=-1 if cull is None else cull)
+    renderer.turn(0.7)
+    frame, encoded = renderer.render(motion, 0.3), avatar.encode(motion, 0.3)
+    shader, beside = as_seen_from(encoded.root, Shader(sky, mode).turned(0.7), camera)
+    with make_rasterizer("cpu") as cpu:
+        parts = draw(avatar.posed(encoded), shader, beside, cpu, cull=cull)
+    np.testing.assert_array_equal(frame.radiance, parts.image)
+    np.testing.assert_array_equal(frame.alpha, parts.alpha)
+    np.testing.assert_array_equal(frame.image, tone_map(parts.image, parts.alpha))
+    stages = ["motion", "encoders", "posing", "shading", "projection", "sort", "raster", "tone map"]
+    assert list(frame.stage_seconds) == stages
 
 
 def test_turning_the_light_equals_another_light(avatar, motion, sky):

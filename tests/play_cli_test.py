@@ -31,7 +31,7 @@ FRAMES = 6
 @pytest.fixture
 def files(tmp_path, monkeypatch) -> dict[str, Path]:
     """Input files, and an avatar that needs none."""
-    monkeypatch.setattr(rnd_viewer.play.Avatar, "load", lambda path, threads=None: FakeAvatar())
+    monkeypatch.setattr(rnd_viewer.play.Avatar, "load", lambda path, **_: FakeAvatar())
     monkeypatch.setattr(rnd_viewer.play, "kernels_are_cold", lambda: False)  # whatever ran before
     save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
     rng = np.random.default_rng(0)
@@ -150,7 +150,7 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     (tmp_path / "out/frames/mine.png").write_bytes(b"a user's own")
     assert main(_arguments(files, tmp_path / "whole")) == 0
     code = "import sys; sys.path.insert(0, 'tests'); import play_fakes, rnd_viewer.play, rnd_viewer.cli\n"
-    code += "rnd_viewer.play.Avatar.load = lambda path, threads=None: play_fakes.FakeAvatar()\n"
+    code += "rnd_viewer.play.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
     code += "sys.exit(rnd_viewer.cli.main(sys.argv[1:]))"
     parts = [_arguments(files, tmp_path / "out", frames=part) for part in (":2", "2:")]
     root = Path(__file__).parent.parent

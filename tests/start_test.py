@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import gc
 
+import numpy as np
 import pytest
 
+from rnd_runtime.avatar import Avatar
+from rnd_runtime.errors import InputError
 from rnd_runtime.start import quick_start, settle
+from tiny import body, motion
 
 
 @pytest.fixture(autouse=True)
@@ -47,3 +51,20 @@ def test_settling_twice_freezes_once():
         settle()
         assert gc.get_freeze_count() == frozen
         assert len(kept) == 100
+
+
+def test_an_avatars_networks_are_loaded_meanwhile(tiny_avatar):
+    with quick_start(tiny_avatar, 1) as ahead:
+        avatar, alone = Avatar.load(tiny_avatar, ahead=ahead), Avatar.load(tiny_avatar, threads=1)
+    ours, theirs = (each.pose(motion(body()), 0.1) for each in (avatar, alone))
+    np.testing.assert_array_equal(ours.means, theirs.means)
+
+
+def test_what_is_wrong_with_an_avatar_is_told_when_it_is_asked_for(tmp_path):
+    with quick_start(tmp_path / "none.onnx") as ahead, pytest.raises(InputError, match=r"none\.onnx"):
+        Avatar.load(tmp_path / "none.onnx", ahead=ahead)
+
+
+def test_nothing_is_loaded_ahead_for_threads_that_will_be_refused(tiny_avatar):
+    with quick_start(tiny_avatar, 10**6) as ahead:
+        assert ahead is None

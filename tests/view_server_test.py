@@ -76,7 +76,7 @@ def has_ipv6_loopback() -> bool:
 
 @pytest.fixture
 def options(tmp_path, monkeypatch) -> ViewOptions:
-    monkeypatch.setattr(rnd_viewer.view_scene.Avatar, "load", lambda path, threads=None: CountedAvatar())
+    monkeypatch.setattr(rnd_viewer.view_scene.Avatar, "load", lambda path, **_: CountedAvatar())
     save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
     sky = np.random.default_rng(0).uniform(0.2, 1, (16, 32, 3)).astype(np.float32)
     sky[5, 9] = 200  # a sun

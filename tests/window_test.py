@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
-from rnd_runtime.skeleton import SMPL_NAMES
-from rnd_runtime.window import motion_window
+from rnd_runtime.skeleton import SMPL_NAMES, Skeleton, smpl_skeleton
+from rnd_runtime.window import moment, motion_window
 
 POSES, SECONDS = 10, 0.5
 FLOAT32 = 1e-6  # results are float32 of numbers up to 1
@@ -110,3 +111,38 @@ def test_window_of_one_pose_and_of_a_still():
     still = Motion(np.tile(np.eye(3), (1, 3, 1, 1)), np.zeros((1, 3)), 30.0, ("root", "a", "b"))
     window, velocity = motion_window(still, 0.0, poses=3, seconds=0.2)
     assert window.shape == (3, 2, 6) and (velocity == 0).all()
+
+
+def _in_world(bones, root):
+    """[J, 3, 4] of the root's frame, taken to the world."""
+    return root[:3, :3] @ bones + np.pad(root[:3, 3:], ((0, 0), (3, 0)))
+
+
+@pytest.mark.parametrize("time_s", [-1.0, 0.4, 1.23, 9.0])
+@pytest.mark.parametrize("twist", [0.0, 1.9])  # of a wrist, which its forearm shares beyond 60°
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_moment_has_the_bones_and_the_window_of_its_pose(time_s, twist, closed):
+    rng = np.random.default_rng(1)
+    smooth, places = _smooth_motion(24), rng.normal(size=(24, 3))
+    rotations = smooth.rotations.copy()
+    wrist, elbow = (SMPL_NAMES.index(name) for name in ("left_wrist", "left_elbow"))
+    axis = (places[wrist] - places[elbow]) / np.linalg.norm(places[wrist] - places[elbow])
+    rotations[:, wrist] = axis_angle_to_matrix(twist * axis)
+    rotations[:, elbow] = np.eye(3)
+    moved = np.cumsum(rng.normal(0, 0.01, (len(rotations), 3)), 0)
+    motion, skeleton = Motion(rotations, moved, 24.0, SMPL_NAMES, closed=closed), smpl_skeleton(places)
+    got = moment(motion, time_s, skeleton, poses=POSES, seconds=SECONDS)
+    now = motion.at(time_s)
+    expected = skinning_bones(skeleton, now.rotations[0], now.translations[0])
+    assert_allclose(_in_world(got.bones, got.root), expected, atol=5 * FLOAT32)
+    assert (np.abs(expected[elbow] - expected[SMPL_NAMES.index("left_shoulder")]).max() > 0.1) == (twist > 0)
+    assert_allclose(got.bones[0], np.eye(4)[:3], atol=FLOAT32)
+    assert_allclose(got.root[3], [0, 0, 0, 1], atol=0)
+    for ours, alone in zip(got[:2], motion_window(motion, time_s, poses=POSES, seconds=SECONDS)):
+        np.testing.assert_array_equal(ours, alone)
+
+
+def test_a_skeleton_without_arms_has_moments_too():
+    skeleton = Skeleton(("root", "a", "b"), np.array([-1, 0, 1]), np.zeros((3, 3)))
+    got = moment(_spin(0.8), 1.0, skeleton, poses=3, seconds=0.2)
+    assert_allclose(got.bones[1, :, :3], axis_angle_to_matrix([0, 0, 0.8]), atol=FLOAT32)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ._twin import twin
 from .errors import InputError
 
 Floats = NDArray[np.float64]
@@ -64,9 +64,8 @@ class Camera:
 
     def in_frame(self, frame_to_world: Floats) -> Camera:
         """The same view for points in another frame, which ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
-        camera = copy(self)  # what is rigid stays so and need not be looked at again in every frame
-        object.__setattr__(camera, "world_to_camera", self.world_to_camera @ frame_to_world)
-        return camera
+        # what is rigid stays so and need not be looked at again in every frame
+        return twin(self, world_to_camera=self.world_to_camera @ frame_to_world)
 
     @classmethod
     def look_at(

@@ -23,7 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from .rotations import axis_angle_to_matrix
+from .interpolation import turned
 from .skeleton import Skeleton, bone_transforms
 
 Floats = NDArray[np.float64]
@@ -47,16 +47,14 @@ def share_twists(skeleton: Skeleton, rotations: ArrayLike) -> Floats:
     rotations = shared = np.asarray(rotations, np.float64)
     for elbow, wrist, axis, turns in twist_turns(skeleton, rotations):
         if shared is rotations:
-            shared = rotations.copy()
-        turn = axis_angle_to_matrix(turns[..., None] * axis)
-        shared[..., elbow, :, :] @= np.swapaxes(turn, -1, -2)
-        shared[..., wrist, :, :] = turn @ shared[..., wrist, :, :]
+            shared = np.array(rotations, order="C")
+        _turn_all(shared.reshape(-1, *shared.shape[-3:]), elbow, wrist, axis, turns.reshape(-1))
     return shared
 
 
 def twist_turns(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, int, Floats, Floats]]:
     """Of each forearm that shares a twist its elbow, its wrist, u [3] and δ [...] radians; rotations [..., J, 3, 3]."""
-    for elbow, wrist, axis in _forearms(skeleton):
+    for elbow, wrist, axis in forearms(skeleton):
         turns = np.empty(rotations.shape[:-3])
         _shares(rotations.reshape(-1, *rotations.shape[-3:]), elbow, wrist, axis, turns.reshape(-1))
         if turns.any():
@@ -64,7 +62,7 @@ def twist_turns(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, in
 
 
 @lru_cache(maxsize=16)
-def _forearms(skeleton: Skeleton) -> tuple[tuple[int, int, Floats], ...]:
+def forearms(skeleton: Skeleton) -> tuple[tuple[int, int, Floats], ...]:
     """Of each forearm its elbow, its wrist and its axis [3], unit, from one to the other at rest."""
     found = []
     for side in ("left", "right"):
@@ -103,4 +101,31 @@ def _handed_on(rotation, axis):  # type: ignore[no-untyped-def]
 def _shares(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-def]
     """Fill ``turns`` [B] with δ of ``rotations`` [B, J, 3, 3]."""
     for pose in range(len(rotations)):
-        turns[pose] = _handed_on(rotations[pose, elbow], axis) - _handed_on(rotations[pose, wrist], axis)
+        turns[pose] = share(rotations[pose], elbow, wrist, axis)
+
+
+@njit(error_model="numpy")
+def share(rotations, elbow, wrist, axis):  # type: ignore[no-untyped-def]
+    """δ of one pose [J, 3, 3]."""
+    return _handed_on(rotations[elbow], axis) - _handed_on(rotations[wrist], axis)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _turn_all(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-def]
+    for pose in range(len(rotations)):
+        hand_on(rotations[pose], elbow, wrist, axis, turns[pose])
+
+
+@njit(error_model="numpy")
+def hand_on(rotations, elbow, wrist, axis, turn):  # type: ignore[no-untyped-def]
+    """Turn a forearm of one pose [J, 3, 3] by δ."""
+    back = -turn * axis[0], -turn * axis[1], -turn * axis[2]
+    before, after = rotations[elbow].copy(), np.empty((3, 3))
+    turned(before, back, rotations[elbow])
+    for row in range(3):
+        for column in range(3):
+            before[column, row] = rotations[wrist, row, column]
+    turned(before, back, after)
+    for row in range(3):
+        for column in range(3):
+            rotations[wrist, row, column] = after[column, row]

@@ -15,11 +15,11 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from . import raster_cpu
+from . import frame_cpu, raster_cpu
 from .avatar import Avatar, Encoded
 from .camera import Camera, Floats
 from .gaussians import Floats32, Gaussians, Raster, Rasterizer
-from .in_view import in_view
+from .in_view import opacities_of, seen_of
 from .light import Light
 from .motion import Motion
 from .outline import sharpened
@@ -96,7 +96,8 @@ class FrameRenderer:
         )
         started = perf_counter()
         image = tone_map(raster.image, raster.alpha) if raster.srgb is None else raster.srgb
-        seconds = {**encoded.seconds, **raster.seconds, "tone map": perf_counter() - started}
+        seconds = {**encoded.seconds, **raster.seconds}
+        seconds.setdefault("tone map", perf_counter() - started)  # unless that was done where the rest was
         return Frame(image, raster.image, raster.alpha, seconds)
 
     def close(self) -> None:
@@ -119,15 +120,17 @@ def draw_encoded(
     *,
     cull: float | None = None,
 ) -> Raster:
-    """Pose and :func:`draw`: on the device where ``rasterizer`` draws with OpenGL and the avatar's file allows it.
+    """Pose and :func:`draw`: where the avatar's file allows it all on OpenGL's device, or in one call of the CPU's.
 
     The raster's ``seconds`` have "posing" too.
     """
     shader, camera = as_seen_from(encoded.root, shader, camera)
-    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
-        unposed = avatar.unposed(encoded)
-        if unposed is not None:
+    unposed = avatar.unposed(encoded)
+    if unposed is not None and isinstance(rasterizer, ChosenRasterizer):
+        if rasterizer.renderer is not None:
             return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
+        if frame_cpu.draws(shader):
+            return frame_cpu.draw(unposed, shader, camera, cull=cull)
     started = perf_counter()
     gaussians = avatar.posed(encoded)
     posing = perf_counter() - started
@@ -158,16 +161,15 @@ def draw(
     if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
-    means, covariances, opacities = gaussians.means, gaussians.covariances, gaussians.opacities
-    seen = in_view(means, covariances, opacities, camera, normals=gaussians.normals, cull=cull)
+    seen = seen_of(gaussians, camera, cull)
     radiance = _shade(gaussians, shader, camera, seen, kept)
     seconds = {"shading": perf_counter() - started}
     if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
-        arrays = means, covariances, opacities, radiance
+        arrays = gaussians.means, gaussians.covariances, gaussians.opacities, radiance
         raster = raster_cpu.rasterize(*arrays, camera, depth=False, outlines=True, seen=seen)
     else:
-        opacities = np.where(seen, opacities, np.float32(0))
-        raster = sharpened(rasterizer(means, covariances, opacities, radiance, camera, depth=False))
+        arrays = gaussians.means, gaussians.covariances, opacities_of(gaussians, seen), radiance
+        raster = sharpened(rasterizer(*arrays, camera, depth=False))
     return replace(raster, seconds={**seconds, **raster.seconds})
 
 

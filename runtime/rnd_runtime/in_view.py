@@ -12,12 +12,14 @@ from ._lanes import WIDTH, load, load_points, root, store_mask
 from ._raster_input import check_shape, floats
 from ._raster_project import Pinhole, pinhole
 from .camera import Camera
+from .gaussians import Gaussians
 from .raster_oracle import ALPHA_MIN, DILATION, NEAR
 
 # Of α = 1/255 at opacity 1, in standard deviations, and a hundredth for a camera's rotation that is one to 1e-4 only
 REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
 LEAST_OPACITY = np.float32(ALPHA_MIN)
 ZERO = np.float32(0)
+EVERYTHING = np.float32(-1)  # no cosine is below it
 CHUNK = 128 * WIDTH  # Gaussians looked at by a thread at a time
 
 
@@ -48,12 +50,26 @@ def in_view(
     check_shape("means", means, (count, 3))
     check_shape("covariances", covariances, (count, 6))
     check_shape("opacities", opacities, (count,))
-    facing = floats(np.empty((0, 3)) if normals is None or cull is None else normals)
-    check_shape("normals", facing, (count if facing.size else 0, 3))
-    seen = np.empty(count, np.bool_)
-    limits = floats(camera.position), np.float32(-1 if cull is None else cull)
-    _in_view(means, covariances, opacities, facing, limits, pinhole(camera), seen)
+    if normals is None or cull is None:
+        facing, least = means, EVERYTHING
+    else:
+        facing, least = floats(normals), np.float32(cull)
+    check_shape("normals", facing, (count, 3))
+    seen: NDArray[np.bool_] = look(
+        means, covariances, opacities, facing, floats(camera.position), least, pinhole(camera)
+    )
     return seen
+
+
+def seen_of(gaussians: Gaussians, camera: Camera, cull: float | None = None) -> NDArray[np.bool_]:
+    """:func:`in_view` of ``gaussians``."""
+    arrays = gaussians.means, gaussians.covariances, gaussians.opacities
+    return in_view(*arrays, camera, normals=gaussians.normals, cull=cull)
+
+
+def opacities_of(gaussians: Gaussians, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[N]; 0 for what is not ``seen``, so that rasterisers that ask for no mask leave it out."""
+    return np.where(seen, gaussians.opacities, np.float32(0))
 
 
 @njit(inline="always")
@@ -109,7 +125,9 @@ def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _in_view(means, covariances, opacities, normals, limits, view, seen):  # type: ignore[no-untyped-def]
+def look(means, covariances, opacities, normals, eye, least, view):  # type: ignore[no-untyped-def]
+    """:func:`in_view` from ``eye`` [3], where n·v is ``least`` or more; EVERYTHING looks at no normal."""
+    seen = np.empty(len(means), np.bool_)
     sides = np.empty((5, 5), np.float64)
     sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
     sides[1] = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
@@ -118,7 +136,9 @@ def _in_view(means, covariances, opacities, normals, limits, view, seen):  # typ
     sides[4] = _ahead(view)
     arrays = (means, covariances, opacities, normals)
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
-        _look_at(chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen)), arrays, sides, limits, seen)
+        last = min((chunk + 1) * CHUNK, len(seen))
+        _look_at(chunk * CHUNK, last, arrays, sides, (eye, least), seen)
+    return seen
 
 
 @njit(error_model="numpy")
@@ -126,7 +146,7 @@ def _look_at(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyp
     """Fill ``seen`` from ``first``, a whole number of sixteen, up to ``last``."""
     means, covariances, opacities, normals = arrays
     eye, least = limits
-    culling = len(normals) > 0
+    culling = least > EVERYTHING
     # Of most the middle is in the picture: seen sixteen at a time, and rounding may err, for the others are looked at
     a, b, c, d, e = (
         _rounded(sides[0]),

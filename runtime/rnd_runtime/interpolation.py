@@ -42,14 +42,14 @@ def interpolate_rotations(rotations: Floats, place: Floats) -> Floats:
                     result[time, joint, k // 3, k % 3] = a[k // 3, k % 3]
                 continue
             b = rotations[before + 1, joint]
-            _step(a, b, step)
+            step_between(a, b, step)
             for k in range(3):
                 previous[k] = following[k] = step[k]
             if before > 0:
-                _step(rotations[before - 1, joint], a, previous)
+                step_between(rotations[before - 1, joint], a, previous)
             if before + 2 < frames:
-                _step(b, rotations[before + 2, joint], following)
-            _turned(
+                step_between(b, rotations[before + 2, joint], following)
+            turned(
                 a,
                 _hermite(previous, step, following, before > 0, before + 2 < frames, t),
                 result[time, joint],
@@ -88,7 +88,7 @@ def steps(before: Floats, after: Floats) -> Floats:
     """log(Aᵀ B) [J, 3] rad of rotations A [J, 3, 3] ``before`` and B ``after``."""
     result = np.empty((len(before), 3), np.float64)
     for joint in range(len(before)):
-        _step(before[joint], after[joint], result[joint])
+        step_between(before[joint], after[joint], result[joint])
     return result
 
 
@@ -153,7 +153,7 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _step(a, b, out):  # type: ignore[no-untyped-def]
+def step_between(a, b, out):  # type: ignore[no-untyped-def]
     """log(aᵀ b) [3] rad, through the quaternion; see :func:`.rotations.matrix_to_axis_angle`."""
     m00 = a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
     m01 = a[0, 0] * b[0, 1] + a[1, 0] * b[1, 1] + a[2, 0] * b[2, 1]
@@ -179,8 +179,8 @@ def _step(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _turned(a, turn, out):  # type: ignore[no-untyped-def]
-    """out = a · exp(turn)."""
+def turned(a, turn, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with a · exp(turn) [3, 3]; turn: three numbers, rad."""
     x, y, z = turn
     angle = np.sqrt(x * x + y * y + z * z)
     half = 0.5 * angle

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from copy import copy
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._twin import twin
 from .errors import InputError
 from .files import existing_file
 from .images import read_header, read_image
@@ -68,12 +70,10 @@ class Light:
             raise InputError("light up", expected=" or ".join(_TO_Y_UP), got=self.up)
         object.__setattr__(self, "radiance", radiance)
 
-    @property
+    @cached_property
     def rotation(self) -> Floats:
         """[3, 3], light's frame → world."""
-        cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
-        turn: Floats = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
-        return np.asarray(turn @ _TO_Y_UP[self.up])
+        return _rotation(self.yaw, self.up)
 
     @property
     def maximum(self) -> float:
@@ -90,9 +90,7 @@ class Light:
     def turned(self, yaw: float) -> Light:
         """The same light at another ``yaw``; no texel is looked at, so it may be turned in every frame."""
         _check_yaw(yaw)
-        light = copy(self)
-        object.__setattr__(light, "yaw", yaw)
-        return light
+        return twin(self, yaw=yaw, rotation=_rotation(yaw, self.up))
 
     def resized(self, height: int, width: int) -> Light:
         """The same light on another grid, by :func:`downsize`."""
@@ -121,8 +119,14 @@ class Light:
         return np.asarray((1 - t) * upper + t * lower, np.float32)
 
 
+def _rotation(yaw: float, up: Up) -> Floats:
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    turn: Floats = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+    return turn if up == "y" else turn @ _TO_Y_UP[up]
+
+
 def _check_yaw(yaw: float) -> None:
-    if not np.isfinite(yaw):
+    if not math.isfinite(yaw):
         raise InputError("light yaw", expected="finite radians", got=yaw)
 
 

@@ -101,14 +101,16 @@ class Motion:
         Beyond its ends a motion holds its end poses; a closed one goes round. ``fps`` of the result is still that of
         the recording and says nothing about ``times_s``.
         """
+        rotations, translations, place = self.path_at(times_s)
+        poses = interpolate_rotations(rotations, place), interpolate_points(translations, place)
+        return replace(self, rotations=poses[0], translations=poses[1], closed=False)
+
+    def path_at(self, times_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
+        """Rotations [F, J, 3, 3] and translations [F, 3], and where among them the poses of :meth:`at` lie [T]."""
         place = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
         if self.closed:
-            place, path = 1 + place % self.frame_count, self._lap
-        else:
-            place, path = np.clip(place, 0, self.frame_count - 1), (self.rotations, self.translations)
-        rotations = interpolate_rotations(path[0], place)
-        translations = interpolate_points(path[1], place)
-        return replace(self, rotations=rotations, translations=translations, closed=False)
+            return *self._lap, 1 + place % self.frame_count
+        return self.rotations, self.translations, np.minimum(np.maximum(place, 0), self.frame_count - 1)
 
     @cached_property
     def _lap(self) -> tuple[Floats, Floats]:

@@ -48,6 +48,7 @@ from ._lanes import (
     store,
     transpose,
 )
+from ._raster_input import floats
 
 Floats32 = NDArray[np.float32]
 
@@ -125,13 +126,9 @@ class RestPose:
             visibility: [M, S] harmonics, S ≤ 16; what is missing is 0.
             bones: [J, 3, 4] m, rest pose → posed.
         """
-        rest, rows = self.arrays, _bone_rows(bones)
-        fields = self.node_fields(logits, offsets, visibility, bones)
-        count = len(rest.neighbours)
-        posed = Posed(*(np.empty((count, width), np.float32) for width in (3, 6, 3, _HARMONICS)))
-        limits = tuple(np.float32(x) for x in (self.max_offset, self.floor, self.fallback))
-        _pose(fields, rest, rows, limits, posed)
-        return Posed(*(values[: len(self.points)] for values in posed))
+        nodes = self.nodes(logits, offsets, visibility)
+        posed: Posed = pose(self.arrays, nodes, floats(bones), self.limits, len(self.points))
+        return posed
 
     def node_fields(
         self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
@@ -141,13 +138,21 @@ class RestPose:
         Σ_j e^(Δ_j − c) B_j row by row [12], the same without B, c and two zeros; offsets [6] and zeros up to 16;
         visibility [16]; Δ logits with zeros up to C, a whole number of 16.
         """
-        nodes = len(np.asarray(offsets))
-        changes = np.zeros((nodes, self.log_template.shape[1])) if logits is None else logits
-        fields: Floats32 = _node_fields(
-            *(np.require(values, np.float32, ["C", "W"]) for values in (changes, offsets, visibility)),
-            _bone_rows(bones),
-        )
+        fields: Floats32 = _node_fields(*self.nodes(logits, offsets, visibility), _bone_rows(floats(bones)))
         return fields
+
+    def nodes(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike
+    ) -> tuple[Floats32, Floats32, Floats32]:
+        """The networks' outputs as the kernels want them: Δ logits [M, J], which may be None, offsets, visibility."""
+        offsets = floats(offsets)
+        changes = np.zeros((len(offsets), self.log_template.shape[1])) if logits is None else logits
+        return floats(changes), offsets, floats(visibility)
+
+    @cached_property
+    def limits(self) -> tuple[np.float32, np.float32, np.float32]:
+        """Of offsets, of variances, and a normal's share of A_R."""
+        return np.float32(self.max_offset), np.float32(self.floor), np.float32(self.fallback)
 
     @cached_property
     def template(self) -> Template:
@@ -183,14 +188,6 @@ class RestPose:
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
         by_sixteens = own.reshape(-1, WIDTH, _OWN).transpose(0, 2, 1)
         return RestArrays(neighbours, weights, *_slots(self.template, whole), by_sixteens.ravel())
-
-
-def _bone_rows(bones: ArrayLike) -> Floats32:
-    """[J, 16]: of each joint B row by row, a one and zeros."""
-    given = np.asarray(bones, np.float32).reshape(-1, _SUM)
-    rows = np.zeros((len(given), WIDTH), np.float32)
-    rows[:, :_SUM], rows[:, _SUM] = given, _ONE
-    return rows
 
 
 def _slots(template: Template, whole: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
@@ -254,6 +251,30 @@ def _tanh(x):  # type: ignore[no-untyped-def]
     x = select(x > _LARGEST_TANH, _LARGEST_TANH, x)
     x = select(x < -_LARGEST_TANH, -_LARGEST_TANH, x)
     return lanes(_ONE) - lanes(_TWO) / (_exp(x * _TWO) + _ONE)
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def pose(rest, nodes, bones, limits, count):  # type: ignore[no-untyped-def]
+    """The ``count`` Gaussians of ``rest`` :class:`Posed`; arguments as :class:`RestPose` makes them."""
+    logits, offsets, visibility = nodes
+    rows = _bone_rows(bones)
+    fields = _node_fields(logits, offsets, visibility, rows)
+    whole = len(rest.neighbours)
+    means, covariances = np.empty((whole, 3), np.float32), np.empty((whole, 6), np.float32)
+    normals, harmonics = np.empty((whole, 3), np.float32), np.empty((whole, _HARMONICS), np.float32)
+    _pose(fields, rest, rows, limits, Posed(means, covariances, normals, harmonics))
+    return Posed(means[:count], covariances[:count], normals[:count], harmonics[:count])
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def _bone_rows(bones):  # type: ignore[no-untyped-def]
+    """[J, 16]: of each joint B row by row, a one and zeros."""
+    rows = np.zeros((len(bones), WIDTH), np.float32)
+    for j in range(len(bones)):
+        for k in range(_SUM):
+            rows[j, k] = bones[j, k // 4, k % 4]
+        rows[j, _SUM] = _ONE
+    return rows
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")

@@ -87,12 +87,12 @@ def sh_rotation(rotation: ArrayLike) -> Floats:
     M is orthogonal and block-diagonal by degree. Each entry is ∫ Y_i(ω) Y_j(Rᵀω) dω, a polynomial of degree
     6, by a quadrature that is exact up to degree 7, hence right to rounding (1e-14).
     """
-    return np.asarray(_rotation_matrix(*_weighted_basis(), np.array(rotation, np.float64, order="C")))
+    return np.asarray(rotation_matrix(*sh_quadrature(), np.array(rotation, np.float64, order="C")))
 
 
 @cache
-def _weighted_basis() -> tuple[Floats, Floats]:
-    """Directions [32, 3] of the quadrature, and the functions there times its weights [32, 16]."""
+def sh_quadrature() -> tuple[Floats, Floats]:
+    """Of :func:`sh_rotation`: directions [32, 3], and the functions there times their weights [32, 16]."""
     directions, weights = sphere_quadrature(SH_DEGREE + 1)
     return directions, sh_basis(directions) * weights[:, None]
 
@@ -100,9 +100,9 @@ def _weighted_basis() -> tuple[Floats, Floats]:
 compiled_sh_columns = njit(sh_columns)
 
 
-@njit(cache=True)
-def _rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-def]
-    """In numba: every frame needs one, and numpy takes a tenth of a millisecond."""
+@njit(nogil=True, cache=True)
+def rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-def]
+    """:func:`sh_rotation` with its :func:`sh_quadrature`. In numba: every frame needs one, and numpy takes 0.1 ms."""
     matrix = np.zeros((SH_COUNT, SH_COUNT))
     for k in range(len(directions)):
         x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]

@@ -14,15 +14,17 @@ All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_refer
 
 from __future__ import annotations
 
-import copy
 import re
+from functools import cached_property
+from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._raster_input import floats, mask
-from .brdf import ggx32, roughness_to_alpha
+from ._twin import twin
+from .brdf import ROUGHNESS_RANGE, ggx32
 from .errors import InputError
 from .gaussians import Gaussians
 from .light import Light
@@ -48,6 +50,15 @@ TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
 
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-12)
 _ONE_OVER_PI = np.float32(1 / np.pi)
+_ROUGHNESS_LOW, _ROUGHNESS_HIGH = (np.float32(bound) for bound in ROUGHNESS_RANGE)
+
+
+class SunArrays(NamedTuple):
+    """S suns: where they are, what they lay on a surface that faces them, and how wide they are."""
+
+    directions: Floats32  # [S, 3] unit
+    irradiance: Floats32  # [S, 3]
+    spread_squared: Floats32  # [S] rad²
 
 
 class Shader:
@@ -87,16 +98,12 @@ class Shader:
 
     def turned(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
-        shader = copy.copy(self)
-        shader.light = self.light.turned(yaw)
-        shader.light_to_world = shader.light.rotation
-        return shader
+        light = self.light.turned(yaw)
+        return twin(self, light=light, light_to_world=light.rotation)
 
     def in_frame(self, frame_to_world: ArrayLike) -> Shader:
         """The same light for Gaussians in a frame that ``frame_to_world`` [3, 3] turns to the world's axes."""
-        shader = copy.copy(self)
-        shader.light_to_world = np.asarray(frame_to_world, np.float64).T @ self.light.rotation
-        return shader
+        return twin(self, light_to_world=np.asarray(frame_to_world, np.float64).T @ self.light.rotation)
 
     def shade(
         self,
@@ -116,33 +123,38 @@ class Shader:
         seen = mask(seen, len(gaussians.means))
         radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
         if self.suns and len(radiance):
-            directions = np.array([sun.direction for sun in self.suns]) @ light_to_world.T
-            visibility = np.ones((len(radiance), len(directions)), np.float32)
+            suns = self.sun_arrays()
+            visibility = np.ones((len(radiance), len(suns.directions)), np.float32)
             if sun_shadows:
                 visibility = directional_visibility(
                     gaussians.means,
                     gaussians.normals,
-                    directions,
+                    suns.directions,
                     radii=shadow_radii(gaussians),
                     resolution=SHADOW_RESOLUTION,
                     receivers=seen,
                 )
-            _add_suns(
-                floats(gaussians.means),
-                floats(gaussians.normals),
-                floats(gaussians.albedo),
-                floats(roughness_to_alpha(gaussians.roughness)),
-                floats(visibility),
-                np.array(camera_position, np.float32),
-                tuple(np.array(a, np.float32, order="C") for a in (directions, *self._sun_arrays())),
-                seen,
-                radiance,
-            )
+            surfaces = gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness
+            eye = np.array(camera_position, np.float32)
+            add_suns(tuple(floats(a) for a in surfaces), floats(visibility), eye, suns, seen, radiance)
         return radiance
 
-    def _sun_arrays(self) -> tuple[Floats, Floats]:
-        """Irradiance [S, 3] and mean square angle [S]."""
-        return np.array([sun.irradiance for sun in self.suns]), np.array([sun.spread**2 for sun in self.suns])
+    def sun_arrays(self) -> SunArrays:
+        """The suns as kernels want them, in the frame of the Gaussians."""
+        directions, irradiance, spreads = self._suns
+        if not self.suns:
+            return SunArrays(irradiance, irradiance, spreads)
+        turned = directions @ self.light_to_world.T
+        return SunArrays(np.array(turned, np.float32, order="C"), irradiance, spreads)
+
+    @cached_property
+    def _suns(self) -> tuple[Floats, Floats32, Floats32]:
+        """Of the suns what :meth:`sun_arrays` returns, with directions in the light probe's frame."""
+        return (
+            np.array([sun.direction for sun in self.suns]).reshape(-1, 3),
+            np.array([sun.irradiance for sun in self.suns], np.float32).reshape(-1, 3),
+            np.array([sun.spread**2 for sun in self.suns], np.float32),
+        )
 
 
 def check_mode(mode: str) -> None:
@@ -163,23 +175,26 @@ def _light_count(mode: str) -> int:
 
 def shadow_radii(gaussians: Gaussians) -> Floats32:
     """Disc radius [N] m of each Gaussian in a depth map; flat ones have σ² twice in the trace."""
-    radii = np.empty(len(gaussians.means), np.float32)
-    _radii(floats(gaussians.covariances), floats(gaussians.opacities), radii)
+    radii: Floats32 = disc_radii(floats(gaussians.covariances), floats(gaussians.opacities))
     return radii
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _radii(covariances, opacities, radii):  # type: ignore[no-untyped-def]
+def disc_radii(covariances, opacities):  # type: ignore[no-untyped-def]
+    """:func:`shadow_radii` of covariances [N, 6] and opacities [N]."""
+    radii = np.empty(len(opacities), np.float32)
     for i in range(len(radii)):
         trace = covariances[i, 0] + covariances[i, 3] + covariances[i, 5]
         radii[i] = DISC_SIGMAS * np.sqrt(trace / 2) if opacities[i] > CASTING_OPACITY else 0
+    return radii
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, radiance):  # type: ignore[no-untyped-def]
+def add_suns(surfaces, visibility, camera, suns, seen, radiance):  # type: ignore[no-untyped-def]
     """Add what ``suns`` lay on the Gaussians to ``radiance`` [N, 3]. A sun of one texel is a point: see ``sun``."""
     # A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks
     # for α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own.
+    means, normals, albedo, roughness = surfaces
     directions, irradiance, spread_squared = suns
     for i in numba.prange(len(means)):
         if not seen[i]:
@@ -192,6 +207,8 @@ def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, rad
         facing = min((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), _ONE)
         if not facing > _ZERO:
             continue
+        alpha = min(max(roughness[i], _ROUGHNESS_LOW), _ROUGHNESS_HIGH)
+        alpha *= alpha
         for sun in range(len(directions)):
             lx, ly, lz = directions[sun, 0], directions[sun, 1], directions[sun, 2]
             n_dot_l = nx * lx + ny * ly + nz * lz
@@ -204,7 +221,7 @@ def _add_suns(means, normals, albedo, alpha, visibility, camera, suns, seen, rad
             sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
             blur = spread_squared[sun] / np.sqrt(half_squared)
             shine = ggx32(
-                min(alpha[i] * alpha[i] + blur, _ONE),
+                min(alpha * alpha + blur, _ONE),
                 n_dot_l,
                 n_dot_v,
                 sine_squared,

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,7 +24,7 @@ from ._lanes import WIDTH, lanes, load, store, total
 from ._raster_input import floats, mask
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
-from .sh import SH_COUNT, sh_basis, sh_rotation
+from .sh import SH_COUNT, rotation_matrix, sh_basis, sh_quadrature
 from .shading_lookup import DIFFUSE_SIZE, SPECULAR_SIZE, look_up, turned
 from .specular_lobe import LOBE_WIDTHS, lobe_rows
 
@@ -31,6 +32,16 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+class TableArrays(NamedTuple):
+    """What :func:`shade_by_tables` looks up, see :class:`SkyTables`, :func:`lobe_rows` and :func:`sh_quadrature`."""
+
+    diffuse: Floats32  # [33·33, 3·16]
+    specular: Floats32  # [49·49, 7, 16]
+    lobes: Floats32  # [16, 49, 16]
+    directions: Floats  # [32, 3]
+    weighted: Floats  # [32, 16]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +84,23 @@ class SkyTables:
         seen: ArrayLike | None = None,
     ) -> Floats32:
         """Linear radiance [N, 3] towards the camera, close to ``shade_reference``; 0 where not ``seen``."""
-        root_to_light = light_to_world.T @ np.asarray(gaussians.root_rotation, np.float64)
-        radiance = np.zeros((len(gaussians.means), 3), np.float32)
         arrays = (
             gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility,
         )  # fmt: skip
-        diffuse = turned(self.diffuse, sh_rotation(root_to_light).astype(np.float32))
-        look_up(
+        radiance: Floats32 = shade_by_tables(
             tuple(floats(array) for array in arrays),
             np.array(camera_position, np.float32),
-            tuple(np.array(r, np.float32, order="C") for r in (light_to_world, root_to_light)),
-            (diffuse, self.specular_cells, lobe_rows()),
-            mask(seen, len(radiance)),
-            radiance,
+            np.array(light_to_world, np.float64, order="C"),
+            np.array(gaussians.root_rotation, np.float64, order="C"),
+            self.arrays,
+            mask(seen, len(gaussians.means)),
         )
         return radiance
+
+    @cached_property
+    def arrays(self) -> TableArrays:
+        """As the kernel wants them."""
+        return TableArrays(self.diffuse, self.specular_cells, lobe_rows(), *sh_quadrature())
 
     @cached_property
     def specular_cells(self) -> Floats32:
@@ -102,6 +115,22 @@ class SkyTables:
             moved = nodes[:, down:, right:].transpose(1, 2, 0, 3)
             cells[: moved.shape[0], : moved.shape[1], :, corner, :3] = moved
         return cells.reshape(SPECULAR_SIZE * SPECULAR_SIZE, len(nodes), WIDTH)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, seen):  # type: ignore[no-untyped-def]
+    """:meth:`SkyTables.shade` of ``surfaces``: means, normals, albedo, roughness and visibility."""
+    root_to_light = np.zeros((3, 3))
+    for row in range(3):
+        for column in range(3):
+            for k in range(3):
+                root_to_light[row, column] += light_to_world[k, row] * root_rotation[k, column]
+    turn = rotation_matrix(tables.directions, tables.weighted, root_to_light).astype(np.float32)
+    rotations = light_to_world.astype(np.float32), root_to_light.astype(np.float32)
+    radiance = np.zeros((len(seen), 3), np.float32)
+    diffuse = turned(tables.diffuse, turn)
+    look_up(surfaces, camera, rotations, (diffuse, tables.specular, tables.lobes), seen, radiance)
+    return radiance
 
 
 @cache

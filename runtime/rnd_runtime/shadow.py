@@ -78,13 +78,18 @@ def directional_visibility(
         raise InputError("directions of a shadow", expected="[K, 3]", got=directions.shape)
     if not 8 <= resolution <= 8192:
         raise InputError("resolution of a depth map", expected="8 to 8192 texels", got=resolution)
-    disc_radii = np.full(len(points), radii, np.float32)
-    visibility = np.zeros((len(directions), len(points)), np.float32)
-    wanted = mask(receivers, len(points))
-    for direction, row in zip(directions, visibility):
-        arrays = (points, normals, disc_radii, wanted)
-        _one_direction(arrays, axes_towards(direction), resolution, numba.get_num_threads(), row)
-    return visibility.T
+    arrays = points, normals, np.full(len(points), radii, np.float32), mask(receivers, len(points))
+    visibility: Floats32 = cast_shadows(arrays, directions, resolution, numba.get_num_threads())
+    return visibility
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def cast_shadows(arrays, directions, resolution, threads):  # type: ignore[no-untyped-def]
+    """:func:`directional_visibility` [N, K] of points, normals, radii and receivers."""
+    visibility = np.zeros((len(directions), len(arrays[0])), np.float32)
+    for k in range(len(directions)):
+        _one_direction(arrays, axes_towards(directions[k]), resolution, threads, visibility[k])
+    return np.ascontiguousarray(visibility.T)
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")

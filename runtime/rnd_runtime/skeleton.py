@@ -93,7 +93,7 @@ class Skeleton:
         posed = np.zeros((*batch, count, 4, 4))
         posed[..., 3, 3] = 1
         posed[..., 0, :3, 3] = self.rest_joints[0] + translation
-        _chain(
+        chain(
             np.ascontiguousarray(np.broadcast_to(rotations, (*batch, count, 3, 3))).reshape(-1, count, 3, 3),
             self.parents, self.rest_joints, posed.reshape(-1, count, 4, 4),
         )  # fmt: skip
@@ -118,9 +118,8 @@ def bone_transforms(
         translation: [..., 3] m.
     """
     posed = skeleton.joint_transforms(rotations, translation)
-    turn = posed[..., :3, :3]
-    shift = posed[..., :3, 3] - (turn @ skeleton.rest_joints[..., None])[..., 0]
-    return np.concatenate([turn, shift[..., None]], -1).astype(np.float32)
+    bones: NDArray[np.float32] = bones_of(posed.reshape(-1, *posed.shape[-3:]), skeleton.rest_joints)
+    return bones.reshape(*posed.shape[:-2], 3, 4)
 
 
 def taken_along(bones: ArrayLike, motion: Floats) -> NDArray[np.float32]:
@@ -131,7 +130,22 @@ def taken_along(bones: ArrayLike, motion: Floats) -> NDArray[np.float32]:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
+def bones_of(posed, rest_joints):  # type: ignore[no-untyped-def]
+    """:func:`bone_transforms` [B, J, 3, 4] float32 of world transforms [B, J, 4, 4]."""
+    bones = np.empty((*posed.shape[:2], 3, 4), np.float32)
+    for pose in range(posed.shape[0]):
+        for joint in range(posed.shape[1]):
+            for row in range(3):
+                at_rest = 0.0
+                for k in range(3):
+                    bones[pose, joint, row, k] = posed[pose, joint, row, k]
+                    at_rest += posed[pose, joint, row, k] * rest_joints[joint, k]
+                bones[pose, joint, row, 3] = posed[pose, joint, row, 3] - at_rest
+    return bones
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
     """Fill ``posed`` [B, J, 4, 4], whose roots' places and last rows are there, from the root outwards."""
     for pose in range(rotations.shape[0]):
         for k in range(9):

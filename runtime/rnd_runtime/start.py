@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .networks import Networks
 
 
 @contextmanager
-def quick_start() -> Iterator[None]:
+def quick_start(
+    avatar: str | Path | None = None, threads: int | None = None
+) -> Iterator[Future[Networks] | None]:
     """For commands, not for libraries: numba loads without scipy, and no garbage is collected until :func:`settle`.
 
     Loading makes half a million objects that stay, which Python would look through again and again: a tenth of the
     time to the first frame. To be left when the command has ended.
+
+    Args:
+        avatar: a file whose networks are loaded meanwhile, for :meth:`rnd_runtime.avatar.Avatar.load`, which also tells
+            what is wrong with it. threads: of onnxruntime; with more than there are cores nothing is loaded.
     """
     gc.disable()
+    aside = ThreadPoolExecutor(1, "ahead")
     try:
+        sound = threads is None or 1 <= threads <= (os.cpu_count() or 1)
+        ahead = aside.submit(_networks, avatar, threads) if avatar is not None and sound else None
+        aside.shutdown(wait=False)
         _load_numba_without_scipy()
-        yield
+        yield ahead
     finally:
         gc.unfreeze()  # or libraries would report what the interpreter's end does not reach
         gc.enable()
@@ -29,6 +46,12 @@ def settle() -> None:
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
+
+
+def _networks(avatar: str | Path, threads: int | None) -> Networks:
+    from .networks import Networks
+
+    return Networks.load(avatar, threads)
 
 
 def _load_numba_without_scipy() -> None:

@@ -37,7 +37,7 @@ def tone_map(radiance: ArrayLike, alpha: ArrayLike, behind: ArrayLike | None = N
     if background.shape not in ((3,), radiance.shape):
         raise InputError("background", expected=f"[3] or {radiance.shape}", got=background.shape)
     image = np.empty(radiance.shape, np.uint8)
-    _tone_map(radiance, alpha, background.reshape(-1, 3), *_tables(), image)
+    _tone_map(radiance, alpha, background.reshape(-1, 3), *tone_tables(), image)
     return image
 
 
@@ -45,13 +45,13 @@ def tone_map_straight(radiance: ArrayLike, alpha: ArrayLike) -> Bytes:
     """8-bit sRGB and alpha [H, W, 4], not premultiplied, as PNG has it."""
     radiance, alpha = _checked(radiance, alpha)
     image = np.empty((*alpha.shape, 4), np.uint8)
-    _tone_map_straight(radiance, alpha, *_tables(), image)
+    _tone_map_straight(radiance, alpha, *tone_tables(), image)
     return image
 
 
 def code_steps() -> Floats32:
     """The least float32 of every code, and infinity [257]: ``steps[c] <= x < steps[c + 1]`` has the code c."""
-    return _tables()[0]
+    return tone_tables()[0]
 
 
 def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]:
@@ -62,7 +62,7 @@ def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]
 
 
 @cache
-def _tables() -> tuple[Floats32, NDArray[np.uint8]]:
+def tone_tables() -> tuple[Floats32, NDArray[np.uint8]]:
     """:func:`code_steps`, and the code that each cell starts with."""
     codes = np.arange(1, 256)
     low = np.zeros(255, np.int64)  # bits of positive floats are ordered as the floats are
@@ -92,6 +92,15 @@ def _code(x, steps, first):  # type: ignore[no-untyped-def]
 
 
 _START = int(_LOWEST.view(np.int32)) >> _SHIFT
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def tone_map_on_black(radiance, alpha, tables):  # type: ignore[no-untyped-def]
+    """:func:`tone_map` over black, with :func:`tone_tables`."""
+    image = np.empty(radiance.shape, np.uint8)
+    steps, first = tables
+    _tone_map(radiance, alpha, np.zeros((1, 3), np.float32), steps, first, image)
+    return image
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")

@@ -99,19 +99,20 @@ def draw(folder: str, spawned: float) -> None:
     """
     from rnd_runtime.start import quick_start
 
-    with quick_start():  # as rnd-play does
-        _draw(Path(folder), spawned)
+    out = Path(folder)
+    point = Point(**json.loads((out / "point.json").read_text("utf-8")))
+    with quick_start(point.avatar, point.threads) as ahead:  # as rnd-play does
+        _draw(point, out, spawned, ahead)
 
 
-def _draw(out: Path, spawned: float) -> None:
+def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
     from rnd_runtime.avatar import Avatar
     from rnd_runtime.frame import FrameRenderer
     from rnd_runtime.light import load_light
     from rnd_runtime.motion import load_motion
     from rnd_runtime.start import settle
 
-    point = Point(**json.loads((out / "point.json").read_text("utf-8")))
-    avatar = Avatar.load(point.avatar, threads=point.threads)
+    avatar = Avatar.load(point.avatar, threads=point.threads, ahead=ahead)
     motion = load_motion(Path(point.motion), avatar.skeleton)
     light = load_light(Path(point.hdr))
     raster: Any = point.raster

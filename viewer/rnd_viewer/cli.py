@@ -22,10 +22,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
         if options.doctor:
             return _doctor()
-        with quick_start():
+        with quick_start(options.avatar, options.threads) as ahead:
             from .play import play  # here, so that --help and --doctor work where a library does not load
 
-            return play(options)
+            return play(options, ahead)
 
     return run_command("rnd-play", command)
 

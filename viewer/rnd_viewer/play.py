@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from time import perf_counter
@@ -19,6 +20,7 @@ from rnd_runtime.files import is_folder, output_folder
 from rnd_runtime.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.light import light_notes
 from rnd_runtime.motion import Motion, motion_inputs
+from rnd_runtime.networks import Networks
 from rnd_runtime.raster import ChosenRasterizer, make_rasterizer
 from rnd_runtime.shading import Shader
 from rnd_runtime.start import settle
@@ -58,13 +60,16 @@ OWN_TO_A_PROCESS = (
 FILES = ("avatar", "motion", "hdr", "joint_map")  # a run goes by what they are, however their paths are spelt
 
 
-def play(options: PlayOptions) -> int:
+def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
     """Render the run that ``options`` describe into ``options.out`` and print a summary.
+
+    Args:
+        ahead: the avatar's networks, where they are being loaded already.
 
     Raises:
         InputError: for whatever cannot be used; what was finished before stays.
     """
-    played = _Run.of(options)
+    played = _Run.of(options, ahead)
     for note in played.notes:
         warn(note)
     seconds = played.render()
@@ -110,7 +115,7 @@ class _Run:
     in_view: bool = False
 
     @classmethod
-    def of(cls, options: PlayOptions) -> _Run:
+    def of(cls, options: PlayOptions, ahead: Future[Networks] | None) -> _Run:
         """Check the options, the cheap ones first, and load what they name."""
         avatar_file, motion_file, out = _required(options)
         background, aovs = Background.parse(options.background), parse_aovs(options.aov)
@@ -119,7 +124,7 @@ class _Run:
 
         times = StageTimes()
         with times.stage("load"):
-            avatar = Avatar.load(avatar_file, threads=options.threads)
+            avatar = Avatar.load(avatar_file, threads=options.threads, ahead=ahead)
             motion = options.read_motion(motion_file, avatar.skeleton)
             light = chosen_light(
                 avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure

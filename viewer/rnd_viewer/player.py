@@ -12,7 +12,7 @@ from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
 from rnd_runtime.frame import KeptRadiance, as_seen_from, chosen_cull, draw, draw_encoded
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
-from rnd_runtime.in_view import in_view
+from rnd_runtime.in_view import opacities_of, seen_of
 from rnd_runtime.light import Light
 from rnd_runtime.motion import Motion
 from rnd_runtime.outline import sharpened
@@ -155,16 +155,13 @@ class Player:
     def _raster_with_aovs(self, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
         """Radiance, then the AOVs' features, splatted; both are the CPU's."""
         with self.times.stage("shading"):
-            seen = in_view(
-                gaussians.means, gaussians.covariances, gaussians.opacities, camera,
-                normals=gaussians.normals, cull=self.cull,
-            )  # fmt: skip
+            seen = seen_of(gaussians, camera, self.cull)
             radiance = shader.shade(gaussians, camera.position, seen)
             features = np.concatenate([radiance, *splat_features(self.aovs, gaussians, camera)], axis=1)
         raster = self.rasterizer(
             gaussians.means,
             gaussians.covariances,
-            np.where(seen, gaussians.opacities, np.float32(0)),
+            opacities_of(gaussians, seen),
             features.astype(np.float32),
             camera,
             depth="depth" in self.aovs,

@@ -36,7 +36,7 @@ def view(options: ViewOptions) -> int:
     Raises:
         InputError: for whatever cannot be used.
     """
-    with quick_start():
+    with quick_start(options.avatar, options.threads) as ahead:
         from .view_scene import Scene  # here, so that --help works where a library does not load
         from .view_server import load_websockets, serve
 
@@ -45,7 +45,7 @@ def view(options: ViewOptions) -> int:
         console = Console(highlight=False)
         cold = kernels_are_cold()
         with console.status("loading"):
-            scene = Scene(options)
+            scene = Scene(options, ahead)
             if cold:
                 print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
             scene.warm_up()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -19,10 +20,11 @@ from rnd_runtime.errors import InputError
 from rnd_runtime.files import existing_file
 from rnd_runtime.frame import as_seen_from, chosen_cull, draw
 from rnd_runtime.gaussians import Gaussians, Raster
-from rnd_runtime.in_view import in_view
+from rnd_runtime.in_view import opacities_of, seen_of
 from rnd_runtime.light import Light, downsize, light_notes, load_light
 from rnd_runtime.motion import Motion
 from rnd_runtime.motion_edit import edit_motion
+from rnd_runtime.networks import Networks
 from rnd_runtime.outline import sharpened
 from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.shading import Shader
@@ -58,12 +60,15 @@ class Picture:
 class Scene:
     """Loads everything that ``options`` name; renders any :class:`ViewState`, one at a time.
 
+    Args:
+        ahead: the avatar's networks, where they are being loaded already.
+
     Raises:
         InputError: for whatever cannot be used.
     """
 
-    def __init__(self, options: ViewOptions) -> None:
-        self.avatar = Avatar.load(options.avatar, threads=options.threads)
+    def __init__(self, options: ViewOptions, ahead: Future[Networks] | None = None) -> None:
+        self.avatar = Avatar.load(options.avatar, threads=options.threads, ahead=ahead)
         self.capture: Capture | None = load_capture(options.capture) if options.capture else None
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
@@ -216,10 +221,9 @@ class Scene:
 
     def _draw_material(self, output: str, gaussians: Gaussians, camera: Camera) -> Raster:
         features = splat_features((output,), gaussians, camera)[0].astype(np.float32)
-        means, covariances, opacities = gaussians.means, gaussians.covariances, gaussians.opacities
-        seen = in_view(means, covariances, opacities, camera, normals=gaussians.normals, cull=self._cull)
-        opacities = np.where(seen, opacities, np.float32(0))
-        return sharpened(self.rasterizer(means, covariances, opacities, features, camera, depth=False))
+        opacities = opacities_of(gaussians, seen_of(gaussians, camera, self._cull))
+        arrays = gaussians.means, gaussians.covariances, opacities, features
+        return sharpened(self.rasterizer(*arrays, camera, depth=False))
 
     def _light_name(self, state: ViewState) -> str | Path | None:
         """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""

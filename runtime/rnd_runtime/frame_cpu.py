@@ -1,0 +1,109 @@
+"""Frames on the CPU: posed, shaded, splatted and tone mapped in one compiled call.
+
+The kernels are those that the stages have of their own, and so are the pictures, to the bit. What a call of its own
+costs each of them, and what Python does in between with cold caches, is a tenth of a frame.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import get_num_threads, njit
+from numpy.typing import NDArray
+
+from ._clock import now
+from ._raster_input import floats
+from ._raster_pass import splat
+from ._raster_project import pinhole
+from .camera import Camera
+from .gaussians import Floats32, Raster
+from .in_view import look
+from .posing import Unposed, pose
+from .shading import SHADOW_RESOLUTION, Shader, SunArrays, add_suns, disc_radii
+from .shading_tables import SkyTables, TableArrays, shade_by_tables
+from .shadow import cast_shadows
+from .tone import tone_map_on_black, tone_tables
+
+_STAGES = ("posing", "shading", "projection", "sort", "raster", "tone map")
+
+
+class _Material(NamedTuple):
+    """What of N Gaussians no pose changes."""
+
+    opacities: Floats32  # [N]
+    albedo: Floats32  # [N, 3]
+    roughness: Floats32  # [N]
+
+
+class _Light(NamedTuple):
+    """A light as :class:`Shader` has it, in the frame of the bones."""
+
+    to_frame: NDArray[np.float64]  # [3, 3]
+    tables: TableArrays
+    suns: SunArrays
+
+
+def draws(shader: Shader) -> bool:
+    """Whether :func:`draw` knows the ``shader``'s mode: tables, with suns or without."""
+    return isinstance(shader.sky, SkyTables)
+
+
+def draw(body: Unposed, shader: Shader, camera: Camera, *, cull: float | None = None) -> Raster:
+    """The picture's linear radiance [H, W, 3], outlines sharpened, without depth, and its 8-bit codes.
+
+    What :meth:`rnd_runtime.avatar.Avatar.posed`, :func:`rnd_runtime.frame.draw` and :func:`rnd_runtime.tone.tone_map`
+    make one after the other, with ``seconds`` of "tone map" too.
+
+    Args:
+        cull: as of :class:`rnd_runtime.frame.FrameRenderer`; what is culled casts shadows all the same.
+    """
+    assert isinstance(shader.sky, SkyTables)
+    rest = body.rest
+    image, alpha, codes, seconds = _draw(
+        rest.arrays,
+        rest.nodes(body.logits, body.offsets, body.visibility),
+        floats(body.bones),
+        rest.limits,
+        _Material(floats(body.opacities), floats(body.albedo), floats(body.roughness)),
+        pinhole(camera),
+        np.array(camera.position, np.float32),
+        np.float32(-1 if cull is None else cull),
+        _Light(shader.light_to_world, shader.sky.arrays, shader.sun_arrays()),
+        tone_tables(),
+        get_num_threads(),
+    )
+    return Raster(image, alpha, _no_depth(alpha.shape), dict(zip(_STAGES, seconds)), codes)
+
+
+@lru_cache(maxsize=4)
+def _no_depth(shape: tuple[int, int]) -> Floats32:
+    return np.broadcast_to(np.float32(0), shape)
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def _draw(rest, nodes, bones, limits, material, view, eye, least, light, codes, threads):  # type: ignore[no-untyped-def]
+    started = now()
+    count = len(material.opacities)
+    means, covariances, normals, visibility = pose(rest, nodes, bones, limits, count)
+    posed = now()
+    seen = look(means, covariances, material.opacities, normals, eye, least, view)
+    surfaces = means, normals, material.albedo, material.roughness, visibility
+    root = bones[0, :, :3].astype(np.float64)
+    radiance = shade_by_tables(surfaces, eye, light.to_frame, root, light.tables, seen)
+    if len(light.suns.directions) > 0:
+        radii = disc_radii(covariances, material.opacities)
+        shadows = cast_shadows(
+            (means, normals, radii, seen), light.suns.directions, SHADOW_RESOLUTION, threads
+        )
+        add_suns(surfaces[:4], shadows, eye, light.suns, seen, radiance)
+    shaded = now()
+    arrays = means, covariances, material.opacities, radiance
+    _, image, alpha, (projection, sort) = splat(arrays, seen, view, threads, False, False, True)
+    splatted = now()
+    picture = tone_map_on_black(image, alpha, codes)
+    seconds = (
+        posed - started, shaded - posed, projection, sort, splatted - shaded - projection - sort, now() - splatted
+    )  # fmt: skip
+    return image, alpha, picture, seconds
