@@ -71,6 +71,8 @@ def measure(point: Point) -> Drawn:
     environment = os.environ | {
         "NUMBA_NUM_THREADS": str(point.threads), "OMP_NUM_THREADS": str(point.threads), "OMP_WAIT_POLICY": "PASSIVE",
     }  # fmt: skip
+    # of a player that was used before not only the kernels are compiled: some machines forbid it, for tidiness
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
