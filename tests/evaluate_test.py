@@ -399,21 +399,21 @@ def test_the_albedos_scale_is_fitted_to_training_frames() -> None:
 
 
 def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, tmp_path, monkeypatch) -> None:
-    seconds = iter([0.5] * 5 + [0.01] * 30 + [0.001] * 5)
+    seconds, now = iter([0.5] * 5 + [0.01] * 30 + [0.001] * 5), [0.0]
 
     class Renderer:
         def __init__(self, *_: object, **__: object) -> None:
             pass
 
-        def render(self, *_: object) -> SimpleNamespace:
-            whole = next(seconds)
-            return SimpleNamespace(stage_seconds={"pose": whole / 4, "splat": 3 * whole / 4})
+        def render(self, *_: object) -> None:
+            now[0] += next(seconds)
 
         def close(self) -> None:
             pass
 
     monkeypatch.setattr(rnd_trainer.held_out, "FrameRenderer", Renderer)
     monkeypatch.setattr(rnd_trainer.held_out.Avatar, "load", lambda path: None)
+    monkeypatch.setattr(rnd_trainer.held_out, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     (tmp_path / "avatar.onnx").write_bytes(bytes(3_000_000))
     judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
     assert playback(tmp_path / "avatar.onnx", judge) == {"file_mb": 3.0, "fps": pytest.approx(100)}

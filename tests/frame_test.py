@@ -10,7 +10,7 @@ import pytest
 
 from rnd_runtime.avatar import Avatar
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import FrameRenderer, as_seen_from, draw
+from rnd_runtime.frame import FrameRenderer, as_seen_from, draw, draw_encoded
 from rnd_runtime.images import linear_to_srgb, to_bytes
 from rnd_runtime.in_view import in_view
 from rnd_runtime.light import Light, load_light
@@ -94,6 +94,18 @@ def test_one_call_draws_what_its_stages_draw(avatar, motion, sky, mode, cull):
     np.testing.assert_array_equal(frame.image, tone_map(parts.image, parts.alpha))
     stages = ["motion", "encoders", "posing", "shading", "projection", "sort", "raster", "tone map"]
     assert list(frame.stage_seconds) == stages
+
+
+def test_codes_are_made_where_they_are_asked_for(avatar, motion, sky):
+    encoded, shader = avatar.encode(motion, 0.3), Shader(sky, "table")
+    with make_rasterizer("cpu") as cpu:
+        coded, plain = (
+            draw_encoded(avatar, encoded, shader, CAMERA, cpu, coded=yes) for yes in (True, False)
+        )
+    np.testing.assert_array_equal(coded.image, plain.image)
+    np.testing.assert_array_equal(coded.srgb, tone_map(coded.image, coded.alpha))
+    assert plain.srgb is None
+    assert "tone map" not in plain.seconds
 
 
 def test_turning_the_light_equals_another_light(avatar, motion, sky):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from rnd_runtime.errors import InputError
 from rnd_runtime.forearm import skinning_bones
 from rnd_runtime.motion import Motion
 from rnd_runtime.rotations import axis_angle_to_matrix, rotation_6d
@@ -140,6 +141,13 @@ def test_a_moment_has_the_bones_and_the_window_of_its_pose(time_s, twist, closed
     assert_allclose(got.root[3], [0, 0, 0, 1], atol=0)
     for ours, alone in zip(got[:2], motion_window(motion, time_s, poses=POSES, seconds=SECONDS)):
         np.testing.assert_array_equal(ours, alone)
+
+
+@pytest.mark.parametrize("joints", [23, 25])
+def test_a_motion_of_other_joints_is_refused(joints):
+    motion = Motion(np.tile(np.eye(3), (2, joints, 1, 1)), np.zeros((2, 3)), 24.0, ("joint",) * joints)
+    with pytest.raises(InputError, match=f"joints of the motion: expected 24, got {joints}"):
+        moment(motion, 0.0, smpl_skeleton(np.zeros((24, 3))), poses=POSES, seconds=SECONDS)
 
 
 def test_a_skeleton_without_arms_has_moments_too():

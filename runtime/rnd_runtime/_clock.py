@@ -14,7 +14,7 @@ if _MONOTONIC is None:
 
     @njit(nogil=True)
     def now():  # type: ignore[no-untyped-def]
-        """No clock: every stage but the last seems to take no time."""
+        """No clock: what it is asked of seems to take no time."""
         return 0.0
 
 else:

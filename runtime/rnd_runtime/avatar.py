@@ -70,7 +70,8 @@ class Avatar:
         """Read an avatar. ``threads``: of onnxruntime; by default one per core.
 
         Args:
-            ahead: its networks, where they are being loaded already: see :func:`rnd_runtime.start.quick_start`.
+            ahead: its networks, where they are being loaded already, with threads of their own: see
+                :func:`rnd_runtime.start.quick_start`.
 
         Raises:
             InputError: for anything that is not a whole avatar of the schema we know.

@@ -118,7 +118,7 @@ def _turn_all(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-
 
 @njit(error_model="numpy")
 def hand_on(rotations, elbow, wrist, axis, turn):  # type: ignore[no-untyped-def]
-    """Turn a forearm of one pose [J, 3, 3] by δ."""
+    """Turn the forearm of one pose [J, 3, 3] by δ, and the hand back."""
     back = -turn * axis[0], -turn * axis[1], -turn * axis[2]
     before, after = rotations[elbow].copy(), np.empty((3, 3))
     turned(before, back, rotations[elbow])

@@ -119,10 +119,12 @@ def draw_encoded(
     rasterizer: Rasterizer,
     *,
     cull: float | None = None,
+    coded: bool = True,
 ) -> Raster:
     """Pose and :func:`draw`: where the avatar's file allows it all on OpenGL's device, or in one call of the CPU's.
 
-    The raster's ``seconds`` have "posing" too.
+    That call is for shading by tables. With ``coded`` it makes ``srgb`` too, as a device always does. The raster's
+    ``seconds`` have "posing" and what else was done.
     """
     shader, camera = as_seen_from(encoded.root, shader, camera)
     unposed = avatar.unposed(encoded)
@@ -130,7 +132,7 @@ def draw_encoded(
         if rasterizer.renderer is not None:
             return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
         if frame_cpu.draws(shader):
-            return frame_cpu.draw(unposed, shader, camera, cull=cull)
+            return frame_cpu.draw(unposed, shader, camera, cull=cull, coded=coded)
     started = perf_counter()
     gaussians = avatar.posed(encoded)
     posing = perf_counter() - started

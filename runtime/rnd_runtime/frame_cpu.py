@@ -1,4 +1,4 @@
-"""Frames on the CPU: posed, shaded, splatted and tone mapped in one compiled call.
+"""Frames on the CPU: posed, shaded by tables, splatted and tone mapped in one compiled call.
 
 The kernels are those that the stages have of their own, and so are the pictures, to the bit. What a call of its own
 costs each of them, and what Python does in between with cold caches, is a tenth of a frame.
@@ -7,6 +7,7 @@ costs each of them, and what Python does in between with cold caches, is a tenth
 from __future__ import annotations
 
 from functools import lru_cache
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
@@ -50,15 +51,19 @@ def draws(shader: Shader) -> bool:
     return isinstance(shader.sky, SkyTables)
 
 
-def draw(body: Unposed, shader: Shader, camera: Camera, *, cull: float | None = None) -> Raster:
+def draw(
+    body: Unposed, shader: Shader, camera: Camera, *, cull: float | None = None, coded: bool = True
+) -> Raster:
     """The picture's linear radiance [H, W, 3], outlines sharpened, without depth, and its 8-bit codes.
 
     What :meth:`rnd_runtime.avatar.Avatar.posed`, :func:`rnd_runtime.frame.draw` and :func:`rnd_runtime.tone.tone_map`
-    make one after the other, with ``seconds`` of "tone map" too.
+    make one after the other, with ``seconds`` of "tone map" too. "posing" has what is between the stages.
 
     Args:
         cull: as of :class:`rnd_runtime.frame.FrameRenderer`; what is culled casts shadows all the same.
+        coded: make ``srgb`` too.
     """
+    started = perf_counter()
     assert isinstance(shader.sky, SkyTables)
     rest = body.rest
     image, alpha, codes, seconds = _draw(
@@ -72,9 +77,14 @@ def draw(body: Unposed, shader: Shader, camera: Camera, *, cull: float | None = 
         np.float32(-1 if cull is None else cull),
         _Light(shader.light_to_world, shader.sky.arrays, shader.sun_arrays()),
         tone_tables(),
+        coded,
         get_num_threads(),
     )
-    return Raster(image, alpha, _no_depth(alpha.shape), dict(zip(_STAGES, seconds)), codes)
+    stages = dict(zip(_STAGES, seconds))
+    if not coded:
+        del stages["tone map"]
+    stages["posing"] += perf_counter() - started - sum(seconds)
+    return Raster(image, alpha, _no_depth(alpha.shape), stages, codes if coded else None)
 
 
 @lru_cache(maxsize=4)
@@ -83,7 +93,7 @@ def _no_depth(shape: tuple[int, int]) -> Floats32:
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _draw(rest, nodes, bones, limits, material, view, eye, least, light, codes, threads):  # type: ignore[no-untyped-def]
+def _draw(rest, nodes, bones, limits, material, view, eye, least, light, codes, coded, threads):  # type: ignore[no-untyped-def]
     started = now()
     count = len(material.opacities)
     means, covariances, normals, visibility = pose(rest, nodes, bones, limits, count)
@@ -102,7 +112,7 @@ def _draw(rest, nodes, bones, limits, material, view, eye, least, light, codes, 
     arrays = means, covariances, material.opacities, radiance
     _, image, alpha, (projection, sort) = splat(arrays, seen, view, threads, False, False, True)
     splatted = now()
-    picture = tone_map_on_black(image, alpha, codes)
+    picture = tone_map_on_black(image, alpha, codes) if coded else np.empty((0, 0, 3), np.uint8)
     seconds = (
         posed - started, shaded - posed, projection, sort, splatted - shaded - projection - sort, now() - splatted
     )  # fmt: skip

@@ -54,8 +54,9 @@ class Raster:
         alpha: [H, W], Σ w_i.
         depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
         seconds: how long each stage took, by its name: "projection", "sort" and "raster" from the CPU, from a GL target
-            "projection+sort", "raster" and "read-back"; who draws whole frames adds what comes before.
-        srgb: [H, W, 3] 8-bit over black, the bytes of :func:`rnd_runtime.tone.tone_map`, where a device made them.
+            "projection+sort", "raster" and "read-back"; who draws whole frames adds what comes before and after.
+        srgb: [H, W, 3] 8-bit over black, the bytes of :func:`rnd_runtime.tone.tone_map`, if they were made with the
+            rest: by a device, or in one call of the CPU's.
     """
 
     image: Floats32

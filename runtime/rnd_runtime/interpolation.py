@@ -83,15 +83,6 @@ def interpolate_points(points: Floats, place: Floats) -> Floats:
     return result
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def steps(before: Floats, after: Floats) -> Floats:
-    """log(Aᵀ B) [J, 3] rad of rotations A [J, 3, 3] ``before`` and B ``after``."""
-    result = np.empty((len(before), 3), np.float64)
-    for joint in range(len(before)):
-        step_between(before[joint], after[joint], result[joint])
-    return result
-
-
 @njit(inline="always")
 def _move(points, k):  # type: ignore[no-untyped-def]
     """From point k to the next."""

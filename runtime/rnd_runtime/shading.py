@@ -15,7 +15,6 @@ All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_refer
 from __future__ import annotations
 
 import re
-from functools import cached_property
 from typing import NamedTuple
 
 import numba
@@ -95,6 +94,11 @@ class Shader:
             self.sky = DistantLights.all_texels(light, texels)
         else:
             self.sky = DistantLights.median_cut(light, _light_count(mode))
+        self._in_probe = (  # what sun_arrays returns, with directions in the light probe's frame
+            np.array([sun.direction for sun in self.suns]).reshape(-1, 3),
+            np.array([sun.irradiance for sun in self.suns], np.float32).reshape(-1, 3),
+            np.array([sun.spread**2 for sun in self.suns], np.float32),
+        )
 
     def turned(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as :class:`Light`); shares all tables."""
@@ -141,20 +145,11 @@ class Shader:
 
     def sun_arrays(self) -> SunArrays:
         """The suns as kernels want them, in the frame of the Gaussians."""
-        directions, irradiance, spreads = self._suns
+        directions, irradiance, spreads = self._in_probe
         if not self.suns:
             return SunArrays(irradiance, irradiance, spreads)
         turned = directions @ self.light_to_world.T
         return SunArrays(np.array(turned, np.float32, order="C"), irradiance, spreads)
-
-    @cached_property
-    def _suns(self) -> tuple[Floats, Floats32, Floats32]:
-        """Of the suns what :meth:`sun_arrays` returns, with directions in the light probe's frame."""
-        return (
-            np.array([sun.direction for sun in self.suns]).reshape(-1, 3),
-            np.array([sun.irradiance for sun in self.suns], np.float32).reshape(-1, 3),
-            np.array([sun.spread**2 for sun in self.suns], np.float32),
-        )
 
 
 def check_mode(mode: str) -> None:

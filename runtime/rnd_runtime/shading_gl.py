@@ -64,17 +64,16 @@ class GlShading:
         light_to_world = shader.light_to_world
         textures, uniforms = self._sky_of(shader.sky)
         textures = {**textures, **surfaces.textures(), "order": order}
-        suns = shader.suns
-        if suns:
-            directions = np.array([sun.direction for sun in suns])
-            axes = np.stack([axes_towards(d) for d in (directions @ light_to_world.T).astype(np.float32)])
+        if shader.suns:
+            suns = shader.sun_arrays()
+            axes = np.stack([axes_towards(direction) for direction in suns.directions])
             maps = self._suns.draw(surfaces.points, surfaces.normals, surfaces.gaussians, axes)
             textures |= {"depths": maps.depths, "bounds": maps.bounds}
             uniforms = uniforms | {
                 "sun_axes": maps.axes,
-                "sun_directions": directions,
-                "sun_irradiances": np.array([sun.irradiance for sun in suns]),
-                "sun_blurs": np.array([sun.spread**2 for sun in suns]),
+                "sun_directions": np.array([sun.direction for sun in shader.suns]),
+                "sun_irradiances": suns.irradiance,
+                "sun_blurs": suns.spread_squared,
             }
         program = self._pass_of(shader)
         (radiance,), _ = self._radiance.reserve(ranks)

@@ -26,7 +26,8 @@ def quick_start(
 
     Args:
         avatar: a file whose networks are loaded meanwhile, for :meth:`rnd_runtime.avatar.Avatar.load`, which also tells
-            what is wrong with it. threads: of onnxruntime; with more than there are cores nothing is loaded.
+            what is wrong with it; a command that ends before waits for it. threads: of onnxruntime; with more than
+            there are cores nothing is loaded.
     """
     gc.disable()
     aside = ThreadPoolExecutor(1, "ahead")

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from .errors import InputError
 from .forearm import forearms, hand_on, share
 from .interpolation import interpolate_points, interpolate_rotations, step_between
 from .motion import Motion
@@ -36,7 +37,13 @@ def moment(motion: Motion, time_s: float, skeleton: Skeleton, *, poses: int, sec
 
     δ is the spacing of the window, ``seconds`` itself where ``poses`` is 1. Before a motion starts its first pose is
     held.
+
+    Raises:
+        InputError: the motion has other joints than the skeleton; :func:`rnd_runtime.motion.load_motion` maps them.
     """
+    joints = motion.rotations.shape[1]
+    if joints != len(skeleton):
+        raise InputError("joints of the motion", expected=len(skeleton), got=joints)
     return Moment(*_moment(*_recent(motion, time_s, poses, seconds), poses, _tree(skeleton)))
 
 

@@ -109,7 +109,9 @@ class Player:
     def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
         """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
         if quality == FULL and not self.aovs:
-            raster = draw_encoded(self.avatar, encoded, self.shader, camera, self.rasterizer, cull=self.cull)
+            raster = draw_encoded(
+                self.avatar, encoded, self.shader, camera, self.rasterizer, cull=self.cull, coded=False
+            )
             self._kept = None  # by the next frame of less quality it would be out of date
         else:
             with self.times.stage("posing"):

@@ -113,7 +113,7 @@ function lookUp({ depth, width, texel }, position, normal, k, radius) {
   return Math.min(lit, 1);
 }
 
-/** Lambert and GGX under one sun, whose disc widens the highlight (shading.py, _add_suns). */
+/** Lambert and GGX under one sun, whose disc widens the highlight (shading.py, add_suns). */
 function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibility, radiance) {
   const [lx, ly, lz] = sun.direction, spread = sun.spread ** 2;
   for (let i = 0; i < count; i++) {
