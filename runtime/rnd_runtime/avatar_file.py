@@ -28,9 +28,9 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -38,6 +38,8 @@ from numpy.typing import NDArray
 
 from .errors import InputError
 from .onnx_parts import OnnxFile
+
+T = TypeVar("T")
 
 SCHEMA = "rnd-avatar/1"
 METADATA_KEY = "rnd_avatar"
@@ -143,16 +145,17 @@ def read_metadata(file: OnnxFile) -> AvatarMetadata:
 
 def metadata_of(avatar_file: Path) -> AvatarMetadata:
     """What ``avatar_file`` says of itself. Raises :class:`InputError` naming the file."""
-    try:
-        return read_metadata(OnnxFile(avatar_file.read_bytes()))
-    except InputError as error:
-        raise error.at(file=avatar_file) from error
+    return _read(avatar_file, read_metadata)
 
 
 def advice_of(avatar_file: Path) -> PlayerAdvice:
     """What ``avatar_file`` says of how it may be played. Raises :class:`InputError` naming the file."""
+    return _read(avatar_file, read_advice)
+
+
+def _read(avatar_file: Path, what: Callable[[OnnxFile], T]) -> T:
     try:
-        return read_advice(OnnxFile(avatar_file.read_bytes()))
+        return what(OnnxFile(avatar_file.read_bytes()))
     except InputError as error:
         raise error.at(file=avatar_file) from error
 
