@@ -71,7 +71,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
             "shading mode: expected one of ao, table, table+sun",
         ),
         (f"rnd-eval OUT {CAPTURE} --seeds 2", "--seeds: expected the default, got 2"),
-        (f"rnd-eval OUT {CAPTURE} --cull 2", "--cull: expected -1 to 1, got 2"),
+        (f"rnd-eval OUT {CAPTURE} --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
         (f"rnd-eval OUT {CAPTURE} --ablate --study causes", "variant 'true normals': expected normal_gt"),
         (
             f"rnd-train {CAPTURE} --out OUT --device mps",

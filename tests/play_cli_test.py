@@ -242,7 +242,7 @@ def test_what_faces_away_is_left_out_on_every_path(files, tmp_path, capsys):
     assert np.abs(pictures["cpu"] - pictures["gl"]).max() <= 2
     np.testing.assert_array_equal(pictures["aov"], pictures["cpu"])
     assert main(_arguments(files, tmp_path / "no", cull=2)) == 2
-    assert "--cull: expected -1 to 1, got 2" in capsys.readouterr().err
+    assert "--cull: expected a cosine, from -1 to 1, got 2" in capsys.readouterr().err
 
 
 def test_the_same_run_again_takes_nothing_away(files, tmp_path):

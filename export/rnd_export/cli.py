@@ -11,7 +11,15 @@ from typing import Annotated, Literal
 import tyro
 
 from rnd_runtime.avatar_file import EncoderKind, Precision
-from rnd_runtime.errors import InputError, check_option, flag, parse_options, refuse_changed, run_command
+from rnd_runtime.errors import (
+    InputError,
+    check_cull,
+    check_option,
+    flag,
+    parse_options,
+    refuse_changed,
+    run_command,
+)
 from rnd_runtime.light import Up
 
 
@@ -104,9 +112,7 @@ def _export(options: Options) -> None:
     from rnd_trainer.notes import say_notes
 
     check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
-    check_option(
-        options.cull is None or -1 <= options.cull <= 1, "--cull", "a cosine, from -1 to 1", options.cull
-    )
+    check_cull(options.cull)
     check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
     bounds = {kind: getattr(options, name) for kind, name in BOUNDS.items()}
     given = {kind: value for kind, value in bounds.items() if value is not None}

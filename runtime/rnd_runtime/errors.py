@@ -100,6 +100,11 @@ def check_option(good: bool, name: str, expected: str, got: object) -> None:
         raise InputError(name, expected=expected, got=got)
 
 
+def check_cull(cosine: float | None) -> None:
+    """Raise :class:`InputError` for the option ``--cull`` unless it is a cosine, or was not given."""
+    check_option(cosine is None or -1 <= cosine <= 1, "--cull", "a cosine, from -1 to 1", cosine)
+
+
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Run ``main`` as the command ``name`` and return its exit code.
 

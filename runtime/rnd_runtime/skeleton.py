@@ -90,14 +90,12 @@ class Skeleton:
                 got=f"{list(rotations.shape)} and {list(translation.shape)}",
             )
         batch = np.broadcast_shapes(rotations.shape[:-3], translation.shape[:-1])
-        posed = np.zeros((*batch, count, 4, 4))
-        posed[..., 3, 3] = 1
-        posed[..., 0, :3, 3] = self.rest_joints[0] + translation
-        chain(
+        posed: Floats = chain(
             np.ascontiguousarray(np.broadcast_to(rotations, (*batch, count, 3, 3))).reshape(-1, count, 3, 3),
-            self.parents, self.rest_joints, posed.reshape(-1, count, 4, 4),
+            np.ascontiguousarray(np.broadcast_to(translation, (*batch, 3))).reshape(-1, 3),
+            self.parents, self.rest_joints,
         )  # fmt: skip
-        return posed
+        return posed.reshape(*batch, count, 4, 4)
 
 
 def smpl_skeleton(rest_joints: ArrayLike) -> Skeleton:
@@ -145,11 +143,16 @@ def bones_of(posed, rest_joints):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-def]
-    """Fill ``posed`` [B, J, 4, 4], whose roots' places and last rows are there, from the root outwards."""
+def chain(rotations, translations, parents, rest_joints):  # type: ignore[no-untyped-def]
+    """:meth:`Skeleton.joint_transforms` [B, J, 4, 4] of poses [B, J, 3, 3] and their translations [B, 3]."""
+    posed = np.zeros((*rotations.shape[:2], 4, 4))
     for pose in range(rotations.shape[0]):
-        for k in range(9):
-            posed[pose, 0, k // 3, k % 3] = rotations[pose, 0, k // 3, k % 3]
+        for joint in range(rotations.shape[1]):
+            posed[pose, joint, 3, 3] = 1.0
+        for row in range(3):
+            posed[pose, 0, row, 3] = rest_joints[0, row] + translations[pose, row]
+            for k in range(3):
+                posed[pose, 0, row, k] = rotations[pose, 0, row, k]
         for joint in range(1, rotations.shape[1]):
             parent = posed[pose, parents[joint]]
             for row in range(3):
@@ -161,3 +164,4 @@ def chain(rotations, parents, rest_joints, posed):  # type: ignore[no-untyped-de
                         total += parent[row, inner] * rotations[pose, joint, inner, k]
                     posed[pose, joint, row, k] = total
                 posed[pose, joint, row, 3] = place
+    return posed

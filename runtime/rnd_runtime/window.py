@@ -124,10 +124,5 @@ def _bones(rotations, translation, tree, root):  # type: ignore[no-untyped-def]
         turn = share(rotations, elbow, wrist, axis)
         if turn != 0.0:
             hand_on(rotations, elbow, wrist, axis, turn)
-    posed = np.zeros((1, len(rotations), 4, 4))
-    for joint in range(len(rotations)):
-        posed[0, joint, 3, 3] = 1.0
-    for k in range(3):
-        posed[0, 0, k, 3] = place[k]
-    chain(np.expand_dims(rotations, 0), tree.parents, tree.rest_joints, posed)
+    posed = chain(np.expand_dims(rotations, 0), np.zeros((1, 3)), tree.parents, tree.rest_joints)
     return bones_of(posed, tree.rest_joints)[0]

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from rnd_runtime.errors import check_option, flag, parse_options, run_command
+from rnd_runtime.errors import check_cull, check_option, flag, parse_options, run_command
 from rnd_runtime.files import earlier_rows, write_json
 from rnd_runtime.plain import print_plain
 
@@ -77,9 +77,7 @@ def _raster(options: Raster) -> None:
 
 def _frame(options: Frame) -> None:
     _prepare(options, "n", "size", "threads", "runs")
-    check_option(
-        options.cull is None or -1 <= options.cull <= 1, "--cull", "a cosine, from -1 to 1", options.cull
-    )
+    check_cull(options.cull)
     from rich.console import Console
 
     from rnd_runtime.shading import check_mode

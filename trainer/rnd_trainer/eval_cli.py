@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, parse_options, refuse_changed, run_command
+from rnd_runtime.errors import InputError, check_cull, parse_options, refuse_changed, run_command
 from rnd_runtime.files import is_folder, output_file, output_folder, refuse_input, write_json
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def evaluate_run(options: EvalOptions) -> None:
     from .perceptual import load_lpips
 
     check_mode(options.shade)
-    check_option(options.cull is None or -1 <= options.cull <= 1, "--cull", "-1 to 1", options.cull)
+    check_cull(options.cull)
     check_outputs(options)
     path = _checkpoint_file(options)
     checkpoint = load_checkpoint(path)

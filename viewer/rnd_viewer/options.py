@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.errors import InputError, check_cull, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.light import Up
 from rnd_runtime.motion import Motion, load_motion
 from rnd_runtime.motion_edit import EDIT_LIMITS, MotionEdits, edit_motion
@@ -168,9 +168,9 @@ class PlayOptions(LitOptions):
             "hdr_yaw": (-1e6, 1e6),
             "hdr_turn": (-1e6, 1e6),
             "exposure": (-30, 30),
-            "cull": (-1, 1),
         }
         refuse_outside(self, limits)
+        check_cull(self.cull)
         for name in ("orbit_seconds", "hdr_turn"):
             check_option(getattr(self, name) != 0, flag(name), "not 0", 0)
         if self.camera != "orbit":
