@@ -22,9 +22,10 @@ from .camera import Camera
 from .gaussians import Floats32, Raster
 from .in_view import look
 from .posing import Unposed, pose
-from .shading import SHADOW_RESOLUTION, Shader, SunArrays, add_suns, disc_radii
+from .shading import SHADOW_RESOLUTION, Shader, disc_radii
 from .shading_tables import SkyTables, TableArrays, shade_by_tables
 from .shadow import cast_shadows
+from .sunlight import SunArrays, add_suns
 from .tone import tone_map_on_black, tone_tables
 
 _STAGES = ("posing", "shading", "projection", "sort", "raster", "tone map")
@@ -107,7 +108,7 @@ def _draw(rest, nodes, bones, limits, material, view, eye, least, light, codes, 
         shadows = cast_shadows(
             (means, normals, radii, seen), light.suns.directions, SHADOW_RESOLUTION, threads
         )
-        add_suns(surfaces[:4], shadows, eye, light.suns, seen, radiance)
+        add_suns(surfaces, shadows, eye, light.suns, seen, radiance)
     shaded = now()
     arrays = means, covariances, material.opacities, radiance
     _, image, alpha, (projection, sort) = splat(arrays, seen, view, threads, False, False, True)

@@ -15,7 +15,6 @@ All but ``table+sun`` approximate the same sum, :func:`rnd_runtime.shading_refer
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._raster_input import floats, mask
 from ._twin import twin
-from .brdf import ROUGHNESS_RANGE, ggx32
 from .errors import InputError
 from .gaussians import Gaussians
 from .light import Light
@@ -32,6 +30,7 @@ from .shading_sum import DistantLights
 from .shading_tables import SkyTables
 from .shadow import directional_visibility
 from .sun import Sun, extract_suns
+from .sunlight import SunArrays, add_suns
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -43,21 +42,6 @@ SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 # of 2 σ hide nothing more, but rise above their neighbours where normals disagree: speckled thighs.
 DISC_SIGMAS = 1.4
 CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
-# What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
-# shade. Suns fade out over these n·v, chosen on training pictures of the dancer (36.19 dB without, 36.27 with).
-TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
-
-_ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-12)
-_ONE_OVER_PI = np.float32(1 / np.pi)
-_ROUGHNESS_LOW, _ROUGHNESS_HIGH = (np.float32(bound) for bound in ROUGHNESS_RANGE)
-
-
-class SunArrays(NamedTuple):
-    """S suns: where they are, what they lay on a surface that faces them, and how wide they are."""
-
-    directions: Floats32  # [S, 3] unit
-    irradiance: Floats32  # [S, 3]
-    spread_squared: Floats32  # [S] rad²
 
 
 class Shader:
@@ -138,7 +122,9 @@ class Shader:
                     resolution=SHADOW_RESOLUTION,
                     receivers=seen,
                 )
-            surfaces = gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness
+            surfaces = (
+                gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility,
+            )  # fmt: skip
             eye = np.array(camera_position, np.float32)
             add_suns(tuple(floats(a) for a in surfaces), floats(visibility), eye, suns, seen, radiance)
         return radiance
@@ -174,54 +160,11 @@ def shadow_radii(gaussians: Gaussians) -> Floats32:
     return radii
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def disc_radii(covariances, opacities):  # type: ignore[no-untyped-def]
     """:func:`shadow_radii` of covariances [N, 6] and opacities [N]."""
     radii = np.empty(len(opacities), np.float32)
-    for i in range(len(radii)):
+    for i in numba.prange(len(radii)):
         trace = covariances[i, 0] + covariances[i, 3] + covariances[i, 5]
         radii[i] = DISC_SIGMAS * np.sqrt(trace / 2) if opacities[i] > CASTING_OPACITY else 0
     return radii
-
-
-@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def add_suns(surfaces, visibility, camera, suns, seen, radiance):  # type: ignore[no-untyped-def]
-    """Add what ``suns`` lay on the Gaussians to ``radiance`` [N, 3]. A sun of one texel is a point: see ``sun``."""
-    # A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks
-    # for α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own.
-    means, normals, albedo, roughness = surfaces
-    directions, irradiance, spread_squared = suns
-    for i in numba.prange(len(means)):
-        if not seen[i]:
-            continue
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
-        distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _TINY)
-        vx, vy, vz = vx / distance, vy / distance, vz / distance
-        n_dot_v = nx * vx + ny * vy + nz * vz
-        facing = min((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), _ONE)
-        if not facing > _ZERO:
-            continue
-        alpha = min(max(roughness[i], _ROUGHNESS_LOW), _ROUGHNESS_HIGH)
-        alpha *= alpha
-        for sun in range(len(directions)):
-            lx, ly, lz = directions[sun, 0], directions[sun, 1], directions[sun, 2]
-            n_dot_l = nx * lx + ny * ly + nz * lz
-            arriving = facing * visibility[i, sun] * n_dot_l
-            if not arriving > _ZERO:
-                continue
-            hx, hy, hz = lx + vx, ly + vy, lz + vz
-            half_squared = max(hx * hx + hy * hy + hz * hz, _TINY)
-            cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
-            sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
-            blur = spread_squared[sun] / np.sqrt(half_squared)
-            shine = ggx32(
-                min(alpha * alpha + blur, _ONE),
-                n_dot_l,
-                n_dot_v,
-                sine_squared,
-                half_squared,
-            )
-            for channel in range(3):
-                reflectance = albedo[i, channel] * _ONE_OVER_PI + shine
-                radiance[i, channel] += arriving * reflectance * irradiance[sun, channel]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .gl_passes import GaussianTargets, Pass
 from .sh import SH_COUNT, sh_basis, sh_rotation
-from .shading import AT_SILHOUETTE, SHADOW_RESOLUTION, TURNED_AWAY, Shader
+from .shading import SHADOW_RESOLUTION, Shader
 from .shading_ambient import AmbientLight
 from .shading_lookup import DIFFUSE_SIZE, SPECULAR_SIZE
 from .shading_sum import DistantLights
@@ -24,6 +24,7 @@ from .shading_tables import SkyTables
 from .shadow import CLEARANCE, CLEARANCE_TEXELS, SLOPE_FLOOR, SOFTNESS, axes_towards
 from .shadow_gl import SunMaps
 from .specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
+from .sunlight import AT_SILHOUETTE, TURNED_AWAY
 from .surfaces_gl import Surfaces
 
 Floats32 = NDArray[np.float32]

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from ._lanes import WIDTH, load, magnitude, root, select, spread, store, transpose, whole
-from .brdf import ROUGHNESS_RANGE
+from .brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
 from .specular_lobe import COSINE_COUNT, ROUGHNESS_COUNT
 
 CHUNK = 512  # Gaussians that a thread shades at a time
@@ -18,6 +18,8 @@ ZERO, ONE = np.float32(0), np.float32(1)
 TINY = np.float32(1e-12)
 ROUGHNESS_LOW = np.float32(ROUGHNESS_RANGE[0])
 ROUGHNESS_SPAN = np.float32(ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
+_HALF, _F0, _COSINE_FLOOR = np.float32(0.5), np.float32(F0), np.float32(COSINE_FLOOR)
+_ONE_OVER_PI = np.float32(1 / np.pi)
 
 # Rows of sixteen in the working memory of a thread: what goes in, what comes out in place of the albedo, where to look
 (NORMAL, VIEW, ALBEDO) = (0, 3 * WIDTH, 6 * WIDTH)  # three each, one after the other
@@ -126,6 +128,19 @@ def mean_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
         along_normal * nz + along_tangent * tz,
     )
     return unit((x, y, z))
+
+
+@njit(inline="always")
+def ggx_in_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type: ignore[no-untyped-def]
+    """:func:`.brdf.ggx`."""
+    lobe = sine_squared + alpha_squared * (ONE - sine_squared)
+    n_dot_l, n_dot_v = at_least(n_dot_l, _COSINE_FLOOR), at_least(n_dot_v, _COSINE_FLOOR)
+    shadowing = n_dot_l + root(alpha_squared + (ONE - alpha_squared) * n_dot_l * n_dot_l)
+    masking = n_dot_v + root(alpha_squared + (ONE - alpha_squared) * n_dot_v * n_dot_v)
+    grazing = at_least(ONE - _HALF * root(half_squared), ZERO)
+    grazing_squared = grazing * grazing
+    fresnel = _F0 + (ONE - _F0) * grazing_squared * grazing_squared * grazing
+    return _ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
 
 
 @njit(inline="always")

@@ -11,9 +11,10 @@ from .brdf import specular
 from .gaussians import Gaussians
 from .light import Light, texel_directions, texel_solid_angles
 from .sh import sh_basis
-from .shading import AT_SILHOUETTE, SHADOW_RESOLUTION, TURNED_AWAY, shadow_radii
+from .shading import SHADOW_RESOLUTION, shadow_radii
 from .shadow import directional_visibility
 from .sun import extract_suns
+from .sunlight import AT_SILHOUETTE, TURNED_AWAY
 
 Floats = NDArray[np.float64]
 

@@ -37,7 +37,9 @@ DROP, RIM_TEXELS = np.float32(2), np.float32(0.5)
 EDGE_ON = np.float32(0.02)
 SOFTNESS = np.float32(0.25)
 SLOPE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
-_EMPTY = np.float32(-np.inf)
+_FAR = np.float32(np.inf)
+_EMPTY = -_FAR
+_NOWHERE = (_FAR, _FAR, -_FAR, -_FAR)  # the least and the greatest x and y of no points
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 BLOCK_SHIFT = 2
 BLOCK = 1 << BLOCK_SHIFT  # texels; a block is one value of sixteen lanes
@@ -103,12 +105,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
     for chunk in numba.prange(chunks):
         first, last = chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)
         _turn(arrays, frame, first, last, position, normal, bounds[chunk])
-    left, bottom, right, top = (
-        np.float32(np.inf),
-        np.float32(np.inf),
-        -np.float32(np.inf),
-        -np.float32(np.inf),
-    )
+    left, bottom, right, top = _NOWHERE
     for chunk in range(chunks):
         left, bottom = min(left, bounds[chunk, 0]), min(bottom, bounds[chunk, 1])
         right, top = max(right, bounds[chunk, 2]), max(top, bounds[chunk, 3])
@@ -123,7 +120,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
     across, down = (width + BLOCK - 1) // BLOCK, (height + BLOCK - 1) // BLOCK
     depth = aligned_floats(across * down * WIDTH)  # block by block
     depth[:] = _EMPTY
-    for i in range(count):
+    for i in numba.prange(count):
         if normal[i, 2] > 0:
             position[i, 0] = (position[i, 0] - left) / texel + 1
             position[i, 1] = (position[i, 1] - bottom) / texel + 1
@@ -142,7 +139,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
 def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
     """Rows first … last − 1 in the axes of ``frame``, and the least and greatest x and y among them."""
     points, normals, radii, _ = arrays
-    bounds[:2], bounds[2:] = np.inf, -np.inf
+    left, bottom, right, top = _NOWHERE
     for i in range(first, last):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -153,9 +150,9 @@ def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore
             fx, fy, fz = frame[axis, 0], frame[axis, 1], frame[axis, 2]
             position[i, axis] = fx * px + fy * py + fz * pz
             normal[i, axis] = fx * nx + fy * ny + fz * nz
-        for axis in range(2):
-            bounds[axis] = min(bounds[axis], position[i, axis])
-            bounds[2 + axis] = max(bounds[2 + axis], position[i, axis])
+        left, right = min(left, position[i, 0]), max(right, position[i, 0])
+        bottom, top = min(bottom, position[i, 1]), max(top, position[i, 1])
+    bounds[0], bounds[1], bounds[2], bounds[3] = left, bottom, right, top
 
 
 @numba.njit(error_model="numpy")

@@ -3,7 +3,7 @@
 import { clampRoughness, ggx } from "./brdf.js";
 
 const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
-const TURNED_AWAY = -0.2, AT_SILHOUETTE = 0;  // n·v over which suns fade out on what faces away (shading.py)
+const TURNED_AWAY = -0.2, AT_SILHOUETTE = 0;  // n·v over which suns fade out on what faces away (sunlight.py)
 const CLEARANCE_TEXELS = 0.35, COSINE_FLOOR = 0.1;  // and of a disc's radius, once
 const DROP = 2, RIM_TEXELS = 0.5, EDGE_ON = 0.02, SOFTNESS = 0.25;
 
@@ -113,7 +113,7 @@ function lookUp({ depth, width, texel }, position, normal, k, radius) {
   return Math.min(lit, 1);
 }
 
-/** Lambert and GGX under one sun, whose disc widens the highlight (shading.py, add_suns). */
+/** Lambert and GGX under one sun, whose disc widens the highlight (sunlight.py, add_suns). */
 function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibility, radiance) {
   const [lx, ly, lz] = sun.direction, spread = sun.spread ** 2;
   for (let i = 0; i < count; i++) {
