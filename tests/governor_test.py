@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from itertools import pairwise
 
 import numpy as np
@@ -9,26 +10,28 @@ import pytest
 
 from play_fakes import FakeAvatar, fake_motion
 from rnd_runtime.light import Light
+from rnd_runtime.raster import make_rasterizer
 from rnd_runtime.raster_cpu import rasterize
 from rnd_runtime.shading import Shader
 from rnd_viewer.cameras import CameraOptions, frame_motion, front_path
-from rnd_viewer.governor import FULL, LADDER, Governor, Quality, enlarged
+from rnd_viewer.governor import FULL, LADDER, LADDER_AT_ONCE, Governor, Quality, enlarged
 from rnd_viewer.player import Player
 
 MOTION = fake_motion()
 CAMERA = front_path(frame_motion(FakeAvatar().skeleton, MOTION), CameraOptions(96, 80, 0.6, 0.1))(0, 0.0)
 
 
-def test_one_slow_frame_gives_nothing_up_and_steady_ones_do_step_by_step():
-    governor = Governor(fps=50)
+@pytest.mark.parametrize("ladder", [LADDER, LADDER_AT_ONCE])
+def test_one_slow_frame_gives_nothing_up_and_steady_ones_do_step_by_step(ladder):
+    governor = Governor(50, ladder)
     for seconds in (0.01, 0.5, 0.01, 0.01, 0.019, 0.019):
         governor.observe(seconds)
     assert governor.quality == FULL
     met = []
     for _ in range(60):
         governor.observe(0.021)
-        met.append(LADDER.index(governor.quality))
-    assert sorted(set(met)) == list(range(len(LADDER))) and met == sorted(met) and met[-1] == len(LADDER) - 1
+        met.append(ladder.index(governor.quality))
+    assert sorted(set(met)) == list(range(len(ladder))) and met == sorted(met) and met[-1] == len(ladder) - 1
 
 
 def test_room_is_used_only_after_a_calm_while():
@@ -50,6 +53,19 @@ def test_the_ladder_takes_shading_before_resolution():
     assert LADDER[1].scale == 1
 
 
+def test_what_is_drawn_at_once_gives_up_no_shading():
+    """A step of its own would cost more than it saves."""
+    light = Light(np.ones((16, 32, 3), np.float32))
+
+    def ladder(mode, rasterizer):
+        return Player(FakeAvatar(), light, Shader(light, mode), rasterizer).ladder
+
+    with closing(make_rasterizer("cpu")) as ours:
+        assert ladder("table", ours) == ladder("table+sun", ours) == LADDER_AT_ONCE
+        assert ladder("brute", ours) == ladder("ao", ours) == ladder("table", rasterize) == LADDER
+    assert {quality.shade_every for quality in LADDER_AT_ONCE} == {1}
+
+
 def test_enlarging_keeps_planes_and_constants():
     y, x = np.mgrid[:12, :17].astype(np.float32) + np.float32(0.5)
     plane = np.dstack([2 * x + 3 * y, np.ones_like(x)])
@@ -61,7 +77,9 @@ def test_enlarging_keeps_planes_and_constants():
     np.testing.assert_array_equal(enlarged(plane, 12, 17), plane)
 
 
-@pytest.mark.parametrize(("quality", "least"), [(Quality(2), 40), (Quality(4, 0.5), 20)])
+@pytest.mark.parametrize(
+    ("quality", "least"), [(Quality(2), 40), (Quality(4, 0.5), 20), (Quality(1, 0.5), 20)]
+)
 def test_less_quality_looks_like_more(quality, least):
     """Against full quality in the same place of the motion, in dB; the first frame is shaded anew."""
     light = Light(np.linspace(2, 0, 16, dtype=np.float32)[:, None, None] * np.ones((16, 32, 3), np.float32))
@@ -72,7 +90,7 @@ def test_less_quality_looks_like_more(quality, least):
         assert ours.radiance.shape == full.radiance.shape and ours.alpha.shape == full.alpha.shape
         error = np.mean((ours.radiance - full.radiance) ** 2)
         assert error < 10 ** (-least / 10)
-    if quality.scale == 1:
+    if quality.scale == 1:  # shaded anew
         np.testing.assert_array_equal(less[0].radiance, whole[0].radiance)
     assert (less[1].radiance != whole[1].radiance).any()
 

@@ -43,6 +43,16 @@ def test_the_next_frame_is_encoded_and_the_last_written_while_one_is_drawn():
     assert ended[3].is_set()
 
 
+def test_one_frame_is_encoded_ahead_and_no_more():
+    """Two frames ahead it would only wait longer."""
+    begun = {k: threading.Event() for k in range(6)}
+
+    def draw(number, _):
+        assert number + 2 not in begun or not begun[number + 2].wait(0.05)
+
+    assert list(run(range(6), lambda k: begun[k].set(), draw, lambda *_: None)) == list(range(6))
+
+
 @pytest.mark.parametrize("stage", ["encode", "draw", "write"])
 @pytest.mark.parametrize("overlap", [True, False])
 def test_what_a_stage_raises_arrives_and_what_was_drawn_is_written(stage, overlap):

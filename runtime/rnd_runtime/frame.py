@@ -140,6 +140,13 @@ def draw_encoded(
     return replace(raster, seconds={"posing": posing, **raster.seconds})
 
 
+def drawn_at_once(shader: Shader, rasterizer: Rasterizer) -> bool:
+    """Whether :func:`draw_encoded` poses, shades and splats an avatar of ours in one go: on a device, or by tables."""
+    return isinstance(rasterizer, ChosenRasterizer) and (
+        rasterizer.renderer is not None or frame_cpu.draws(shader)
+    )
+
+
 def as_seen_from(frame_to_world: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:
     """Light and camera for what is posed in the frame that ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
     return shader.in_frame(frame_to_world[:3, :3]), camera.in_frame(frame_to_world)

@@ -1,11 +1,13 @@
 """Holding a frame rate: what to give up, in which order, before a frame would be dropped.
 
-Shading is given up first: a Gaussian's radiance changes slowly from frame to frame. Then resolution: the picture keeps
-its size and loses detail.
+Where shading is a step of its own, it is given up first: a Gaussian's radiance changes slowly from frame to frame. Then
+resolution: the picture keeps its size and loses detail. Where a frame is drawn at once, by tables or on a device,
+shading is too small a part of it for that.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +30,8 @@ class Quality(NamedTuple):
 
 FULL = Quality()
 LADDER = (FULL, Quality(2), Quality(4), Quality(4, 0.75), Quality(4, 0.5))
+LADDER_AT_ONCE = (FULL, Quality(1, 0.75), Quality(1, 0.5))
+"""for frames that are drawn at once"""
 
 
 class Governor:
@@ -35,16 +39,17 @@ class Governor:
 
     Args:
         fps: the rate to hold.
+        ladder: what it chooses among, the best first.
     """
 
-    def __init__(self, fps: float) -> None:
-        self._budget = 1 / fps
+    def __init__(self, fps: float, ladder: Sequence[Quality] = LADDER) -> None:
+        self._budget, self._ladder = 1 / fps, ladder
         self._level = 0
         self._seconds: list[float] = []
 
     @property
     def quality(self) -> Quality:
-        return LADDER[self._level]
+        return self._ladder[self._level]
 
     def observe(self, seconds: float) -> None:
         """Tell how long the last frame took to render."""
@@ -55,7 +60,7 @@ class Governor:
             self._go(-1)
 
     def _go(self, step: int) -> None:
-        self._level = min(max(self._level + step, 0), len(LADDER) - 1)
+        self._level = min(max(self._level + step, 0), len(self._ladder) - 1)
         self._seconds = []  # what frames of another quality took says nothing of this one
 
 

@@ -41,7 +41,7 @@ def run(
         waiting: list[tuple[int, Future[Encoded]]] = []
 
         def fill() -> None:
-            while len(waiting) <= _AHEAD and (number := next(numbers, None)) is not None:
+            while len(waiting) < _AHEAD and (number := next(numbers, None)) is not None:
                 waiting.append((number, encoder.submit(encode, number)))
 
         fill()

@@ -136,6 +136,7 @@ class _Run:
         for path in _inputs(options):
             if is_of_a_run(path, out):
                 raise InputError("cannot be an input: runs write such files into --out", file=path)
+        player = Player(avatar, light, shader, rasterizer, background, aovs, times, options.cull)
         fps = options.fps or motion.fps
         count = motion.frames_at(fps)
         frames = parse_frames(options.frames, count)
@@ -144,7 +145,7 @@ class _Run:
             options=options,
             out=out,
             formats=formats,
-            player=Player(avatar, light, shader, rasterizer, background, aovs, times, options.cull),
+            player=player,
             rasterizer=rasterizer,
             motion=motion,
             fps=fps,
@@ -153,7 +154,7 @@ class _Run:
             framing=framing,
             camera_at=_camera_path(options, size, framing, frames),
             notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light), *clip_notes(formats, fps)],
-            governor=Governor(options.fps_floor) if options.fps_floor else None,
+            governor=Governor(options.fps_floor, player.ladder) if options.fps_floor else None,
         )
 
     @property

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar, Encoded
 from rnd_runtime.camera import Camera
-from rnd_runtime.frame import KeptRadiance, as_seen_from, chosen_cull, draw, draw_encoded
+from rnd_runtime.frame import KeptRadiance, as_seen_from, chosen_cull, draw, draw_encoded, drawn_at_once
 from rnd_runtime.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.in_view import opacities_of, seen_of
 from rnd_runtime.light import Light
@@ -21,7 +21,7 @@ from rnd_runtime.tone import tone_map, tone_map_straight
 
 from .aov import CHANNELS, aov_values, splat_features
 from .background import Background
-from .governor import FULL, Quality, enlarged
+from .governor import FULL, LADDER, LADDER_AT_ONCE, Quality, enlarged
 from .timing import StageTimes
 
 Floats32 = NDArray[np.float32]
@@ -92,6 +92,11 @@ class Player:
     def __post_init__(self) -> None:
         self.cull = chosen_cull(self.avatar, self.cull)
 
+    @property
+    def ladder(self) -> tuple[Quality, ...]:
+        """Qualities of :meth:`draw`, from the best to the fastest."""
+        return LADDER_AT_ONCE if drawn_at_once(self.shader, self.rasterizer) else LADDER
+
     def turn(self, yaw: float) -> None:
         """Turn the light to ``yaw`` radians (as :class:`Light`) from the next :meth:`draw` on; no table is built."""
         if yaw != self.light.yaw:
@@ -108,19 +113,23 @@ class Player:
 
     def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
         """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
-        if quality == FULL and not self.aovs:
+        sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
+        resized = camera if quality.scale == 1 else camera.resized(*sides)
+        if quality.shade_every == 1 and not self.aovs:
             raster = draw_encoded(
-                self.avatar, encoded, self.shader, camera, self.rasterizer, cull=self.cull, coded=False
+                self.avatar, encoded, self.shader, resized, self.rasterizer, cull=self.cull, coded=False
             )
-            self._kept = None  # by the next frame of less quality it would be out of date
+            self._kept = None  # by the next frame of less shading it would be out of date
         else:
             with self.times.stage("posing"):
                 gaussians = self.avatar.posed(encoded)
-            brought = as_seen_from(encoded.root, self.shader, camera)
+            brought = as_seen_from(encoded.root, self.shader, resized)
             if self.aovs:
                 raster = self._raster_with_aovs(gaussians, *brought)
             else:
-                raster = self._cheaper_raster(gaussians, *brought, quality)
+                raster = self._raster_of_kept(gaussians, *brought, quality.shade_every)
+        if quality.scale != 1:
+            raster = self._enlarged(raster, camera)
         for stage, seconds in raster.seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):
@@ -135,19 +144,18 @@ class Player:
             aovs[name] = aov_values(name, splatted, raster.alpha)
         return Frame(raster.image[..., :3], raster.alpha, behind, aovs, raster.srgb)
 
-    def _cheaper_raster(
-        self, gaussians: Gaussians, shader: Shader, camera: Camera, quality: Quality
+    def _raster_of_kept(
+        self, gaussians: Gaussians, shader: Shader, camera: Camera, shade_every: int
     ) -> Raster:
+        """With radiance of up to ``shade_every`` − 1 frames ago."""
         count = len(gaussians.means)
-        if self._kept is None or self._kept[1] >= quality.shade_every or len(self._kept[0].known) != count:
+        if self._kept is None or self._kept[1] >= shade_every or len(self._kept[0].known) != count:
             self._kept = KeptRadiance(count), 0
         kept, age = self._kept
         self._kept = kept, age + 1
-        sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
-        resized = camera.resized(*sides)
-        raster = draw(gaussians, shader, resized, self.rasterizer, cull=self.cull, kept=kept)
-        if quality.scale == 1:
-            return raster
+        return draw(gaussians, shader, camera, self.rasterizer, cull=self.cull, kept=kept)
+
+    def _enlarged(self, raster: Raster, camera: Camera) -> Raster:
         with self.times.stage("enlarging"):
             picture = np.dstack([raster.image, raster.alpha])
             picture = enlarged(picture, camera.height, camera.width)
