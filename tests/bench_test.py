@@ -258,8 +258,6 @@ def test_a_crossed_grid_says_how_far_it_is(tmp_path, monkeypatch, capsys) -> Non
     assert [line.strip() for line in lines[5:10]] == [
         "(kept)", "(kept)", "(2 left)", "(1 left, about 1 min)", "(0 left, about 0 min)"
     ]  # fmt: skip
-    code, lines = said(*files[:2])
-    assert code == 2 and "--chart: expected files of its own beside --cross and --sample" in lines[-1]
 
 
 def test_an_interrupted_grid_goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:

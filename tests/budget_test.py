@@ -13,6 +13,7 @@ import pytest
 from numba import get_num_threads
 from scipy.spatial import cKDTree
 
+from rnd_export import candidates
 from rnd_export.bake import BakedAvatar, bake
 from rnd_export.budget import LADDERS, Bound, Found, Plan, given_up, search
 from rnd_export.candidates import Measured, Recipe, Scene, Workbench
@@ -163,6 +164,9 @@ class _Formula:
         mb = bits * (1 + n / 10_000)
         return Measured(float(-10 * np.log10(square)), 4 + n / 5_000 + m / 1_500 * dynamic, mb)
 
+    def allows(self, precision: str) -> bool:
+        return True
+
     def still_share(self, recipe: Recipe) -> float:
         return 0.5
 
@@ -226,6 +230,33 @@ def test_times_of_a_busy_and_of_a_calm_machine_can_be_compared() -> None:
     assert stopwatch.ms(machine.player(10.0)) == pytest.approx(busy)
 
 
+def test_a_machine_that_becomes_calm_is_noticed_once() -> None:
+    machine = _Machine(99.0)
+    machine.busy_until = 9.0
+    stopwatch = Stopwatch(machine.player(20.0), lambda: machine.seconds)
+    assert stopwatch.ms(machine.player(10.0)) == pytest.approx(30.0) and not stopwatch.recalibrated()
+    machine.seconds = 9.0
+    stopwatch.ms(machine.player(10.0))
+    assert stopwatch.recalibrated() and not stopwatch.recalibrated()
+    assert stopwatch.ms(machine.player(10.0)) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("bound", ["--target-ms", "--max-mb"])
+def test_a_search_on_a_busy_machine_begins_again_where_time_counts(
+    bound, tiny_checkpoint, tmp_path, monkeypatch, capsys
+) -> None:
+    busy = iter([True, False])
+    monkeypatch.setattr(Workbench, "recalibrated", lambda self: next(busy))
+    out = tmp_path / "small.onnx"
+    words = ["rnd-export", str(tiny_checkpoint), "--size", "48", "--frames", "30", bound, "1000"]
+    monkeypatch.setattr("sys.argv", [*words, "--out", str(out)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().out
+    assert not end.value.code and out.exists() and next(busy, None) is None
+    assert ("begins again" in said) == (bound == "--target-ms")
+
+
 def test_what_was_measured_unseen_is_measured_once() -> None:
     """A time that just held may not hold again: what ended the search is what is told."""
     bench = _Formula()
@@ -286,6 +317,29 @@ def test_what_saves_most_for_its_cost_may_be_far_down_its_ladder() -> None:
     search(bench, Bound("mb", 0.27 * bench.measure(Recipe(), "seen").mb), steps.append)
     plan = steps[-1].plan
     assert (plan.precision, plan.dynamic_mm, plan.gaussians) == (2, len(LADDERS["dynamic_mm"]), 0)
+
+
+class _Exact(_Formula):
+    """Where constants of fewer bits than 16 move too much."""
+
+    def allows(self, precision: str) -> bool:
+        return precision != "int8"
+
+
+def test_a_precision_that_moves_places_too_far_is_not_taken() -> None:
+    deepest = {name: len(rungs) for name, rungs in LADDERS.items()} | {"precision": 1}
+    smallest = _Exact().measure(Plan(**deepest).recipe(CONFIG), "seen").mb
+    assert search(_Exact(), Bound("mb", 1.01 * smallest), lambda _: None).plan.precision == 1
+    with pytest.raises(InputError, match="no file keeps"):
+        search(_Exact(), Bound("mb", 0.99 * smallest), lambda _: None)
+    assert search(_Formula(), Bound("mb", 0.99 * smallest), lambda _: None).plan.precision == 2
+
+
+def test_what_precision_is_allowed_is_what_moves_places_little(bench, monkeypatch) -> None:
+    monkeypatch.setattr(bench, "_allowed", {})
+    assert bench.allows("f32") and bench.allows("f16")
+    monkeypatch.setitem(candidates.MAX_P99_M, "int8", 0.0)
+    assert not bench.allows("int8")
 
 
 def test_a_size_that_no_file_has_is_refused_with_the_smallest() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -75,6 +76,14 @@ def export_bounded(
         console.print(line, highlight=False, soft_wrap=True)
 
     found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
+    while bench.recalibrated():
+        if kind == "ms":
+            console.print("the machine was busy when the search began, and is calmer now: it begins again")
+            steps.clear()
+            found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
+        else:  # what was chosen is the same; what is told of it is not
+            found = replace(found, held_out=bench.measure(found.model, bench.held_out))
+            steps[0] = replace(steps[0], measured=bench.measure(steps[0].model, bench.seen))
     with atomic_path(out) as temporary:
         onnx.save_model(found.model, str(temporary))
     assert found.held_out is not None

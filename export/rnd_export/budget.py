@@ -220,11 +220,13 @@ def _saved(bound: Bound, now: Found, found: Found) -> float:
 
 
 def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan | None:
-    """The next rung of ``name`` down the ladder, or up for −1, that makes another file; None at its end."""
+    """The next rung of ``name`` down the ladder, or up for −1, that makes another file that is allowed; None at its
+    end."""
     last = len(LADDERS[name]) if way > 0 else 0
     for rung in range(getattr(plan, name) + way, last + way, way):
         other = replace(plan, **{name: rung})
-        if other.recipe(bench.config) != plan.recipe(bench.config):
+        recipe = other.recipe(bench.config)
+        if recipe != plan.recipe(bench.config) and bench.allows(recipe.variant.precision):
             return other
     return None
 

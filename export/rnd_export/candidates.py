@@ -14,6 +14,7 @@ import onnx
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar import Avatar
+from rnd_runtime.avatar_file import Precision
 from rnd_runtime.camera import Camera
 from rnd_runtime.frame import FrameRenderer
 from rnd_runtime.gaussians import Gaussians
@@ -26,7 +27,7 @@ from rnd_trainer.template import node_interpolation
 
 from .bake import BakedAvatar, bake
 from .culling import advise
-from .export import refuse_ablations, written
+from .export import MAX_P99_M, refuse_ablations, written
 from .merge import contributions, fitted_albedo, merged
 from .places import gaussians_by_place
 from .shots import Shot, Shots, resized, shots_around
@@ -88,10 +89,23 @@ class Workbench:
         )
         renderer = self._renderer(self._whole)
         self._truth = {shot: self._picture(renderer, shot) for shot in (*self.seen, *self.held_out)}
-        self._clock = clock or self._stopwatch()
+        self._stopwatch = None if clock else Stopwatch(self._frames(self._whole))
+        self._clock = clock or self._timed
         self._fit = [Shot(shot.time, resized(shot.camera, FIT_SIDE)) for shot in self.seen]
         self._shares = contributions(self._posed(self._whole))
         self._moves = self._gaussian_moves()
+        self._allowed: dict[Precision, bool] = {}
+
+    def allows(self, precision: Precision) -> bool:
+        """Whether constants of ``precision`` move places no farther than ``rnd-export`` allows by itself."""
+        if precision not in self._allowed:
+            coarser, motion = _loaded(self.model(Recipe(Variant(precision=precision)))), self._scene.motion
+            both = [
+                (self._whole.pose(motion, shot.time), coarser.pose(motion, shot.time)) for shot in self.seen
+            ]
+            apart = [np.linalg.norm(exact.means - rounded.means, axis=1) for exact, rounded in both]
+            self._allowed[precision] = bool(np.percentile(apart, 99) <= MAX_P99_M[precision])
+        return self._allowed[precision]
 
     def model(self, recipe: Recipe) -> onnx.ModelProto:
         """The file of ``recipe``."""
@@ -119,6 +133,10 @@ class Workbench:
         """Milliseconds of ``USUAL_FRAMES`` frames of ``model`` as this machine draws them now, busy moments and all."""
         draw = self._frames(_loaded(model))
         return milliseconds(draw, USUAL_FRAMES)
+
+    def recalibrated(self) -> bool:
+        """Whether times that were measured so far were of a busy machine, see :meth:`Stopwatch.recalibrated`."""
+        return self._stopwatch is not None and self._stopwatch.recalibrated()
 
     def still_share(self, recipe: Recipe) -> float:
         """Share of the skinning network's nodes that ``recipe`` gives the template's weights."""
@@ -151,9 +169,9 @@ class Workbench:
     def _posed(self, avatar: Avatar) -> list[tuple[Gaussians, Camera]]:
         return [(avatar.pose(self._scene.motion, shot.time), shot.camera) for shot in self._fit]
 
-    def _stopwatch(self) -> Callable[[Avatar], float]:
-        stopwatch = Stopwatch(self._frames(self._whole))
-        return lambda avatar: stopwatch.ms(self._frames(avatar))
+    def _timed(self, avatar: Avatar) -> float:
+        assert self._stopwatch
+        return self._stopwatch.ms(self._frames(avatar))
 
     def _site_moves(self, baked: BakedAvatar) -> Floats:
         """By how many mm dynamic skinning moves what reads each of ``baked``'s nodes [M], through other nodes too where

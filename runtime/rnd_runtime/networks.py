@@ -128,8 +128,8 @@ class Networks:
 
     @cached_property
     def _parts(self) -> tuple[tuple[str, ...], ...]:
-        """What is evaluated at once: skinning's network takes as long as the two others. On a core each, none of their
-        hundred operations has to wait for a second thread."""
+        """What is evaluated at once: skinning's network takes about as long as the two others. On a core each, none of
+        their hundred operations has to wait for a second thread."""
         if not self.posed_outside:
             return (POSED_OUTPUTS,)
         skinning = (NODE_LOGITS,) if NODE_LOGITS in self._file.outputs else ()
@@ -142,9 +142,8 @@ def _session(model: bytes, threads: int) -> ort.InferenceSession:
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
-    # Threads that spin on take the cores from the kernels that follow, and from everyone on a busy machine: at load 13
-    # a run of 30 000 Gaussians' networks takes 28 ms without and 157 ms with it (medians). As long as an operation's
-    # gap they may: 3.2 ms instead of 3.8 on an idle machine, 5.3 instead of 4.1 beside two busy processes.
+    # Of a session that has threads, these may spin as long as an operation's gap, and no longer: else they would take
+    # the cores from the kernels that follow, and from everyone on a busy machine.
     options.add_session_config_entry("session.intra_op.spin_duration_us", "50")
     options.log_severity_level = 4  # its complaints about broken files go into our one line instead
     try:

@@ -23,7 +23,11 @@ SEEDED = "seeded"
 """``avatar`` of a row whose networks nobody trained"""
 HARD = "X"
 """marks a frame of one of the hardest scenes"""
+EDGES = {"ao": "#aaaaaa", "table": "#000000", "table+sun": "#f4d03f", "lights": "#ff4fa3", "brute": "#00c8ff"}
+"""of a mark: its shading"""
 MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
+EDGE = 0.9
+"""points wide"""
 CEILING_DB = 60.0
 """points above it are drawn on it: a picture that is the reference's has a hundred"""
 LEAST_SPAN = 5.0
@@ -96,6 +100,14 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
     handles += [
         axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()
     ]
+    handles += [
+        axes.scatter([], [], facecolor="#ddd", edgecolor=edge, lw=EDGE, label=f"shade {mode}")
+        for mode, edge in EDGES.items() if any(_mode(row) == mode for row in rows)
+    ]  # fmt: skip
+    handles += [
+        axes.scatter([], [], s=_area(side), color="#555", label=f"{side}²")
+        for side in sorted({row["size"] for row in rows})
+    ]
     if any(_hard(row) for row in rows):
         hard = ", ".join(row["scene"] for row in rows if _hard(row))
         handles.append(axes.scatter([], [], color="#555", marker=HARD, label=hard))
@@ -103,7 +115,7 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
         handles.append(
             axes.scatter([], [], facecolor="none", edgecolor="#555", label="hollow: an untrained avatar")
         )
-    words.legend(handles=handles, loc="lower left", fontsize=8, frameon=False, borderaxespad=0)
+    words.legend(handles=handles, loc="lower left", fontsize=8, frameon=False, borderaxespad=0, ncols=2)
 
 
 def _stage(axes: Any, rows: list[Row], stage: str) -> None:
@@ -124,6 +136,16 @@ def _hard(row: Row) -> bool:
     return str(row.get("scene", USUAL_SCENE)) != USUAL_SCENE
 
 
+def _mode(row: Row) -> str:
+    """Its shading, without how many lights."""
+    return str(row["shade"]).partition(":")[0]
+
+
+def _area(side: int) -> float:
+    """Of the mark of a picture of so many pixels' side."""
+    return 14 + 26 * (side / 512)
+
+
 def _shown_db(row: Row) -> float:
     return min(float(row["psnr_db"]), CEILING_DB)
 
@@ -134,9 +156,9 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
     for row in rows:
         colour, seeded = COLOURS.get(row["n"], "#333"), row["avatar"] == SEEDED
         axes.scatter(
-            row[cost], _shown_db(row), s=14 + 26 * (row["size"] / 512), alpha=0.85, lw=0.5, zorder=2,
+            row[cost], _shown_db(row), s=_area(row["size"]), alpha=0.85, lw=EDGE, zorder=2,
             marker=HARD if _hard(row) else MARKERS[row["encoder"]],
-            facecolor="none" if seeded else colour, edgecolor=colour if seeded else "white",
+            facecolor="none" if seeded else colour, edgecolor=colour if seeded else EDGES[_mode(row)],
         )  # fmt: skip
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1, 2, 5)))

@@ -116,9 +116,6 @@ def _grid(options: Grid) -> None:
 
     check_chart(*options.chart)
     cross = [name.strip() for name in options.cross.split(",")] if options.cross else []
-    for name in ("json", "chart"):  # theirs are the tables and the chart of the documentation
-        own = not (cross or options.sample) or getattr(options, name) != getattr(Grid(), name)
-        check_option(own, flag(name), "files of its own beside --cross and --sample", "the usual ones")
     console, done = Console(), list[float]()
     # when each new point was; the first one's time is no other's: kernels are compiled, references made
 

@@ -16,13 +16,19 @@ WARMUP = 2
 
 def times(run: Callable[[], Any]) -> dict[str, float]:
     """Median, 95th percentile and least milliseconds of a call."""
-    taken: list[float] = []
-    until = perf_counter() + SECONDS
-    while len(taken) < WARMUP + REPEATS or perf_counter() < until:
-        start = perf_counter()
-        run()
-        taken.append(1e3 * (perf_counter() - start))
-    return summary(taken[WARMUP:])
+    return by_turns([run])[0]
+
+
+def by_turns(runs: Sequence[Callable[[], Any]]) -> list[dict[str, float]]:
+    """:func:`times` of several calls that take turns, so that a busy moment slows all of them."""
+    taken: list[list[float]] = [[] for _ in runs]
+    until = perf_counter() + SECONDS * len(runs)
+    while len(taken[0]) < WARMUP + REPEATS or perf_counter() < until:
+        for run, mine in zip(runs, taken):
+            start = perf_counter()
+            run()
+            mine.append(1e3 * (perf_counter() - start))
+    return [summary(mine[WARMUP:]) for mine in taken]
 
 
 def summary(taken: Sequence[float]) -> dict[str, float]:

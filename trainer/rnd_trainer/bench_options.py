@@ -99,11 +99,11 @@ class Grid:
     also precision, window, raster, threads, cull: all nine are days"""
     sample: int | None = None
     """so many of the combinations of --cross, or of all nine factors, drawn at random; more of them go on with fewer"""
-    json: Path = Path("assets/bench/grid.json")
+    json: Path = Path("out/bench/grid.json")
     """rows; those measured on this machine, of the same files and by the same code, are not measured again"""
     fresh: bool = False
     """measure all again, kept avatars and references too: on another machine of the same name"""
-    chart: tuple[Path, ...] = (Path("assets/bench/grid.svg"), Path("assets/bench/grid.png"))
+    chart: tuple[Path, ...] = (Path("out/bench/grid.svg"), Path("out/bench/grid.png"))
     """the chart, SVG or PNG by suffix"""
     files: tyro.conf.OmitArgPrefixes[Files] = field(default_factory=Files)
 
@@ -135,8 +135,8 @@ class Shards:
     """how it moves"""
     hdr: Path = Path("assets/sky.exr")
     """and what lights it"""
-    frames: int = 120
-    """of the clip, from its start"""
+    frames: int = 480
+    """of the clip at 120 frames a second, from its start"""
     size: int = 512
     """picture side in pixels"""
     cores: int = 2

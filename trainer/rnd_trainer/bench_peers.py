@@ -15,17 +15,16 @@ import moderngl
 import numpy as np
 import torch
 
-from rnd_runtime.avatar import Avatar
-from rnd_runtime.avatar_file import NODE_LOGITS, NODE_OUTPUTS
 from rnd_runtime.camera import Camera
 from rnd_runtime.doctor import machine
 from rnd_runtime.errors import InputError
 from rnd_runtime.gaussians import Gaussians
 from rnd_runtime.gl_context import Backend, create_context, renderer
+from rnd_runtime.networks import Networks
 from rnd_runtime.projection_gl import GlProjection, Sorting
 from rnd_runtime.surfaces_gl import SurfaceUpload
 
-from .bench_clock import REPEATS, times
+from .bench_clock import REPEATS, by_turns, times
 from .bench_raster import Row, Scene, bench_raster, body_scene
 from .bench_scenes import bench_camera
 from .checkpoint import load_checkpoint
@@ -81,7 +80,7 @@ def _orders(context: moderngl.Context, gaussians: Gaussians, camera: Camera) -> 
 
 @torch.no_grad()
 def encoders(checkpoint: Path, avatar: Path, threads: int) -> list[Row]:
-    """The networks at the nodes, from a pose to logits, offsets and visibility."""
+    """The networks at the nodes, from a pose to logits, offsets and visibility, by turns."""
     model = load_checkpoint(checkpoint).model
     joints, poses = model.log_weights.shape[1], model.config.window_poses
     generator = torch.Generator().manual_seed(0)
@@ -94,28 +93,29 @@ def encoders(checkpoint: Path, avatar: Path, threads: int) -> list[Row]:
     def eager() -> Any:
         return _networks(model, encoded, (window, velocity, normals))
 
-    loaded = Avatar.load(avatar, threads=threads)
+    networks = Networks.load(avatar, threads)
     inputs = (window.numpy(), velocity.numpy(), bones.numpy())
-    names = (*NODE_OUTPUTS, NODE_LOGITS)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
-    peers: list[tuple[str, Callable[[], Any]]] = [
-        ("onnxruntime", lambda: loaded.run(inputs, names)),
-        ("torch eager", eager),
-        ("torch.compile", torch.compile(eager)),
-    ]
-    rows = []
+    peers: dict[str, Callable[[], Any]] = {
+        "onnxruntime": lambda: networks.at(inputs),
+        "torch eager": eager,
+        "torch.compile": torch.compile(eager),
+    }
+    rows: dict[str, Row] = {}
     try:
-        for peer, run in peers:
-            row: Row = {"stage": "encoders", "peer": peer, "nodes": len(encoded), "threads": threads}
+        for peer, run in peers.items():
+            rows[peer] = {"stage": "encoders", "peer": peer, "nodes": len(encoded), "threads": threads}
             try:
-                row |= times(run)
+                run()
             except Exception as error:  # a compiler that is missing or too old, in its own many words
-                row["failed"] = str(error).strip().splitlines()[0][:160]
-            rows.append({**row, "machine": machine()})
+                rows[peer]["failed"] = str(error).strip().splitlines()[0][:160]
+        able = [peer for peer in peers if "failed" not in rows[peer]]
+        for peer, measured in zip(able, by_turns([peers[peer] for peer in able])):
+            rows[peer] |= measured
     finally:
         torch.set_num_threads(before)
-    return rows
+    return [{**row, "machine": machine()} for row in rows.values()]
 
 
 def _networks(model: AvatarModel, encoded: torch.Tensor, inputs: tuple[torch.Tensor, ...]) -> Any:

@@ -19,11 +19,13 @@ from rnd_runtime.errors import InputError
 
 REPEATS = 3
 """of each way, which take turns; the median is reported"""
+FPS = 120
+"""of the clip: more frames of the motion, so that what a process needs to start is not most of it"""
 PLAY = "import sys; from rnd_viewer.cli import main; sys.exit(main(sys.argv[1:]))"
 
 
 class Way(NamedTuple):
-    """So many processes, each with so many threads."""
+    """So many processes, each with so many threads; of one thread, a process overlaps no frames either."""
 
     processes: int
     threads: int
@@ -39,26 +41,32 @@ def bench_shards(
 ) -> Iterator[dict[str, Any]]:
     """Rows of wall time from the first process' start to the last one's end, PNGs written, and the speed-up.
 
+    ``start_seconds`` is what a process needs for one frame, and ``speed_up_drawing`` the speed-up of the rest.
+
     Args:
         avatar, motion, hdr: of ``rnd-play``.
-        frames: of the clip, from its start; size: picture side in pixels.
+        frames: of the clip at ``FPS``, from its start; size: picture side in pixels.
         cores: processes, or threads, at most.
 
     Raises:
         InputError: ``rnd-play`` failed; with its last line.
     """
-    inputs = [str(avatar), "--motion", str(motion), "--hdr", str(hdr), "--size", str(size), "--format", "png"]
+    inputs = [str(avatar), "--motion", str(motion), "--hdr", str(hdr), "--size", str(size), "--format", "png",
+              "--fps", str(FPS)]  # fmt: skip
     seconds: dict[Way, list[float]] = {way: [] for way in ways(cores)}
+    starts: list[float] = []
     for _ in range(REPEATS):
+        starts.append(_play(Way(1, 1), inputs, 1))
         for way, taken in seconds.items():
             taken.append(_play(way, inputs, frames))
     gaussians = Avatar.load(avatar, threads=1).gaussians
-    alone = statistics.median(seconds[Way(1, 1)])
+    alone, start = statistics.median(seconds[Way(1, 1)]), statistics.median(starts)
     for way, taken in seconds.items():
         median = statistics.median(taken)
         yield {
             "processes": way.processes, "threads": way.threads, "seconds": median, "fps": frames / median,
-            "speed_up": alone / median, "frames": frames, "size": size, "avatar": avatar.name,
+            "speed_up": alone / median, "start_seconds": start, "speed_up_drawing": (alone - start) / (median - start),
+            "frames": frames, "size": size, "avatar": avatar.name,
             "gaussians": gaussians, "machine": machine(),
         }  # fmt: skip
 
@@ -77,7 +85,7 @@ def _play(way: Way, inputs: list[str], frames: int) -> float:
         processes = [
             subprocess.Popen(
                 [sys.executable, "-c", PLAY, *inputs, "--threads", str(way.threads),
-                 "--frames", f"{start}:{end}", "--out", out],
+                 "--frames", f"{start}:{end}", "--out", out, *([] if way.threads > 1 else ["--no-pipeline"])],
                 env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
             )
             for start, end in shards(frames, way.processes)
