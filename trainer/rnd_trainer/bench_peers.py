@@ -42,12 +42,16 @@ def bench_peers(checkpoint: Path, avatar: Path, n: int, size: int, threads: int)
 
 def depth_order(n: int, size: int, threads: int) -> list[Row]:
     """Projecting and ordering the Gaussians of :func:`body_scene` on every OpenGL backend of this machine."""
-    gaussians, camera, rows = _gaussians(body_scene(n)), bench_camera(size), []
+    gaussians, camera = _gaussians(body_scene(n)), bench_camera(size)
+    rows: list[Row] = []
     backends: tuple[Backend, ...] = ("egl", "osmesa")
     for backend in backends:
         try:
             context = create_context(backend)
-        except InputError:
+        except InputError as error:
+            rows.append(
+                {"stage": f"projection+sort, {backend}", "peer": "compute shaders", "failed": str(error)}
+            )
             continue
         with context:
             known = {"n": n, "threads": threads, "renderer": renderer(context), "machine": machine()}
