@@ -20,8 +20,8 @@ from rnd_export.candidates import Measured, Recipe, Scene, Workbench
 from rnd_export.cli import main
 from rnd_export.export import random_motion
 from rnd_export.merge import fitted_albedo, merged
-from rnd_export.places import moving_sites
-from rnd_export.shots import COUNT, resized, shots_of
+from rnd_export.places import gaussians_by_place, moving_sites
+from rnd_export.shots import COUNT, FITTED, resized, shots_around, shots_of
 from rnd_export.stopwatch import Stopwatch
 from rnd_export.variant import OWN_NODES, Variant, reduced, static_where
 from rnd_runtime.avatar import Avatar
@@ -509,6 +509,30 @@ def test_merging_keeps_mass_and_valid_gaussians(tiny_checkpoint) -> None:
     )
 
 
+def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> None:
+    baked = gaussians_by_place(bake(load_checkpoint(tiny_checkpoint).model))
+    seen = np.random.default_rng(3).uniform(0.1, 1, len(baked.points))
+    seen[np.isin(baked.rows, baked.rows[baked.node_rows], invert=True) & (baked.rows % 5 == 0)] = 0
+    count = (len(seen) + len(baked.node_rows)) // 2
+    left = np.isin(baked.rows, merged(baked, count, seen).rows)
+    own = left.copy()
+    own[baked.node_rows] = False  # which stay for the networks' sake
+    assert left.sum() == count and (seen[own] > 0).all()
+    assert seen[own].mean() > 1.15 * seen[~left & (seen > 0)].mean()
+    assert cKDTree(baked.points[left]).query(baked.points)[0].max() < 6 * np.median(
+        cKDTree(baked.points).query(baked.points, 2)[0][:, 1]
+    )
+
+
+def test_sides_that_are_fitted_are_of_the_searchs_moments(bench) -> None:
+    motion = random_motion(bench._whole.skeleton, frames=30, seed=2)
+    seen, fitted, held_out = shots_around(motion, 32, lambda time: bench._whole.pose(motion, time))
+    assert (len(seen), len(fitted), len(held_out)) == (COUNT, FITTED, COUNT)
+    assert {shot.time for shot in fitted} == {shot.time for shot in seen}
+    assert not {shot.time for shot in fitted} & {shot.time for shot in held_out}
+    assert len({shot.camera.position.tobytes() for shot in fitted}) == FITTED
+
+
 def test_merging_keeps_the_moments(tiny_checkpoint) -> None:
     """Σ mass, Σ mass·x and Σ mass·(Σ + x xᵀ) of all Gaussians are those of the fewer."""
     baked = bake(load_checkpoint(tiny_checkpoint).model)
@@ -567,20 +591,26 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
 
 def test_a_search_looks_at_the_captures_views(tiny_checkpoint, tmp_path, monkeypatch) -> None:
     capture = load_capture(ASSETS / "capture")
-    seen, held_out = shots_of(capture, 40)
+    seen, fitted, held_out = shots_of(capture, 40)
 
     def views(split) -> set[tuple[float, bytes]]:
         cameras = capture.cameras
         return {(f.frame / capture.fps, cameras[f.camera].position.tobytes()) for f in capture.split(split)}
 
-    for shots, split in ((seen, "train"), (held_out, "novel_pose")):
-        assert len(shots) == COUNT and {(s.time, s.camera.position.tobytes()) for s in shots} <= views(split)
+    for shots, split, count in (
+        (seen, "train", COUNT),
+        (fitted, "train", FITTED),
+        (held_out, "novel_pose", COUNT),
+    ):
+        assert len(shots) == min(count, len(capture.split(split))) and {
+            (s.time, s.camera.position.tobytes()) for s in shots
+        } <= views(split)
         assert len({shot.time for shot in shots}) >= COUNT / 2  # spread over the split
         assert {max(shot.camera.width, shot.camera.height) for shot in shots} == {40}
     train = tuple(capture.split("train"))
-    seen, held_out = shots_of(replace(capture, frames=train[:5]), 40)
-    assert len(seen) == 3 and len(held_out) == 2
-    assert not {shot.time for shot in seen} & {shot.time for shot in held_out}
+    seen, fitted, held_out = shots_of(replace(capture, frames=train[:5]), 40)
+    assert len(seen) == len(fitted) == 3 and len(held_out) == 2
+    assert not {shot.time for shot in (*seen, *fitted)} & {shot.time for shot in held_out}
     with pytest.raises(InputError, match="training views of the capture: expected at least 2, got 1"):
         shots_of(replace(capture, frames=train[:1]), 40)
 

@@ -62,11 +62,11 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
     found = advised_cull(avatar, motion)
     assert found in COSINES[1:-1]
     light = Light(avatar.trained_light)
-    seen, held_out = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
+    around = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
 
     def coded(cull: float) -> np.ndarray:
         """8-bit pictures as they are looked at."""
-        shots = [*seen, *held_out]
+        shots = [*around.seen, *around.held_out]
         drawn = (FrameRenderer(avatar, light, s.camera, cull=cull).render(motion, s.time) for s in shots)
         return np.array([frame.image for frame in drawn]) / 255.0
 

@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 USUAL_FRAMES = 90
 FIT_SIDE = 256
-"""of the pictures that colours are fitted to"""
+"""of the pictures that say what Gaussians contribute, and that colours are fitted to"""
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,14 @@ class Workbench:
         self.config, self._checkpoint, self._scene = checkpoint.config.model, checkpoint, scene
         self._baked = gaussians_by_place(bake(checkpoint.model))
         self._whole = _loaded(self.model(Recipe()))
-        self.seen, self.held_out = scene.shots or shots_around(
+        self.seen, fitted, self.held_out = scene.shots or shots_around(
             scene.motion, scene.size, lambda time: self._whole.pose(scene.motion, time)
         )
         renderer = self._renderer(self._whole)
         self._truth = {shot: self._picture(renderer, shot) for shot in (*self.seen, *self.held_out)}
         self._stopwatch = None if clock else Stopwatch(self._frames(self._whole))
         self._clock = clock or self._timed
-        self._fit = [Shot(shot.time, resized(shot.camera, FIT_SIDE)) for shot in self.seen]
+        self._fit = [Shot(shot.time, resized(shot.camera, FIT_SIDE)) for shot in fitted]
         self._shares = contributions(self._posed(self._whole))
         self._moves = self._gaussian_moves()
         self._allowed: dict[Precision, bool] = {}

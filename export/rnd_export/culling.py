@@ -28,8 +28,8 @@ def advised_cull(avatar: Avatar, motion: Motion) -> float | None:
     They are taken all along ``motion`` and from all around, of ``SIZE`` pixels that the body fills, under the light
     that was learned. None where no cosine does: a body with holes, or one that is seen through.
     """
-    seen, held_out = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
-    shots = [*seen, *held_out]
+    around = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
+    shots = [*around.seen, *around.held_out]
     renderer = FrameRenderer(avatar, Light(avatar.trained_light), shots[0].camera, cull=-1)
 
     def pictures() -> list[Floats]:
