@@ -95,6 +95,15 @@ def test_less_quality_looks_like_more(quality, least):
     assert (less[1].radiance != whole[1].radiance).any()
 
 
+def test_aovs_are_drawn_at_full_quality():
+    light = Light(np.ones((16, 32, 3), np.float32))
+    player = Player(FakeAvatar(), light, Shader(light, "table"), rasterize, aovs=("albedo",))
+    encoded = player.encode(MOTION, 0.1)
+    whole, less = (player.draw(encoded, CAMERA, quality) for quality in (FULL, Quality(1, 0.5)))
+    np.testing.assert_array_equal(less.alpha, whole.alpha)
+    np.testing.assert_array_equal(less.aovs["albedo"], whole.aovs["albedo"])
+
+
 def test_after_a_frame_of_full_quality_nothing_older_is_used():
     light = Light(np.linspace(2, 0, 16, dtype=np.float32)[:, None, None] * np.ones((16, 32, 3), np.float32))
     player = Player(FakeAvatar(), light, Shader(light, "table"), rasterize)

@@ -18,7 +18,7 @@ from rnd_runtime.motion import Motion
 COUNT = 6
 """to search in; as many others are held out"""
 FITTED = 24
-"""to fit in: of six the merged avatar learns what they show, 1 to 3 dB worse in others (the dancer)"""
+"""to fit in: of six the merged avatar learns what they show, 1 to 2 dB worse in others (the dancer)"""
 FIELD_OF_VIEW = 0.6
 
 

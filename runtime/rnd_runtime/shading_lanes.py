@@ -19,7 +19,7 @@ TINY = np.float32(1e-12)
 ROUGHNESS_LOW = np.float32(ROUGHNESS_RANGE[0])
 ROUGHNESS_SPAN = np.float32(ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 _HALF, _F0, _COSINE_FLOOR = np.float32(0.5), np.float32(F0), np.float32(COSINE_FLOOR)
-_ONE_OVER_PI = np.float32(1 / np.pi)
+ONE_OVER_PI = np.float32(1 / np.pi)
 
 # Rows of sixteen in the working memory of a thread: what goes in, what comes out in place of the albedo, where to look
 (NORMAL, VIEW, ALBEDO) = (0, 3 * WIDTH, 6 * WIDTH)  # three each, one after the other
@@ -140,7 +140,7 @@ def ggx_in_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  
     grazing = at_least(ONE - _HALF * root(half_squared), ZERO)
     grazing_squared = grazing * grazing
     fresnel = _F0 + (ONE - _F0) * grazing_squared * grazing_squared * grazing
-    return _ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
+    return ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
 
 
 @njit(inline="always")

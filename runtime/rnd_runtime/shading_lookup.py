@@ -26,6 +26,7 @@ from .shading_lanes import (
     FREE,
     NORMAL,
     ONE,
+    ONE_OVER_PI,
     RADIANCE,
     ROW,
     TINY,
@@ -50,7 +51,6 @@ from .shading_lanes import (
 
 DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
 SPECULAR_SIZE = 49
-_ONE_OVER_PI = np.float32(1 / np.pi)
 
 # A row of the specular table: RGB and nothing, of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1) in (s, t). A
 # corner's share is (s or 1 − s)(t or 1 − t): constant plus slope times s, times the same of t.
@@ -130,7 +130,7 @@ def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):
         at = channel * WIDTH
         shine = load(columns, at) + load(columns, at + 4 * WIDTH)
         shine += load(columns, at + 8 * WIDTH) + load(columns, at + 12 * WIDTH)
-        matt = load(room, ALBEDO + at) * _ONE_OVER_PI * load(room, _IRRADIANCE + at)
+        matt = load(room, ALBEDO + at) * ONE_OVER_PI * load(room, _IRRADIANCE + at)
         store(room, RADIANCE + at, at_least(matt + energy * shine, ZERO) + broken)
 
 

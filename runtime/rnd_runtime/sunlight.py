@@ -21,8 +21,10 @@ from .shading_lanes import (
     FREE,
     NORMAL,
     ONE,
+    ONE_OVER_PI,
     RADIANCE,
     ROUGHNESS,
+    ROUGHNESS_LOW,
     TINY,
     VIEW,
     ZERO,
@@ -40,8 +42,7 @@ Floats32 = NDArray[np.float32]
 # shade. Suns fade out over these n·v, chosen on training pictures of the dancer (36.19 dB without, 36.27 with).
 TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
 
-_ONE_OVER_PI = np.float32(1 / np.pi)
-_ROUGHNESS_LOW, _ROUGHNESS_HIGH = (np.float32(bound) for bound in ROUGHNESS_RANGE)
+_ROUGHNESS_HIGH = np.float32(ROUGHNESS_RANGE[1])
 _OPEN = FREE  # a row of a thread's working memory
 _ROOM = FREE + WIDTH
 
@@ -83,7 +84,7 @@ def _light_sixteen(members, visibility, suns, room):  # type: ignore[no-untyped-
     normal, view = three(room, NORMAL), unit(three(room, VIEW))
     n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
     facing = clamped((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), ONE)
-    alpha = at_least(clamped(load(room, ROUGHNESS), _ROUGHNESS_HIGH), _ROUGHNESS_LOW)
+    alpha = at_least(clamped(load(room, ROUGHNESS), _ROUGHNESS_HIGH), ROUGHNESS_LOW)
     alpha = alpha * alpha
     albedo = three(room, ALBEDO)
     red, green, blue = lanes(ZERO), lanes(ZERO), lanes(ZERO)
@@ -101,9 +102,9 @@ def _light_sixteen(members, visibility, suns, room):  # type: ignore[no-untyped-
         alpha_squared = alpha * alpha + suns.spread_squared[sun] / root(half_squared)
         alpha_squared = select(alpha_squared < ONE, alpha_squared, ONE)
         shine = ggx_in_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
-        red += arriving * (albedo[0] * _ONE_OVER_PI + shine) * suns.irradiance[sun, 0]
-        green += arriving * (albedo[1] * _ONE_OVER_PI + shine) * suns.irradiance[sun, 1]
-        blue += arriving * (albedo[2] * _ONE_OVER_PI + shine) * suns.irradiance[sun, 2]
+        red += arriving * (albedo[0] * ONE_OVER_PI + shine) * suns.irradiance[sun, 0]
+        green += arriving * (albedo[1] * ONE_OVER_PI + shine) * suns.irradiance[sun, 1]
+        blue += arriving * (albedo[2] * ONE_OVER_PI + shine) * suns.irradiance[sun, 2]
     store(room, RADIANCE, red)
     store(room, RADIANCE + WIDTH, green)
     store(room, RADIANCE + 2 * WIDTH, blue)

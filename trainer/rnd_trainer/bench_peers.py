@@ -49,9 +49,8 @@ def depth_order(n: int, size: int, threads: int) -> list[Row]:
         try:
             context = create_context(backend)
         except InputError as error:
-            rows.append(
-                {"stage": f"projection+sort, {backend}", "peer": "compute shaders", "failed": str(error)}
-            )
+            failed = {"stage": f"projection+sort, {backend}", "peer": "compute shaders", "failed": str(error)}
+            rows.append({**failed, "machine": machine()})
             continue
         with context:
             known = {"n": n, "threads": threads, "renderer": renderer(context), "machine": machine()}

@@ -112,7 +112,12 @@ class Player:
             return self.avatar.encode(motion, time_s)
 
     def draw(self, encoded: Encoded, camera: Camera, quality: Quality = FULL) -> Frame:
-        """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before."""
+        """The second half of :meth:`render`; below full ``quality`` it uses what it kept of the frames before.
+
+        AOVs are drawn at full quality.
+        """
+        if self.aovs:
+            quality = FULL
         sides = (max(round(side * quality.scale), 1) for side in (camera.width, camera.height))
         resized = camera if quality.scale == 1 else camera.resized(*sides)
         if quality.shade_every == 1 and not self.aovs:
