@@ -21,7 +21,7 @@ need_system_packages() {
 }
 
 # numba's cache knows a kernel by its own file: constants and helpers from other files would stay as they were
-export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/numba-$(cat runtime/rnd_runtime/*.py trainer/rnd_trainer/*.py | sha256sum | cut -c1-12)}
+export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/numba-$(find runtime trainer -name "*.py" -print0 | sort -z | xargs -0 cat | sha256sum | cut -c1-12)}
 
 # $1: extras of rnd-avatar to install, such as dev
 need_python_packages() {

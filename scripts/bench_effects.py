@@ -15,18 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from rnd_runtime.doctor import machine
-from rnd_runtime.files import write_json
-from rnd_trainer.bench_grid import FACTORS
+from rnd_bench.speed.grid import FACTORS
+from rnd_runtime.core.files import write_json
+from rnd_runtime.playback.doctor import machine
 
 NOISE = 1.2
 """times as long as usual a frame may take by what else the host does"""
 Row = dict[str, Any]
 
 
-def effects(
-    rows: list[Row], factors: dict[str, tuple[Any, ...]]
-) -> dict[tuple[str, str], tuple[float, float, float]]:
+def effects(rows: list[Row], factors: dict[str, tuple[Any, ...]]) -> dict[tuple[str, str], tuple[float, float, float]]:
     """(factor, value) → what it multiplies the time by, all else alike, and twice the standard error below and above.
 
     Least squares of log ms, beside the first value of each factor.
@@ -51,10 +49,16 @@ def table(rows: list[Row]) -> list[Row]:
     gl = effects([row for row in rows if row["raster"] != "cpu"], others)
     alike = {"of": len(rows), "machine": machine()}
     lines = [
-        {"factor": name, "value": value, "instead_of": _said(FACTORS[name][0]), "cpu": _stated(cpu[name, value]),
-         "opengl": _stated(gl[name, value]), **alike}
+        {
+            "factor": name,
+            "value": value,
+            "instead_of": _said(FACTORS[name][0]),
+            "cpu": _stated(cpu[name, value]),
+            "opengl": _stated(gl[name, value]),
+            **alike,
+        }
         for name, value in cpu
-    ]  # fmt: skip
+    ]
     whole = effects(rows, FACTORS)
     return lines + [
         {"factor": name, "value": value, "instead_of": "cpu", "opengl": _stated(whole[name, value]), **alike}
@@ -88,8 +92,7 @@ def _said(value: object) -> str:
 def main(sampled: Path, crossed: Path, out: Path) -> None:
     """Write both answers."""
     rows, others = (
-        [row for row in json.loads(path.read_text("utf-8")) if "psnr_db" in row]
-        for path in (sampled, crossed)
+        [row for row in json.loads(path.read_text("utf-8")) if "psnr_db" in row] for path in (sampled, crossed)
     )
     write_json(out, {"effects": table(rows), "beyond": beyond(rows, others), "sampled": len(rows)})
 

@@ -25,10 +25,11 @@ ASSETS, DIST = ROOT / "assets", ROOT / "viewer/web/dist"
 sys.path.insert(0, str(ROOT / "tests"))
 
 from browser import Page, chromium  # noqa: E402
-from rnd_runtime.doctor import machine  # noqa: E402
-from rnd_viewer.view_options import ViewOptions  # noqa: E402
-from rnd_viewer.view_scene import Scene  # noqa: E402
-from rnd_viewer.view_server import serve  # noqa: E402
+
+from rnd_runtime.playback.doctor import machine  # noqa: E402
+from rnd_viewer.view.options import ViewOptions  # noqa: E402
+from rnd_viewer.view.scene import Scene  # noqa: E402
+from rnd_viewer.view.server import serve  # noqa: E402
 
 SIZE, PLAYED_S, ONE_BY_ONE = 512, 6, 30
 
@@ -95,9 +96,7 @@ def _measure(page: Page, url: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("avatar", nargs="?", type=Path, default=ASSETS / "avatar.onnx")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()

@@ -13,13 +13,13 @@ from pathlib import Path
 
 from numba import get_num_threads
 
-from rnd_export.candidates import Recipe, Scene, Workbench
-from rnd_export.variant import Variant
-from rnd_runtime.doctor import machine
-from rnd_runtime.files import write_json
-from rnd_runtime.light import load_light
-from rnd_runtime.motion import load_motion
-from rnd_trainer.checkpoint import load_checkpoint
+from rnd_export.reduce.variant import Variant
+from rnd_export.search.candidates import Recipe, Scene, Workbench
+from rnd_runtime.core.files import write_json
+from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.playback.doctor import machine
+from rnd_runtime.shading.light import load_light
+from rnd_trainer.model.checkpoint import load_checkpoint
 
 ASSETS = Path(__file__).parent.parent / "assets"
 ROUNDS = 3
@@ -54,11 +54,20 @@ def main(checkpoint: Path, out: Path) -> None:
         for name, model in models.items():
             found[name].append(bench.measure(model, shots))
     rows = [
-        {"networks": name, "ms": min(one.ms for one in took), "psnr_db": took[0].psnr, "mb": took[0].mb,
-         "nodes": bench.config.nodes, "gaussians": bench.config.gaussians, "size": 512, "shade": "table",
-         "threads": get_num_threads(), "machine": machine()}
+        {
+            "networks": name,
+            "ms": min(one.ms for one in took),
+            "psnr_db": took[0].psnr,
+            "mb": took[0].mb,
+            "nodes": bench.config.nodes,
+            "gaussians": bench.config.gaussians,
+            "size": 512,
+            "shade": "table",
+            "threads": get_num_threads(),
+            "machine": machine(),
+        }
         for name, took in found.items()
-    ]  # fmt: skip
+    ]
     write_json(out, rows)
 
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.files import earlier_rows, write_json
-from rnd_trainer.bench_chart import BUDGET_MS
+from rnd_bench.speed.chart import BUDGET_MS
+from rnd_runtime.core.files import earlier_rows, write_json
 
 COLD_START_MS = 1500.0
 TIMES = ("ms_median", "ms_p95", "cold_start_ms")
@@ -43,7 +43,4 @@ if __name__ == "__main__":
     if len(sys.argv) < 3:
         raise SystemExit(__doc__)
     out, *files = map(Path, sys.argv[1:])
-    write_json(
-        out,
-        [together(earlier_rows(file, what="rows of rnd-bench frame --runs", names=SAME)) for file in files],
-    )
+    write_json(out, [together(earlier_rows(file, what="rows of rnd-bench frame --runs", names=SAME)) for file in files])

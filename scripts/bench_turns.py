@@ -59,11 +59,11 @@ class Player:
 
 def draw(avatar_file: str, shade: str, threads: str) -> None:
     """What such a process does: one line of times for each line that says where to begin."""
-    from rnd_runtime.avatar import Avatar
-    from rnd_runtime.frame import FrameRenderer
-    from rnd_runtime.light import load_light
-    from rnd_runtime.motion import load_motion
-    from rnd_trainer.bench_scenes import USUAL, bench_camera
+    from rnd_bench.scenes.scenes import USUAL, bench_camera
+    from rnd_runtime.avatar.avatar import Avatar
+    from rnd_runtime.motion.motion import load_motion
+    from rnd_runtime.playback.frame import FrameRenderer
+    from rnd_runtime.shading.light import load_light
 
     avatar = Avatar.load(avatar_file, threads=int(threads))
     motion = load_motion(ROOT / "assets/walk.npz", avatar.skeleton)
@@ -94,19 +94,20 @@ def compared(players: Sequence[Player], turns: int) -> list[dict[str, Any]]:
         ratios = np.median(after, 1) / np.median(before, 1)
         rows.append(
             {
-                "stage": stage, "ratio": float(np.median(ratios)),
+                "stage": stage,
+                "ratio": float(np.median(ratios)),
                 "ratio_se": float(MEDIANS_ERROR * ratios.std() / np.sqrt(turns)),
-                "before_ms": float(np.median(before)), "after_ms": float(np.median(after)),
-                "before_p95": float(np.percentile(before, 95)), "after_p95": float(np.percentile(after, 95)),
+                "before_ms": float(np.median(before)),
+                "after_ms": float(np.median(after)),
+                "before_p95": float(np.percentile(before, 95)),
+                "after_p95": float(np.percentile(after, 95)),
             }
-        )  # fmt: skip
+        )
     return rows
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkouts", type=Path, nargs=2, metavar=("BEFORE", "AFTER"))
     parser.add_argument("--avatar", type=Path, required=True)
     parser.add_argument("--shade", default="table")
@@ -115,18 +116,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
 
-    from rnd_runtime.doctor import machine
-    from rnd_runtime.errors import run_command
-    from rnd_runtime.files import existing_file, sha256_of, write_json
+    from rnd_runtime.core.errors import run_command
+    from rnd_runtime.core.files import existing_file, sha256_of, write_json
+    from rnd_runtime.playback.doctor import machine
 
     def command() -> None:
         for checkout in options.checkouts:
-            existing_file(checkout / "runtime/rnd_runtime/frame.py", what="checkout's player")
+            existing_file(checkout / "runtime/rnd_runtime/playback/frame.py", what="checkout's player")
         avatar = existing_file(options.avatar, what="avatar").resolve()
-        players = [
-            Player(checkout.resolve(), avatar, options.shade, options.threads)
-            for checkout in options.checkouts
-        ]
+        players = [Player(checkout.resolve(), avatar, options.shade, options.threads) for checkout in options.checkouts]
         try:
             for player in players:
                 player.turn(WARM_UP)
@@ -135,12 +133,15 @@ def main() -> None:
             for player in players:
                 player.close()
         about = {
-            **{
-                name: _commit(checkout) for name, checkout in zip(("before", "after"), options.checkouts)
-            },
-            "avatar_sha256": sha256_of(avatar), "size": 512, "shade": options.shade, "threads": options.threads,
-            "turns": options.turns, "frames": FRAMES, "machine": machine(),
-        }  # fmt: skip
+            **{name: _commit(checkout) for name, checkout in zip(("before", "after"), options.checkouts)},
+            "avatar_sha256": sha256_of(avatar),
+            "size": 512,
+            "shade": options.shade,
+            "threads": options.threads,
+            "turns": options.turns,
+            "frames": FRAMES,
+            "machine": machine(),
+        }
         write_json(options.json, [row | about for row in rows])
         for row in rows:
             print(

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rnd_runtime.images import read_image, write_image
+from rnd_runtime.core.images import read_image, write_image
 
 COLUMNS = 6
 

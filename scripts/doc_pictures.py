@@ -9,22 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from rnd_runtime.avatar import Avatar
-from rnd_runtime.camera import Camera
-from rnd_runtime.frame import draw
-from rnd_runtime.images import write_image
-from rnd_runtime.light import Light, load_light
-from rnd_runtime.motion import Motion, load_motion
-from rnd_runtime.raster import make_rasterizer
-from rnd_runtime.raster_cpu import rasterize
-from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_runtime.shading import Shader
-from rnd_runtime.skeleton import bone_transforms
-from rnd_runtime.tone import tone_map
-from rnd_viewer.aov import aov_picture
-from rnd_viewer.background import Background
-from rnd_viewer.cameras import CameraOptions, frame_motion, front_path, orbit_path
-from rnd_viewer.player import Player
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.images import write_image
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.motion import Motion, load_motion
+from rnd_runtime.motion.skeleton import bone_transforms
+from rnd_runtime.playback.frame import draw
+from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.raster.tone import tone_map
+from rnd_runtime.shading.light import Light, load_light
+from rnd_runtime.shading.shader import Shader
+from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
+from rnd_viewer.play.aov import aov_picture
+from rnd_viewer.play.player import Player
 
 ROOT = Path(__file__).parent.parent
 SIDE, TIME_S = 400, 0.55
@@ -50,20 +50,12 @@ def main() -> None:
 
     learned = Light(avatar.trained_light)
     lights = [learned, *(replace(sky, yaw=math.radians(yaw)) for yaw in (0, 120, 240))]
-    _write(
-        "relight.png",
-        [Player(avatar, x, Shader(x), rasterize).render(walk, TIME_S, camera).srgb for x in lights],
-    )
+    _write("relight.png", [Player(avatar, x, Shader(x), rasterize).render(walk, TIME_S, camera).srgb for x in lights])
 
-    rest = Motion(
-        np.tile(np.eye(3), (1, len(avatar.skeleton), 1, 1)), np.zeros((1, 3)), 30, avatar.skeleton.names
-    )
+    rest = Motion(np.tile(np.eye(3), (1, len(avatar.skeleton), 1, 1)), np.zeros((1, 3)), 30, avatar.skeleton.names)
     tiles = []
     for motion, time_s in ((rest, 0.0), (walk, TIME_S)):
-        view = front_path(
-            frame_motion(avatar.skeleton, motion.at([time_s])),
-            CameraOptions(SIDE, SIDE),
-        )
+        view = front_path(frame_motion(avatar.skeleton, motion.at([time_s])), CameraOptions(SIDE, SIDE))
         tiles.append(_weights(avatar, motion, time_s, view(0, 0.0)))
     _write("weights.png", tiles)
     _forearm(avatar, rest, sky)
@@ -82,8 +74,8 @@ def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
 
 def _weights(avatar: Avatar, motion: Motion, time_s: float, camera) -> np.ndarray:
     """Skinning weights as colours: each joint has its own, a Gaussian the mixture of its joints'."""
-    from rnd_runtime.forearm import skinning_bones
-    from rnd_runtime.window import motion_window
+    from rnd_runtime.posing.forearm import skinning_bones
+    from rnd_runtime.posing.window import motion_window
 
     gaussians = avatar.pose(motion, time_s)
     now = motion.at([time_s])

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.images import read_image, write_image
-from rnd_trainer.preview import TILES, captions
+from rnd_runtime.core.images import read_image, write_image
+from rnd_trainer.evaluation.preview import TILES, captions
 
 SHOWN = (330, 150)
 """height and width of a tile in the sheet, pixels"""

@@ -11,7 +11,7 @@ import pytest
 @pytest.fixture(scope="session")
 def tiny_capture(tmp_path_factory):
     """A capture of six 64² pictures of the embedded body."""
-    from tiny import write_capture
+    from support.tiny import write_capture
 
     return write_capture(tmp_path_factory.mktemp("capture"))
 
@@ -36,8 +36,8 @@ def tiny_config():
 @pytest.fixture(scope="session")
 def tiny_run(tiny_capture, tiny_config, tmp_path_factory) -> Path:
     """The folder of a finished tiny training."""
-    from rnd_trainer.train import Training
-    from rnd_trainer.training_run import run
+    from rnd_trainer.training.run import run
+    from rnd_trainer.training.training import Training
 
     folder = tmp_path_factory.mktemp("run")
     run(Training(tiny_capture, tiny_config), folder, on_step=lambda step: None, on_preview=lambda: None)
@@ -49,15 +49,13 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
     """avatar.ckpt of an untrained model with random weights: every network says something, unlike after 14 steps."""
     import torch
 
-    from rnd_trainer.checkpoint import save_checkpoint
     from rnd_trainer.config import ModelConfig, TrainConfig
-    from rnd_trainer.model import AvatarModel
-    from rnd_trainer.template import sample_template
-    from tiny import body
+    from rnd_trainer.model.checkpoint import save_checkpoint
+    from rnd_trainer.model.model import AvatarModel
+    from rnd_trainer.model.template import sample_template
+    from support.tiny import body
 
-    config = TrainConfig(
-        model=ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, window_poses=5)
-    )
+    config = TrainConfig(model=ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, window_poses=5))
     template = body()
     torch.manual_seed(1)
     model = AvatarModel(config.model, sample_template(template, 800, 200, seed=1))
@@ -65,9 +63,7 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
         for parameter in model.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     path = tmp_path_factory.mktemp("checkpoint") / "avatar.ckpt"
-    save_checkpoint(
-        path, model, torch.ones(32, 64, 3), template.skeleton, config, {"body_license": "CC0-1.0"}
-    )
+    save_checkpoint(path, model, torch.ones(32, 64, 3), template.skeleton, config, {"body_license": "CC0-1.0"})
     return path
 
 
@@ -75,7 +71,7 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
 def tiny_avatar(tiny_checkpoint) -> Path:
     """avatar.onnx of ``tiny_checkpoint``."""
     from rnd_export.export import export
-    from rnd_trainer.checkpoint import load_checkpoint
+    from rnd_trainer.model.checkpoint import load_checkpoint
 
     path = tiny_checkpoint.with_suffix(".onnx")
     export(load_checkpoint(tiny_checkpoint), path)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from rnd_runtime.body import Body
-from rnd_runtime.motion import save_motion
-from rnd_trainer.stage.dances import walk
-from rnd_trainer.stage.template import template_body
+from rnd_runtime.capture.body import Body
+from rnd_runtime.motion.motion import save_motion
+from rnd_stage.film.dances import walk
+from rnd_stage.people.template import template_body
 
 from . import sky
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rnd_runtime.body import Body
-from rnd_runtime.camera import Camera
-from rnd_runtime.capture import Capture, CaptureLight, Frame, Split, load_capture, save_capture
-from rnd_runtime.images import linear_to_srgb, to_bytes, write_image
-from rnd_trainer.stage.dances import FPS, TRAIN_SECONDS, dance
-from rnd_trainer.stage.remesh import Floats
+from rnd_runtime.capture.body import Body
+from rnd_runtime.capture.capture import Capture, CaptureLight, Frame, Split, load_capture, save_capture
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.images import linear_to_srgb, to_bytes, write_image
+from rnd_stage.film.dances import FPS, TRAIN_SECONDS, dance
+from rnd_stage.people.remesh import Floats
 
 from . import sky, stage
 from .clothes import Wardrobe, dress
@@ -52,11 +52,7 @@ def shots() -> list[tuple[Split, str, int, str]]:
     train = range(0, round(TRAIN_SECONDS * FPS), 2)
     return [
         *(("train", "cam00", frame, TRAIN_LIGHT) for frame in train),
-        *(
-            ("novel_view", c, f, TRAIN_LIGHT)
-            for c in ("cam01", "cam02", "cam03", "cam04")
-            for f in NOVEL_VIEW_FRAMES
-        ),
+        *(("novel_view", c, f, TRAIN_LIGHT) for c in ("cam01", "cam02", "cam03", "cam04") for f in NOVEL_VIEW_FRAMES),
         *(("novel_pose", c, f, TRAIN_LIGHT) for c in ("cam00", "cam02") for f in NOVEL_POSE_FRAMES),
         *(
             ("relight", c, f, light)
@@ -100,9 +96,7 @@ def contact_sheet(folder: Path) -> None:
     strips = []
     for row in rows:
         shown = [capture.load_frame(frame) for frame in row[:11]]
-        strips.append(
-            [cv2.resize(s.image_srgb[:, 48:208], (80, 128), interpolation=cv2.INTER_AREA) for s in shown]
-        )
+        strips.append([cv2.resize(s.image_srgb[:, 48:208], (80, 128), interpolation=cv2.INTER_AREA) for s in shown])
     shown = [capture.load_frame(frame) for frame in train[::7][:11]]
     normals = [0.5 * (s.normal + 1) * (s.mask[..., None] > 0.05) for s in shown]
     strips.append([cv2.resize(n[:, 48:208], (80, 128), interpolation=cv2.INTER_AREA) for n in normals])

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body
-from rnd_runtime.motion import Motion
-from rnd_runtime.rotations import matrix_to_axis_angle
-from rnd_runtime.skeleton import SMPL_NAMES, bone_transforms
-from rnd_trainer.stage.dressing import transferred_weights
-from rnd_trainer.stage.person import person
-from rnd_trainer.stage.remesh import Floats, Ints, vertex_normals
-from rnd_trainer.stage.solids import project, smooth_min, surface
+from rnd_runtime.capture.body import Body
+from rnd_runtime.core.rotations import matrix_to_axis_angle
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import SMPL_NAMES, bone_transforms
+from rnd_stage.people.dressing import transferred_weights
+from rnd_stage.people.person import person
+from rnd_stage.people.remesh import Floats, Ints, vertex_normals
+from rnd_stage.people.solids import project, smooth_min, surface
 
 SKIN, SHIRT, TROUSERS, SHOES, HAIR = range(5)
 STEP = 0.005  # m between the dressed mesh's vertices: finer than a pixel of the capture (9 mm)
@@ -123,9 +123,7 @@ class Wardrobe:
         return vertices, vertex_normals(vertices, self.dressed.faces)
 
     def _skinned(self, frame: int) -> Floats:
-        bones = bone_transforms(
-            self.body.skeleton, self.motion.rotations[frame], self.motion.translations[frame]
-        )
+        bones = bone_transforms(self.body.skeleton, self.motion.rotations[frame], self.motion.translations[frame])
         blended = np.tensordot(self.dressed.weights, bones.astype(np.float64), axes=1)
         return np.einsum("vij,vj->vi", blended[:, :, :3], self.dressed.vertices) + blended[:, :, 3]
 
@@ -141,27 +139,16 @@ class Wardrobe:
             bend = np.minimum(np.linalg.norm(turn[side + "elbow"]), 2.0)
             s = x - 0.448
             inside = 0.45 + 0.55 * np.clip(normal[:, 2], -0.5, 1)
-            shirt += (
-                here
-                * 0.0055
-                * bend
-                * inside
-                * np.exp(-((s / 0.085) ** 2))
-                * np.sin(175 * s + 20 * (y - 1.41))
-            )
+            shirt += here * 0.0055 * bend * inside * np.exp(-((s / 0.085) ** 2)) * np.sin(175 * s + 20 * (y - 1.41))
             raised = np.linalg.norm(turn[side + "shoulder"] + turn[side + "collar"])
             reach = np.hypot(x - 0.135, y - 1.345)
-            near = np.exp(-((reach / 0.11) ** 2)) - np.exp(
-                -((reach / 0.06) ** 2)
-            )  # not where spokes would meet
+            near = np.exp(-((reach / 0.11) ** 2)) - np.exp(-((reach / 0.06) ** 2))  # not where spokes would meet
             spokes = np.sin(6 * np.arctan2(y - 1.345, x - 0.135) + 40 * reach)
             shirt += here * 0.0060 * np.minimum(raised, 1.6) * near * spokes
             bend = np.minimum(np.linalg.norm(turn[side + "knee"]), 2.0)
             s = y - 0.49
             behind = 0.45 - 0.55 * np.clip(normal[:, 2], -1, 0.5)
-            jeans += (
-                here * 0.0060 * bend * behind * np.exp(-((s / 0.10) ** 2)) * np.sin(125 * s + 25 * (x - 0.11))
-            )
+            jeans += here * 0.0060 * bend * behind * np.exp(-((s / 0.10) ** 2)) * np.sin(125 * s + 25 * (x - 0.11))
             flexed = np.clip(-turn[side + "hip"][0], 0, 1.6)
             s = y - 0.87 + 0.35 * (x - 0.09)
             front = np.clip(normal[:, 2] + 0.2, 0, 1)
@@ -187,9 +174,7 @@ def _hair(points: Floats) -> Floats:
     strands = 0.0035 * np.sin(95 * x + 30 * np.sin(25 * z)) * np.cos(70 * z + 40 * y) * crown
     cap = skull - (0.009 + 0.015 * crown + 0.006 * ramp(z, 0.05, 0.09) * crown) - strands
     line = np.interp(
-        z,
-        [-0.11, -0.08, -0.045, -0.012, 0.012, 0.035, 0.062, 0.10],
-        [1.54, 1.55, 1.58, 1.655, 1.64, 1.668, 1.70, 1.71],
+        z, [-0.11, -0.08, -0.045, -0.012, 0.012, 0.035, 0.062, 0.10], [1.54, 1.55, 1.58, 1.655, 1.64, 1.668, 1.70, 1.71]
     )
     line = line + 0.006 * np.sin(120 * x + 2.0) * (z > 0.03)  # an uneven fringe
     return -smooth_min(-cap, -0.8 * (line - y), 0.010)

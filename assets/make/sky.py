@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rnd_runtime.images import write_image
-from rnd_runtime.light import texel_directions
-from rnd_trainer.stage.remesh import Floats
+from rnd_runtime.core.images import write_image
+from rnd_runtime.shading.light import texel_directions
+from rnd_stage.people.remesh import Floats
 
 HEIGHT, WIDTH = 128, 256
 SUBSAMPLES = 8  # per texel and axis, so that the sun's disc has the right area
@@ -27,7 +27,7 @@ EVENING_SUN = direction(150.0, 14.0)
 
 
 def noon() -> Floats:
-    """A clear sky [128, 256, 3]: blue above, pale at the horizon, warm sun at :data:`NOON_SUN`, grey-brown ground."""
+    """A clear sky [128, 256, 3]: blue above, pale at the horizon, warm sun at ``NOON_SUN``, grey-brown ground."""
     return _sky(
         NOON_SUN,
         sun=SUN_RADIANCE * np.array([1.0, 0.93, 0.82]),
@@ -39,7 +39,7 @@ def noon() -> Floats:
 
 
 def evening() -> Floats:
-    """A low orange sun at :data:`EVENING_SUN` under a violet sky."""
+    """A low orange sun at ``EVENING_SUN`` under a violet sky."""
     return _sky(
         EVENING_SUN,
         sun=0.45 * SUN_RADIANCE * np.array([1.0, 0.56, 0.26]),
@@ -67,9 +67,7 @@ def studio() -> Floats:
         u = np.degrees(np.arctan2(np.abs(d @ right), ahead)) / half_u
         v = np.degrees(np.arctan2(np.abs(d @ np.cross(right, axis)), ahead)) / half_v
         edge = np.clip(8.0 * (1.0 - np.maximum(u, v)), 0, 1) * (d @ axis > 0)
-        radiance = (
-            radiance + edge[..., None] * colour * (1.0 - 0.25 * np.minimum(u * u + v * v, 1))[..., None]
-        )
+        radiance = radiance + edge[..., None] * colour * (1.0 - 0.25 * np.minimum(u * u + v * v, 1))[..., None]
     return radiance.reshape(HEIGHT, 2, WIDTH, 2, 3).mean(axis=(1, 3))
 
 
@@ -80,18 +78,14 @@ def make_light(path: Path, radiance: Floats) -> None:
     write_image(path, rounded)
 
 
-def _sky(
-    towards_sun: Floats, *, sun: Floats, zenith: Floats, horizon: Floats, glow: Floats, ground: Floats
-) -> Floats:
+def _sky(towards_sun: Floats, *, sun: Floats, zenith: Floats, horizon: Floats, glow: Floats, ground: Floats) -> Floats:
     d = texel_directions(HEIGHT, WIDTH)
     up = d[..., 1:2]
     cosine = np.clip(d @ towards_sun, -1, 1)[..., None]
     clear = zenith + (horizon - zenith) * np.exp(-np.maximum(up, 0) / 0.22)
     halo = glow * (0.9 * np.exp(-np.arccos(cosine) / 0.12) + 0.35 * np.exp(-np.arccos(cosine) / 0.5))
     azimuth = np.arctan2(d[..., 2], d[..., 0])[..., None]
-    veil = np.sin(3 * azimuth + 9 * up) * np.sin(5 * azimuth - 14 * up + 1) + 0.6 * np.sin(
-        7 * azimuth + 21 * up + 2
-    )
+    veil = np.sin(3 * azimuth + 9 * up) * np.sin(5 * azimuth - 14 * up + 1) + 0.6 * np.sin(7 * azimuth + 21 * up + 2)
     veil = np.clip(veil, 0, 1) * np.exp(-(((up - 0.30) / 0.16) ** 2))  # a band of thin cloud
     above = (clear + halo) * (1 - 0.25 * veil) + 0.28 * veil * horizon
     near_horizon = np.exp(np.minimum(up, 0) / 0.06)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from rnd_runtime.camera import Camera
-from rnd_trainer.stage.remesh import Floats
-from rnd_trainer.stage.render import Surface, environment, mesh, sensor
+from rnd_runtime.core.camera import Camera
+from rnd_stage.people.remesh import Floats
+from rnd_stage.render import Surface, environment, mesh, sensor
 
 mi.set_variant("scalar_rgb")  # needs no LLVM
 
@@ -50,7 +50,7 @@ def render(surface: Surface, camera: Camera, radiance: Floats, *, samples: int, 
 
 def check_environment() -> float:
     """Look at single lit texels and return the worst error in degrees between where they are and should be."""
-    from rnd_runtime.light import texel_directions
+    from rnd_runtime.shading.light import texel_directions
 
     height, width = 16, 32
     directions, worst = texel_directions(height, width), 0.0
@@ -84,6 +84,4 @@ def _figure(surface: Surface) -> mi.Mesh:
         "metallic": 0.0,
         "specular": 0.5,  # F0 = 0.04
     }
-    return mesh(
-        surface, material, {"vertex_color": surface.colour, "vertex_roughness": surface.roughness[:, None]}
-    )
+    return mesh(surface, material, {"vertex_color": surface.colour, "vertex_roughness": surface.roughness[:, None]})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rnd_trainer.stage.remesh import Floats
+from rnd_stage.people.remesh import Floats
 
 from .clothes import HAIR, SHIRT, SHOES, SKIN, TROUSERS, Dressed, neck_opening, ramp
 
@@ -25,13 +25,7 @@ def paint(dressed: Dressed) -> tuple[Floats, Floats]:
     """Linear base colour [V, 3] in [0.03, 0.80] and perceptual roughness [V]."""
     p, material = dressed.vertices, dressed.material
     colour, roughness = np.zeros_like(p), np.zeros(len(p))
-    for kind, brush in (
-        (SKIN, _skin),
-        (SHIRT, _shirt),
-        (TROUSERS, _trousers),
-        (SHOES, _shoes),
-        (HAIR, _hair),
-    ):
+    for kind, brush in ((SKIN, _skin), (SHIRT, _shirt), (TROUSERS, _trousers), (SHOES, _shoes), (HAIR, _hair)):
         here = material == kind
         colour[here], roughness[here] = brush(p[here])
     return np.clip(colour, 0.03, 0.80), np.clip(roughness, 0.2, 0.95)
@@ -49,11 +43,7 @@ def _band(value: Floats, centre: float, width: float, soft: float = 0.003) -> Fl
 def _mottle(p: Floats, scale: float) -> Floats:
     """A smooth pattern in [-1, 1] with features of about ``scale`` metres."""
     x, y, z = (p / scale).T
-    return (
-        np.sin(2.1 * x + 1.3 * np.sin(1.7 * y))
-        * np.sin(2.3 * y + 1.1 * np.sin(1.9 * z))
-        * np.sin(2.2 * z + x + 1)
-    )
+    return np.sin(2.1 * x + 1.3 * np.sin(1.7 * y)) * np.sin(2.3 * y + 1.1 * np.sin(1.9 * z)) * np.sin(2.2 * z + x + 1)
 
 
 def _skin(p: Floats) -> tuple[Floats, Floats]:
@@ -121,13 +111,11 @@ def _prints(colour: Floats, p: Floats) -> tuple[Floats, Floats]:
 
 def _trousers(p: Floats) -> tuple[Floats, Floats]:
     x, y, z = np.abs(p[:, 0]), p[:, 1], p[:, 2]
-    worn = np.exp(-(((y - 0.66) / 0.14) ** 2)) * ramp(z, 0.02, 0.08) + 0.8 * np.exp(
-        -(((y - 0.49) / 0.06) ** 2)
-    ) * ramp(z, 0, 0.06)
-    worn += 0.6 * np.exp(-(((y - 0.86) / 0.08) ** 2)) * ramp(z, -0.05, -0.11)
-    colour = _blend(
-        np.broadcast_to(DENIM, p.shape), WORN, np.clip(0.75 * worn + 0.10 * _mottle(p, 0.02) + 0.08, 0, 1)
+    worn = np.exp(-(((y - 0.66) / 0.14) ** 2)) * ramp(z, 0.02, 0.08) + 0.8 * np.exp(-(((y - 0.49) / 0.06) ** 2)) * ramp(
+        z, 0, 0.06
     )
+    worn += 0.6 * np.exp(-(((y - 0.86) / 0.08) ** 2)) * ramp(z, -0.05, -0.11)
+    colour = _blend(np.broadcast_to(DENIM, p.shape), WORN, np.clip(0.75 * worn + 0.10 * _mottle(p, 0.02) + 0.08, 0, 1))
     axis = np.interp(y, [0.05, 0.49, 0.93], [0.131, 0.112, 0.090])
     seam = _band(z + 0.01, 0.0, 0.008) * (x > axis)
     colour = _blend(colour, MUSTARD * 0.7, 0.8 * seam)
@@ -146,9 +134,7 @@ def _shoes(p: Floats) -> tuple[Floats, Floats]:
     colour = _blend(np.broadcast_to(RED, p.shape), TEAL * 0.5, ramp(z, -0.02, -0.05))
     sole = ramp(y, 0.024, 0.020)
     toe = ramp(z, 0.150, 0.158)
-    laces = (
-        _band(np.mod(z, 0.022), 0.011, 0.010) * _band(x, 0.138, 0.042) * (z > 0.04) * (z < 0.125) * (y > 0.05)
-    )
+    laces = _band(np.mod(z, 0.022), 0.011, 0.010) * _band(x, 0.138, 0.042) * (z > 0.04) * (z < 0.125) * (y > 0.05)
     colour = _blend(colour, WHITE, np.clip(np.maximum(np.maximum(sole, toe), laces), 0, 1))
     return colour, 0.42 + 0.2 * sole
 

@@ -15,16 +15,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rnd_trainer.encoders import JointAttention
-from rnd_trainer.model import AvatarModel
-from rnd_trainer.skinning import small_rotation
+from rnd_trainer.model.encoders import JointAttention
+from rnd_trainer.model.model import AvatarModel
+from rnd_trainer.model.skinning import small_rotation
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class BakedAttention:
-    """A :class:`JointAttention` without its query side.
+    """A ``JointAttention`` without its query side.
 
     ``query`` [width, width] and ``query_bias`` [width] are scaled by 1/√(width per head); ``out`` [O, width] takes
     the output projection and the layer after it in one; the rest is the module's.
@@ -51,7 +51,7 @@ class BakedSkinning:
 @dataclass(frozen=True)
 class Rates:
     """At how many nodes each network is evaluated: the first so many in farthest-point order. All nodes read these as
-    Gaussians read nodes, by :func:`rnd_trainer.template.node_interpolation`."""
+    Gaussians read nodes, by ``rnd_trainer.model.template.node_interpolation``."""
 
     skinning: int
     offsets: int
@@ -66,7 +66,7 @@ class BakedAvatar:
     ``codes`` [M, 3] m and ``node_rows`` [M] (the Gaussian that stands at a node) are in the order of the nodes,
     ``all_codes`` [N, 3] m belong to the Gaussians;
     ``factors`` [N, 3, 3] m is R S in the rest pose; ``offsets`` and ``visibility`` are a
-    :class:`PoseConditioned` each, ``skinning`` None where the template's weights are used as they are. Skinning is
+    ``PoseConditioned`` each, ``skinning`` None where the template's weights are used as they are. Skinning is
     dynamic at the first ``dynamic_nodes`` nodes, the template's at the others. ``node_ranks`` [M] are the nodes'
     places in the farthest-point order, by which ``rates`` counts; ``area`` is the template's, m².
     """

@@ -10,8 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.avatar_file import EncoderKind, Precision
-from rnd_runtime.errors import (
+from rnd_runtime.avatar.file import EncoderKind, Precision
+from rnd_runtime.core.errors import (
     InputError,
     check_cull,
     check_option,
@@ -20,7 +20,7 @@ from rnd_runtime.errors import (
     refuse_changed,
     run_command,
 )
-from rnd_runtime.light import Up
+from rnd_runtime.shading.light import Up
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,15 @@ BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
 SEARCHES = ("size", "hdr", "hdr_up", "capture", "json")
 """options that say how a bound's search goes"""
 CHOICES = (
-    "encoder", "precision", "nodes", "skinning_nodes", "offset_nodes", "visibility_nodes", "window_poses",
+    "encoder",
+    "precision",
+    "nodes",
+    "skinning_nodes",
+    "offset_nodes",
+    "visibility_nodes",
+    "window_poses",
     "visibility_degree",
-)  # fmt: skip
+)
 """options that say what a file leaves out, which a search finds by itself"""
 
 
@@ -96,20 +102,21 @@ def main() -> None:
 
 def _export(options: Options) -> None:
     try:
+        from rnd_export.reduce.variant import Variant
+
         from .export import MOST_FRAMES, export, random_motion
-        from .variant import Variant
     except ModuleNotFoundError as error:
         raise InputError(
             f"{error.name} is not installed",
             hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
         ) from error
-    from rnd_runtime.avatar_file import advice_of
-    from rnd_runtime.capture import capture_file
-    from rnd_runtime.files import existing_file, output_file, refuse_input
-    from rnd_runtime.kernels import COMPILING, kernels_are_cold
-    from rnd_runtime.motion import load_motion
-    from rnd_trainer.checkpoint import load_checkpoint
-    from rnd_trainer.notes import say_notes
+    from rnd_runtime.avatar.file import advice_of
+    from rnd_runtime.capture.capture import capture_file
+    from rnd_runtime.core.files import existing_file, output_file, refuse_input
+    from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
+    from rnd_runtime.motion.motion import load_motion
+    from rnd_trainer.model.checkpoint import load_checkpoint
+    from rnd_trainer.training.notes import say_notes
 
     check_option(2 <= options.frames <= MOST_FRAMES, "--frames", f"2 to {MOST_FRAMES}", options.frames)
     check_cull(options.cull)
@@ -141,7 +148,7 @@ def _export(options: Options) -> None:
     else:
         motion = random_motion(checkpoint.skeleton, frames=options.frames, seed=0)
     if given:
-        from .bounded import export_bounded
+        from rnd_export.search.bounded import export_bounded
 
         export_bounded(options, checkpoint, out, motion, given)
         return
@@ -161,16 +168,12 @@ def _export(options: Options) -> None:
         f"weights {drift.weights:.1e}, positions {1e3 * drift.position_m:.4f} mm, "
         f"99 % within {1e3 * drift.position_p99_m:.4f} mm, "
         f"normals {drift.normal:.1e}, visibility {drift.visibility:.1e}; "
-        + (
-            "players draw all of it"
-            if cull is None
-            else f"players leave out what faces away (n·v < {cull:g})"
-        )
+        + ("players draw all of it" if cull is None else f"players leave out what faces away (n·v < {cull:g})")
     )
 
 
 def _refuse_idle(options: Options, *, bounded: bool) -> None:
-    """Raise :class:`InputError` for an option that was changed and would do nothing beside the others."""
+    """Raise ``InputError`` for an option that was changed and would do nothing beside the others."""
     bounds = " or ".join(map(flag, BOUNDS.values()))
     if bounded:
         refuse_changed(options, (*CHOICES, "cull"), "a bound finds this by itself")

@@ -13,9 +13,12 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
+from rnd_export.build.graph import build_model
+from rnd_export.reduce.culling import advise, advised_cull
+from rnd_export.reduce.variant import Variant, reduced
 from rnd_runtime import __version__
-from rnd_runtime.avatar import Avatar
-from rnd_runtime.avatar_file import (
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.avatar.file import (
     METADATA_KEY,
     SCHEMA,
     AvatarMetadata,
@@ -24,20 +27,17 @@ from rnd_runtime.avatar_file import (
     VariantMetadata,
     encode_light,
 )
-from rnd_runtime.errors import InputError
-from rnd_runtime.files import atomic_path
-from rnd_runtime.motion import Motion
-from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_runtime.skeleton import Skeleton
-from rnd_runtime.window import motion_window
-from rnd_trainer.checkpoint import Checkpoint
-from rnd_trainer.data import pose_input
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.posing.window import motion_window
+from rnd_trainer.model.checkpoint import Checkpoint
+from rnd_trainer.training.data import pose_input
 
 from .bake import BakedAvatar, bake
-from .culling import advise, advised_cull
-from .graph import build_model
-from .places import gaussians_by_place, moving_sites, nodes_by_place
-from .variant import Variant, reduced
+from .order import gaussians_by_place, moving_sites, nodes_by_place
 
 MOST_FRAMES = 1_000
 """that a file is compared with torch on: half a minute with 30 000 Gaussians"""
@@ -80,9 +80,9 @@ def export(
     """Write ``out``, a name in .onnx; how far it is from torch over ``motion``, by default 120 random frames.
 
     ``cull`` is what the file tells players to leave out of the back: a cosine, −1 for nothing, by default what is found
-    not to show along ``motion`` (:func:`advised_cull`).
+    not to show along ``motion`` (``advised_cull``).
 
-    Raises :class:`InputError`, leaving nothing under ``out``, when the difference exceeds what the variant's
+    Raises ``InputError``, leaving nothing under ``out``, when the difference exceeds what the variant's
     precision allows. What ``coarse``, ``static`` and the like give up is meant: it is measured, not bounded.
     """
     refuse_ablations(checkpoint)
@@ -99,15 +99,15 @@ def export(
         avatar = Avatar.load(temporary)
         drift = measure_drift(avatar, checkpoint, motion, baked.rows)
         if not np.isfinite(dataclasses.astuple(drift)).all():
-            raise InputError(
-                "export refused: places", expected="finite numbers", got="NaN or infinity", file=out
-            )
+            raise InputError("export refused: places", expected="finite numbers", got="NaN or infinity", file=out)
         for what, got, bound in _bounds(drift, variant):
             if not got <= bound:
                 raise InputError(
                     f"export refused: {what} of onnxruntime and torch differ",
-                    expected=f"at most {bound:g}", got=f"{got:.3g}", file=out,
-                )  # fmt: skip
+                    expected=f"at most {bound:g}",
+                    got=f"{got:.3g}",
+                    file=out,
+                )
         if cull is None:
             advise(model, advised_cull(avatar, motion))
             onnx.save_model(model, str(temporary))
@@ -129,7 +129,7 @@ def refuse_ablations(checkpoint: Checkpoint) -> None:
 
 
 def written(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
-    """The file of ``baked``, which has been :func:`reduced` to ``variant``."""
+    """The file of ``baked``, which has been ``reduced`` to ``variant``."""
     poses = variant.window_poses or checkpoint.config.model.window_poses
     metadata = _metadata(checkpoint, baked, variant)
     return build_model(nodes_by_place(baked), variant.precision, poses, {METADATA_KEY: metadata})
@@ -164,9 +164,7 @@ def measure_drift(avatar: Avatar, checkpoint: Checkpoint, motion: Motion, rows: 
         time = int(frame) / motion.fps
         pose = pose_input(motion, checkpoint.skeleton, time, config)
         posed = checkpoint.model(pose)
-        window, velocity = motion_window(
-            motion, time, poses=avatar.window_poses, seconds=avatar.window_seconds
-        )
+        window, velocity = motion_window(motion, time, poses=avatar.window_poses, seconds=avatar.window_seconds)
         ours = avatar.run((window, velocity, pose.bones.numpy()), outputs)
         theirs = (posed.weights, posed.means, posed.normals, posed.visibility, posed.covariances)
         errors = [np.abs(a - b.numpy()[rows]) for a, b in zip(ours, theirs)]

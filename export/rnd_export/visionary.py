@@ -7,18 +7,18 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from rnd_runtime.avatar_file import read_metadata
-from rnd_runtime.files import atomic_path
-from rnd_runtime.light import Up
-from rnd_runtime.motion import Motion
-from rnd_runtime.onnx_parts import OnnxFile
-from rnd_trainer.checkpoint import Checkpoint
-from rnd_viewer.convert import convert
-from rnd_viewer.convert_cli import SplatOptions
-from rnd_viewer.visionary import check_clip
+from rnd_export.reduce.variant import Variant
+from rnd_runtime.avatar.file import read_metadata
+from rnd_runtime.avatar.onnx_parts import OnnxFile
+from rnd_runtime.core.files import atomic_path
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.shading.light import Up
+from rnd_trainer.model.checkpoint import Checkpoint
+from rnd_viewer.convert.cli import SplatOptions
+from rnd_viewer.convert.convert import convert
+from rnd_viewer.convert.visionary import check_clip
 
 from .export import export
-from .variant import Variant
 
 PART = "rnd-convert splats --format visionary --frames takes a part of it"
 
@@ -35,7 +35,7 @@ def export_visionary(
     """Write what ``rnd-convert splats --format visionary`` makes of the exported avatar; yields notes for the user.
 
     Args:
-        checkpoint: the avatar. out: the .onnx to write, in :mod:`rnd_viewer.visionary`'s contract.
+        checkpoint: the avatar. out: the .onnx to write, in ``rnd_viewer.convert.visionary``'s contract.
         motion: what ``motion_file`` holds, on the avatar's skeleton; every frame of it becomes one of the clip.
         variant: what the avatar leaves out. hdr, hdr_up: the light, by default the learned one.
 

@@ -17,7 +17,7 @@ Conventions, stated once and tested in ``tests/conventions_test.py``:
 
 import os
 
-from ._kernel_cache import keep_kernels_by_source
+from rnd_runtime.core.kernel_cache import keep_kernels_by_source
 
 # Idle threads of GNU OpenMP spin for milliseconds unless told not to before it is loaded (with torch, or with the first
 # kernel). On two cores at load 8 one forward and backward pass of the rasteriser then took 350 ms instead of 26. But a

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from rnd_runtime.errors import InputError, check_option
+from rnd_runtime.core.errors import InputError, check_option
 
 MOST_NODES = 1_875
 """3 cm apart on a body, over which what the networks say is smooth. Twice as many gain less than 0.1 dB in held-out
@@ -194,7 +194,7 @@ def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> Tr
 
 
 def check_sizes(config: TrainConfig) -> None:
-    """Raise :class:`InputError`, naming the option, where a training cannot be of that size."""
+    """Raise ``InputError``, naming the option, where a training cannot be of that size."""
     gaussians, scale = config.model.gaussians, config.image_scale
     check_option(config.steps >= 1, "--steps", "at least 1", config.steps)
     check_option(0 < scale <= 1, "--image-scale", "more than 0, at most 1", scale)
@@ -213,9 +213,13 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
     third stage, the repulsion and the black backgrounds, which are on today, are off there, and rates fall as they did.
     """
     before = {
-        "unseen_fraction": 0.0, "weight_repulsion": 0.0, "black_backgrounds": 0.0, "weight_smooth": 0.0,
-        "rate_kept": 0.1, "rate_cooled": 1.0,
-    }  # fmt: skip
+        "unseen_fraction": 0.0,
+        "weight_repulsion": 0.0,
+        "black_backgrounds": 0.0,
+        "weight_smooth": 0.0,
+        "rate_kept": 0.1,
+        "rate_cooled": 1.0,
+    }
     return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
 
 

@@ -11,14 +11,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.capture import Capture, Frame, FrameImages, load_capture
-from rnd_runtime.capture_format import decode_normals, read_unit_range
-from rnd_runtime.errors import InputError
-from rnd_trainer.data import MAX_BAD_MASKS, light_names, usable
-from rnd_trainer.silhouette import overlap
+from rnd_runtime.capture.capture import Capture, Frame, FrameImages, load_capture
+from rnd_runtime.capture.format import decode_normals, read_unit_range
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.training.data import MAX_BAD_MASKS, light_names, usable
 
 from .hypotheses import explain, explain_timing
 from .normals import judge, pixels
+from .silhouette import overlap
 from .views import Sight, mean_overlap, sight, spread
 
 Floats = NDArray[np.float64]
@@ -66,7 +66,7 @@ class FrameOverlap:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What :func:`check_capture` found.
+    """What ``check_capture`` found.
 
     Attributes:
         findings: in the order in which things depend on each other.
@@ -88,9 +88,7 @@ class Report:
         return float(np.mean([entry.iou for entry in self.overlaps])) if self.overlaps else 0.0
 
 
-def check_capture(
-    path: str | Path, *, on_frame: Callable[[int, int], None] = lambda done, total: None
-) -> Report:
+def check_capture(path: str | Path, *, on_frame: Callable[[int, int], None] = lambda done, total: None) -> Report:
     """Check a capture against itself.
 
     Files, sizes, channels and indices are checked by reading it; then what trains, lights, units, cameras, masks,
@@ -108,9 +106,7 @@ def check_capture(
     findings += [*_units(capture), *_cameras(capture), *_speed(capture)]
     sights, overlaps, normal_pixels, bad_masks, bright = [], [], [], [], []
     for done, frame in enumerate(capture.frames):
-        bare = msgspec.structs.replace(
-            frame, normal=None, normal_gt=None
-        )  # flipped normals are judged, not refused
+        bare = msgspec.structs.replace(frame, normal=None, normal_gt=None)  # flipped normals are judged, not refused
         images = capture.load_frame(bare)
         if usable(images.mask):
             seen = sight(capture, bare, images.mask)
@@ -165,9 +161,7 @@ def _units(capture: Capture) -> list[Finding]:
     for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("inches", 0.0254)):
         if low <= size * factor <= high:
             return [Finding("wrong", "units", f"the template is {size:.4g} m across: these look like {unit}")]
-    return [
-        Finding("wrong", "units", f"the template is {size:.4g} m across; a person is {low:g} to {high:g}")
-    ]
+    return [Finding("wrong", "units", f"the template is {size:.4g} m across; a person is {low:g} to {high:g}")]
 
 
 def _cameras(capture: Capture) -> list[Finding]:
@@ -223,9 +217,7 @@ def _speed(capture: Capture) -> list[Finding]:
     if fast > FASTEST_JOINT:
         sentence = f"joints move at {fast:.0f} m/s: frame rate {motion.fps:g} is too high, or the poses jump"
         return [Finding("wrong", "frame rate", sentence)]
-    return [
-        Finding("ok", "frame rate", f"{motion.fps:g} per second; the fastest joint moves at {fast:.1f} m/s")
-    ]
+    return [Finding("ok", "frame rate", f"{motion.fps:g} per second; the fastest joint moves at {fast:.1f} m/s")]
 
 
 def _masks(bad: list[tuple[Frame, FrameImages]], capture: Capture) -> list[Finding]:
@@ -266,9 +258,7 @@ def _fit(capture: Capture, sights: list[Sight], overlaps: list[FrameOverlap]) ->
         sentence = f"{numbers}: {timing.sentence} (mean IoU {timing.overlap:.2f} then)"
         return [Finding("wrong", "timing", sentence)]
     if mean < GOOD_OVERLAP:
-        sentence = (
-            f"{numbers}: the template misses the masks, and no usual mistake explains it; look at the overlay"
-        )
+        sentence = f"{numbers}: the template misses the masks, and no usual mistake explains it; look at the overlay"
         return [Finding("wrong", "silhouette", sentence)]
     return [Finding("ok", "silhouette", numbers), *_distortion(capture, few)]
 
@@ -330,15 +320,19 @@ def _normals(capture: Capture, pairs: list[tuple[Floats, Floats]], count: int) -
     axes = judge(pairs, _matrix(_imported(capture).get("normal_axes")))
     degrees = np.degrees(np.arccos(np.clip(axes.cosine, -1, 1)))
     if axes.wrong:
-        return [Finding("wrong", "normals", f"mean cosine {axes.cosine:.2f} to the template; with --normal-axes="
-                        f"{axes.best_axes} it would be {axes.best_cosine:.2f}")]  # fmt: skip
+        return [
+            Finding(
+                "wrong",
+                "normals",
+                f"mean cosine {axes.cosine:.2f} to the template; with --normal-axes="
+                f"{axes.best_axes} it would be {axes.best_cosine:.2f}",
+            )
+        ]
     if axes.facing < 0.9:
         sentence = f"{1 - axes.facing:.0%} point away from the camera: z should be negative"
         return [Finding("wrong", "normals", sentence)]
     return [
         Finding(
-            "ok",
-            "normals",
-            f"in {count} frames, {degrees:.0f}° from the template, {axes.facing:.0%} face the camera",
+            "ok", "normals", f"in {count} frames, {degrees:.0f}° from the template, {axes.facing:.0%} face the camera"
         )
     ]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.capture import Capture
-from rnd_runtime.rotations import axis_angle_to_matrix
+from rnd_runtime.capture.capture import Capture
+from rnd_runtime.core.rotations import axis_angle_to_matrix
 
 from .views import Sight, mean_overlap, posed
 
@@ -79,14 +79,8 @@ def explanations(rest: Floats, world: Floats) -> list[tuple[str, Callable[[Sight
         ),
         ("the pelvis's place looks taken off trans twice", lambda s: at(s, s.joint + offset)),
         ("the root rotation looks transposed", lambda s: s.moved(s.turn.T, s.joint)),
-        (
-            "the motion looks Z up where the cameras are Y up: turn one of them",
-            lambda s: turned(s, _QUARTER.T),
-        ),
-        (
-            "the motion looks Y up where the cameras are Z up: turn one of them",
-            lambda s: turned(s, _QUARTER),
-        ),
+        ("the motion looks Z up where the cameras are Y up: turn one of them", lambda s: turned(s, _QUARTER.T)),
+        ("the motion looks Y up where the cameras are Z up: turn one of them", lambda s: turned(s, _QUARTER)),
         ("the motion looks Y down: turn it by 180° about X", lambda s: turned(s, _FLIP[:3, :3])),
         ("world_to_camera looks like camera-to-world: invert it", lambda s: camera(s, _inverse)),
         (
@@ -112,7 +106,7 @@ def explanations(rest: Floats, world: Floats) -> list[tuple[str, Callable[[Sight
 
 
 def explain(rest: Floats, world: Floats, sights: list[Sight]) -> Verdict | None:
-    """The best of :func:`explanations` of a poor fit, or None when nothing known makes it better."""
+    """The best of ``explanations`` of a poor fit, or None when nothing known makes it better."""
     as_it_is = mean_overlap(sights)
     best = Verdict("", as_it_is)
     for sentence, change in explanations(rest, world):
@@ -127,9 +121,7 @@ def explain_timing(capture: Capture, sights: list[Sight]) -> Verdict | None:
     candidates: list[tuple[str, Callable[[int], int]]] = []
     for shift in SHIFTS:
         when = f"{abs(shift)} frame{'s' * (abs(shift) > 1)} {'late' if shift > 0 else 'early'}"
-        candidates.append(
-            (f"the motion looks {when}: picture k shows motion frame k{shift:+d}", shift.__add__)
-        )
+        candidates.append((f"the motion looks {when}: picture k shows motion frame k{shift:+d}", shift.__add__))
     for rate in STRIDES:
         sentence = f"the motion looks sampled at {rate:.3g} times the rate of the pictures"
         candidates.append((sentence, lambda k, rate=rate: round(rate * k)))  # type: ignore[misc]

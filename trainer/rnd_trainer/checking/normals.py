@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_trainer.silhouette import DrawnMesh
+from .silhouette import DrawnMesh
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ def parse_axes(text: str) -> Floats:
 
 
 def axes_in_words(matrix: Floats) -> str:
-    """What :func:`parse_axes` turns into the signed permutation ``matrix`` [3, 3]."""
+    """What ``parse_axes`` turns into the signed permutation ``matrix`` [3, 3]."""
     columns = np.abs(matrix).argmax(1)
     return ",".join(("" if row[column] > 0 else "-") + _AXES[column] for row, column in zip(matrix, columns))
 

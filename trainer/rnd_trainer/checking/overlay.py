@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.camera import Camera
-from rnd_runtime.images import write_image
-from rnd_trainer.silhouette import draw
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.images import write_image
 
 from .check import Report
+from .silhouette import draw
 from .views import Sight
 
 TILE, COLUMNS, MOST = 256, 4, 12
@@ -45,9 +45,7 @@ def _tile(report: Report, index: int) -> NDArray[np.uint8]:
     template = draw(small.vertices, small.faces, camera).mask
     height, width = template.shape
     mask = cv2.resize(images.mask[rows, columns], (width, height), interpolation=cv2.INTER_AREA) > 0.5
-    picture = (
-        cv2.resize(images.image_srgb[rows, columns], (width, height), interpolation=cv2.INTER_AREA) * 255
-    )
+    picture = cv2.resize(images.image_srgb[rows, columns], (width, height), interpolation=cv2.INTER_AREA) * 255
     for where, colour in ((mask & ~template, MASK_ONLY), (template & ~mask, TEMPLATE_ONLY)):
         picture[where] = 0.35 * picture[where] + 0.65 * np.array(colour, np.float32)
     outline = template & ~cv2.erode(template.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
 
-from rnd_runtime.files import write_json
+from rnd_runtime.core.files import write_json
 
 from .check import Report, check_capture
 from .overlay import save_overlay
@@ -27,9 +27,7 @@ def check_and_report(capture: Path, out: Path) -> int:
     """Check ``capture``, print the findings, write ``check.json`` and ``check.png`` into ``out``; 1 when wrong."""
     with passing_progress() as progress:
         task = progress.add_task("checking")
-        report = check_capture(
-            capture, on_frame=lambda done, total: progress.update(task, completed=done, total=total)
-        )
+        report = check_capture(capture, on_frame=lambda done, total: progress.update(task, completed=done, total=total))
     try:
         save_report(report, out)
     finally:  # shown where they cannot be saved, and saved where nobody reads them
@@ -41,9 +39,7 @@ def check_and_report(capture: Path, out: Path) -> int:
 def _show(report: Report) -> None:
     console = Console(emoji=False)
     for finding in report.findings:
-        console.print(
-            f"{_MARKS[finding.level]:>5} {finding.subject}: {escape(finding.sentence)}", soft_wrap=True
-        )
+        console.print(f"{_MARKS[finding.level]:>5} {finding.subject}: {escape(finding.sentence)}", soft_wrap=True)
 
 
 def save_report(report: Report, out: Path) -> None:

@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import posed_vertices
-from rnd_runtime.camera import Camera
-from rnd_runtime.capture import Capture, Frame
-from rnd_trainer.silhouette import DrawnMesh, draw, overlap, silhouette
+from rnd_runtime.capture.body import posed_vertices
+from rnd_runtime.capture.capture import Capture, Frame
+from rnd_runtime.core.camera import Camera
+
+from .silhouette import DrawnMesh, draw, overlap, silhouette
 
 Floats = NDArray[np.float64]
 

@@ -1,1 +1,1 @@
-"""What people have, turned into captures: data sets, videos with body poses, body models."""
+"""Videos and data sets of other programs, made into captures."""

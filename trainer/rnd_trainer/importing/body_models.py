@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body, posed_vertices
-from rnd_runtime.errors import InputError
-from rnd_runtime.files import npz_output, refuse_input
-from rnd_runtime.motion_files import SMPLH_NAMES, SMPLX_NAMES
-from rnd_runtime.npz import Npz
-from rnd_runtime.skeleton import SMPL_NAMES, Skeleton
-from rnd_runtime.unpickle import read_pickle
+from rnd_runtime.capture.body import Body, posed_vertices
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import npz_output, refuse_input
+from rnd_runtime.core.npz import Npz
+from rnd_runtime.motion.readers.arrays import SMPLH_NAMES, SMPLX_NAMES
+from rnd_runtime.motion.readers.unpickle import read_pickle
+from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton
 
 from .anny_body import anny_body
 
@@ -64,9 +64,7 @@ class BodyModel:
         joints = self.joint_regressor @ vertices
         old = self.template.skeleton
         skeleton = Skeleton(old.names, old.parents, joints)
-        return Body(
-            vertices, self.template.faces, self.template.skinning_weights, skeleton, self.template.license
-        )
+        return Body(vertices, self.template.faces, self.template.skinning_weights, skeleton, self.template.license)
 
     def posed(self, betas: Floats | None, rotations: Floats, translation: Floats) -> Floats:
         """Vertices [V, 3] m under local ``rotations`` [J, 3, 3] and root ``translation`` [3]."""
@@ -135,9 +133,11 @@ def _need(names: tuple[str, ...], path: Path) -> None:
     missing = [name for name in _MEMBERS if name not in names]
     if missing:
         raise InputError(
-            "body model", expected="vertices … rest_joints (ours) or " + ", ".join(_MEMBERS),
-            got=", ".join(map(str, names[:8])) or "nothing", file=path,
-        )  # fmt: skip
+            "body model",
+            expected="vertices … rest_joints (ours) or " + ", ".join(_MEMBERS),
+            got=", ".join(map(str, names[:8])) or "nothing",
+            file=path,
+        )
 
 
 def _from_members(members: dict[str, Any]) -> BodyModel:
@@ -155,10 +155,14 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
         raise InputError("joints of the body model", expected=known, got=joints)
     family, names = _FAMILIES[joints]
     shapes: dict[str, tuple[int | None, ...]] = {
-        "v_template": (count, 3), "weights": (count, joints), "J_regressor": (joints, count),
-        "kintree_table": (2, joints), "shapedirs": (count, 3, None), "f": (None, 3),
+        "v_template": (count, 3),
+        "weights": (count, joints),
+        "J_regressor": (joints, count),
+        "kintree_table": (2, joints),
+        "shapedirs": (count, 3, None),
+        "f": (None, 3),
         "posedirs": (count, 3, 9 * (joints - 1)),
-    }  # fmt: skip
+    }
     for name, array in arrays.items():
         wanted = shapes[name]
         if array.ndim != len(wanted) or any(w not in (None, h) for w, h in zip(wanted, array.shape)):

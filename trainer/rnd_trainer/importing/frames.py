@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rnd_runtime.errors import InputError
-from rnd_runtime.files import existing_file
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import existing_file
 
-from .pictures import Bytes
+from .images import Bytes
 
 _KEPT = 3  # frames behind the reader: masks and pictures of one frame are asked for one after the other
 
@@ -30,9 +30,7 @@ class Film:
     def __init__(self, path: str | Path) -> None:
         self.path = existing_file(path, what="video")
         if importlib.util.find_spec("av") is None:
-            raise InputError(
-                "PyAV is not installed", hint='pip install "rnd-avatar[video]", in a clone ".[video]"'
-            )
+            raise InputError("PyAV is not installed", hint='pip install "rnd-avatar[video]", in a clone ".[video]"')
         container = self._open()
         with container:
             stream = container.streams.video[0]

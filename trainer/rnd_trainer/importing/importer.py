@@ -9,11 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.errors import InputError, check_option, flag, refuse_changed, refuse_outside
-from rnd_runtime.files import output_folder
-from rnd_runtime.motion_files import FPS_LIMITS
-
-from . import (
+from rnd_runtime.core.errors import InputError, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.core.files import output_folder
+from rnd_runtime.motion.readers.arrays import FPS_LIMITS
+from rnd_trainer.importing.layouts import (
     arah,
     easymocap,
     humannerf,
@@ -23,14 +22,15 @@ from . import (
     neuman,
     rana,
     snapshot,
-    video,
     zju,
 )
+from rnd_trainer.importing.surfaces.estimate import attached, with_masks, with_normals
+
+from . import video
 from .body_models import BodyModel, load_body_model
 from .options import ImportOptions
 from .pose_files import read_poses
 from .recording import Recording, RootConvention, read_as, straightened
-from .surfaces import attached, with_masks, with_normals
 from .write import Scene, chosen_shots, placed, refuse_cameras, write_capture
 
 LAYOUTS: dict[str, Any] = {
@@ -77,9 +77,12 @@ def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
         if found is not None:
             return layout, found
     raise InputError(
-        "source", expected="a known layout", got="none of " + ", ".join(LAYOUTS), file=source,
+        "source",
+        expected="a known layout",
+        got="none of " + ", ".join(LAYOUTS),
+        file=source,
         hint="docs/own-video.md lists what each one needs",
-    )  # fmt: skip
+    )
 
 
 def _said(name: str | None) -> tuple[str | None, RootConvention | None]:
@@ -91,9 +94,7 @@ def _said(name: str | None) -> tuple[str | None, RootConvention | None]:
 
 
 def _detect(layout: str, source: Path) -> str | None:
-    found: str | None = (
-        LAYOUTS[layout].detect(source) if source.is_dir() or layout in ("video", "nerfstudio") else None
-    )
+    found: str | None = LAYOUTS[layout].detect(source) if source.is_dir() or layout in ("video", "nerfstudio") else None
     return found
 
 
@@ -125,9 +126,7 @@ def import_source(
     _refuse_full(out, source, options)
     _refuse_unmakeable(out)
     if options.body is None:
-        raise InputError(
-            "--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none"
-        )
+        raise InputError("--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none")
     _refuse_unused(layout, options)
     model = load_body_model(options.body)
     try:
@@ -145,9 +144,8 @@ def import_source(
     shots = chosen_shots(recording, options.choice)
     shots = with_masks(shots, scene, recording, options.mask_net)
     shots, axes = with_normals(
-        shots, scene, recording,
-        net=options.normal_net, axes=options.normal_axes, found=options.normals is not None,
-    )  # fmt: skip
+        shots, scene, recording, net=options.normal_net, axes=options.normal_axes, found=options.normals is not None
+    )
     write_capture(out, recording, scene, shots, on_shot, normal_axes=axes)
     return scene
 
@@ -188,8 +186,10 @@ def _check_numbers(options: ImportOptions) -> None:
     check_option(stop > choice.start, "--stop", f"more than --start {choice.start}", choice.stop)
     check_option(
         len(options.distortion) in _COEFFICIENTS and all(map(math.isfinite, options.distortion)),
-        "--distortion", "k1 k2 p1 p2 [k3 …], as OpenCV has them", " ".join(map(str, options.distortion)),
-    )  # fmt: skip
+        "--distortion",
+        "k1 k2 p1 p2 [k3 …], as OpenCV has them",
+        " ".join(map(str, options.distortion)),
+    )
     refuse_outside(options, {"fps": FPS_LIMITS})
 
 
@@ -233,14 +233,18 @@ def _contents(recording: Recording) -> str:
 def _read(layout: str, source: Path, model: BodyModel, options: ImportOptions) -> Recording:
     if layout == "video":
         if options.poses is None:
-            raise InputError(
-                "--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none"
-            )
+            raise InputError("--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none")
         poses = read_poses(options.poses, person=options.person)
         return video.read(
-            source, model, poses, intrinsics=options.intrinsics, distortion=options.distortion,
-            count=options.count, fps=options.fps, choice=options.choice,
-        )  # fmt: skip
+            source,
+            model,
+            poses,
+            intrinsics=options.intrinsics,
+            distortion=options.distortion,
+            count=options.count,
+            fps=options.fps,
+            choice=options.choice,
+        )
     if layout == "nerfstudio":
         return nerfstudio.read(source, poses=options.poses, person=options.person)
     if layout == "easymocap":

@@ -28,9 +28,7 @@ class Choice:
 
     def keeps(self, frame: int) -> bool:
         """Whether the frame of this number may be taken."""
-        return (
-            self.start <= frame < (frame + 1 if self.stop is None else self.stop) and frame % self.every == 0
-        )
+        return self.start <= frame < (frame + 1 if self.stop is None else self.stop) and frame % self.every == 0
 
 
 ALL = Choice()

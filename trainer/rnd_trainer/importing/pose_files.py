@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from rnd_runtime.errors import InputError
-from rnd_runtime.motion_files import frame_rate, names_of_joints
-from rnd_runtime.npz import Npz
-from rnd_runtime.unpickle import read_pickle
-from rnd_runtime.video_fits import (
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.npz import Npz
+from rnd_runtime.motion.readers.arrays import frame_rate, names_of_joints
+from rnd_runtime.motion.readers.unpickle import read_pickle
+from rnd_runtime.motion.readers.video_fits import (
     PHALP_FOCAL,
     VideoFits,
     easymocap_files,
@@ -28,7 +28,7 @@ from rnd_runtime.video_fits import (
     with_root,
 )
 
-from .pictures import count_shift, listed, natural, numbers_of
+from .images import count_shift, listed, natural, numbers_of
 from .recording import Floats, Lens, Poses, easymocap_poses, moved, smpl_poses, threes
 
 Focal = Callable[[int, int], float]
@@ -122,15 +122,13 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
                 "body poses", expected="the layout its keys promise", got=repr(error), file=path
             ) from error
     keys = ", ".join(map(str, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
-    raise InputError(
-        "body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys, file=path
-    )
+    raise InputError("body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys, file=path)
 
 
 def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
     """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
 
-    Numbers of files may be counted from elsewhere: :func:`.pictures.count_shift`. Poses without numbers belong to the
+    Numbers of files may be counted from elsewhere: ``.pictures.count_shift``. Poses without numbers belong to the
     frames from the first on; that there are more or fewer is noted.
 
     Raises:
@@ -144,11 +142,9 @@ def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Pos
     if not {*numbers} & {*poses.frames.tolist()}:
         raise InputError(
             "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
-        )  # fmt: skip
-    if not found.numbered and last != numbers[-1]:
-        return poses, (
-            f"poses end with frame {last}, pictures with frame {numbers[-1]}: both begin with frame 0",
         )
+    if not found.numbered and last != numbers[-1]:
+        return poses, (f"poses end with frame {last}, pictures with frame {numbers[-1]}: both begin with frame 0",)
     return poses, ()
 
 
@@ -194,9 +190,7 @@ def _wham(content: dict[Any, Any], person: int | None, path: Path) -> FoundPoses
 
 def _gvhmr(content: dict[str, Any]) -> FoundPoses:
     entry = content["smpl_params_incam"]
-    body, root, trans = (
-        np.asarray(entry[key], np.float64) for key in ("body_pose", "global_orient", "transl")
-    )
+    body, root, trans = (np.asarray(entry[key], np.float64) for key in ("body_pose", "global_orient", "transl"))
     angles = np.concatenate([root.reshape(-1, 3), body.reshape(len(body), -1)[:, :63]], 1)
     K = np.asarray(content["K_fullimg"], np.float64).reshape(-1, 3, 3)[0] if "K_fullimg" in content else None
     poses = smpl_poses(range(len(angles)), angles, trans.reshape(-1, 3), entry["betas"], family="SMPL-X")
@@ -218,9 +212,7 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
     rows = sorted(rows, key=lambda row: row[0]) or film  # of a video, ROMP writes both, in one folder
     kept = [(k, row) for k, row in rows if len(np.atleast_2d(row["smpl_thetas"]))]
     if not kept:
-        raise InputError(
-            "ROMP results", expected="smpl_thetas of at least one frame", got="none", file=files[0]
-        )
+        raise InputError("ROMP results", expected="smpl_thetas of at least one frame", got="none", file=files[0])
     thetas, trans, betas = (
         np.stack([np.atleast_2d(np.asarray(row[key], np.float64))[0] for _, row in kept])
         for key in ("smpl_thetas", "cam_trans", "smpl_betas")
@@ -229,9 +221,13 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
     several = any(len(np.atleast_2d(row["smpl_thetas"])) > 1 for _, row in kept)
     notes = ("ROMP saw several people in a frame: its first is taken",) if several else ()
     return FoundPoses(
-        "ROMP", poses, focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)), notes=notes,
-        numbered=bool(singles) and numbers_of(singles) is not None, in_camera=True,
-    )  # fmt: skip
+        "ROMP",
+        poses,
+        focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)),
+        notes=notes,
+        numbered=bool(singles) and numbers_of(singles) is not None,
+        in_camera=True,
+    )
 
 
 def _romp_content(file: Path) -> dict[str, Any]:
@@ -273,9 +269,7 @@ def _npz(path: Path) -> FoundPoses:
         smplx = _is_smplx(archive) or poses.shape[1] == 165
         fps = frame_rate(archive)
         turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
-        Rh, trans = (
-            np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift)
-        )
+        Rh, trans = (np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift))
     if shift is None:
         notes += ("no trans in the file: the root stays at its rest place",)
     frames = range(len(poses))
@@ -283,9 +277,7 @@ def _npz(path: Path) -> FoundPoses:
     place = shift or "trans"
     if turn is not None:
         members = (turn, place)
-        found = easymocap_poses(
-            frames, poses, Rh, trans, betas, family=family, members=members, joint_names=names
-        )
+        found = easymocap_poses(frames, poses, Rh, trans, betas, family=family, members=members, joint_names=names)
         return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
     found = smpl_poses(frames, poses, trans, betas, family=family, member=place, joint_names=names)
     return FoundPoses("SMPL", found, fps=fps, notes=notes)

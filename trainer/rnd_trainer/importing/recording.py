@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.camera import Camera
-from rnd_runtime.capture_format import Split
-from rnd_runtime.errors import InputError
-from rnd_runtime.motion_names import NAMES_BY_COUNT
-from rnd_runtime.rotations import axis_angle_to_matrix
-from rnd_runtime.skeleton import SMPL_NAMES
+from rnd_runtime.capture.format import Split
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.readers.smpl_names import NAMES_BY_COUNT
+from rnd_runtime.motion.skeleton import SMPL_NAMES
 
-from .pictures import fitting, undistorted
+from .images import fitting, undistorted
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -44,7 +44,7 @@ class Shot:
     """One picture, read when asked for.
 
     Attributes:
-        camera, frame: the lens, and the number that :class:`Poses` knows the moment by.
+        camera, frame: the lens, and the number that ``Poses`` knows the moment by.
         image: gives [H, W, 3] uint8 sRGB.
         mask: gives [H, W] uint8 coverage; None where there is none.
         normals: gives [H, W, 3] in OpenCV's camera axes, zero where unknown; None where there are none.
@@ -96,7 +96,7 @@ class Poses:
         if self.rotations.shape != (count, len(self.joint_names), 3, 3):
             raise InputError(
                 "body poses", expected=f"{count} × {len(self.joint_names)} rotations", got=list(self.rotations.shape)
-            )  # fmt: skip
+            )
         places = self.root(np.zeros(3))
         if places.shape != (count, 3):
             raise InputError("places of the root", expected=f"{count} × 3", got=_shape(places))
@@ -176,7 +176,7 @@ def smpl_poses(
     offsets = threes(member, trans, len(rotations))
     return Poses(
         np.asarray(frames, np.int64), rotations, lambda rest: rest + offsets, names, family, mean_betas(betas), "smpl"
-    )  # fmt: skip
+    )
 
 
 def easymocap_poses(
@@ -193,16 +193,21 @@ def easymocap_poses(
     """Poses in EasyMocap's convention: a body with an unturned root, then x = R(Rh) X + Th about the origin.
 
     A root rotation in ``axis_angles`` (zero in its own files) is applied about the pelvis first. ``members``: what the
-    file calls ``Rh`` and ``Th``; ``joint_names`` as for :func:`smpl_poses`.
+    file calls ``Rh`` and ``Th``; ``joint_names`` as for ``smpl_poses``.
     """
     rotations, names = _rotations(axis_angles, joint_names)
     turn = axis_angle_to_matrix(threes(members[0], Rh, len(rotations)))
     offsets = threes(members[1], Th, len(rotations))
     rotations[:, 0] = turn @ rotations[:, 0]
     return Poses(
-        np.asarray(frames, np.int64), rotations, lambda rest: turn @ rest + offsets, names, family, mean_betas(betas),
+        np.asarray(frames, np.int64),
+        rotations,
+        lambda rest: turn @ rest + offsets,
+        names,
+        family,
+        mean_betas(betas),
         "easymocap",
-    )  # fmt: skip
+    )
 
 
 def read_as(poses: Poses, convention: RootConvention) -> Poses:
@@ -214,9 +219,7 @@ def read_as(poses: Poses, convention: RootConvention) -> Poses:
     if convention == poses.convention:
         return poses
     if poses.convention == "placed":
-        raise InputError(
-            "--as", expected="no root convention: this layout says where the pelvis is", got=convention
-        )
+        raise InputError("--as", expected="no root convention: this layout says where the pelvis is", got=convention)
     offsets, turn = poses.root(np.zeros(3)), poses.rotations[:, 0]
 
     def root(rest: Floats) -> Floats:

@@ -19,10 +19,12 @@ def import_and_report(source: Path, out: Path, options: ImportOptions) -> int:
     with passing_progress() as progress:
         task = progress.add_task("writing")
         scene = import_source(
-            source, out, options,
+            source,
+            out,
+            options,
             on_shot=lambda done, total: progress.update(task, completed=done, total=total),
             on_found=lambda sentence: console.print(f"found {escape(sentence)}", soft_wrap=True),
-        )  # fmt: skip
+        )
     for note in scene.notes:
         console.print(f" note {escape(note)}", soft_wrap=True)
     return check_and_report(out, out / "check")

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.errors import InputError
-from rnd_runtime.motion import Motion
-from rnd_runtime.skeleton import Skeleton
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton
 
 
 def sharpness(picture: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> float:

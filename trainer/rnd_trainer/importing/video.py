@@ -12,15 +12,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rnd_runtime.body import posed_vertices
-from rnd_runtime.capture_format import TRAIN_SHARE, Split
-from rnd_runtime.errors import InputError
-from rnd_trainer.silhouette import silhouette
+from rnd_runtime.capture.body import posed_vertices
+from rnd_runtime.capture.format import TRAIN_SHARE, Split
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.checking.silhouette import silhouette
 
 from .body_models import BodyModel
 from .frames import Film
+from .images import PICTURES, Bytes, camera_of, listed, numbers_of, read_rgb, sized
 from .options import ALL, Choice
-from .pictures import PICTURES, Bytes, camera_of, listed, numbers_of, read_rgb, sized
 from .pose_files import FoundPoses, paired
 from .recording import Floats, Lens, Recording, Shot
 from .select import select_frames, sharpness
@@ -29,9 +29,7 @@ from .write import Scene, placed
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 FPS = 30.0
 CAMERA = "0"
-_SMALL = (
-    320  # pixels, the side at which sharpness is measured: motion blur shows there, sensor noise does not
-)
+_SMALL = 320  # pixels, the side at which sharpness is measured: motion blur shows there, sensor noise does not
 
 
 def detect(source: Path) -> str | None:
@@ -47,7 +45,7 @@ def detect(source: Path) -> str | None:
 
 
 class _Folder:
-    """A folder of frames with a :class:`Film`'s face.
+    """A folder of frames with a ``Film``'s face.
 
     Its ``numbers`` count the pictures from 0; where ``numbered``, they are those in their names, if all have one.
     """
@@ -66,10 +64,7 @@ class _Folder:
     def frame(self, number: int) -> Bytes:
         pixels, path = read_rgb(self.pictures[number]), self.pictures[number]
         if pixels.shape[:2] != (self.height, self.width):
-            expected, got = (
-                f"{self.width} x {self.height} as the first",
-                f"{pixels.shape[1]} x {pixels.shape[0]}",
-            )
+            expected, got = (f"{self.width} x {self.height} as the first", f"{pixels.shape[1]} x {pixels.shape[0]}")
             raise InputError("size of image", expected=expected, got=got, file=path, frame=number)
         return pixels
 
@@ -103,7 +98,7 @@ def read(
     poses, counted = paired(found, film.numbers, film.path)
     recording = Recording(
         f"a video with {found.kind}'s poses", {CAMERA: lens}, [], poses, rate, (*found.notes, *notes, *counted)
-    )  # fmt: skip
+    )
     chosen = _choose(film, placed(recording, model), recording, count, choice)
     stills = _stills(film, [frame for frame, _ in chosen])
     shots = [
@@ -115,9 +110,7 @@ def read(
     return replace(recording, shots=shots, notes=(*recording.notes, kept), film=names)
 
 
-def _lens(
-    found: FoundPoses, width: int, height: int, intrinsics: Sequence[float]
-) -> tuple[Floats, tuple[str, ...]]:
+def _lens(found: FoundPoses, width: int, height: int, intrinsics: Sequence[float]) -> tuple[Floats, tuple[str, ...]]:
     own = found.K
     if own is None and found.focal is not None:
         focal = found.focal(width, height)
@@ -164,14 +157,9 @@ def _choose(
     early, late = sharp.copy(), sharp.copy()
     early[border:], late[:border] = -np.inf, -np.inf
     if not np.isfinite(early).any():
-        raise InputError(
-            "frames", expected="some with poses and the person in view", got="none", file=film.path
-        )
+        raise InputError("frames", expected="some with poses and the person in view", got="none", file=film.path)
     chosen: list[tuple[int, Split]] = []
-    parts: list[tuple[np.ndarray, int, Split]] = [
-        (early, count, "train"),
-        (late, max(1, count // 4), "novel_pose"),
-    ]
+    parts: list[tuple[np.ndarray, int, Split]] = [(early, count, "train"), (late, max(1, count // 4), "novel_pose")]
     for scores, number, split in parts:
         if np.isfinite(scores).any():
             picked = select_frames(scene.motion, scene.body.skeleton, scores, number)

@@ -9,27 +9,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.body import Body
-from rnd_runtime.camera import Camera
-from rnd_runtime.capture import Capture, Frame, save_capture
-from rnd_runtime.capture_format import TRAIN_SHARE
-from rnd_runtime.errors import InputError, refuse_changed
-from rnd_runtime.files import output_folder
-from rnd_runtime.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
-from rnd_runtime.motion import Motion
-from rnd_runtime.motion_files import SMPL_REST_ROOT, SMPLX_REST_ROOT
-from rnd_runtime.rotations import slerp_matrices
+from rnd_runtime.capture.body import Body
+from rnd_runtime.capture.capture import Capture, Frame, save_capture
+from rnd_runtime.capture.format import TRAIN_SHARE
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError, refuse_changed
+from rnd_runtime.core.files import output_folder
+from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
+from rnd_runtime.core.rotations import slerp_matrices
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, SMPLX_REST_ROOT
 
 from .body_models import BodyModel
+from .images import fitting
 from .options import Choice
-from .pictures import fitting
 from .recording import Poses, Recording, Shot
 
 Floats = NDArray[np.float64]
 
-UPS = {
-    "x": (1.0, 0, 0), "-x": (-1.0, 0, 0), "y": (0, 1.0, 0), "-y": (0, -1.0, 0), "z": (0, 0, 1.0), "-z": (0, 0, -1.0),
-}  # fmt: skip
+UPS = {"x": (1.0, 0, 0), "-x": (-1.0, 0, 0), "y": (0, 1.0, 0), "-y": (0, -1.0, 0), "z": (0, 0, 1.0), "-z": (0, 0, -1.0)}
 SNAP = np.cos(np.radians(30))
 """a person who stands within 30° of an axis on average stands along it; farther off the world was never levelled"""
 MOST_FILLED = 100_000
@@ -72,9 +70,7 @@ def placed(recording: Recording, model: BodyModel, up: str | None = None) -> Sce
     turn = _upright(rotations[:, 0], up or recording.up, notes)
     rotations[:, 0] = turn @ rotations[:, 0]
     roots = roots @ turn.T
-    motion = _filled(
-        poses.frames, rotations, roots - body.skeleton.rest_joints[0], body, recording.fps, notes
-    )
+    motion = _filled(poses.frames, rotations, roots - body.skeleton.rest_joints[0], body, recording.fps, notes)
     back = np.eye(4)
     back[:3, :3] = turn.T
     cameras = {
@@ -97,16 +93,12 @@ def chosen_shots(recording: Recording, choice: Choice) -> list[Shot]:
     first, last = int(recording.poses.frames[0]), int(recording.poses.frames[-1])
     kept = [shot for shot in recording.shots if first <= shot.frame <= last and choice.keeps(shot.frame)]
     if not kept:
-        raise InputError(
-            "pictures", expected=f"some in the {last - first + 1} frames that have poses", got="none"
-        )
+        raise InputError("pictures", expected=f"some in the {last - first + 1} frames that have poses", got="none")
     seen = list(dict.fromkeys(shot.camera for shot in kept))
     if all(shot.split is not None for shot in kept):
         refuse_cameras(choice, seen, "the pictures' splits are given")
         return kept
-    moving = len({shot.frame for shot in kept}) == len(
-        kept
-    )  # one picture a moment: a single, maybe moving camera
+    moving = len({shot.frame for shot in kept}) == len(kept)  # one picture a moment: a single, maybe moving camera
     camera = choice.train_camera or kept[0].camera
     if camera not in seen:
         known = " or ".join(seen[:8])
@@ -148,7 +140,7 @@ def write_capture(
     """Write ``shots`` of a straightened ``recording``, placed as ``scene``, as a capture into ``folder``.
 
     ``normal_axes`` [3, 3] is how the user's normals were turned, from where
-    :func:`rnd_trainer.checking.check.check_capture` reasons.
+    ``checking.check.check_capture`` reasons.
     """
     output_folder(folder)
     first = int(recording.poses.frames[0])
@@ -158,12 +150,7 @@ def write_capture(
         on_shot(done + 1, len(shots))
     used = {name: scene.cameras[name] for name in dict.fromkeys(frame.camera for frame in frames)}
     undone = {name: list(lens.undone) for name in used if any((lens := recording.lenses[name]).undone)}
-    information = {
-        "kind": recording.kind,
-        "notes": scene.notes,
-        "distortion": undone,
-        "turn": scene.turn.tolist(),
-    }
+    information = {"kind": recording.kind, "notes": scene.notes, "distortion": undone, "turn": scene.turn.tolist()}
     if normal_axes is not None:
         information["normal_axes"] = normal_axes.tolist()
     capture = Capture(folder, used, {}, scene.body, scene.motion, tuple(frames))
@@ -189,9 +176,13 @@ def _write_shot(folder: Path, shot: Shot, camera: Camera, frame: int) -> Frame:
         write_image(folder / "normals" / name, np.where(known, to_bytes((unit + 1) / 2), 0).astype(np.uint8))
     assert shot.split is not None
     return Frame(
-        f"images/{name}", f"masks/{name}", shot.camera, frame, shot.split,
+        f"images/{name}",
+        f"masks/{name}",
+        shot.camera,
+        frame,
+        shot.split,
         normal=None if normals is None else f"normals/{name}",
-    )  # fmt: skip
+    )
 
 
 def _by_name(poses: Poses, body: Body) -> Floats:
@@ -206,9 +197,10 @@ def _by_name(poses: Poses, body: Body) -> Floats:
             matched += 1
     if matched < 2:
         raise InputError(
-            "joints of the body", expected=f"some of {', '.join(poses.joint_names[:4])}, …",
+            "joints of the body",
+            expected=f"some of {', '.join(poses.joint_names[:4])}, …",
             got=", ".join(body.skeleton.names[:4]),
-        )  # fmt: skip
+        )
     return rotations
 
 
@@ -238,20 +230,16 @@ def _upright(root: Floats, up: str | None, notes: list[str]) -> Floats:
 
 
 def _filled(
-    frames: NDArray[np.int64],
-    rotations: Floats,
-    translations: Floats,
-    body: Body,
-    fps: float,
-    notes: list[str],
+    frames: NDArray[np.int64], rotations: Floats, translations: Floats, body: Body, fps: float, notes: list[str]
 ) -> Motion:
     """A pose for every frame from the first to the last, slerped where the source has none."""
     missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
     if missing > MOST_FILLED:
         raise InputError(
-            "frames of the poses", expected=f"at most {MOST_FILLED} left out",
+            "frames of the poses",
+            expected=f"at most {MOST_FILLED} left out",
             got=f"{missing} between {frames[0]} and {frames[-1]}",
-        )  # fmt: skip
+        )
     wanted = np.arange(frames[0], frames[-1] + 1)
     after = np.minimum(np.searchsorted(frames, wanted, side="right"), len(frames) - 1)
     before = np.maximum(np.searchsorted(frames, wanted, side="right") - 1, 0)

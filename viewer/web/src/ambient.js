@@ -1,4 +1,4 @@
-// A light of sixteen harmonics times each Gaussian's occlusion (rnd_runtime/shading_ambient.py).
+// A light of sixteen harmonics times each Gaussian's occlusion (rnd_runtime/shading/ambient.py).
 
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { lobeAt, lobeTable } from "./lobe.js";

@@ -1,4 +1,4 @@
-// avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar_file.py, avatar.py, skeleton.py).
+// avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar/file.py, avatar.py, skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
 import { LARGEST_ALBEDO } from "./brdf.js";
@@ -17,7 +17,7 @@ const REST = [
   "neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs", "posing_limits",
 ];
 
-// What the metadata may say (AvatarMetadata of rnd_runtime/avatar_file.py): true for a value, an object for one inside.
+// What the metadata may say (AvatarMetadata of rnd_runtime/avatar/file.py): true for a value, an object for one inside.
 const FIELDS = {
   schema: true, gaussians: true, spacing_m: true, window_poses: true, window_seconds: true, trained_light: true,
   body_license: true, checkpoint_sha256: true, conventions: true, generator: true,
@@ -81,7 +81,7 @@ export class Avatar {
     return { values: this.outputs.map((name) => made[name].data), bones, root, joints };
   }
 
-  /** The Gaussians of what was encoded, as rnd_runtime/gaussians.py has them, in the frame of the `root`: {rotation [9],
+  /** The Gaussians of what was encoded, as rnd_runtime/core/gaussians.py has them, in the frame of the `root`: {rotation [9],
    *  translation [3]} → world; and joints [J·3] m in the world. */
   posed({ values, bones, root, joints }) {
     const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
@@ -89,7 +89,7 @@ export class Avatar {
   }
 }
 
-/** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar_file.py). */
+/** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar/file.py). */
 function advisedCull(file) {
   const advice = JSON.parse(file.metadata.get("rnd_player") ?? "{}"), cull = advice?.cull ?? -1;
   if (advice?.constructor !== Object || !(typeof cull === "number" && cull >= -1 && cull <= 1))

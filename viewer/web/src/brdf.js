@@ -1,4 +1,4 @@
-// GGX with Smith's separable masking and Schlick, metallic 0 (rnd_runtime/brdf.py).
+// GGX with Smith's separable masking and Schlick, metallic 0 (rnd_runtime/shading/brdf.py).
 
 export const ROUGHNESS_LOW = 0.09, ROUGHNESS_HIGH = 0.99;
 const F0 = 0.04, COSINE_FLOOR = 1e-4;

@@ -1,10 +1,10 @@
-// Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/camera.py, rnd_viewer/cameras.py).
+// Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/core/camera.py, rnd_viewer/inputs/cameras.py).
 
 import { jointsAt } from "./avatar.js";
 import { multiply, rotate, transposed } from "./rotations.js";
 
 const PADDING = 0.14;  // of the skeleton's height: what the body reaches beyond its joints
-const ELEVATION = 5 * Math.PI / 180, FIELD_OF_VIEW = 35 * Math.PI / 180;  // as rnd_viewer/options.py has them
+const ELEVATION = 5 * Math.PI / 180, FIELD_OF_VIEW = 35 * Math.PI / 180;  // as rnd_viewer/inputs/options.py has them
 
 /** The camera of a state: {width, height, focal, rotation [9], translation [3], position [3]}. */
 export function cameraOf({ azimuth, elevation, distance, target, fov, width, height }) {

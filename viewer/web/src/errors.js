@@ -1,4 +1,4 @@
-// A user's mistake in one line (rnd_runtime/errors.py).
+// A user's mistake in one line (rnd_runtime/core/errors.py).
 
 /** "walk.npz: frame 17: poses: expected finite numbers, got nan", to be thrown; parts that nobody gave are left out. */
 export function refusal(what, { expected, got, file, frame, hint } = {}) {

@@ -1,4 +1,4 @@
-// Forearms that share a twist between elbow and wrist (rnd_runtime/forearm.py, which has the formulas).
+// Forearms that share a twist between elbow and wrist (rnd_runtime/posing/forearm.py, which has the formulas).
 
 import { axisAngleToMatrix, multiply, transposed } from "./rotations.js";
 

@@ -1,4 +1,4 @@
-// Poses between the frames of a recording: cubic Hermite paths (rnd_runtime/interpolation.py says which and why).
+// Poses between the frames of a recording: cubic Hermite paths (rnd_runtime/motion/interpolation.py says which and why).
 
 import { axisAngleToMatrix, matrixToAxisAngle, multiply, transposedTimes } from "./rotations.js";
 

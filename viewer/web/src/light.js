@@ -1,4 +1,4 @@
-// Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/light.py).
+// Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/shading/light.py).
 
 import { refusal, short } from "./errors.js";
 import { readExr } from "./exr.js";
@@ -20,7 +20,7 @@ export function readLight(bytes, name) {
   return repair({ ...image, name });
 }
 
-/** What the user should know of a light, one sentence each (rnd_runtime/light.py). */
+/** What the user should know of a light, one sentence each (rnd_runtime/shading/light.py). */
 export function lightNotes({ radiance, repaired, chromaticities, exposure = 1 }) {
   const notes = [];
   if (exposure !== 1) notes.push(`the light's pixels are divided by the exposure that its file states, ${short(exposure, 4)}`);

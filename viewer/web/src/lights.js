@@ -1,4 +1,4 @@
-// The sum over distant lights, each with the whole BRDF and its own visibility (rnd_runtime/shading_sum.py).
+// The sum over distant lights, each with the whole BRDF and its own visibility (rnd_runtime/shading/sum.py).
 
 import { clampRoughness, ggx } from "./brdf.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";

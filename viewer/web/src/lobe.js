@@ -1,4 +1,4 @@
-// What a specular lobe looks like to a light map: energy, mean direction, width (rnd_runtime/specular_lobe.py).
+// What a specular lobe looks like to a light map: energy, mean direction, width (rnd_runtime/shading/specular_lobe.py).
 
 import { ROUGHNESS_HIGH, ROUGHNESS_LOW, clampRoughness, ggx } from "./brdf.js";
 

@@ -1,4 +1,4 @@
-// Motions: a file's poses on an avatar's skeleton (rnd_runtime/motion.py), and the window its skinning looks at (window.py).
+// Motions: a file's poses on an avatar's skeleton (rnd_runtime/motion/motion.py), and the window its skinning looks at (window.py).
 
 import { refusal } from "./errors.js";
 import { pointAt, rotationsAt } from "./interpolation.js";

@@ -1,4 +1,4 @@
-// The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion_files.py).
+// The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion/readers/arrays.py).
 
 import { refusal, short, sizes } from "./errors.js";
 import { NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT } from "./motion_names.js";

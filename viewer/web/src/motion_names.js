@@ -1,4 +1,4 @@
-// The SMPL family's joints, and where its mean bodies have their pelvis (rnd_runtime/motion_names.py).
+// The SMPL family's joints, and where its mean bodies have their pelvis (rnd_runtime/motion/readers/smpl_names.py).
 
 const SMPL = [
   "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3",

@@ -1,4 +1,4 @@
-// .npz archives: zip (fflate) of .npy, one member at a time when asked for, numbers and strings only (rnd_runtime/npz.py).
+// .npz archives: zip (fflate) of .npy, one member at a time when asked for, numbers and strings only (rnd_runtime/core/npz.py).
 
 import { unzipSync } from "fflate";
 import { crc32, crcs } from "./crc.js";

@@ -1,4 +1,4 @@
-// Cutting what one wants out of an ONNX file (rnd_runtime/onnx_parts.py): onnxruntime computes every node of a graph.
+// Cutting what one wants out of an ONNX file (rnd_runtime/avatar/onnx_parts.py): onnxruntime computes every node of a graph.
 
 // Field numbers of onnx.proto
 const MODEL_GRAPH = 7, MODEL_METADATA = 14;

@@ -1,6 +1,6 @@
-// The Gaussians of a pixel's tile, blended front to back by the rule of rnd_runtime/raster_oracle.py: a pixel stops before
+// The Gaussians of a pixel's tile, blended front to back by the rule of rnd_runtime/raster/oracle.py: a pixel stops before
 // the one that would leave less than 1e-4 of its light, which no blending unit can do. Then the background, and sRGB; or
-// what a material map shows (rnd_viewer/aov.py).
+// what a material map shows (rnd_viewer/play/aov.py).
 
 uniform sampler2D records;   // TEXELS for each Gaussian; see project.js
 uniform usampler2D pairs;    // Gaussians, tile by tile, front to back
@@ -64,7 +64,7 @@ vec3 srgb(vec3 linear) {
 void main() {
     ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
     vec4 value = blend(at);
-    value *= value.a * (3.0 - 2.0 * value.a);  // outlines as sharp as a body's: rnd_runtime/outline.py
+    value *= value.a * (3.0 - 2.0 * value.a);  // outlines as sharp as a body's: rnd_runtime/raster/outline.py
     vec3 result;
     if (show == 0) {
         vec3 far = behind == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;

@@ -1,4 +1,4 @@
-// From what the networks say at the nodes to posed Gaussians (rnd_runtime/posing.py, which has the formulas).
+// From what the networks say at the nodes to posed Gaussians (rnd_runtime/posing/posing.py, which has the formulas).
 //
 // Everything is summed in float32 and in the order in which the compiled pass sums it on a machine that multiplies and
 // adds at once, rounding once. The bits are the same then, and so is which of two Gaussians at one depth is in front; what
@@ -9,7 +9,7 @@ const LOG2_E = f32(Math.LOG2E), SMALLEST_POWER = -126, LARGEST_TANH = 9, SHORTES
 const HARMONICS = 16, NEVER = f32(-1e30), DEEPEST = 60;
 const TERMS = 14, SUM = 12, GREATEST = 13;  // of a node's blend: Σ_j e^(Δ_j − c) B_j, the same without B, and c
 const TO_WHOLE = 1.5 * 2 ** 52;  // added and taken away again rounds to whole numbers, halves to even ones
-// 2^x on [−½, ½] (rnd_runtime/_lanes.py)
+// 2^x on [−½, ½] (rnd_runtime/core/simd.py)
 const E0 = 1.0000001192092896, E1 = 0.6931471824645996, E2 = 0.2402210682630539, E3 = 0.055503569543361664;
 const E4 = 0.009676031768321991, E5 = 0.0013390863314270973;
 const POWERS = Float32Array.from({ length: 255 }, (_, k) => 2 ** (k - 127));

@@ -1,4 +1,4 @@
-// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/_raster_project.py, _raster_tiles.py).
+// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/raster/project.py, _raster_tiles.py).
 
 export const ROW_GAUSSIANS = 512, ROW_PAIRS = 2048, TILE = 4;
 export const TEXELS = 3;  // whole and broken part of the centre less ½; shear, fall_y, fall_x, peak; three attributes
@@ -11,7 +11,7 @@ const RADIX = 11, DIGITS = 1 << RADIX;
  * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
  * front to back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
  * A Gaussian with a number that is not finite, or of no extent, is not drawn: NaN fails every guard. Nor is one whose n·v
- * is below `cull` (rnd_runtime/in_view.py).
+ * is below `cull` (rnd_runtime/raster/in_view.py).
  */
 export function project({ means, covariances, opacities, normals }, count, features, camera, grown, cull) {
   const { rotation: r, translation: t, position: eye, focal, width, height } = camera;

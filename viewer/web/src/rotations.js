@@ -1,4 +1,4 @@
-// Rotations as in rnd_runtime/rotations.py: axis-angle at file borders, row-major 3×3 matrices inside.
+// Rotations as in rnd_runtime/core/rotations.py: axis-angle at file borders, row-major 3×3 matrices inside.
 
 /** Rodrigues' formula: axis-angle (x, y, z) rad → nine numbers of `out` from `at`. */
 export function axisAngleToMatrix(x, y, z, out, at) {

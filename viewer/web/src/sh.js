@@ -1,4 +1,4 @@
-// Real spherical harmonics of degree 3, in the order and with the signs of rnd_runtime/sh.py.
+// Real spherical harmonics of degree 3, in the order and with the signs of rnd_runtime/core/sh.py.
 
 const C0 = Math.sqrt(1 / (4 * Math.PI)), C1 = Math.sqrt(3 / (4 * Math.PI));
 const C2 = Math.sqrt(15 / (4 * Math.PI)), C20 = Math.sqrt(5 / (16 * Math.PI));

@@ -1,4 +1,4 @@
-// Relighting posed Gaussians: the modes of rnd_runtime/shading.py.
+// Relighting posed Gaussians: the modes of rnd_runtime/shading/shader.py.
 
 import { buildAmbient, shadeAmbient } from "./ambient.js";
 import { allTexels, medianCut, shadeLights } from "./lights.js";

@@ -1,4 +1,4 @@
-// Suns: a hard shadow from a depth map splatted from the Gaussians (rnd_runtime/shadow.py), and their own shading.
+// Suns: a hard shadow from a depth map splatted from the Gaussians (rnd_runtime/shading/shadow.py), and their own shading.
 
 import { clampRoughness, ggx } from "./brdf.js";
 

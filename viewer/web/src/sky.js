@@ -1,4 +1,4 @@
-// Shading by tables over the normal that depend on the light alone (rnd_runtime/shading_tables.py).
+// Shading by tables over the normal that depend on the light alone (rnd_runtime/shading/tables.py).
 
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { WIDTHS, lobeAt, lobeTable } from "./lobe.js";

@@ -1,4 +1,4 @@
-// Taking the sun out of a light probe (rnd_runtime/sun.py): sky + suns = map.
+// Taking the sun out of a light probe (rnd_runtime/shading/sun.py): sky + suns = map.
 
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 

@@ -1,0 +1,1 @@
+"""Fewer Gaussians and coarser networks."""

@@ -1,0 +1,139 @@
+"""What an exported file may leave out for speed or size."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_export.bake import BakedAvatar, BakedSkinning, Rates
+from rnd_export.order import moving_sites, nodes_in_order
+from rnd_runtime.avatar.file import EncoderKind, Precision
+from rnd_runtime.core.errors import InputError, flag
+from rnd_runtime.core.sh import SH_DEGREE
+from rnd_trainer.config import ModelConfig
+from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
+
+COARSE_SHARE = 4
+"""``coarse`` evaluates the networks at one of this many nodes: 23 mm apart become 45 mm on a person"""
+
+
+OWN_NODES = {"skinning_nodes": "skinning", "offset_nodes": "offsets", "visibility_nodes": "visibility"}
+"""fields of ``Variant`` that concern one network each, and which of ``Rates`` that is"""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way of writing an avatar; the defaults leave nothing out.
+
+    Attributes:
+        encoder: ``full``; ``coarse``: the networks at ``nodes`` points, by default a quarter of the checkpoint's;
+            ``static``: the template's skinning weights, no attention.
+        precision: how constants are stored; arithmetic is float32 always.
+        nodes: M, a prefix of the farthest-point order; for ``coarse``.
+        skinning_nodes, offset_nodes, visibility_nodes: of these M, at how many that network alone is evaluated.
+        window_poses: d; fewer poses span the same seconds, those between are interpolated.
+        visibility_degree: 0 to 3; higher coefficients are left out.
+    """
+
+    encoder: EncoderKind = "full"
+    precision: Precision = "f32"
+    nodes: int | None = None
+    skinning_nodes: int | None = None
+    offset_nodes: int | None = None
+    visibility_nodes: int | None = None
+    window_poses: int | None = None
+    visibility_degree: int = SH_DEGREE
+
+    def node_count(self, config: ModelConfig) -> int:
+        """M of the file."""
+        if self.encoder != "coarse":
+            return config.nodes
+        return self.nodes or max(NEIGHBOURS, config.nodes // COARSE_SHARE)
+
+    def rates(self, config: ModelConfig) -> Rates:
+        """Nodes of each network, of the M of the file."""
+        most = self.node_count(config)
+        return Rates(**{network: getattr(self, name) or most for name, network in OWN_NODES.items()})
+
+    def check(self, config: ModelConfig) -> None:
+        """Raise ``InputError`` for what no file of this checkpoint can be."""
+        least = {
+            **dict.fromkeys(["nodes", *OWN_NODES], NEIGHBOURS),
+            "window_poses": 2 if config.window_poses > 1 else 1,
+            "visibility_degree": 0,
+        }
+        most = {
+            "nodes": config.nodes,
+            **dict.fromkeys(OWN_NODES, self.node_count(config)),
+            "window_poses": config.window_poses,
+            "visibility_degree": SH_DEGREE,
+        }
+        for name, low in least.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= most[name]:
+                option = flag(name)
+                raise InputError(option, expected=f"{low} to {most[name]}", got=value)
+        if self.nodes is not None and self.encoder != "coarse":
+            raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
+        static = self.encoder == "static" or not config.dynamic_skinning
+        if self.skinning_nodes is not None and static:
+            raise InputError("--skinning-nodes", expected="dynamic skinning", got="the template's weights")
+        if self.window_poses is not None and static:
+            got = "the template's weights, which have no window"
+            raise InputError("--window-poses", expected="dynamic skinning", got=got)
+
+
+def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:
+    """``baked`` without what ``variant`` leaves out."""
+    changes: dict[str, Any] = {"rates": variant.rates(config)}
+    nodes, skinning = variant.node_count(config), baked.skinning
+    if nodes < len(baked.codes):
+        neighbours, weights = node_interpolation(baked.all_codes, baked.codes[:nodes], baked.area)
+        changes |= {
+            "codes": baked.codes[:nodes],
+            "node_rows": baked.node_rows[:nodes],
+            "node_ranks": baked.node_ranks[:nodes],
+            "neighbours": neighbours,
+            "neighbour_weights": weights,
+            "dynamic_nodes": nodes if skinning else 0,
+        }
+    if variant.encoder == "static":
+        changes |= {"skinning": None, "dynamic_nodes": 0}
+    elif skinning is not None and variant.window_poses not in (None, config.window_poses):
+        changes["skinning"] = _shorter(skinning, config.window_poses, int(variant.window_poses or 0))
+    if variant.visibility_degree < SH_DEGREE:
+        kept = (variant.visibility_degree + 1) ** 2
+        out = {name: baked.visibility[name][:kept] for name in ("out.weight", "out.bias")}
+        changes["visibility"] = {**baked.visibility, **out}
+    return dataclasses.replace(baked, **changes)
+
+
+def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
+    """The template's skinning at the nodes ``still`` [M]; the others come first in the file's order."""
+    moved = nodes_in_order(baked, np.argsort(still, kind="stable"))
+    moved = dataclasses.replace(moved, dynamic_nodes=int((~still).sum()))
+    if len(moving_sites(moved)):
+        return moved
+    return dataclasses.replace(moved, dynamic_nodes=0, skinning=None)
+
+
+def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:
+    """Tokens of ``fewer`` poses: the first layer reads the missing ones off the line between their neighbours."""
+    module = dict(skinning.temporal.module)
+    weight = module["embed.weight"]  # [width, poses · 6]
+    spread = line_through(poses, fewer)
+    module["embed.weight"] = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), spread).reshape(
+        len(weight), fewer * 6
+    )
+    return dataclasses.replace(skinning, temporal=dataclasses.replace(skinning.temporal, module=module))
+
+
+def line_through(poses: int, fewer: int) -> NDArray[np.float64]:
+    """[poses, fewer]: piecewise linear interpolation of evenly spaced values, ends kept."""
+    places = np.linspace(0, fewer - 1, poses)
+    weights: NDArray[np.float64] = np.maximum(0, 1 - np.abs(places[:, None] - np.arange(fewer)))
+    return weights

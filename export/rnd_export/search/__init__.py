@@ -1,0 +1,1 @@
+"""The best file within a bound of time, size or error."""

@@ -1,0 +1,265 @@
+"""No more than a scene needs: the cheapest file of an avatar that keeps a bound, found on this machine.
+
+The search starts from the whole avatar and takes, one after another, the step that saves most for what it costs in the
+picture. Steps that a bound of time or size turns out not to need are then taken back, the dearest in the picture first.
+Pictures are compared with those of the whole avatar under the same player, light and poses, the worst one counts. What
+is found must keep the bound in shots that the search has not seen; a file that does not is given up for the one before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import onnx
+
+from rnd_export.reduce.variant import OWN_NODES, Variant
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.config import ModelConfig
+
+from .candidates import Measured, Recipe, Workbench
+
+PRECISIONS: tuple[Literal["f32", "f16", "int8"], ...] = ("f32", "f16", "int8")
+LADDERS: dict[str, tuple[float, ...]] = {
+    "precision": (1, 2),
+    "cull": (-0.7, -0.5, -0.4, -0.3, -0.2),
+    "dynamic_mm": (0.05, 0.2, 0.5, 1.0, 2.0, np.inf),
+    "nodes": (0.5, 0.25, 0.125),
+    "skinning_nodes": (0.5, 0.25, 0.125),
+    "offset_nodes": (0.5, 0.25, 0.125),
+    "visibility_nodes": (0.5, 0.25, 0.125),
+    "gaussians": (0.85, 0.7, 0.55, 0.4, 0.3, 0.2),
+    "visibility_degree": (2, 1, 0),
+    "window": (0.5, 0.3, 0.2),
+}
+"""steps of each choice away from the whole; nodes, Gaussians and window poses as shares of the checkpoint's, nodes of
+one network as shares of the file's"""
+MARGIN_DB = 0.3
+"""that the search keeps from a least PSNR: shots it has not seen are a little worse"""
+LEAST_GAIN = 0.01
+"""of the cost: a step goes down a ladder to the first rung that saves more, and others are taken when none is left"""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """``ms`` a frame at most, ``psnr`` (dB) at least, or ``mb`` (1e6 bytes) at most."""
+
+    kind: Literal["ms", "psnr", "mb"]
+    value: float
+
+    def held(self, found: Measured) -> bool:
+        """Does a file of which ``found`` was measured keep it?"""
+        value: float = getattr(found, self.kind)
+        return value >= self.value if self.kind == "psnr" else value <= self.value
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How many rungs down each of ``LADDERS`` a file is."""
+
+    precision: int = 0
+    cull: int = 0
+    dynamic_mm: int = 0
+    nodes: int = 0
+    skinning_nodes: int = 0
+    offset_nodes: int = 0
+    visibility_nodes: int = 0
+    gaussians: int = 0
+    visibility_degree: int = 0
+    window: int = 0
+
+    def recipe(self, config: ModelConfig) -> Recipe:
+        """For a checkpoint of ``config``."""
+
+        def rung(name: str) -> float | None:
+            at = getattr(self, name)
+            return LADDERS[name][at - 1] if at else None
+
+        nodes, gaussians, window, degree = (rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree"))
+        static = rung("dynamic_mm") == np.inf
+        most = _nodes(nodes, config.nodes) or config.nodes
+        own = {name: _nodes(rung(name), most) for name in OWN_NODES}
+        if static:
+            own["skinning_nodes"] = None
+        variant = Variant(
+            encoder="coarse" if nodes else "full",
+            precision=PRECISIONS[self.precision],
+            nodes=_nodes(nodes, config.nodes),
+            **own,
+            window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
+            visibility_degree=3 if degree is None else int(degree),
+        )
+        count = max(int(gaussians * config.gaussians), most) if gaussians else None  # nodes stay
+        return Recipe(variant, count, rung("dynamic_mm") or 0.0, rung("cull"))
+
+
+def _nodes(share: float | None, most: int) -> int | None:
+    """That share of ``most`` nodes."""
+    return None if share is None else min(max(16, int(share * most)), most)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A plan, its file, and what was measured on the shots of the search and, at the end, on the others."""
+
+    plan: Plan
+    model: onnx.ModelProto
+    measured: Measured
+    held_out: Measured | None = None
+
+
+def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> Found:
+    """The cheapest file that keeps ``bound``, on held-out shots too; ``on_step`` sees every step taken.
+
+    Raises ``InputError`` where no file of the ladders does.
+    """
+    path, worths = [_made(bench, Plan())], dict.fromkeys(LADDERS, np.inf)
+    on_step(path[-1])
+    while True:
+        now = path[-1]
+        if bound.kind != "psnr" and bound.held(now.measured):
+            now = path[-1] = _tested(bench, now)
+            if _kept(bound, now):
+                return _relaxed(bench, bound, now, on_step)
+        step = _best_step(bench, bound, now, worths)
+        if step is None and bound.kind != "psnr":  # each for itself saves little, all of them may be enough
+            step, worths = _mildest_step(bench, bound, now), dict.fromkeys(LADDERS, np.inf)
+        if step is None:
+            break
+        path.append(step)
+        on_step(step)
+    for found in reversed(path):
+        tested = _tested(bench, found)
+        if _kept(bound, tested):
+            return tested
+    raise InputError(
+        f"no file keeps the bound of {bound.kind}",
+        expected=f"{bound.value:g}",
+        got=f"{getattr(path[-1].measured, bound.kind):.3g} at the end of all steps",
+    )
+
+
+def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Found], None]) -> Found:
+    """``found`` with steps taken back for as long as ``bound`` holds: of each round's, what the picture gains most by.
+
+    What saved most for its cost at first may be dear beside what was found later, and the last step may save too much.
+    """
+    while True:
+        plans = [_next(bench, found.plan, name, -1) for name in LADDERS]
+        made = [_made(bench, plan) for plan in plans if plan is not None]
+        gains = (f for f in made if bound.held(f.measured) and f.measured.psnr > found.measured.psnr)
+        for candidate in sorted(gains, key=_square):
+            tested = _tested(bench, candidate)
+            if _kept(bound, tested):
+                found = tested
+                on_step(found)
+                break
+        else:
+            return found
+
+
+def _tested(bench: Workbench, found: Found) -> Found:
+    """``found``, measured on the shots that the search does not see too: once, as no time is measured twice alike."""
+    return found if found.held_out else replace(found, held_out=bench.measure(found.model, bench.held_out))
+
+
+def _kept(bound: Bound, found: Found) -> bool:
+    return found.held_out is not None and bound.held(found.held_out)
+
+
+def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, float]) -> Found | None:
+    """Of the steps further down, the one that saves most for what it costs in the picture.
+
+    ``worths`` of each ladder are remembered from earlier rounds, and looked at again only where they promise most:
+    what saves little once seldom saves more later.
+    """
+    made: dict[str, Found] = {}
+    while True:
+        name = max(worths, key=lambda name: worths[name])
+        if worths[name] <= 0:
+            return None
+        if name in made:
+            return made[name]
+        found = _further(bench, bound, now, name, LEAST_GAIN)
+        if found is None or (bound.kind == "psnr" and found.measured.psnr < bound.value + MARGIN_DB):
+            worths[name] = 0
+            continue
+        worths[name] = _saved(bound, now, found) / max(_square(found) - _square(now), 1e-9)
+        made[name] = found
+
+
+def _mildest_step(bench: Workbench, bound: Bound, now: Found) -> Found | None:
+    """Of the steps further down, the one that costs least in the picture; of size, that makes the file any smaller."""
+    least = 0.0 if bound.kind == "mb" else -np.inf  # of time, that may be noise
+    steps = [_further(bench, bound, now, name, least) for name in LADDERS]
+    return min((step for step in steps if step is not None), key=_square, default=None)
+
+
+def _further(bench: Workbench, bound: Bound, now: Found, name: str, least: float) -> Found | None:
+    """The first rung of ``name`` down the ladder that saves more than ``least`` of the cost; None where none does.
+
+    The first rungs of a ladder may save nothing, as those of dynamic skinning do of the size until it is static.
+    """
+    plan = _next(bench, now.plan, name, 1)
+    while plan is not None:
+        found = _made(bench, plan)
+        if _saved(bound, now, found) > least:
+            return found
+        plan = _next(bench, plan, name, 1)
+    return None
+
+
+def _saved(bound: Bound, now: Found, found: Found) -> float:
+    """Share of the cost, the size for a bound of it and the time for others, that ``found`` saves over ``now``."""
+    cost = "mb" if bound.kind == "mb" else "ms"
+    return float(1 - getattr(found.measured, cost) / getattr(now.measured, cost))
+
+
+def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan | None:
+    """The next rung of ``name`` down the ladder, or up for −1, that makes another file that is allowed; None at its
+    end."""
+    last = len(LADDERS[name]) if way > 0 else 0
+    for rung in range(getattr(plan, name) + way, last + way, way):
+        other = replace(plan, **{name: rung})
+        recipe = other.recipe(bench.config)
+        if recipe != plan.recipe(bench.config) and bench.allows(recipe.variant.precision):
+            return other
+    return None
+
+
+def _made(bench: Workbench, plan: Plan) -> Found:
+    model = bench.model(plan.recipe(bench.config))
+    return Found(plan, model, bench.measure(model, bench.seen))
+
+
+def _square(found: Found) -> float:
+    return float(10 ** (-found.measured.psnr / 10))
+
+
+def given_up(bench: Workbench, plan: Plan) -> list[str]:
+    """What a file of ``plan`` leaves out, a line each."""
+    recipe, config = plan.recipe(bench.config), bench.config
+    lines = []
+    if recipe.cull is not None:
+        lines.append(f"what faces away (n·v < {recipe.cull:g})")
+    if recipe.gaussians is not None:
+        lines.append(f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again")
+    if recipe.variant.nodes is not None:
+        lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
+    for name, network in OWN_NODES.items():
+        if count := getattr(recipe.variant, name):
+            lines.append(f"{network} at {count} of {recipe.variant.node_count(config)} nodes")
+    if recipe.dynamic_mm == np.inf:
+        lines.append("dynamic skinning nowhere")
+    elif recipe.dynamic_mm:
+        share = bench.still_share(recipe)
+        lines.append(f"dynamic skinning where it moves less than {recipe.dynamic_mm:g} mm ({share:.0%} of its nodes)")
+    if recipe.variant.visibility_degree < 3:
+        lines.append(f"visibility above degree {recipe.variant.visibility_degree}")
+    if recipe.variant.window_poses is not None:
+        lines.append(f"{config.window_poses - recipe.variant.window_poses} of {config.window_poses} window poses")
+    if recipe.variant.precision != "f32":
+        lines.append(f"constants of 32 bits: {recipe.variant.precision}")
+    return lines or ["nothing"]

@@ -1,0 +1,150 @@
+"""An ``avatar.onnx`` at work: its networks in onnxruntime, the rest of its posing in our kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton, taken_along
+from rnd_runtime.posing.posing import RestPose, Unposed
+from rnd_runtime.posing.window import moment
+from rnd_runtime.shading.brdf import LARGEST_ALBEDO
+
+from .file import REST_OUTPUTS
+from .networks import Networks
+
+
+class Encoded(NamedTuple):
+    """What the networks say of one pose, for ``Avatar.posed``.
+
+    It is posed in the root's frame, which leaves the root's own turn and path to camera and light: float32 then has to
+    resolve a body and not its place in the world, and where all three turn together the picture stays.
+    """
+
+    values: list[NDArray[np.float32]]  # node outputs: logits, unless skinning is static, offsets and visibility
+    bones: NDArray[np.float32]  # [J, 3, 4] m, rest pose → this frame
+    root: NDArray[np.float64]  # [4, 4] m, this frame → world
+    seconds: dict[str, float]  # that "motion" and "encoders" took
+
+    def in_world(self) -> Encoded:
+        """The same, to be posed in the world."""
+        return self._replace(bones=taken_along(self.bones, self.root), root=np.eye(4))
+
+
+class Avatar:
+    """An avatar read from ``avatar.onnx``, ready to be posed. Get one with ``load``.
+
+    Attributes:
+        skeleton: its joint tree. window_poses, window_seconds: the motion window. gaussians: N.
+        spacing: mean distance between Gaussians, m. trained_light: [32, 64, 3] linear radiance.
+        metadata: everything the file says of itself. advice: how it may be played.
+    """
+
+    def __init__(self, networks: Networks) -> None:
+        self._networks, metadata = networks, networks.metadata
+        self.metadata, self.advice, self.trained_light = metadata, networks.advice, networks.trained_light
+        tree = metadata.skeleton
+        self.skeleton = Skeleton(tuple(tree.names), np.array(tree.parents), np.array(tree.rest_joints, np.float64))
+        self.window_poses, self.window_seconds = metadata.window_poses, metadata.window_seconds
+        self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
+        self._opacities, albedo, self._roughness = networks.materials
+        self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
+        self._rest = _rest_pose(networks) if networks.posed_outside else None
+
+    @classmethod
+    def load(cls, path: str | Path, *, threads: int | None = None, ahead: Future[Networks] | None = None) -> Avatar:
+        """Read an avatar. ``threads``: of onnxruntime; by default one per core.
+
+        Args:
+            ahead: its networks, where they are being loaded already, with threads of their own: see
+                ``playback.start.quick_start``.
+
+        Raises:
+            InputError: for anything that is not a whole avatar of the schema we know.
+        """
+        networks = Networks.load(path, threads) if ahead is None else ahead.result()
+        try:
+            return cls(networks)
+        except InputError as error:
+            raise error.at(file=path) from error
+
+    def pose(self, motion: Motion, time: float) -> Gaussians:
+        """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton), in the world frame."""
+        return self.posed(self.encode(motion, time).in_world())
+
+    def encode(self, motion: Motion, time: float) -> Encoded:
+        """The first half of ``pose``: what the networks say. Runs in onnxruntime, so it may overlap any kernel."""
+        started = perf_counter()
+        window, velocity, bones, root = moment(
+            motion, time, self.skeleton, poses=self.window_poses, seconds=self.window_seconds
+        )
+        known = perf_counter()
+        values = self._networks.at((window, velocity, bones))
+        return Encoded(values, bones, root, {"motion": known - started, "encoders": perf_counter() - known})
+
+    def posed(self, encoded: Encoded) -> Gaussians:
+        """The second half of ``pose``, in the frame of ``encoded``."""
+        values, bones = encoded.values, encoded.bones
+        if self._rest is None:
+            means, covariances, normals, visibility = values
+        else:
+            *logits, offsets, harmonics = values
+            posed = self._rest.pose(logits[0] if logits else None, offsets, harmonics, bones)
+            means, covariances, normals, visibility = posed
+        return Gaussians(
+            means,
+            covariances,
+            self._opacities,
+            normals,
+            self._albedo,
+            self._roughness,
+            visibility,
+            np.ascontiguousarray(bones[0, :, :3], np.float32),
+        )
+
+    def unposed(self, encoded: Encoded) -> Unposed | None:
+        """What ``posed`` is made of, for those who pose elsewhere; None where the graph has posed already."""
+        if self._rest is None:
+            return None
+        *logits, offsets, visibility = encoded.values
+        return Unposed(
+            self._rest,
+            logits[0] if logits else None,
+            offsets,
+            visibility,
+            encoded.bones,
+            self._opacities,
+            self._albedo,
+            self._roughness,
+        )
+
+    def run(self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike], outputs: Sequence[str]) -> list[NDArray[np.float32]]:
+        """Named outputs of the graph: ``avatar.networks.Networks.run``."""
+        return self._networks.run(inputs, outputs)
+
+
+def _rest_pose(networks: Networks) -> RestPose:
+    neighbours, weights, log_template, *rest, limits = networks.rest
+    nodes = networks.nodes
+    inside = neighbours.size and neighbours.min() >= 0 and neighbours.max() < nodes
+    if neighbours.shape != weights.shape or not inside:
+        expected = f"{list(weights.shape)} of {nodes} nodes, from 0"
+        raise InputError(REST_OUTPUTS[0], expected=expected, got=_range(neighbours))
+    max_offset, floor, fallback = limits.tolist()
+    points, factors, normals, limbs = rest
+    return RestPose(
+        neighbours.astype(np.int32), weights, log_template, points, factors, normals, limbs, max_offset, floor, fallback
+    )
+
+
+def _range(values: NDArray[Any]) -> str:
+    return f"{list(values.shape)} from {values.min()} to {values.max()}" if values.size else "none"

@@ -1,0 +1,1 @@
+"""Errors, files, arrays, cameras and kernels that everything else stands on."""

@@ -1,0 +1,46 @@
+"""What every compiled rasteriser asks of the arrays it is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .gaussians import Floats32
+
+
+def floats(array: ArrayLike) -> Floats32:
+    """``array`` as the kernels are compiled for: float32, contiguous, aligned, writable; copied only if needed."""
+    if type(array) is np.ndarray and array.dtype == np.float32 and array.flags.carray:
+        return array
+    return np.require(array, np.float32, ["C", "A", "W"])
+
+
+def mask(chosen: ArrayLike | None, count: int) -> NDArray[np.bool_]:
+    """Which of ``count`` Gaussians are ``chosen``, as the kernels are compiled for; all where it is None."""
+    if chosen is None:
+        return np.ones(count, np.bool_)
+    given = np.require(chosen, np.bool_, ["C", "A", "W"])
+    check_shape("chosen Gaussians", given, (count,))
+    return given
+
+
+def check_shape(what: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Raise ``InputError`` where ``array`` has another shape: the kernels look at no bounds."""
+    if array.shape != shape:
+        raise InputError(what, expected=f"shape {shape}", got=f"{array.shape}")
+
+
+def checked(
+    means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, features: ArrayLike
+) -> tuple[Floats32, Floats32, Floats32, Floats32]:
+    """The four arrays through ``floats``: [N, 3], [N, 6], [N] and [N, C], or an ``InputError``."""
+    arrays = floats(means), floats(covariances), floats(opacities), floats(features)
+    count = len(arrays[0]) if arrays[0].ndim else 0
+    channels = arrays[3].shape[-1] if arrays[3].ndim else 0
+    shapes = {"means": (count, 3), "covariances": (count, 6), "opacities": (count,), "features": (count, channels)}
+    for array, (name, shape) in zip(arrays, shapes.items()):
+        check_shape(name, array, shape)
+    return arrays

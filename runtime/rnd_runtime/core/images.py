@@ -1,0 +1,221 @@
+"""Image files and the two roundings between radiance and bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import InputError
+from .files import atomic_path, existing_file
+
+Floats = NDArray[np.floating[Any]]  # float32 or float64, as given
+Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+# A file that claims more pixels than deflate (1032 : 1) could hide in it is damaged; reading it would fill the memory.
+_MOST_COMPRESSED = 2000
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+_SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
+_PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
+# Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
+_UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
+_LARGEST_UNBOUNDED = 1 << 31
+
+
+def linear_to_srgb(linear: ArrayLike) -> Floats:
+    """sRGB's transfer function (IEC 61966-2-1, piecewise) of linear values; negative ones become 0.
+
+    Values above 1 are continued by the curve; ``to_bytes`` clips them. float32 stays float32.
+    """
+    x = np.maximum(_floats(linear), 0)
+    srgb: Floats = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
+    return srgb
+
+
+def srgb_to_linear(srgb: ArrayLike) -> Floats:
+    """The inverse of ``linear_to_srgb``, for values in [0, 1]. float32 stays float32."""
+    x = np.maximum(_floats(srgb), 0)
+    linear: Floats = np.where(x <= 0.04045, x / 12.92, np.power((x + 0.055) / 1.055, 2.4))
+    return linear
+
+
+def to_bytes(values: ArrayLike) -> NDArray[np.uint8]:
+    """8-bit values of numbers in [0, 1]: clipped, halves rounded up, NaN becomes 0."""
+    x = np.nan_to_num(np.asarray(values), nan=0.0, posinf=1.0, neginf=0.0)
+    rounded: NDArray[np.uint8] = np.floor(np.clip(x, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return rounded
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file says about itself before its pixels are read."""
+
+    width: int
+    height: int
+    channels: tuple[str, ...]
+    pixel_type: str  # uint8, uint16, half, float, …
+    chromaticities: tuple[float, ...] | None = None  # x, y of red, green, blue and white, where an EXR says
+
+
+def read_header(path: str | Path) -> ImageHeader:
+    """The size and channel names of an image file, without decoding it."""
+    with _opened(path) as source:
+        return _checked_header(source.spec(), path)
+
+
+def read_image(path: str | Path) -> Image:
+    """The pixels [H, W, C] exactly as the file stores them: uint8, uint16, or float32 for HALF and FLOAT.
+
+    Nothing is converted: no colour management, no multiplication by alpha (OpenImageIO does that to PNGs
+    unless told not to). Only the first picture of a file is read.
+
+    Raises:
+        InputError: not a file, not an image, cut short, turned by EXIF, a crop of a larger canvas, or with a channel
+            of another type, such as an EXR's UINT.
+    """
+    with _opened(path) as source:
+        spec = source.spec()
+        _checked_header(spec, path)
+        kinds = [str(kind) for kind in (spec.format, *spec.channelformats)]
+        if other := next((kind for kind in kinds if kind not in _PIXEL_TYPES), None):
+            raise InputError("type of pixels", expected=" or ".join(_PIXEL_TYPES), got=other, file=path)
+        kind = str(spec.format)
+        pixels = source.read_image(0, 0, 0, spec.nchannels, kind if kind in ("uint8", "uint16") else "float")
+        if pixels is None:
+            raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
+    return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str, ...] | None = None) -> None:
+    """Write [H, W] or [H, W, C] pixels as they are: uint8 or uint16 to PNG, float32 to EXR as FLOAT.
+
+    FLOAT and not HALF, because sun texels exceed HALF's 65 504. Equal pixels give equal bytes. A PNG's
+    alpha is straight by its specification, so hand over colours that are not multiplied by it.
+
+    Args:
+        channel_names: C names for an EXR's channels, such as ``("albedo.R", "albedo.G", "albedo.B")``.
+    """
+    path, pixels = Path(path), np.asarray(array)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    suffix = path.suffix.lower()
+    kinds = {".png": ("uint8", "uint16"), ".exr": ("float32",)}
+    if suffix not in kinds:
+        raise InputError("image format", expected=" or ".join(kinds), got=suffix or "no suffix", file=path)
+    assert pixels.ndim == 3 and pixels.dtype.name in kinds[suffix], (pixels.shape, pixels.dtype)
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "float" if suffix == ".exr" else pixels.dtype.name)
+    if channel_names is not None:
+        assert len(channel_names) == channels, (channel_names, channels)
+        spec.channelnames = channel_names
+    if suffix == ".exr":
+        spec.attribute("compression", "zip")
+        spec.attribute("DateTime", "1970:01:01 00:00:00")  # otherwise the time of writing gets in
+    else:
+        spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are divided by alpha
+    with atomic_path(path) as temporary:
+        target: Any = oiio.ImageOutput.create(_text(temporary))
+        written = target.open(_text(temporary), spec) and target.write_image(np.ascontiguousarray(pixels))
+        reason = target.geterror()
+        if not (target.close() and written):
+            raise InputError("image cannot be written", got=_reason(reason or target.geterror()), file=path)
+        # of a full disk its writer says nothing
+        if suffix == ".png" and not temporary.read_bytes().endswith(_PNG_END):
+            raise InputError("image cannot be written", got="half a file: the disk may be full", file=path)
+
+
+def _text(path: str | Path) -> str:
+    """``path`` as OpenImageIO takes names; raises ``InputError`` where it is not UTF-8."""
+    try:
+        return str(path).encode().decode()
+    except UnicodeEncodeError as error:
+        raise InputError("name of an image", expected="UTF-8", got="other bytes", file=path) from error
+
+
+def _floats(values: ArrayLike) -> Floats:
+    array = np.asarray(values)
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[Any]:
+    existing_file(path, what="image")
+    settings = oiio.ImageSpec()
+    settings.attribute("oiio:UnassociatedAlpha", 1)
+    source = None
+    try:
+        source = oiio.ImageInput.open(_text(path), settings)
+        if source is None:
+            reason = _reason(oiio.geterror())
+            raise InputError("image cannot be read", got=_other_format(Path(path)) or reason, file=path)
+        yield source
+    except UnicodeDecodeError as error:  # names and complaints of a damaged file need not be text
+        raise InputError("image is damaged", got="names that are not text", file=path) from error
+    finally:
+        if source is not None:
+            source.close()
+
+
+def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
+    turned = spec.get_int_attribute("Orientation", 1)
+    if turned != 1:
+        raise InputError(
+            "image is stored turned",
+            expected="EXIF orientation 1",
+            got=turned,
+            file=path,
+            hint="save it upright: cameras are calibrated to the pixels as stored",
+        )
+    stored = (spec.x, spec.y, spec.width, spec.height)
+    canvas = (spec.full_x, spec.full_y, spec.full_width, spec.full_height)
+    if stored != canvas or spec.deep or spec.depth != 1:
+        raise InputError(
+            "image layout",
+            expected="one flat picture that fills its canvas",
+            got=f"pixels {stored} of canvas {canvas}" + (", deep" if spec.deep else ""),
+            file=path,
+        )
+    claimed = spec.width * spec.height * spec.nchannels * spec.format.size()
+    file_bytes = Path(path).stat().st_size
+    unbounded = spec.get_string_attribute("compression").startswith(_UNBOUNDED_CODECS)
+    if claimed > (_LARGEST_UNBOUNDED if unbounded else _MOST_COMPRESSED * file_bytes + _SMALL_IMAGE):
+        expected = f"{claimed} bytes of pixels"
+        raise InputError("image is cut short or damaged", expected=expected, got=f"{file_bytes} stored", file=path)
+    primaries = spec.getattribute("chromaticities")
+    return ImageHeader(
+        spec.width,
+        spec.height,
+        tuple(spec.channelnames),
+        str(spec.format),
+        tuple(primaries) if isinstance(primaries, tuple) and len(primaries) == 8 else None,
+    )
+
+
+_BEGINNINGS = {
+    ".png": b"\x89PNG",
+    ".exr": b"\x76\x2f\x31\x01",
+    ".hdr": b"#?",
+    ".jpg": b"\xff\xd8",
+    ".jpeg": b"\xff\xd8",
+}
+
+
+def _other_format(path: Path) -> str | None:
+    """What ``path`` is, if its first bytes are not those of the format that its name says."""
+    suffix = path.suffix.lower()
+    with path.open("rb") as file:
+        head = file.read(4)
+    if not head:
+        return "an empty file"
+    return None if head.startswith(_BEGINNINGS.get(suffix, b"")) else f"something else than a {suffix} file"
+
+
+def _reason(message: str) -> str:
+    """OpenImageIO's words in one line."""
+    return " ".join(message.split()) or "no reason given by OpenImageIO"

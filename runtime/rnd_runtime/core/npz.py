@@ -1,0 +1,141 @@
+"""Named arrays that somebody else wrote, in .npz archives or elsewhere, and writing ours."""
+
+from __future__ import annotations
+
+import lzma
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .files import atomic_path, existing_file
+
+# What numpy and zipfile raise for archives that are cut, scrambled, encrypted or hold Python objects.
+_UNREADABLE = (
+    *(ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError),
+    *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, struct.error),
+    *(tokenize.TokenError, SyntaxError, TypeError),
+)
+
+
+class Members:
+    """Arrays by name, checked when asked for: every failure is an ``InputError`` naming file and field.
+
+    Args:
+        arrays: what numpy takes for arrays, by name.
+        path: the file they are from, for messages.
+    """
+
+    def __init__(self, arrays: Mapping[str, Any], path: str | Path) -> None:
+        self.path = Path(path)
+        self.names: tuple[str, ...] = tuple(arrays)
+        self._arrays = arrays
+
+    def first_of(self, *names: str) -> str | None:
+        """The first of ``names`` that the archive holds."""
+        return next((name for name in names if name in self.names), None)
+
+    def numbers(self, name: str, shape: tuple[int | None, ...] | None = None) -> NDArray[np.float64]:
+        """The finite numbers of member ``name`` as float64.
+
+        ``shape`` is what it must be, None where any length does. A number that is not finite is reported
+        with its frame (its index along the first axis).
+        """
+        array = self._member(name)
+        if array.dtype.kind not in "fiub":
+            raise InputError(name, expected="numbers", got=f"dtype {array.dtype}", file=self.path)
+        self._check_shape(name, array, shape)
+        numbers = array.astype(np.float64)
+        finite = np.isfinite(numbers)
+        if not finite.all():
+            place = np.argwhere(~finite)[0]
+            frame = int(place[0]) if numbers.ndim > 1 else None
+            raise InputError(name, expected="finite numbers", got=numbers[tuple(place)], file=self.path, frame=frame)
+        return numbers
+
+    def strings(self, name: str) -> tuple[str, ...]:
+        """Member ``name`` as strings."""
+        array = self._member(name)
+        if array.dtype.kind == "S":
+            array = np.char.decode(array.astype(np.bytes_), "utf-8", "replace")
+        if array.dtype.kind != "U":
+            raise InputError(name, expected="strings", got=f"dtype {array.dtype}", file=self.path)
+        try:
+            texts = tuple(str(text) for text in array.reshape(-1))
+            "".join(texts).encode()  # what cannot be written cannot be shown either
+        except (SystemError, ValueError) as error:  # numbers that are no characters
+            raise InputError(name, expected="strings", got="damaged ones", file=self.path) from error
+        return texts
+
+    def _member(self, name: str) -> NDArray[np.generic]:
+        if name not in self.names:
+            raise InputError(f"{name} is missing", got=f"only {', '.join(self.names) or 'nothing'}", file=self.path)
+        return self._read(name)
+
+    def _read(self, name: str) -> NDArray[np.generic]:
+        try:
+            return np.asarray(self._arrays[name])
+        except ValueError as error:
+            raise InputError(name, expected="an array", got="rows of unequal lengths", file=self.path) from error
+
+    def _check_shape(self, name: str, array: NDArray[np.generic], shape: tuple[int | None, ...] | None) -> None:
+        if shape is None:
+            return
+        fits = array.ndim == len(shape)
+        if not fits or any(want not in (None, have) for want, have in zip(shape, array.shape)):
+            wanted = "×".join("n" if want is None else str(want) for want in shape) or "a single number"
+            got = "×".join(map(str, array.shape)) or "a single number"
+            raise InputError(f"shape of {name}", expected=wanted, got=got, file=self.path)
+
+
+class Npz(Members):
+    """The members of an .npz, read one at a time when asked for; use it in a ``with`` statement.
+
+    Members nobody asks for are never touched, so an archive may hold Python objects beside the arrays we
+    need. Nothing is ever unpickled.
+    """
+
+    def __init__(self, path: str | Path, *, what: str) -> None:
+        path = existing_file(path, what=what)
+        self._stream = path.open("rb")  # ours to close: numpy leaves its own open when a file is cut
+        try:
+            archive = np.load(self._stream, allow_pickle=False)
+        except _UNREADABLE as error:
+            self._stream.close()
+            raise InputError(f"{what} cannot be read", expected="an .npz archive", file=path) from error
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            self._stream.close()
+            raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
+        self._archive = archive
+        super().__init__(archive, path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._archive.close()
+        self._stream.close()
+
+    def _read(self, name: str) -> NDArray[np.generic]:
+        try:
+            array: NDArray[np.generic] = self._archive[name]
+            if not isinstance(array, np.ndarray):  # numpy hands over the bytes of what is no array
+                raise ValueError("not an array")
+        except _UNREADABLE as error:
+            objects = "allow_pickle" in str(error)
+            got = "Python objects" if objects else "data that is cut short or damaged"
+            raise InputError(name, expected="an array", got=got, file=self.path) from error
+        return array
+
+
+def save_npz(path: str | Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write ``arrays`` as a compressed .npz, whole or not at all; equal arrays give equal bytes."""
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, **dict(arrays))  # type: ignore[arg-type]  # its keyword allow_pickle

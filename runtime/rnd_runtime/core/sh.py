@@ -1,0 +1,111 @@
+"""Real spherical harmonics of degree 3: sixteen numbers that say how much light reaches a point from where.
+
+Orthonormal on the sphere, ordered ``l² + l + m``, with the signs of 3D Gaussian splatting (Condon–Shortley):
+Y_0 = 0.2820948, Y_1..3 = 0.4886025 · (−y, z, −x), and so on.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from math import pi, sqrt
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+SH_DEGREE = 3
+SH_COUNT = (SH_DEGREE + 1) ** 2
+SH_DEGREES = np.repeat(np.arange(SH_DEGREE + 1), 2 * np.arange(SH_DEGREE + 1) + 1)  # the degree of each function
+
+_C0 = sqrt(1 / (4 * pi))
+_C1 = sqrt(3 / (4 * pi))
+_C2_SIDE, _C2_ZONAL = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi))
+_C3_3, _C3_2, _C3_1, _C3_0 = (sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi)))
+
+
+def sh_columns(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    """The sixteen functions at unit directions given by their columns, in whatever ``x, y, z`` compute with.
+
+    Only ``+ − ×`` are used, so numpy arrays, torch tensors and scalars or lanes inside a numba kernel all do; each
+    of the 16 results has the shape of ``x``.
+    """
+    xx, yy, zz = x * x, y * y, z * z
+    return (
+        _C0 + 0.0 * x,
+        -_C1 * y,
+        _C1 * z,
+        -_C1 * x,
+        _C2_SIDE * (x * y),
+        -_C2_SIDE * (y * z),
+        _C2_ZONAL * (2.0 * zz - xx - yy),
+        -_C2_SIDE * (x * z),
+        (0.5 * _C2_SIDE) * (xx - yy),
+        -_C3_3 * (y * (3.0 * xx - yy)),
+        _C3_2 * (x * y * z),
+        -_C3_1 * (y * (4.0 * zz - xx - yy)),
+        _C3_0 * (z * (2.0 * zz - 3.0 * xx - 3.0 * yy)),
+        -_C3_1 * (x * (4.0 * zz - xx - yy)),
+        (0.5 * _C3_2) * (z * (xx - yy)),
+        -_C3_3 * (x * (xx - 3.0 * yy)),
+    )
+
+
+def sh_basis(directions: ArrayLike) -> NDArray[Any]:
+    """The sixteen functions [..., 16] at unit ``directions`` [..., 3], in the precision that comes in."""
+    directions = np.asarray(directions)
+    return np.stack(sh_columns(directions[..., 0], directions[..., 1], directions[..., 2]), axis=-1)
+
+
+@cache
+def sphere_quadrature(count: int) -> tuple[Floats, Floats]:
+    """Directions [2·count², 3] and weights (sum 4π) that integrate degree ``2·count − 1`` exactly.
+
+    Gauss–Legendre nodes in z times 2·count equal steps of azimuth (Atkinson, Han 2012, §5.1).
+    """
+    z, weights = np.polynomial.legendre.leggauss(count)
+    azimuth = (np.arange(2 * count) + 0.5) * pi / count
+    z, azimuth = (grid.ravel() for grid in np.meshgrid(z, azimuth, indexing="ij"))
+    radius = np.sqrt(1 - z * z)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+    return directions, np.repeat(weights, 2 * count) * (pi / count)
+
+
+def sh_rotation(rotation: ArrayLike) -> Floats:
+    """The matrix M [16, 16] that turns coefficients as ``rotation`` [3, 3] turns directions.
+
+    ``turned = coefficients @ M.T`` gives ``sh_basis(R d) · turned = sh_basis(d) · coefficients`` for every d.
+    M is orthogonal and block-diagonal by degree. Each entry is ∫ Y_i(ω) Y_j(Rᵀω) dω, a polynomial of degree
+    6, by a quadrature that is exact up to degree 7, hence right to rounding (1e-14).
+    """
+    return np.asarray(rotation_matrix(*sh_quadrature(), np.array(rotation, np.float64, order="C")))
+
+
+@cache
+def sh_quadrature() -> tuple[Floats, Floats]:
+    """Of ``sh_rotation``: directions [32, 3], and the functions there times their weights [32, 16]."""
+    directions, weights = sphere_quadrature(SH_DEGREE + 1)
+    return directions, sh_basis(directions) * weights[:, None]
+
+
+compiled_sh_columns = njit(sh_columns)
+
+
+@njit(nogil=True, cache=True)
+def rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-def]
+    """``sh_rotation`` with its ``sh_quadrature``. In numba: every frame needs one, and numpy takes 0.1 ms."""
+    matrix = np.zeros((SH_COUNT, SH_COUNT))
+    for k in range(len(directions)):
+        x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]
+        turned = compiled_sh_columns(  # at Rᵀω
+            rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
+            rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
+            rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
+        )
+        for degree in range(SH_DEGREE + 1):
+            for i in range(degree * degree, (degree + 1) * (degree + 1)):
+                for j in range(degree * degree, (degree + 1) * (degree + 1)):
+                    matrix[i, j] += weighted[k, i] * turned[j]
+    return matrix

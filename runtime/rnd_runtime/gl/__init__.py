@@ -1,0 +1,1 @@
+"""The same frame on an OpenGL device."""

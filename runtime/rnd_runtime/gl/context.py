@@ -1,0 +1,174 @@
+"""OpenGL contexts without a display: EGL first, then OSMesa, then a hidden window; 4.3 where there is, else 3.3.
+
+A context is current inside ``with context:`` and only there, releases of its objects included; outside none is. So
+several live in one process, on EGL and OSMesa side by side: these two share Mesa's one "current" slot of the thread
+without knowing of each other, hence the blocks must not be nested.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol, get_args
+
+import glcontext
+import moderngl
+
+from rnd_runtime.core.errors import InputError
+
+Backend = Literal["auto", "egl", "osmesa", "window"]
+
+INSTALL = {"egl": "apt-get install libegl1 libgl1-mesa-dri", "osmesa": "apt-get install libosmesa6"}
+OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+GL_VERSION = 330  # core; all that drawing needs
+COMPUTE_VERSION = 430  # has compute shaders, which order Gaussians where they lie
+SOFTWARE_RENDERERS = re.compile(
+    r"llvmpipe|softpipe|swrast|swiftshader|software render|software raster|basic render", re.I
+)
+
+
+class Loader(Protocol):
+    """What moderngl asks of a platform's context."""
+
+    def load_opengl_function(self, name: str) -> int: ...
+
+    def __enter__(self) -> Any: ...
+
+    def __exit__(self, *error: object) -> Any: ...
+
+    def release(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class Platform:
+    """Kept in ``context.extra``: which backend made the context, and glFlush, which moderngl does not have."""
+
+    backend: str
+    flush: Callable[[], None]
+
+
+def create_context(backend: Backend = "auto") -> moderngl.Context:
+    """Make a headless OpenGL core context: of 4.3 or newer, or of 3.3 where there is no other.
+
+    Args:
+        backend: "egl" (GPUs and Mesa's llvmpipe), "osmesa" (software, Mesa before 25.1), "window" (X11, Windows,
+            macOS) or "auto", the first of them that works.
+
+    Raises:
+        InputError: none works; the message says what to install.
+    """
+    if backend not in get_args(Backend):
+        raise InputError("OpenGL backend", expected=" | ".join(get_args(Backend)), got=repr(backend))
+    failures = []
+    for name, open_loader in _LOADERS.items():
+        if backend in ("auto", name):
+            for version in (COMPUTE_VERSION, GL_VERSION):
+                try:
+                    return _context_of(name, open_loader(version), version)
+                except Exception as error:  # glcontext, moderngl and ctypes raise nothing more precise
+                    failure = f"{name}: {error}"
+            failures.append(failure)
+    hint = INSTALL.get(backend, f"{INSTALL['egl']}, or {INSTALL['osmesa']}")
+    raise InputError("no OpenGL 3.3 context", got="; ".join(failures), hint=hint)
+
+
+def is_software(context: moderngl.Context) -> bool:
+    """Whether the context draws on the CPU (llvmpipe, softpipe, SwiftShader), told by GL_RENDERER."""
+    return SOFTWARE_RENDERERS.search(renderer(context)) is not None
+
+
+def renderer(context: moderngl.Context) -> str:
+    """GL_RENDERER, such as ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
+    return str(context.info["GL_RENDERER"])
+
+
+def _context_of(backend: str, loader: Loader, version: int) -> moderngl.Context:
+    with loader:  # leaving it undoes that a new context becomes current at once
+        try:
+            settings: dict[str, Any] = {"context": loader}
+            context = moderngl.create_context(require=version, standalone=True, **settings)
+        except Exception:
+            loader.release()
+            raise
+        flush = ctypes.CFUNCTYPE(None)(loader.load_opengl_function("glFlush"))
+        context.extra = Platform(backend, flush)
+        context.info  # noqa: B018  moderngl asks GL the first time, and only now is the context surely current
+    return context
+
+
+def _open_egl(version: int) -> Loader:
+    if sys.platform != "linux":
+        raise OSError(f"not on {sys.platform}")
+    # EGL hands out GL's functions itself, so that libGL need not be installed
+    loader: Loader = glcontext.get_backend_by_name("egl")(
+        mode="standalone", glversion=version, libgl="libEGL.so.1", libegl="libEGL.so.1"
+    )
+    return loader
+
+
+def _open_osmesa(version: int) -> Loader:
+    return OSMesa(version)
+
+
+def _open_window(version: int) -> Loader:
+    loader: Loader = glcontext.default_backend()(mode="standalone", glversion=version)
+    return loader
+
+
+_LOADERS: dict[str, Callable[[int], Loader]] = {"egl": _open_egl, "osmesa": _open_osmesa, "window": _open_window}
+
+
+class OSMesa:
+    """Mesa's off-screen context (GL/osmesa.h) in the form that moderngl takes as ``context=``."""
+
+    _UNSIGNED_BYTE = 0x1401
+
+    def __init__(self, version: int = GL_VERSION) -> None:
+        asked = (
+            (0x33, 0x34),  # OSMESA_PROFILE, OSMESA_CORE_PROFILE
+            (0x36, version // 100),  # OSMESA_CONTEXT_MAJOR_VERSION
+            (0x37, version // 10 % 10),  # OSMESA_CONTEXT_MINOR_VERSION
+        )
+        self._library = _first_library(*OSMESA_LIBRARIES)
+        pointer = ctypes.c_void_p
+        self._library.OSMesaCreateContextAttribs.restype = pointer
+        self._library.OSMesaCreateContextAttribs.argtypes = [pointer, pointer]
+        self._library.OSMesaMakeCurrent.argtypes = [pointer, pointer, *[ctypes.c_int] * 3]
+        self._library.OSMesaMakeCurrent.restype = ctypes.c_ubyte
+        self._library.OSMesaDestroyContext.argtypes = [pointer]
+        self._library.OSMesaGetProcAddress.restype = pointer
+        self._library.OSMesaGetProcAddress.argtypes = [ctypes.c_char_p]
+        flat = [number for pair in asked for number in pair]
+        attributes = (ctypes.c_int * (len(flat) + 1))(*flat, 0)
+        self._handle = self._library.OSMesaCreateContextAttribs(attributes, None)
+        if not self._handle:
+            raise OSError("OSMesaCreateContextAttribs failed")
+        self._pixel = (ctypes.c_ubyte * 4)()  # its own 1 × 1 picture, which nobody draws to
+
+    def load_opengl_function(self, name: str) -> int:
+        return self._library.OSMesaGetProcAddress(name.encode()) or 0
+
+    def __enter__(self) -> OSMesa:
+        if not self._library.OSMesaMakeCurrent(self._handle, self._pixel, self._UNSIGNED_BYTE, 1, 1):
+            raise OSError("OSMesaMakeCurrent failed")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._library.OSMesaMakeCurrent(None, None, 0, 0, 0)
+
+    def release(self) -> None:
+        if self._handle:
+            self._library.OSMesaDestroyContext(self._handle)
+            self._handle = None
+
+
+def _first_library(*names: str) -> ctypes.CDLL:
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except OSError:
+            continue
+    raise OSError(f"{names[0]} not found")

@@ -1,0 +1,105 @@
+"""What is done to a blended picture on an OpenGL device before it comes back: outlines, tone mapping, packing.
+
+The device writes arrays as the CPU wants them: red, green and blue of pixel after pixel, without gaps, so that nothing
+has to be moved once it has arrived.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.gaussians import Floats32
+from rnd_runtime.raster.tone import code_steps
+
+from .context import is_software
+from .passes import Pass, Targets
+
+CHANNELS, PACKED = 3, 4  # of a pixel; numbers in a texel
+
+
+class Finished(NamedTuple):
+    """image [H, W, 3] linear, premultiplied; alpha [H, W]; srgb [H, W, 3] 8-bit over black, or None."""
+
+    image: Floats32
+    alpha: Floats32
+    srgb: NDArray[np.uint8] | None
+
+
+class GlFinish:
+    """Finishes pictures of three channels; the context must be current whenever it is used.
+
+    Args:
+        context: where.
+        tone: make 8-bit pictures too, to the bit those of ``raster.tone.tone_map``; by default where a
+            graphics card does it, as the CPU is faster at it than OpenGL that runs there.
+    """
+
+    def __init__(self, context: moderngl.Context, tone: bool | None = None) -> None:
+        self._context = context
+        self._tone = not is_software(context) if tone is None else tone
+        macros = {"TONE": 1} if self._tone else {}
+        self._pass = Pass(context, ("fill.vert",), ("finish.glsl", "finish.frag"), macros)
+        self._alpha_pass = Pass(context, ("fill.vert",), ("finish.glsl", "finish_alpha.frag"))
+        self._steps = context.texture((len(code_steps()), 1), 1, code_steps().tobytes(), dtype="f4")
+        self._steps.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self._targets: tuple[Targets, Targets] | None = None
+
+    def run(self, blended: moderngl.Texture, camera: Camera) -> None:
+        """Finish ``blended``, a texture of the camera's size: premultiplied radiance and alpha."""
+        packed, alpha = (targets.framebuffer for targets in self._targets_for(camera))
+        self._context.enable_only(moderngl.NOTHING)
+        packed.use()
+        self._pass.bind({"blended": blended, "steps": self._steps}, width=camera.width)
+        self._pass.fill()
+        alpha.use()
+        self._alpha_pass.bind({"blended": blended})
+        self._alpha_pass.fill()
+
+    def read(self, camera: Camera) -> Finished:
+        """What ``run`` made for ``camera``."""
+        packed, coverage = (targets.framebuffer for targets in self._targets_for(camera))
+        alpha = np.empty((camera.height, camera.width), np.float32)
+        coverage.read_into(alpha, components=1, dtype="f4", alignment=1)
+        rows = (camera.height, PACKED * _texels(camera.width))
+        image, codes = np.empty(rows, np.float32), np.empty(rows, np.uint8)
+        packed.read_into(image, components=PACKED, dtype="f4", alignment=1)
+        if self._tone:
+            packed.read_into(codes, components=PACKED, attachment=1, dtype="f1", alignment=1)
+        return Finished(_unpacked(image, camera), alpha, _unpacked(codes, camera) if self._tone else None)
+
+    def release(self) -> None:
+        self._pass.release()
+        self._alpha_pass.release()
+        self._steps.release()
+        for targets in self._targets or ():
+            targets.release()
+        self._targets = None
+
+    def _targets_for(self, camera: Camera) -> tuple[Targets, Targets]:
+        """Of packed numbers, and of coverage; those of another size are released."""
+        size, old = (camera.width, camera.height), self._targets
+        if old is None or old[1].framebuffer.size != size:
+            packed, texture = (_texels(camera.width), camera.height), self._context.texture
+            textures = [texture(packed, PACKED, dtype=dtype) for dtype in ("f4", "f1")[: 1 + self._tone]]
+            coverage = [texture(size, 1, dtype="f4")]
+            self._targets = Targets.of(self._context, textures), Targets.of(self._context, coverage)
+            for targets in old or ():
+                targets.release()  # only now: moderngl binds the one in use again whenever it makes another
+        assert self._targets is not None
+        return self._targets
+
+
+def _texels(width: int) -> int:
+    """In a packed row of ``width`` pixels; the last one may have numbers to spare."""
+    return -(-CHANNELS * width // PACKED)
+
+
+def _unpacked(rows: NDArray, camera: Camera) -> NDArray:  # type: ignore[type-arg]
+    """[H, 4 · texels] → [H, W, 3]; a view, unless rows have numbers to spare."""
+    exact = rows[:, : CHANNELS * camera.width]
+    return np.ascontiguousarray(exact).reshape(camera.height, camera.width, CHANNELS)

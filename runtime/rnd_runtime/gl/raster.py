@@ -1,0 +1,281 @@
+"""The OpenGL rasteriser: one triangle per Gaussian, blended back to front in float32, any number of channels.
+
+Against ``core.gaussians.Rasterizer``'s rule there is one difference: blending cannot stop at a pixel, so
+the Gaussian that would have taken the transmittance below 1e-4, and those behind it, still add what is left: less than
+0.01 of their features, and that only where α is near its clamp.
+
+Projection, order and culling are the CPU rasteriser's own, in float64. On one Mesa, EGL and OSMesa and any number of
+threads give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import perf_counter
+from types import TracebackType
+from typing import NamedTuple
+
+import moderngl
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rnd_runtime.core.arrays import checked
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.raster.project import Pinhole, _project_range, pinhole
+from rnd_runtime.raster.tiles import _front_to_back
+
+from .context import Backend, create_context
+from .passes import ROW_GAUSSIANS, Pass, Targets
+
+LOG2_255 = float(np.log2(255.0))
+GEOMETRY_TEXELS = 2  # centre from the picture's middle, reach, peak; √fall_x, √fall_y, shear, –
+PER_TARGET = 3  # attributes of a target; its fourth component is α
+FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
+
+
+class GlRasterizer:
+    """Obeys ``core.gaussians.Rasterizer``; keeps its programs and framebuffers between calls.
+
+    Args:
+        backend: see ``gl.context.create_context``.
+        context: draw in this context of ``gl.context.create_context`` instead, which is released by
+            ``close`` all the same.
+
+    Raises:
+        InputError: no context; arrays of the wrong shape; a picture or a number of Gaussians above GL's limits.
+    """
+
+    def __init__(self, backend: Backend = "auto", *, context: moderngl.Context | None = None) -> None:
+        self.context = create_context(backend) if context is None else context
+        self._programs: dict[int, Pass] = {}
+        self._targets: dict[tuple[int, int, int], Targets] = {}
+        self._records: moderngl.Texture | None = None
+        info = self.context.info
+        self._max_size = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
+        self._max_attributes = PER_TARGET * info["GL_MAX_DRAW_BUFFERS"]
+
+    def __call__(
+        self,
+        means: Floats32,
+        covariances: Floats32,
+        opacities: Floats32,
+        features: Floats32,
+        camera: Camera,
+        *,
+        depth: bool = True,
+    ) -> Raster:
+        """Splat N Gaussians: means [N, 3] m, covariances [N, 6] m², opacities [N], features [N, C].
+
+        Up to three channels without ``depth`` need one target; each three more attributes need another.
+        """
+        means, covariances, opacities, features = checked(means, covariances, opacities, features)
+        self.check_limits(len(means), camera)
+        channels = features.shape[1]
+        started = perf_counter()
+        splats = sorted_ellipses(means, covariances, opacities, features, pinhole(camera))
+        seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
+        pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
+        with self.context:
+            total = channels + 1 if depth or channels == 0 else channels  # something must carry α
+            for first in range(0, total, self._max_attributes):
+                attributes = min(total - first, self._max_attributes)
+                started = perf_counter()
+                self._draw(splats, first, attributes, camera)
+                self.context.finish()  # else the read-back would be charged with the drawing
+                drawn = perf_counter()
+                pictures += self.read(attributes, camera)
+                seconds["raster"] += drawn - started
+                seconds["read-back"] += perf_counter() - drawn
+        return _assembled(pictures, channels, depth, seconds)
+
+    def close(self) -> None:
+        """Release everything, the context too."""
+        with self.context:
+            for targets in self._targets.values():
+                targets.release()
+            for program in self._programs.values():
+                program.release()
+            if self._records is not None:
+                self._records.release()
+        self._targets, self._programs, self._records = {}, {}, None
+        self.context.release()
+
+    def __enter__(self) -> GlRasterizer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def check_limits(self, count: int, camera: Camera) -> None:
+        """Raise an ``InputError`` where the picture or the number of Gaussians is above GL's limits."""
+        size = f"{camera.width} x {camera.height}"
+        if max(camera.width, camera.height) > self._max_size:
+            raise InputError("picture size", expected=f"at most {self._max_size} x {self._max_size}", got=size)
+        if count > self._max_size * ROW_GAUSSIANS:
+            raise InputError("Gaussians", expected=f"at most {self._max_size * ROW_GAUSSIANS}", got=count)
+
+    def _draw(self, splats: Ellipses, first: int, attributes: int, camera: Camera) -> None:
+        """Draw attributes ``first`` … ``first + attributes`` of all splats into this pass's targets."""
+        count = len(splats.order)
+        records = self._upload(_records(splats, first, attributes, camera)) if count else None
+        if attributes not in self._programs:
+            self._programs[attributes] = splat_pass(self.context, attributes)
+        self.blend(self._programs[attributes], {"records": records} if records else {}, count, attributes, camera)
+
+    def blend(
+        self, splat: Pass, textures: Mapping[str, moderngl.Texture], count: int, attributes: int, camera: Camera
+    ) -> None:
+        """Clear the targets of ``attributes`` and draw ``count`` triangles of ``splat_pass``, first to last."""
+        targets = self.targets_for(attributes, camera)
+        targets.framebuffer.use()
+        targets.framebuffer.clear()
+        if count == 0:
+            return
+        splat.bind(textures, size=(camera.width, camera.height))
+        self.context.enable_only(moderngl.BLEND)
+        self.context.blend_func = moderngl.ONE, moderngl.ONE_MINUS_SRC_ALPHA
+        part = -(-count // FLUSHES)
+        for start in range(0, count, part):
+            splat.render(moderngl.TRIANGLES, 3 * min(part, count - start), first=3 * start)
+            self.context.extra.flush()
+
+    def _upload(self, records: Floats32) -> moderngl.Texture:
+        rows, texels = records.shape[0], records.shape[1]
+        texture = self._records
+        if texture is None or texture.width != texels or texture.height < rows:
+            if texture is not None:
+                texture.release()
+            texture = self._records = self.context.texture((texels, rows), 4, dtype="f4")
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        texture.write(records, viewport=(0, 0, texels, rows))
+        return texture
+
+    def read(self, attributes: int, camera: Camera) -> list[Floats32]:
+        """What was drawn: a picture [H, W, ≤ 4] for each target; the first one's fourth channel is alpha."""
+        targets = self.targets_for(attributes, camera)
+        pictures = []
+        for index, texture in enumerate(targets.textures):
+            picture = np.empty((camera.height, camera.width, texture.components), np.float32)
+            targets.framebuffer.read_into(
+                picture, components=texture.components, attachment=index, dtype="f4", alignment=1
+            )
+            pictures.append(picture)
+        return pictures
+
+    def targets_for(self, attributes: int, camera: Camera) -> Targets:
+        """Float32 targets for ``attributes`` at the camera's size; those of other sizes are released."""
+        key = (attributes, camera.width, camera.height)
+        if key not in self._targets:
+            textures = []
+            for first in range(0, attributes, PER_TARGET):
+                left = attributes - first
+                components = 4 if first == 0 or left >= PER_TARGET else left
+                textures.append(self.context.texture((camera.width, camera.height), components, dtype="f4"))
+            self._targets[key] = Targets.of(self.context, textures)
+            # only now: making a framebuffer, moderngl binds the one in use before again, which must still be there
+            for other in [old for old in self._targets if old[1:] != key[1:]]:
+                self._targets.pop(other).release()
+        return self._targets[key]
+
+
+def splat_pass(context: moderngl.Context, attributes: int, *, lit: bool = False) -> Pass:
+    """The program that draws a triangle for each Gaussian, back to front.
+
+    With ``lit`` the three attributes are the ``radiance`` texture's, and what else it reads stands in splat.vert.
+    """
+    values = [f"attributes[{i // 4}].{'xyzw'[i % 4]}" for i in range(attributes)]
+    values += ["0.0"] * (-attributes % PER_TARGET)
+    targets = range(len(values) // PER_TARGET)
+    macros = {
+        "ATTRIBUTES": attributes,
+        "OUTPUTS": " ".join(f"layout(location = {t}) out vec4 target_{t};" for t in targets),
+        "WRITES": " ".join(
+            f"target_{t} = alpha * vec4({', '.join(values[PER_TARGET * t : PER_TARGET * (t + 1)])}, 1.0);"
+            for t in targets
+        ),
+        **({"LIT": 1} if lit else {"TEXELS": GEOMETRY_TEXELS + -(-attributes // 4)}),
+    }
+    return Pass(context, ("splat.vert",), ("splat.frag",), macros)
+
+
+class Ellipses(NamedTuple):
+    """Projected Gaussians; see ``raster.tiles.Splats`` for the rows."""
+
+    order: NDArray[np.int32]  # [V] of those drawn, front to back
+    centers: NDArray[np.float64]
+    shapes: Floats32
+    attributes: Floats32  # [N, C + 1] features, depth
+
+
+def sorted_ellipses(
+    means: Floats32, covariances: Floats32, opacities: Floats32, features: Floats32, view: Pinhole
+) -> Ellipses:
+    return Ellipses(*_project_and_sort(means, covariances, opacities, features, view))
+
+
+# One thread: numba's others would still spin, waiting for more, when llvmpipe's want the cores (14 of 62 ms).
+@njit(error_model="numpy", nogil=True, cache=True)
+def _project_and_sort(means, covariances, opacities, features, view):  # type: ignore[no-untyped-def]
+    count = means.shape[0]
+    centers, shapes = np.empty((count, 2), np.float64), np.empty((count, 4), np.float32)
+    boxes, attributes = np.empty((count, 4), np.int32), np.empty((count, features.shape[1] + 1), np.float32)
+    depths, starts = np.empty(count, np.float64), np.empty(count + 1, np.int64)
+    starts[0] = 0
+    outputs = (centers, shapes, boxes, attributes, depths, starts[1:])
+    everything = np.empty(0, np.bool_)
+    _project_range(0, count, means, covariances, opacities, features, everything, view, outputs)
+    for i in range(count):
+        starts[i + 1] += starts[i]
+    return _front_to_back(depths, starts), centers, shapes, attributes
+
+
+def _records(splats: Ellipses, first: int, attributes: int, camera: Camera) -> Floats32:
+    """The texture the shaders read, back to front: [rows, ROW_GAUSSIANS · texels, 4]."""
+    texels = GEOMETRY_TEXELS + -(-attributes // 4)
+    rows = -(-len(splats.order) // ROW_GAUSSIANS)
+    records = np.empty((rows * ROW_GAUSSIANS, 4 * texels), np.float32)
+    middle = camera.width / 2, camera.height / 2
+    drawn = splats.order, splats.centers, splats.shapes, splats.attributes
+    _fill_records(records, *drawn, middle, first, attributes)
+    return records.reshape(rows, ROW_GAUSSIANS * texels, 4)
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def _fill_records(records, order, centers, shapes, values, middle, first, attributes):  # type: ignore[no-untyped-def]
+    count = order.size
+    for k in range(count):
+        i = order[count - 1 - k]
+        shear, fall_y, fall_x, peak = shapes[i, 0], shapes[i, 1], shapes[i, 2], shapes[i, 3]
+        records[k, 0], records[k, 1] = centers[i, 0] - middle[0], centers[i, 1] - middle[1]
+        records[k, 2], records[k, 3] = np.sqrt(max(peak + LOG2_255, 0.0)), peak
+        records[k, 4], records[k, 5], records[k, 6], records[k, 7] = (np.sqrt(fall_x), np.sqrt(fall_y), shear, 0.0)
+        for c in range(attributes):
+            records[k, 8 + c] = values[i, first + c]
+
+
+def _assembled(pictures: list[Floats32], channels: int, depth: bool, seconds: dict[str, float]) -> Raster:
+    """Targets [H, W, ≤ 4] → the raster; what needs no copy is a view."""
+    if channels <= PER_TARGET:
+        image = pictures[0][..., :channels]
+    else:
+        image = np.empty((*pictures[0].shape[:2], channels), np.float32)
+        for index, picture in enumerate(pictures):
+            _copy_channels(image, PER_TARGET * index, picture)
+    alpha = pictures[0][..., 3]
+    far = pictures[channels // PER_TARGET][..., channels % PER_TARGET] if depth else np.zeros_like(alpha)
+    return Raster(image, alpha, far, seconds)
+
+
+@njit(error_model="numpy", nogil=True, cache=True)
+def _copy_channels(image, first, picture):  # type: ignore[no-untyped-def]
+    """Three times as fast as numpy, which calls memcpy for every pixel."""
+    count = min(PER_TARGET, picture.shape[2], image.shape[2] - first)
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            for c in range(count):
+                image[y, x, first + c] = picture[y, x, c]

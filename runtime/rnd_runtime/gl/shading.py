@@ -1,0 +1,184 @@
+"""Shading by OpenGL: a fragment for each Gaussian that is drawn writes its radiance into a float32 texture.
+
+The formulas are the kernels' of ``shading_ambient``, ``shading_tables``, ``shading_sum`` and ``shading``, in GLSL. All
+is computed in the light probe's frame, to which each fragment turns the visibility's harmonics: the light's tables are
+uploaded once, and turning light or body costs a few uniforms. The suns' depth maps are drawn here too (``shadow_gl``).
+Nothing is read back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.sh import SH_COUNT, sh_basis, sh_rotation
+from rnd_runtime.shading.ambient import AmbientLight
+from rnd_runtime.shading.lookup import DIFFUSE_SIZE, SPECULAR_SIZE
+from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader
+from rnd_runtime.shading.shadow import CLEARANCE, CLEARANCE_TEXELS, SLOPE_FLOOR, SOFTNESS, axes_towards
+from rnd_runtime.shading.specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
+from rnd_runtime.shading.sum import DistantLights
+from rnd_runtime.shading.sunlight import AT_SILHOUETTE, TURNED_AWAY
+from rnd_runtime.shading.tables import SkyTables
+
+from .passes import GaussianTargets, Pass
+from .shadow import SunMaps
+from .surfaces import Surfaces
+
+Floats32 = NDArray[np.float32]
+
+_ROW_LIGHTS = 128  # lights in a row of their texture: 8192 fit into 768 × 64 texels
+_LIGHT_TEXELS = 6
+_DIFFUSE_TEXELS = 12  # of a node: sixteen numbers of each colour
+# The blocks of 4 × 4 of a rotation of harmonics that are not all zero, as surface.glsl multiplies them.
+_TURN_BLOCKS = ((0, 0), (1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 2), (3, 3))
+
+
+class GlShading:
+    """Obeys ``shading.shader.Shader`` on the device; the context must be current whenever it is used."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._suns = SunMaps(context)
+        self._passes: dict[tuple[type, int], Pass] = {}  # by the kind of sky and the number of suns
+        self._sky: tuple[Any, dict[str, moderngl.Texture], dict[str, Any]] | None = None
+        self._lobes: moderngl.Texture | None = None
+        self._radiance = GaussianTargets(context, (4,))
+
+    def shade(
+        self,
+        shader: Shader,
+        surfaces: Surfaces,
+        order: moderngl.Texture,
+        ranks: int,
+        eye: ArrayLike,
+        root_rotation: ArrayLike,
+    ) -> moderngl.Texture:
+        """Linear radiance of ``ranks`` Gaussians towards ``eye`` [3] m, a texel for each rank.
+
+        Args:
+            order: of type i4, the Gaussian of each rank. All Gaussians of ``surfaces`` cast shadows.
+            root_rotation: [3, 3], root frame → that of the surfaces.
+        """
+        light_to_world = shader.light_to_world
+        textures, uniforms = self._sky_of(shader.sky)
+        textures = {**textures, **surfaces.textures(), "order": order}
+        if shader.suns:
+            suns = shader.sun_arrays()
+            axes = np.stack([axes_towards(direction) for direction in suns.directions])
+            maps = self._suns.draw(surfaces.points, surfaces.normals, surfaces.gaussians, axes)
+            textures |= {"depths": maps.depths, "bounds": maps.bounds}
+            uniforms = uniforms | {
+                "sun_axes": maps.axes,
+                "sun_directions": np.array([sun.direction for sun in shader.suns]),
+                "sun_irradiances": suns.irradiance,
+                "sun_blurs": suns.spread_squared,
+            }
+        program = self._pass_of(shader)
+        (radiance,), _ = self._radiance.reserve(ranks)
+        program.bind(
+            textures,
+            count=ranks,
+            eye=np.asarray(eye, np.float32),
+            world_to_light=light_to_world,  # by column it is the transpose
+            turn=_turn(sh_rotation(light_to_world.T @ np.asarray(root_rotation, np.float64))),
+            **uniforms,
+        )
+        self._context.enable_only(moderngl.NOTHING)
+        program.fill()
+        return radiance
+
+    def release(self) -> None:
+        self._suns.release()
+        for program in self._passes.values():
+            program.release()
+        self._passes = {}
+        self._forget_sky()
+        self._radiance.release()
+        if self._lobes is not None:
+            self._lobes.release()
+            self._lobes = None
+
+    def _forget_sky(self) -> None:
+        if self._sky is not None:
+            for texture in self._sky[1].values():
+                texture.release()
+            self._sky = None
+
+    def _sky_of(
+        self, sky: AmbientLight | SkyTables | DistantLights
+    ) -> tuple[dict[str, moderngl.Texture], dict[str, Any]]:
+        """Textures and uniforms of a sky; uploaded when it is another than before."""
+        if self._sky is None or self._sky[0] is not sky:
+            self._forget_sky()
+            made: dict[str, Floats32] = {}
+            uniforms: dict[str, Any] = {}
+            if isinstance(sky, AmbientLight):
+                uniforms["ambient"] = sky.coefficients.T
+            elif isinstance(sky, SkyTables):
+                made["diffuse"] = sky.diffuse.reshape(DIFFUSE_SIZE, DIFFUSE_SIZE * _DIFFUSE_TEXELS, 4)
+                made["specular"] = sky.specular.reshape(len(LOBE_WIDTHS) * SPECULAR_SIZE, SPECULAR_SIZE, 3)
+            else:
+                made["distant"] = _light_rows(sky)
+                uniforms["lights"] = len(sky.directions)
+            textures = {name: self._constant(values) for name, values in made.items()}
+            self._sky = sky, textures, uniforms
+        if self._lobes is None:
+            lobes = np.zeros((ROUGHNESS_COUNT, COSINE_COUNT, 8), np.float32)
+            lobes[..., : lobe_table().shape[-1]] = lobe_table()
+            self._lobes = self._constant(lobes.reshape(ROUGHNESS_COUNT, 2 * COSINE_COUNT, 4))
+        return {**self._sky[1], "lobes": self._lobes}, self._sky[2]
+
+    def _constant(self, values: NDArray[Any]) -> moderngl.Texture:
+        """A texture of ``values`` [H, W, components]."""
+        height, width, components = values.shape
+        data = np.ascontiguousarray(values, np.float32)
+        texture = self._context.texture((width, height), components, data, dtype="f4")
+        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return texture
+
+    def _pass_of(self, shader: Shader) -> Pass:
+        key = type(shader.sky), len(shader.suns)
+        if key not in self._passes:
+            parts = {
+                AmbientLight: ("lobe.glsl", "sky_ambient.glsl"),
+                SkyTables: ("lobe.glsl", "sky_table.glsl"),
+                DistantLights: ("sky_lights.glsl",),
+            }[key[0]]
+            macros: dict[str, float] = {
+                "LOBE_ROWS": ROUGHNESS_COUNT,
+                "LOBE_COLUMNS": COSINE_COUNT,
+                "DIFFUSE_SIZE": DIFFUSE_SIZE,
+                "SPECULAR_SIZE": SPECULAR_SIZE,
+                "LEVELS": len(LOBE_WIDTHS),
+                "ROW_LIGHTS": _ROW_LIGHTS,
+                "MAP_SIZE": SHADOW_RESOLUTION,
+            }
+            if shader.suns:
+                macros["SUNS"] = len(shader.suns)
+                macros |= {"TURNED_AWAY": float(TURNED_AWAY), "AT_SILHOUETTE": float(AT_SILHOUETTE)}
+                macros |= {"CLEARANCE": float(CLEARANCE), "CLEARANCE_TEXELS": float(CLEARANCE_TEXELS)}
+                macros |= {"SLOPE_FLOOR": float(SLOPE_FLOOR), "SOFTNESS": float(SOFTNESS)}
+                parts = (*parts, "shadow_map.glsl", "suns.glsl")
+            fragment = ("sh.glsl", "ggx.glsl", "surface.glsl", *parts, "shade.frag")
+            self._passes[key] = Pass(self._context, ("fill.vert",), fragment, macros)
+        return self._passes[key]
+
+
+def _turn(rotation: NDArray[np.float64]) -> Floats32:
+    """The blocks [8, 4, 4] of a rotation [16, 16] of harmonics, by column."""
+    blocks = rotation.reshape(4, 4, 4, 4).swapaxes(1, 2)  # row of blocks, column of blocks, row, column
+    return np.asarray(np.stack([blocks[at].T for at in _TURN_BLOCKS]), np.float32)
+
+
+def _light_rows(lights: DistantLights) -> Floats32:
+    """[rows, _ROW_LIGHTS · 6, 4]: direction and flux.r; flux.g, flux.b; sixteen harmonics at the direction."""
+    rows = max(-(-len(lights.directions) // _ROW_LIGHTS), 1)
+    packed = np.zeros((rows * _ROW_LIGHTS, _LIGHT_TEXELS, 4), np.float32)
+    used = packed[: len(lights.directions)].reshape(-1, 4 * _LIGHT_TEXELS)
+    used[:, :3], used[:, 3:6] = lights.directions, lights.flux
+    used[:, 8 : 8 + SH_COUNT] = sh_basis(lights.directions)
+    return packed.reshape(rows, _ROW_LIGHTS * _LIGHT_TEXELS, 4)

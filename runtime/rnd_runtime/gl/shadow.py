@@ -1,0 +1,98 @@
+"""Depth maps of suns drawn by OpenGL: ``shadow.py``'s discs and bounds, read by ``shaders/suns.glsl``.
+
+The maps keep the nearest depth by blending with the maximum, in float32 as the CPU's, and nothing is read back: the
+bounds that the maps are cut to are themselves found on the device, as points blended by maximum onto one texel a sun.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.shading.shader import SHADOW_RESOLUTION
+from rnd_runtime.shading.shadow import DROP, EDGE_ON, RIM_TEXELS, SLOPE_FLOOR
+
+from .passes import Pass
+
+Floats32 = NDArray[np.float32]
+
+_BLOCK = 32  # Gaussians whose bounds one vertex finds
+_FARTHEST = -1e30  # m; nothing
+
+
+class DepthMaps(NamedTuple):
+    """What the shading pass needs of S suns."""
+
+    depths: moderngl.Texture  # [S · SHADOW_RESOLUTION, SHADOW_RESOLUTION] m towards the sun
+    bounds: moderngl.Texture  # [1, S, 4]
+    axes: Floats32  # [S, 3, 3] world → map, transposed as uniforms are
+
+
+class SunMaps:
+    """Draws the depth maps of up to a few suns; the context must be current."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._made: dict[int, _Made] = {}  # by the number of suns
+
+    def draw(self, points: moderngl.Texture, normals: moderngl.Texture, count: int, axes: Floats32) -> DepthMaps:
+        """Maps of all ``count`` Gaussians of two ``gl.passes.GaussianTexture``.
+
+        Args:
+            points: mean m, world, and the radius m of its disc; a Gaussian of radius 0 casts no shadow.
+            normals: unit, world.
+            axes: [S, 3, 3] of ``shading.shadow.axes_towards`` each sun, world.
+        """
+        suns = len(axes)
+        if suns not in self._made:
+            self._made[suns] = _Made(self._context, suns)
+        made = self._made[suns]
+        turned = np.ascontiguousarray(axes.swapaxes(1, 2), np.float32)
+        self._context.enable_only(moderngl.BLEND)
+        self._context.blend_func = moderngl.ONE, moderngl.ONE
+        self._context.blend_equation = moderngl.MAX, moderngl.MAX
+        textures = {"points": points, "normals": normals, "bounds": made.bounds}
+        made.bounds_target.use()
+        made.bounds_target.clear(_FARTHEST, _FARTHEST, _FARTHEST, _FARTHEST)
+        made.surround.bind(textures, sun_axes=turned, count=count)
+        made.surround.render(moderngl.POINTS, suns * -(-count // _BLOCK))
+        made.depths_target.use()
+        made.depths_target.clear(_FARTHEST)
+        made.discs.bind(textures, sun_axes=turned, count=count)
+        made.discs.render(moderngl.TRIANGLES, 6 * suns * count)
+        self._context.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
+        return DepthMaps(made.depths, made.bounds, turned)
+
+    def release(self) -> None:
+        for made in self._made.values():
+            made.release()
+        self._made = {}
+
+
+class _Made:
+    """Programs and targets for a number of suns."""
+
+    def __init__(self, context: moderngl.Context, suns: int) -> None:
+        macros = {
+            "SUNS": suns,
+            "MAP_SIZE": SHADOW_RESOLUTION,
+            "BLOCK": _BLOCK,
+            "SLOPE_FLOOR": float(SLOPE_FLOOR),
+            "DROP": float(DROP),
+            "EDGE_ON": float(EDGE_ON),
+            "RIM_TEXELS": float(RIM_TEXELS),
+        }
+        self.surround = Pass(context, ("sun_bounds.vert",), ("sun_bounds.frag",), macros)
+        self.discs = Pass(context, ("shadow_map.glsl", "sun_discs.vert"), ("sun_discs.frag",), macros)
+        size = (SHADOW_RESOLUTION, suns * SHADOW_RESOLUTION)
+        self.bounds = context.texture((suns, 1), 4, dtype="f4")
+        self.depths = context.texture(size, 1, dtype="f4")
+        self.bounds_target = context.framebuffer([self.bounds])
+        self.depths_target = context.framebuffer([self.depths])
+
+    def release(self) -> None:
+        for part in (self.surround, self.discs, self.bounds_target, self.depths_target, self.bounds, self.depths):
+            part.release()

@@ -1,0 +1,1 @@
+"""Motions: skeletons, retargeting, interpolation and editing."""

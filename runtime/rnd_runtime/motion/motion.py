@@ -1,0 +1,291 @@
+"""Motions: local joint rotations and a root translation over time, in metres, Y up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import is_folder
+from rnd_runtime.core.npz import save_npz
+from rnd_runtime.core.rotations import matrix_to_axis_angle
+from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, check_translations, read_motion_file
+
+from .interpolation import interpolate_points, interpolate_rotations
+from .joint_names import load_joint_map, match_joints
+from .skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""(x, y, z) of a Z-up world is (x, z, −y) of ours: a quarter turn about X."""
+
+# SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
+STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
+
+_PART_OF_A_FRAME = 1e-4  # less than which the rounding of a duration, or of a rate in words, may add or take
+_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
+
+_MOCAP = (".bvh", ".amc")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """F poses of J joints.
+
+    Attributes:
+        rotations: [F, J, 3, 3] local rotations relative to the rest pose, the root first.
+        translations: [F, 3] m, added to the root's rest position.
+        fps: frames per second; frame f happens at f / fps seconds.
+        joint_names: J names.
+        source: where it came from, for messages.
+        notes: what the reader assumed or left out, one sentence each, for the user to see.
+        closed: whether the frame after the last is the first again.
+        left_out: joints of the file that turn and that nothing here follows, by the file's names.
+    """
+
+    rotations: Floats
+    translations: Floats
+    fps: float
+    joint_names: tuple[str, ...]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+    closed: bool = False
+    left_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        frames, joints = len(self.translations), len(self.joint_names)
+        assert self.rotations.shape == (frames, joints, 3, 3), self.rotations.shape
+        assert self.translations.shape == (frames, 3) and frames > 0, self.translations.shape
+        assert self.fps > 0, self.fps
+        for name in ("rotations", "translations"):  # once, and not whenever a pose is asked for
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.translations)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last; of a closed motion to its first frame's return."""
+        return (self.frame_count - (not self.closed)) / self.fps
+
+    def frames_at(self, fps: float) -> int:
+        """How many frames at ``fps`` show it: its first and last pose included, of a closed motion no pose twice."""
+        if self.closed:
+            return max(1, math.ceil(self.duration * fps - _PART_OF_A_FRAME))
+        return math.floor(self.duration * fps + _PART_OF_A_FRAME) + 1
+
+    def goes_round_at(self, fps: float) -> bool:
+        """Whether it is closed, and a whole number of frames at ``fps`` long."""
+        frames = self.duration * fps
+        return self.closed and abs(frames - round(frames)) < _PART_OF_A_FRAME
+
+    def loop_notes(self, fps: float) -> tuple[str, ...]:
+        """What is to be said of it at ``fps``: that it is closed, and does not go round evenly."""
+        if not self.closed or self.goes_round_at(fps):
+            return ()
+        even = max(round(self.duration * fps), 1) / self.duration
+        what = f"the loop of {self.duration:.4g} s is no whole number of frames at {fps:g} per second"
+        return (f"{what}: it jerks where it begins anew ({even:.9g} go round)",)
+
+    def at(self, times_s: ArrayLike) -> Motion:
+        """The poses at ``times_s`` [T] seconds: ``.interpolation`` between frames.
+
+        Beyond its ends a motion holds its end poses; a closed one goes round. ``fps`` of the result is still that of
+        the recording and says nothing about ``times_s``.
+        """
+        rotations, translations, place = self.path_at(times_s)
+        poses = interpolate_rotations(rotations, place), interpolate_points(translations, place)
+        return replace(self, rotations=poses[0], translations=poses[1], closed=False)
+
+    def path_at(self, times_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
+        """Rotations [F, J, 3, 3] and translations [F, 3], and where among them the poses of ``at`` lie [T]."""
+        place = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
+        if self.closed:
+            return *self._lap, 1 + place % self.frame_count
+        return self.rotations, self.translations, np.minimum(np.maximum(place, 0), self.frame_count - 1)
+
+    @cached_property
+    def _lap(self) -> tuple[Floats, Floats]:
+        """Rotations and translations of one round, with the frame before it and the two after it: for their slopes."""
+        frames = np.arange(-1, self.frame_count + 2) % self.frame_count
+        return self.rotations[frames], self.translations[frames]
+
+
+def load_motion(
+    path: str | Path,
+    skeleton: Skeleton,
+    *,
+    up: Literal["auto", "y", "z"] = "auto",
+    fps: float | None = None,
+    joint_names: tuple[str, ...] | None = None,
+    joint_map: str | Path | None = None,
+) -> Motion:
+    """Read a motion file for ``skeleton``, Y up.
+
+    Arrays (.npz, .pkl, .pt, .npy; layouts: ``motion_files.read_motion_file``): joints are matched by name; the
+    root is always the root, and where a file's first joint is nobody's here, it stands above the root and turns it.
+    Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
+    file that ``skeleton`` lacks are left out (``Motion.left_out``). Z-up files are of the SMPL family: they place
+    the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In
+    Y-up files ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
+
+    BVH and AMC have a skeleton of their own: ``retarget.retarget``.
+
+    Args:
+        up: the axis that points up in the file; "auto" goes by the layout and the file's ``up_axis``.
+        fps: overrides the file's frame rate.
+        joint_names: what the columns are, for files that are known to follow a skeleton's order.
+        joint_map: a file that says which of our joints is which of theirs: ``joint_names.load_joint_map``.
+
+    Raises:
+        InputError: with the file, the field and, where there is one, the frame.
+    """
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise InputError("fps", expected="a positive number", got=fps)
+    try:
+        if Path(path).suffix.lower() in _MOCAP:
+            motion = _load_mocap(path, skeleton, up, joint_map)
+        else:
+            motion = _load_arrays(path, skeleton, up, joint_names, joint_map)
+    except InputError as error:
+        raise error.at(file=path) from error
+    if fps is None:
+        return motion
+    notes = tuple(note for note in motion.notes if "frame rate" not in note)
+    return replace(motion, fps=float(fps), notes=notes)
+
+
+def motion_inputs(path: str | Path) -> list[Path]:
+    """The files that ``load_motion`` reads of ``path``: itself, an .amc with its .asf, a folder's .json files.
+
+    Raises:
+        InputError: for an .amc without a skeleton.
+    """
+    path = Path(path)
+    if is_folder(path):
+        from rnd_runtime.motion.readers.video_fits import easymocap_files
+
+        return easymocap_files(path)
+    if path.suffix.lower() != ".amc":
+        return [path]
+    from rnd_runtime.motion.readers.mocap import asf_beside
+
+    return [path, asf_beside(path)]
+
+
+def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | None) -> dict[str, int]:
+    table = None if joint_map is None else load_joint_map(joint_map)
+    return match_joints(names, skeleton.names, table, joint_map)
+
+
+def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
+    from rnd_runtime.motion.readers.mocap import (  # not before there is one: readers take part in every start
+        read_acclaim,
+        read_bvh,
+    )
+
+    from .retarget import retarget
+
+    tree = read_bvh(path) if Path(path).suffix.lower() == ".bvh" else read_acclaim(path)
+    moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
+    first = len(tree.rotations) - len(moved.rotations)
+    finite = np.isfinite(moved.rotations).all((1, 2, 3)) & np.isfinite(moved.translations).all(1)
+    if not finite.all():
+        got = "others after retargeting"
+        raise InputError("motion", expected="finite numbers", got=got, frame=first + int(np.argmin(finite)))
+    check_translations(moved.translations, path, first)
+    return Motion(
+        moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes, left_out=moved.left_out
+    )
+
+
+def _load_arrays(
+    path: str | Path, skeleton: Skeleton, up: str, joint_names: tuple[str, ...] | None, joint_map: str | Path | None
+) -> Motion:
+    record = read_motion_file(path, joint_names)
+    names = list(record.joint_names)
+    if joint_map is not None:
+        matched = _matched(names, skeleton, joint_map)
+        names = ["" if name in matched else name for name in names]  # the table's word counts
+        for ours, place in matched.items():
+            names[place] = ours
+    z_up = (record.up if up == "auto" else up) == "z"
+    rotations, used, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
+    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(_turns(record.rotations)) if k not in used)
+    translations, rest_root = record.translations, record.rest_root
+    if z_up and rest_root is None:
+        rest_root = SMPL_REST_ROOT
+    if rest_root is not None:
+        root_positions = rest_root + translations
+        if z_up:
+            root_positions = root_positions @ Z_UP_TO_Y_UP.T
+            rotations[:, 0] = Z_UP_TO_Y_UP @ rotations[:, 0]
+        translations = root_positions - skeleton.rest_joints[0]
+    notes = record.notes + notes
+    return Motion(rotations, translations, record.fps, skeleton.names, str(path), notes, left_out=left_out)
+
+
+def save_motion(path: str | Path, motion: Motion) -> None:
+    """Write ``motion`` as an AMASS-like .npz that ``load_motion`` reads back for any skeleton.
+
+    Members: ``poses`` (F, 3J) axis-angle rad, ``trans`` (F, 3) m, ``mocap_framerate``, ``joint_names``,
+    ``up_axis`` "y".
+    """
+    save_npz(
+        path,
+        {
+            "poses": matrix_to_axis_angle(motion.rotations).reshape(motion.frame_count, -1),
+            "trans": motion.translations,
+            "mocap_framerate": np.array(motion.fps, np.float64),
+            "joint_names": np.array(motion.joint_names),
+            "up_axis": np.array("y"),
+        },
+    )
+
+
+def _match_joints(
+    rotations: Floats, names: tuple[str, ...], skeleton: Skeleton, path: str | Path
+) -> tuple[Floats, set[int], tuple[str, ...]]:
+    """``rotations`` [F, ·, 3, 3] of ``names`` in the order of ``skeleton``, their columns, and notes."""
+    columns = {name: column for column, name in enumerate(names)}
+    for hand, finger in STAND_INS.items():
+        if hand not in columns and finger in columns:
+            columns[hand] = columns[finger]
+    columns.setdefault(skeleton.names[0], 0)  # the root by any name
+    matched = [name in columns for name in skeleton.names]
+    if sum(matched) < min(2, len(skeleton)):
+        raise InputError(
+            "joints of the motion",
+            expected=f"some of the avatar's ({', '.join(skeleton.names[:4])}, …)",
+            got=f"{', '.join(names[:4])}, …",
+            file=path,
+        )
+    result = np.broadcast_to(np.eye(3), (len(rotations), len(skeleton), 3, 3)).copy()
+    for joint, name in enumerate(skeleton.names):
+        if name in columns:
+            result[:, joint] = rotations[:, columns[name]]
+    used = {columns[name] for name in skeleton.names if name in columns}
+    notes = []
+    if 0 not in used and _turns(rotations)[0]:  # the first joint is above all others, and no other's
+        used.add(0)
+        result[:, 0] = rotations[:, 0] @ result[:, 0]
+        notes.append(f"{names[0] or 'the first joint'}, above {skeleton.names[0]}, turns all below it")
+    missing = [name for name, found in zip(skeleton.names, matched) if not found]
+    if missing:
+        notes.append(f"joints that the motion lacks stay at rest: {', '.join(missing)}")
+    return result, used, tuple(notes)
+
+
+def _turns(rotations: Floats) -> NDArray[np.bool_]:
+    """Which of the joints of ``rotations`` [F, J, 3, 3] turn at all: [J]."""
+    turns: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return turns

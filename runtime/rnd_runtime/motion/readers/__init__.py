@@ -1,0 +1,1 @@
+"""Readers of motion files, one family of formats a module."""

@@ -1,0 +1,273 @@
+"""The array layouts motions come in, read into one record in the file's own axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import is_folder
+from rnd_runtime.core.npz import Members, Npz
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+
+from .smpl_names import NAMES_BY_COUNT
+from .smpl_names import SMPL_REST_ROOT as SMPL_REST_ROOT
+from .smpl_names import SMPLH_NAMES as SMPLH_NAMES
+from .smpl_names import SMPLX_NAMES as SMPLX_NAMES
+from .smpl_names import SMPLX_REST_ROOT as SMPLX_REST_ROOT
+
+Floats = NDArray[np.float64]
+
+# What AMASS' SMPL-X files hold beside the split poses, and nobody else's
+_AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
+_MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and garbage are beyond
+# In degrees half of all rotations are; a root that goes round and round is one of 22 at least.
+_MANY_BEYOND_A_TURN = 0.2
+_MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
+_DEFAULT_FPS = 60.0
+PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
+FPS_LIMITS = (1e-3, 1e4)  # of a recording, least and most frames per second
+
+
+@dataclass(frozen=True, eq=False)
+class MotionRecord:
+    """What a motion file says, in its own axes.
+
+    Attributes:
+        rotations: [F, J, 3, 3] local rotations, the root first.
+        translations: [F, 3] m, added to the root's rest position.
+        rest_root: [3] m, the rest position that ``translations`` was made for; None for the avatar's own.
+        joint_names: J names.
+        fps: frames per second.
+        up: the axis that points up, "y" or "z".
+        notes: what had to be assumed or left out.
+    """
+
+    rotations: Floats
+    translations: Floats
+    rest_root: Floats | None
+    joint_names: tuple[str, ...]
+    fps: float
+    up: str
+    notes: tuple[str, ...]
+
+
+def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = None) -> MotionRecord:
+    """Read a motion from arrays of a known layout: an .npz, or a pickle or folder (``motion_pickles.read_track``).
+
+    ======================================================  ==========================================  ====
+    members                                                 joints                                      up
+    ======================================================  ==========================================  ====
+    ``poses`` (F,156) or (F,52,3), ``trans``                AMASS, SMPL-H                               z
+    ``poses`` (F,165) or (F,55,3), ``trans``                AMASS, SMPL-X                               z
+    ``root_orient``, ``pose_body`` (F,63), ``trans``,       AMASS, SMPL-X without ``poses``; fingers    z
+    ``mocap_frame_rate``, ``pose_hand`` (F,90)?             where there are any
+    ``poses`` (F,72) or (F,24,3), ``trans``                 SMPL                                        y
+    ``poses`` (F,66) or (F,22,3), ``trans``                 SMPL's body without hands                   y
+    ``pose_body | body_pose`` (F,63 | 69), ``root_orient |  SMPL without its root; fingers from         y
+    global_orient``, ``trans | transl``                     ``left_hand_pose``, ``right_hand_pose``
+    ``poses | poses_all``, ``Rh``, ``Th`` (or ``…_all``)    EasyMocap: turned about the origin          z
+    ``poses`` (F,3J) and ``joint_names`` (J)                any; what ``motion.save_motion`` writes  y
+    ======================================================  ==========================================  ====
+
+    ``up_axis`` ("y" or "z") in the file overrides the column *up*. Frame rate: ``mocap_framerate``,
+    ``mocap_frame_rate`` or ``fps``; without one, 60 is assumed and noted.
+
+    Args:
+        joint_names: the joints of the columns, for a file whose place says so (a capture's motion).
+
+    Raises:
+        InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
+    """
+    if is_folder(path) or Path(path).suffix.lower() in PICKLE_SUFFIXES:
+        from .pickles import read_track  # its readers need not take part in every start
+
+        track = read_track(path)
+        return _read(track.members, joint_names, track.rest_root, list(track.notes))
+    with Npz(path, what="motion") as archive:
+        return _read(archive, joint_names, None, [])
+
+
+def _read(
+    members: Members, joint_names: tuple[str, ...] | None, rest_root: Floats | None, notes: list[str]
+) -> MotionRecord:
+    easymocap = members.first_of("Rh", "Rh_all") is not None
+    axis_angles = _axis_angles(members, notes, joint_names)
+    names = names_of_joints(members, axis_angles.shape[1], joint_names)
+    _check_angles(axis_angles, names, members.path, notes)
+    rotations = axis_angle_to_matrix(axis_angles)
+    named = joint_names is not None or "joint_names" in members.names
+    split = "pose_body" in members.names and "poses" not in members.names
+    whole = len(names) in (52, 55) and "poses" in members.names and not named
+    amass = whole or (split and not named and members.first_of(*_AMASS_MEMBERS) is not None)
+    smpl_x = len(names) == 55 or (split and amass)
+    smpl_root = SMPLX_REST_ROOT if smpl_x else SMPL_REST_ROOT
+    if easymocap:
+        turn = axis_angle_to_matrix(_per_frame(members, "Rh", "Rh_all", frames=len(rotations)))
+        rotations[:, 0] = turn @ rotations[:, 0]
+        # Rh turns about the origin: transl = Th + R·J0 − J0
+        shift = turn @ smpl_root - smpl_root
+        translations = _per_frame(members, "Th", "Th_all", frames=len(rotations)) + shift
+    elif members.first_of("trans", "transl") is not None:
+        translations = _per_frame(members, "trans", "transl", frames=len(rotations))
+    else:
+        notes.append("no trans in the file: the root stays in place")
+        translations = np.zeros((len(rotations), 3))
+    check_translations(translations, members.path)
+    if "betas" in members.names:
+        notes.append("the file's betas are ignored: the avatar keeps its own shape")
+    fps = frame_rate(members)
+    if fps is None:
+        notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
+        fps = _DEFAULT_FPS
+    up = _up_axis(members, default="z" if amass or easymocap else "y")
+    if rest_root is None and (amass or easymocap):
+        rest_root = smpl_root
+    return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
+
+
+def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
+    """[F, J, 3] rad with the root first, from whichever member holds the poses."""
+    member = archive.first_of("poses", "poses_all", "pose_body", "body_pose")
+    if member is None:
+        raise InputError(
+            "motion",
+            expected="a member called poses, poses_all, pose_body or body_pose",
+            got=", ".join(archive.names) or "an empty archive",
+            file=archive.path,
+        )
+    poses = archive.numbers(member)
+    shape = poses.shape
+    flat, by_joint = len(shape) == 2 and shape[1] % 3 == 0, len(shape) == 3 and shape[2] == 3
+    if not (flat or by_joint):
+        got = "×".join(map(str, shape)) or "a single number"
+        raise InputError(f"shape of {member}", expected="F×3J or F×J×3", got=got, file=archive.path)
+    if shape[0] == 0:
+        raise InputError(member, expected="at least one frame", got="none", file=archive.path)
+    poses = poses.reshape(shape[0], shape[1] // 3 if flat else shape[1], 3)
+    rootless = joint_names is None and "joint_names" not in archive.names and poses.shape[1] in (21, 23)
+    if not rootless:
+        return poses
+    if archive.first_of("root_orient", "global_orient") is not None:
+        root = _per_frame(archive, "root_orient", "global_orient", frames=len(poses))
+    else:
+        root = np.zeros((len(poses), 3))
+        if archive.first_of("Rh", "Rh_all") is None:
+            notes.append("no root orientation in the file: the root stays upright")
+    return np.concatenate([root[:, None], poses, *_fingers(archive, poses, notes)], 1)
+
+
+def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
+    """Thirty finger joints [F, 30, 3] beside a split body of 21 joints [F, 21, 3], where the file has them."""
+    if body.shape[1] != 21 or ("pose_hand" not in archive.names and "left_hand_pose" not in archive.names):
+        return []
+    sides = ("pose_hand",) if "pose_hand" in archive.names else ("left_hand_pose", "right_hand_pose")
+    poses = [archive.numbers(side) for side in sides]
+    if any(pose.ndim < 2 or len(pose) != len(body) or pose[0].size != 90 // len(sides) for pose in poses):
+        notes.append("hands stay at rest: they are not given as 15 joints each")
+        return []
+    return [np.concatenate([pose.reshape(len(body), -1, 3) for pose in poses], 1)]
+
+
+def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """What ``count`` joints are called: by the file, else as ``given``, else by the SMPL family's order.
+
+    Raises:
+        InputError: there are none, nobody names them, or not as many, or not each by a name of its own.
+    """
+    names = archive.strings("joint_names") if "joint_names" in archive.names else given
+    if names is None:
+        names = NAMES_BY_COUNT.get(count)
+        expected = "22, 24, 52 or 55 joints (66, 72, 156 or 165 columns), or joint_names beside them"
+    else:
+        expected = f"{len(names)} joints ({3 * len(names)} columns)"
+    if names is None or len(names) != count:
+        raise InputError(
+            "joints of the motion", expected=expected, got=f"{count} joints ({3 * count} columns)", file=archive.path
+        )
+    if count == 0:
+        raise InputError("joints of the motion", expected="at least one", got="none", file=archive.path)
+    if len(set(names)) != count:
+        raise InputError("joint_names", expected="each name once", got=", ".join(names), file=archive.path)
+    return names
+
+
+def _per_frame(archive: Members, *members: str, frames: int) -> Floats:
+    """[F, 3] of the first member present; (F, 1, 3) is how EasyMocap's users store it."""
+    member = archive.first_of(*members)
+    if member is None:
+        raise InputError(f"{members[0]} is missing", got=", ".join(archive.names), file=archive.path)
+    array = archive.numbers(member)
+    if array.ndim == 3 and array.shape[1] == 1:
+        array = array[:, 0]
+    if array.shape != (frames, 3):
+        got = "×".join(map(str, array.shape)) or "a single number"
+        raise InputError(
+            f"shape of {member}", expected=f"{frames}×3, as many frames as poses", got=got, file=archive.path
+        )
+    return array
+
+
+def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path, notes: list[str]) -> None:
+    angles = np.linalg.norm(axis_angles, axis=-1)
+    if angles.max() > _MAX_ANGLE:
+        frame, joint = np.argwhere(angles > _MAX_ANGLE)[0]
+        raise InputError(
+            f"poses: {names[joint]}",
+            expected=f"an axis-angle of at most {_MAX_ANGLE:g} rad",
+            got=f"{angles[frame, joint]:g}",
+            file=path,
+            frame=int(frame),
+            hint="are these degrees?",
+        )
+    beyond = float((angles > 2 * np.pi).mean())
+    if beyond > _MANY_BEYOND_A_TURN:
+        notes.append(f"{beyond:.0%} of the rotations are beyond a whole turn: are these degrees instead of radians?")
+
+
+def check_translations(translations: Floats, path: str | Path, first: int = 0) -> None:
+    """Raise ``InputError`` for a root too far away; ``first``: the file's frame of ``translations[0]``."""
+    distances = np.abs(translations).max(-1)
+    if distances.max() > _MAX_DISTANCE:
+        frame = int(np.argmax(distances > _MAX_DISTANCE))
+        raise InputError(
+            "trans",
+            expected=f"metres, at most {_MAX_DISTANCE:g} from the origin",
+            got=f"{distances[frame]:g}",
+            file=path,
+            frame=first + frame,
+            hint="are these millimetres?",
+        )
+
+
+def frame_rate(archive: Members) -> float | None:
+    """Frames per second, within ``FPS_LIMITS``; None where the file has none.
+
+    Raises:
+        InputError: another number, or several.
+    """
+    member = archive.first_of("mocap_framerate", "mocap_frame_rate", "fps")
+    if member is None:
+        return None
+    value = archive.numbers(member)
+    low, high = FPS_LIMITS
+    if value.size != 1 or not low <= value.item() <= high:
+        raise InputError(
+            member,
+            expected=f"frames per second, {low:g} to {high:g}",
+            got=value.reshape(-1)[:4].tolist(),
+            file=archive.path,
+        )
+    return float(value.item())
+
+
+def _up_axis(archive: Members, *, default: str) -> str:
+    if "up_axis" not in archive.names:
+        return default
+    up = "".join(archive.strings("up_axis")).lower()
+    if up not in ("y", "z"):
+        raise InputError("up_axis", expected="y or z", got=up, file=archive.path)
+    return up

@@ -1,0 +1,181 @@
+"""One person's body fits in a video, as EasyMocap (a JSON file a frame) and PHALP (a pickle) leave them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.rotations import matrix_to_axis_angle
+
+Floats = NDArray[np.float64]
+
+PHALP_FOCAL = 5000 / 256
+"""of the picture's longer side: its EXTRA.FOCAL_LENGTH over render.res, to which it scales every picture"""
+
+_HAND_COEFFICIENTS = {78: "SMPL", 87: "SMPL-X"}
+"""columns of EasyMocap's SMPL-H and SMPL-X poses: after 22 joints come coefficients of hands and face, not angles"""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFits:
+    """What was fitted to one person.
+
+    Attributes:
+        person: their number; ``others`` are in the file too.
+        frames: [F] ascending picture numbers.
+        axis_angles: [F, 3J] rad, the root first.
+        translations: [F, 3] m.
+        betas: [F, B].
+        turns: [F, 3] rad, EasyMocap's Rh: x = R(Rh) X + translation, about the origin; None where, as in SMPL, the
+            root turns about its rest place.
+        family: "SMPL" or "SMPL-X".
+    """
+
+    person: int
+    others: tuple[int, ...]
+    frames: NDArray[np.int64]
+    axis_angles: Floats
+    translations: Floats
+    betas: Floats
+    turns: Floats | None = None
+    family: str = "SMPL"
+
+
+def read_easymocap_folder(folder: Path, person: int | None = None) -> VideoFits:
+    """Read ``folder`` of files such as ``000012.json``: a list of {``id``, ``Rh``, ``Th``, ``poses``, ``shapes``}.
+
+    ``person`` is an id; the one with most frames when None.
+    """
+    files = easymocap_files(folder)
+    if not files:
+        raise InputError("EasyMocap fits", expected=".json files", got="none", file=folder)
+    moments: dict[int, dict[int, Any]] = {}
+    for place, file in enumerate(files):
+        moments[trailing_number(file.stem, place)] = _people(file)
+    chosen, others = one_of([key for people in moments.values() for key in people], person, folder)
+    kept = {frame: people[chosen] for frame, people in sorted(moments.items()) if chosen in people}
+    try:
+        poses, turns, translations, betas = (
+            np.stack([np.asarray(entry[key], np.float64).reshape(-1) for entry in kept.values()])
+            for key in ("poses", "Rh", "Th", "shapes")
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError("EasyMocap fits", expected="Rh, Th, poses, shapes", got=repr(error), file=folder) from error
+    if turns.shape[1] != 3 or translations.shape[1] != 3:
+        raise InputError(
+            "Rh and Th", expected="3 numbers", got=f"{turns.shape[1]}, {translations.shape[1]}", file=folder
+        )
+    family = _HAND_COEFFICIENTS.get(poses.shape[1], "SMPL")
+    poses = with_root(poses[:, :66] if poses.shape[1] in _HAND_COEFFICIENTS else poses)
+    frames = np.array(list(kept), np.int64)
+    return VideoFits(chosen, others, frames, poses, translations, betas, turns, family)
+
+
+def easymocap_files(folder: Path) -> list[Path]:
+    """The files of ``folder`` that ``read_easymocap_folder`` reads."""
+    return sorted(folder.glob("*.json"))
+
+
+def is_phalp(content: Mapping[Any, Any]) -> bool:
+    """Whether ``content`` is PHALP's or 4D-Humans': picture → {``tid``, ``smpl``, ``camera``, …}."""
+    moments = _moments(content)
+    return bool(moments) and all({"smpl", "camera", "tid"} <= moment.keys() for moment in moments)
+
+
+def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None) -> VideoFits:
+    """Read what ``is_phalp`` recognises: rotation matrices, and places before a lens of ``PHALP_FOCAL``.
+
+    ``person`` is a track number; the one with most frames when None. Frames are those of the picture list. A track
+    that was not seen in a picture (its last sight repeated, ``tracked_time`` frames old) is left out there.
+    """
+    moments = sorted(_moments(content), key=lambda moment: int(moment.get("time", 0)))
+    tracks = [_phalp_tracks(moment) for moment in moments]
+    chosen, others = one_of([track for seen in tracks for track in seen], person, path)
+    frames, angles, translations, betas = [], [], [], []
+    for number, (moment, seen) in enumerate(zip(moments, tracks)):
+        if chosen not in seen:
+            continue
+        place = seen[chosen]
+        smpl = moment["smpl"][place]
+        parts = [np.asarray(smpl[key], np.float64).reshape(-1, 3, 3) for key in ("global_orient", "body_pose")]
+        frames.append(int(moment.get("time", number)))
+        angles.append(matrix_to_axis_angle(np.concatenate(parts)).reshape(-1))
+        translations.append(np.asarray(moment["camera"][place], np.float64).reshape(3))
+        betas.append(np.asarray(smpl["betas"], np.float64).reshape(-1))
+    return VideoFits(
+        chosen, others, np.array(frames, np.int64), np.stack(angles), np.stack(translations), np.stack(betas)
+    )
+
+
+def _moments(content: Mapping[Any, Any]) -> list[Mapping[str, Any]]:
+    """What ``content`` holds of pictures: some versions note other things beside."""
+    return [value for value in content.values() if isinstance(value, Mapping)]
+
+
+def _phalp_tracks(moment: Mapping[str, Any]) -> dict[int, int]:
+    """The place in ``moment`` of every track that was seen there."""
+    tracks = moment["tid"][: len(moment["smpl"])]
+    ages = moment.get("tracked_time", [0] * len(tracks))
+    return {int(track): place for place, (track, age) in enumerate(zip(tracks, ages)) if age == 0}
+
+
+def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tuple[int, ...]]:
+    """(chosen, others): ``person``, or whom ``seen`` (a number a sighting) holds most often, the first of equals."""
+    numbers = tuple(dict.fromkeys(seen))
+    if not numbers:
+        raise InputError("people", expected="at least one", got="none", file=path)
+    if person is not None and person not in numbers:
+        raise InputError("--person", expected=" or ".join(map(str, numbers)), got=person)
+    chosen = max(numbers, key=list(seen).count) if person is None else person
+    return chosen, tuple(number for number in numbers if number != chosen)
+
+
+def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], list[Floats]]:
+    """A track's frame numbers [F], ascending, and its ``values`` [F, …]; of a number that repeats the first counts.
+
+    Raises:
+        InputError: there are not as many of each.
+    """
+    numbers = np.asarray(frames, np.int64).reshape(-1)
+    arrays = [np.asarray(value, np.float64) for value in values]
+    for array in arrays:
+        if array.shape[:1] != numbers.shape:
+            got = f"{len(array)} and {numbers.size} frame_ids"
+            raise InputError("poses of a track", expected="one a frame", got=got)
+    ascending, first = np.unique(numbers, return_index=True)
+    return ascending, [array[first] for array in arrays]
+
+
+def with_root(poses: Floats) -> Floats:
+    """Poses [F, 3J] with a zero root before those that leave it out (63 and 69 columns)."""
+    if poses.shape[1] in (63, 69):
+        return np.concatenate([np.zeros((len(poses), 3)), poses], 1)
+    return poses
+
+
+def trailing_number(stem: str, otherwise: int) -> int:
+    """The number that ``stem`` ends in."""
+    digits = stem[len(stem.rstrip("0123456789")) :]
+    return int(digits) if digits else otherwise
+
+
+def _people(file: Path) -> dict[int, Any]:
+    """By id, the people in one file."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError("cannot be read", expected="JSON", got=str(error), file=file) from error
+    people = content.get("annots", []) if isinstance(content, dict) else content
+    if not isinstance(people, list) or not all(isinstance(entry, dict) for entry in people):
+        raise InputError("EasyMocap fits", expected="a list of people", got=type(content).__name__, file=file)
+    try:
+        return {int(entry.get("id", 0)): entry for entry in people}
+    except (TypeError, ValueError) as error:
+        raise InputError("id", expected="a whole number", got=str(error), file=file) from error

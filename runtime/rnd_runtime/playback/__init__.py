@@ -1,0 +1,1 @@
+"""One facade that renders a frame of an avatar."""

@@ -1,0 +1,93 @@
+"""Choosing between the OpenGL rasteriser and the CPU kernel."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Literal, get_args
+
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.raster import cpu as raster_cpu
+
+if TYPE_CHECKING:  # OpenGL is loaded where it draws: a twentieth of a start
+    from rnd_runtime.gl.context import Backend
+    from rnd_runtime.gl.frame import GlRenderer
+    from rnd_runtime.gl.raster import GlRasterizer
+
+Kind = Literal["auto", "gl", "gl-egl", "gl-osmesa", "cpu"]
+
+
+class ChosenRasterizer:
+    """A ``core.gaussians.Rasterizer`` that knows its ``name`` and can be closed (or used with ``with``).
+
+    Attributes:
+        name: such as ``gl (egl, llvmpipe (LLVM 15.0.6, 256 bits))`` or ``cpu``.
+        renderer: shades on the device too; None where the CPU draws.
+    """
+
+    def __init__(self, name: str, gl: GlRasterizer | None = None) -> None:
+        self.name = name
+        self._gl = gl
+        self._rasterize = raster_cpu.rasterize if gl is None else gl
+        self.renderer: GlRenderer | None = None
+        if gl is not None:
+            from rnd_runtime.gl.frame import GlRenderer
+
+            self.renderer = GlRenderer(gl)
+
+    def __call__(
+        self,
+        means: Floats32,
+        covariances: Floats32,
+        opacities: Floats32,
+        features: Floats32,
+        camera: Camera,
+        *,
+        depth: bool = True,
+    ) -> Raster:
+        return self._rasterize(means, covariances, opacities, features, camera, depth=depth)
+
+    def close(self) -> None:
+        if self.renderer is not None:
+            self.renderer.close()
+        if self._gl is not None:
+            self._gl.close()
+
+    def __enter__(self) -> ChosenRasterizer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def make_rasterizer(kind: Kind = "auto") -> ChosenRasterizer:
+    """Make the rasteriser ``kind``.
+
+    "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too,
+    five to seven times as slowly. "gl-egl" and "gl-osmesa" name the backend; "gl" takes the first that works.
+
+    Raises:
+        InputError: "gl" and no OpenGL, or no such kind.
+    """
+    if kind not in get_args(Kind):
+        raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))
+    if kind == "cpu":
+        return ChosenRasterizer("cpu")
+    from rnd_runtime.gl.context import create_context, is_software, renderer
+    from rnd_runtime.gl.raster import GlRasterizer
+
+    backends: dict[str, Backend] = {"gl-egl": "egl", "gl-osmesa": "osmesa"}
+    try:
+        context = create_context(backends.get(kind, "auto"))
+    except InputError:
+        if kind != "auto":
+            raise
+        return ChosenRasterizer("cpu")
+    if kind == "auto" and is_software(context):
+        context.release()
+        return ChosenRasterizer("cpu")
+    name = f"gl ({context.extra.backend}, {renderer(context)})"
+    return ChosenRasterizer(name, GlRasterizer(context=context))

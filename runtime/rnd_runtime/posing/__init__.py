@@ -1,0 +1,1 @@
+"""From a moment of a motion to posed Gaussians."""

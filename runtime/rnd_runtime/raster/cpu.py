@@ -1,0 +1,141 @@
+"""The CPU rasteriser: numba, float32 with float64 projection, forward and backward, any number of channels.
+
+The rule is ``core.gaussians.Rasterizer``'s. Besides, a Gaussian with a number that is not finite,
+a covariance of trace zero or a projection that is not positive definite is not drawn and gets zero gradients.
+
+The result does not depend on the number of threads, to the bit. Kernels compile on first use (seconds) and
+are cached beside the package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import check_shape, checked, floats, mask
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.gaussians import Floats32, Raster
+
+from .blend import blend_backward
+from .passes import splat
+from .project import Pinhole, pinhole, project_backward
+from .tiles import Splats
+
+_EVERYTHING = np.empty(0, np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What ``backward`` needs of a forward pass; hold it, do not look into it."""
+
+    means: Floats32
+    covariances: Floats32
+    opacities: Floats32
+    view: Pinhole
+    splats: Splats
+    image: Floats32  # [H, W, K] features, then depth
+    coverage: Floats32  # [H, W]
+    channels: int
+
+
+def rasterize(
+    means: Floats32,
+    covariances: Floats32,
+    opacities: Floats32,
+    features: Floats32,
+    camera: Camera,
+    *,
+    depth: bool = True,
+    outlines: bool = False,
+    seen: ArrayLike | None = None,
+) -> Raster:
+    """Splat N Gaussians: projection, culling, sorting and blending in one compiled pass.
+
+    Args:
+        means: [N, 3] m, world.
+        covariances: [N, 6] m², world, upper triangle (xx, xy, xz, yy, yz, zz).
+        opacities: [N].
+        features: [N, C], any C.
+        camera: the view.
+        depth: False leaves the depth picture all zero and saves its time.
+        outlines: they are sharp, see ``.outline``.
+        seen: [N] the Gaussians to be drawn, as ``raster.in_view.in_view`` tells them; by default all.
+
+    Raises:
+        InputError: an array has the wrong shape.
+    """
+    arrays = checked(means, covariances, opacities, features)
+    chosen = _EVERYTHING if seen is None else mask(seen, len(arrays[0]))
+    return _splat(arrays, chosen, pinhole(camera), depth, False, outlines)[0]
+
+
+def forward(
+    means: Floats32,
+    covariances: Floats32,
+    opacities: Floats32,
+    features: Floats32,
+    camera: Camera,
+    *,
+    depth: bool = True,
+) -> tuple[Raster, State]:
+    """``rasterize`` that also returns what ``backward`` needs.
+
+    Without ``depth`` the depth picture is all zero and costs nothing.
+    """
+    arrays = checked(means, covariances, opacities, features)
+    view = pinhole(camera)
+    raster, splats, image = _splat(arrays, _EVERYTHING, view, depth, True, False)
+    return raster, State(*arrays[:3], view, splats, image, raster.alpha, arrays[3].shape[1])
+
+
+def _splat(
+    arrays: tuple[Floats32, Floats32, Floats32, Floats32],
+    seen: NDArray[np.bool_],
+    view: Pinhole,
+    depth: bool,
+    differentiable: bool,
+    outlines: bool,
+) -> tuple[Raster, Splats, Floats32]:
+    """The pictures, what ``backward`` needs of their making, and features and depth in one picture [H, W, K]."""
+    started = perf_counter()
+    splats, image, coverage, (projection, sort) = splat(
+        arrays, seen, view, get_num_threads(), depth, differentiable, outlines
+    )
+    blending = perf_counter() - started - projection - sort
+    channels = arrays[3].shape[1]
+    far = image[..., channels] if depth else np.zeros_like(coverage)
+    seconds = {"projection": projection, "sort": sort, "raster": blending}
+    return Raster(image[..., :channels], coverage, far, seconds), splats, image
+
+
+def backward(
+    state: State, grad_image: ArrayLike, grad_alpha: ArrayLike, grad_depth: ArrayLike | None = None
+) -> tuple[Floats32, Floats32, Floats32, Floats32]:
+    """Gradients of means [N, 3], covariances [N, 6], opacities [N] and features [N, C].
+
+    Args:
+        state: of ``forward``.
+        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's pictures, [H, W, C], [H, W] and [H, W]; the
+            last is ignored where the forward pass was run without depth.
+
+    Zero where α is clamped at 0.99 and for what was not drawn.
+    """
+    wanted, wanted_alpha = floats(grad_image), floats(grad_alpha)
+    check_shape("gradient of the picture", wanted, (*state.coverage.shape, state.channels))
+    check_shape("gradient of alpha", wanted_alpha, state.coverage.shape)
+    if state.image.shape[2] > state.channels:
+        height, width = state.coverage.shape
+        depth = np.zeros((height, width), np.float32) if grad_depth is None else floats(grad_depth)
+        check_shape("gradient of the depth", depth, (height, width))
+        wanted = np.concatenate([wanted, depth[..., None]], axis=2)
+    splats = state.splats
+    slots = blend_backward(splats, state.image, state.coverage, wanted, wanted_alpha, get_num_threads())
+    arrays = state.means, state.covariances, state.opacities
+    grads: tuple[Floats32, Floats32, Floats32, Floats32] = project_backward(
+        *arrays, state.channels, state.view, splats.slot_starts, slots
+    )
+    return grads

@@ -1,0 +1,176 @@
+"""Which Gaussians a camera may see: what has to be shaded before anything is drawn (numba)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import check_shape, floats
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.core.simd import WIDTH, load, load_points, root, store_mask
+
+from .oracle import ALPHA_MIN, DILATION, NEAR
+from .project import Pinhole, pinhole
+
+# Of α = 1/255 at opacity 1, in standard deviations, and a hundredth for a camera's rotation that is one to 1e-4 only
+REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
+LEAST_OPACITY = np.float32(ALPHA_MIN)
+ZERO = np.float32(0)
+EVERYTHING = np.float32(-1)  # no cosine is below it
+CHUNK = 128 * WIDTH  # Gaussians looked at by a thread at a time
+
+
+def in_view(
+    means: ArrayLike,
+    covariances: ArrayLike,
+    opacities: ArrayLike,
+    camera: Camera,
+    *,
+    normals: ArrayLike | None = None,
+    cull: float | None = None,
+) -> NDArray[np.bool_]:
+    """[N] all that reach the picture of ``raster.cpu.rasterize``, and few others.
+
+    Cheaper than projecting them, since a Gaussian counts as the ball that holds it: one whose σ is √‖Σ‖, Frobenius'
+    norm, which no direction exceeds. Arguments as of ``rasterize``.
+
+    With ``cull`` those are left out that face away, where the cosine n·v of ``normals`` [N, 3] (unit) and the direction
+    to the camera is below it: they lie behind what faces the camera, if the body is closed and opaque. A little below 0
+    the silhouette's own Gaussians are kept, which are seen from their edge. No trained avatar is quite that; what it
+    costs one of 30 000 stands in docs/performance.md (``rnd-bench frame --cull``).
+
+    Raises:
+        InputError: an array has the wrong shape.
+    """
+    means, covariances, opacities = floats(means), floats(covariances), floats(opacities)
+    count = len(means)
+    check_shape("means", means, (count, 3))
+    check_shape("covariances", covariances, (count, 6))
+    check_shape("opacities", opacities, (count,))
+    if normals is None or cull is None:
+        facing, least = means, EVERYTHING
+    else:
+        facing, least = floats(normals), np.float32(cull)
+    check_shape("normals", facing, (count, 3))
+    seen: NDArray[np.bool_] = look(
+        means, covariances, opacities, facing, floats(camera.position), least, pinhole(camera)
+    )
+    return seen
+
+
+def seen_of(gaussians: Gaussians, camera: Camera, cull: float | None = None) -> NDArray[np.bool_]:
+    """``in_view`` of ``gaussians``."""
+    arrays = gaussians.means, gaussians.covariances, gaussians.opacities
+    return in_view(*arrays, camera, normals=gaussians.normals, cull=cull)
+
+
+def opacities_of(gaussians: Gaussians, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """[N]; 0 for what is not ``seen``, so that rasterisers that ask for no mask leave it out."""
+    return np.where(seen, gaussians.opacities, np.float32(0))
+
+
+@njit(inline="always")
+def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, high: float):  # type: ignore[no-untyped-def]
+    """A picture's side as a plane: x, y, z, constant, and how far a ball of σ = 1 m reaches beyond it.
+
+    A point of the camera's frame is projected to u = f x/z + c, and its ball reaches REACH·√(|m|² σ² + DILATION) px
+    from there, where |m|² = (f/z)² (1 + s²) and s is the slope that ``Pinhole`` bounds. It may touch the pixels
+    u ≥ 0 if z u + REACH (f √(1 + s²) σ + z √DILATION) ≥ 0, which is linear in the point.
+    """
+    r, t = view.rotation, view.translation
+    ahead = centre + REACH * math.sqrt(DILATION)
+    slope = max(abs(low), abs(high))
+    return (
+        focal * r[axis, 0] + ahead * r[2, 0],
+        focal * r[axis, 1] + ahead * r[2, 1],
+        focal * r[axis, 2] + ahead * r[2, 2],
+        focal * t[axis] + ahead * t[2],
+        REACH * abs(focal) * math.sqrt(1.0 + slope * slope),
+    )
+
+
+@njit(inline="always")
+def _ahead(view):  # type: ignore[no-untyped-def]
+    """What is nearer than NEAR as a plane, which a ball's middle must pass."""
+    r, t = view.rotation, view.translation
+    return r[2, 0], r[2, 1], r[2, 2], t[2] - 0.999 * NEAR, 0.0
+
+
+@njit(inline="always")
+def _sigma(covariances, i):  # type: ignore[no-untyped-def]
+    squares = 0.0
+    for k in range(6):
+        squares += (1.0 if k in (0, 3, 5) else 2.0) * np.float64(covariances[i, k]) ** 2
+    return math.sqrt(math.sqrt(squares))
+
+
+@njit(inline="always")
+def _distance(side, x, y, z, reach):  # type: ignore[no-untyped-def]
+    return side[0] * x + side[1] * y + side[2] * z + side[3] + side[4] * reach
+
+
+@njit(inline="always")
+def _rounded(side):  # type: ignore[no-untyped-def]
+    return (np.float32(side[0]), np.float32(side[1]), np.float32(side[2]), np.float32(side[3]), ZERO)
+
+
+@njit(inline="always")
+def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
+    """(eye − p)·n and |eye − p|²."""
+    x, y, z = eye[0] - x, eye[1] - y, eye[2] - z
+    return x * normal[0] + y * normal[1] + z * normal[2], x * x + y * y + z * z
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def look(means, covariances, opacities, normals, eye, least, view):  # type: ignore[no-untyped-def]
+    """``in_view`` from ``eye`` [3], where n·v is ``least`` or more; EVERYTHING looks at no normal."""
+    seen = np.empty(len(means), np.bool_)
+    sides = np.empty((5, 5), np.float64)
+    sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
+    sides[1] = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
+    sides[2] = _side(view, 1, view.fy, view.cy, view.low_y, view.high_y)
+    sides[3] = _side(view, 1, -view.fy, view.height - view.cy, view.low_y, view.high_y)
+    sides[4] = _ahead(view)
+    arrays = (means, covariances, opacities, normals)
+    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+        last = min((chunk + 1) * CHUNK, len(seen))
+        _look_at(chunk * CHUNK, last, arrays, sides, (eye, least), seen)
+    return seen
+
+
+@njit(error_model="numpy")
+def _look_at(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyped-def]
+    """Fill ``seen`` from ``first``, a whole number of sixteen, up to ``last``."""
+    means, covariances, opacities, normals = arrays
+    eye, least = limits
+    culling = least > EVERYTHING
+    # Of most the middle is in the picture: seen sixteen at a time, and rounding may err, for the others are looked at
+    a, b, c, d, e = (_rounded(sides[0]), _rounded(sides[1]), _rounded(sides[2]), _rounded(sides[3]), _rounded(sides[4]))
+    sixteens = last // WIDTH * WIDTH
+    for i in range(first, sixteens, WIDTH):
+        x, y, z = load_points(means, 3 * i)
+        inside = (_distance(a, x, y, z, ZERO) >= ZERO) & (_distance(b, x, y, z, ZERO) >= ZERO)
+        inside = inside & (_distance(c, x, y, z, ZERO) >= ZERO) & (_distance(d, x, y, z, ZERO) >= ZERO)
+        inside = inside & (_distance(e, x, y, z, ZERO) >= ZERO) & (load(opacities, i) >= LEAST_OPACITY)
+        if culling:
+            along, squared = _along(eye, x, y, z, load_points(normals, 3 * i))
+            inside = inside & (along - least * root(squared) >= ZERO)
+        store_mask(seen, i, inside)
+    seen[sixteens:last] = False
+    for i in range(first, last):
+        if seen[i] or not opacities[i] >= LEAST_OPACITY:
+            continue
+        if culling:
+            along, squared = _along(eye, means[i, 0], means[i, 1], means[i, 2], normals[i])
+            if not along >= least * np.sqrt(squared):
+                continue
+        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        sigma = _sigma(covariances, i)
+        reached = True
+        for side in sides:
+            reached = reached and _distance(side, x, y, z, sigma) >= 0.0
+        seen[i] = reached

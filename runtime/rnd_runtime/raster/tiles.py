@@ -1,0 +1,125 @@
+"""Front-to-back order and its sorting into tiles (numba)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from .project import TILE, tile_range
+
+RADIX_BITS = 11
+
+
+class Splats(NamedTuple):
+    """What the blending kernels read. P counts (Gaussian, tile) pairs; pairs of a tile lie front to back."""
+
+    centers: NDArray[np.float64]  # [N, 2] px
+    shapes: NDArray[np.float32]  # [N, 4] shear, fall_y, fall_x, peak
+    attributes: NDArray[np.float32]  # [N, K] features, then the depth when it is asked for
+    slot_starts: NDArray[np.int64]  # [N + 1]: the slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]
+    tile_starts: NDArray[np.int64]  # [tiles + 1] into the pairs
+    pair_gaussians: NDArray[np.int32]  # [P]
+    pair_slots: NDArray[np.int32]  # [P] where the pair's gradient goes; empty where none is asked for
+
+
+@njit(error_model="numpy")
+def _front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
+    """Indices of the drawn Gaussians by depth, equal depths by index.
+
+    A stable radix sort of 32-bit keys that span just the visible range: 1 m of depth is cut into 0.2 nm,
+    where float32 depths (60 nm at 1 m) would cost 50 dB.
+    """
+    count = 0
+    near, far = np.inf, -np.inf
+    for i in range(depths.size):
+        if slot_starts[i + 1] > slot_starts[i]:
+            count += 1
+            near, far = min(near, depths[i]), max(far, depths[i])
+    scale = 4294967295.0 / (far - near) if far > near else 0.0
+    keys, order = np.empty(count, np.uint32), np.empty(count, np.int32)
+    other_keys, other_order = np.empty(count, np.uint32), np.empty(count, np.int32)
+    passes = (32 + RADIX_BITS - 1) // RADIX_BITS
+    counts = np.zeros((passes, 1 << RADIX_BITS), np.int32)
+    mask = np.uint32((1 << RADIX_BITS) - 1)
+    k = 0
+    for i in range(depths.size):
+        if slot_starts[i + 1] > slot_starts[i]:
+            key = np.uint32(np.int64((depths[i] - near) * scale))
+            keys[k], order[k] = key, i
+            k += 1
+            for p in range(passes):
+                counts[p, (key >> np.uint32(p * RADIX_BITS)) & mask] += 1
+    for p in range(passes):
+        start = 0
+        for digit in range(1 << RADIX_BITS):
+            start, counts[p, digit] = start + counts[p, digit], start
+        shift = np.uint32(p * RADIX_BITS)
+        for k in range(count):
+            digit = (keys[k] >> shift) & mask
+            place = counts[p, digit]
+            counts[p, digit] = place + 1
+            other_keys[place], other_order[place] = keys[k], order[k]
+        keys, other_keys = other_keys, keys
+        order, other_order = other_order, order
+    return order
+
+
+@njit(inline="always")
+def _next_tile(tile, x, x0, x1, tiles_x):  # type: ignore[no-untyped-def]
+    """The next tile of a range, row by row, without a branch to mispredict."""
+    wraps = x == x1
+    return tile + (tiles_x - (x1 - x0) if wraps else 1), x0 if wraps else x + 1
+
+
+@njit(parallel=True, error_model="numpy", nogil=True, cache=True)
+def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # type: ignore[no-untyped-def]
+    """Counting sort of the (Gaussian, tile) pairs into tiles, front to back within each.
+
+    Takes what ``._raster_project.project`` returns and the picture's ``size`` (width, height). Returns tile_starts,
+    pair_gaussians and pair_slots of ``Splats``, the last one empty unless ``with_slots``. Each thread counts and
+    places a stretch of the Gaussians, near ones first, so their number changes nothing.
+    """
+    tiles_x, tiles_y = (size[0] + TILE - 1) // TILE, (size[1] + TILE - 1) // TILE
+    order = _front_to_back(depths, slot_starts)
+    stretch = (order.size + threads - 1) // threads
+    places = np.zeros((threads, tiles_x * tiles_y), np.int32)
+    for part in prange(threads):
+        own = places[part]
+        for g in order[part * stretch : (part + 1) * stretch]:
+            x0, y0, x1, _ = tile_range(boxes, g)
+            tile, x = y0 * tiles_x + x0, x0
+            for _ in range(slot_starts[g], slot_starts[g + 1]):
+                own[tile] += 1
+                tile, x = _next_tile(tile, x, x0, x1, tiles_x)
+    starts = _starts(places)
+    pair_gaussians = np.empty(starts[-1], np.int32)
+    pair_slots = np.empty(starts[-1] if with_slots else 0, np.int32)
+    for part in prange(threads):
+        own = places[part]
+        for g in order[part * stretch : (part + 1) * stretch]:
+            x0, y0, x1, _ = tile_range(boxes, g)
+            tile, x = y0 * tiles_x + x0, x0
+            for slot in range(slot_starts[g], slot_starts[g + 1]):
+                place = own[tile]
+                own[tile] = place + 1
+                pair_gaussians[place] = g
+                if with_slots:
+                    pair_slots[place] = slot
+                tile, x = _next_tile(tile, x, x0, x1, tiles_x)
+    return starts, pair_gaussians, pair_slots
+
+
+@njit(error_model="numpy")
+def _starts(places):  # type: ignore[no-untyped-def]
+    """Where each tile's pairs begin [tiles + 1]; the counts [threads, tiles] become where each thread's begin."""
+    starts = np.empty(places.shape[1] + 1, np.int64)
+    total = 0
+    for tile in range(places.shape[1]):
+        starts[tile] = total
+        for part in range(len(places)):
+            total, places[part, tile] = total + places[part, tile], total
+    starts[-1] = total
+    return starts

@@ -1,0 +1,137 @@
+"""From linear radiance to 8-bit sRGB in one compiled pass: the same bytes as ``to_bytes(linear_to_srgb(x))``.
+
+The code of a value is a step function, so no power has to be taken: a table over the top bits of the float says which
+code its cell starts with, and one comparison whether the value lies past the cell's only step. 0.4 ms instead of 8 for
+512² pixels of which the body covers a sixth.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import floats
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.images import linear_to_srgb, to_bytes
+
+Bytes = NDArray[np.uint8]
+Floats32 = NDArray[np.float32]
+
+_CELL_BITS = 7  # of the mantissa: 128 cells an octave, where sRGB makes at most 67 steps
+_SHIFT = 23 - _CELL_BITS
+_LOWEST = np.float32(2.0**-14)  # below it the code is 0: the first step is at 1.5e-4
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+def tone_map(radiance: ArrayLike, alpha: ArrayLike, behind: ArrayLike | None = None) -> Bytes:
+    """8-bit sRGB [H, W, 3] of premultiplied ``radiance`` [H, W, 3] and ``alpha`` [H, W] over a background.
+
+    Args:
+        behind: linear radiance of the background, [3] or [H, W, 3]; black when None.
+    """
+    radiance, alpha = _checked(radiance, alpha)
+    background = floats(np.zeros(3) if behind is None else behind)
+    if background.shape not in ((3,), radiance.shape):
+        raise InputError("background", expected=f"[3] or {radiance.shape}", got=background.shape)
+    image = np.empty(radiance.shape, np.uint8)
+    _tone_map(radiance, alpha, background.reshape(-1, 3), *tone_tables(), image)
+    return image
+
+
+def tone_map_straight(radiance: ArrayLike, alpha: ArrayLike) -> Bytes:
+    """8-bit sRGB and alpha [H, W, 4], not premultiplied, as PNG has it."""
+    radiance, alpha = _checked(radiance, alpha)
+    image = np.empty((*alpha.shape, 4), np.uint8)
+    _tone_map_straight(radiance, alpha, *tone_tables(), image)
+    return image
+
+
+def code_steps() -> Floats32:
+    """The least float32 of every code, and infinity [257]: ``steps[c] <= x < steps[c + 1]`` has the code c."""
+    return tone_tables()[0]
+
+
+def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]:
+    radiance, alpha = floats(radiance), floats(alpha)
+    if alpha.ndim != 2 or radiance.shape != (*alpha.shape, 3):
+        raise InputError("picture", expected="[H, W, 3] and [H, W]", got=f"{radiance.shape}, {alpha.shape}")
+    return radiance, alpha
+
+
+@cache
+def tone_tables() -> tuple[Floats32, NDArray[np.uint8]]:
+    """``code_steps``, and the code that each cell starts with."""
+    codes = np.arange(1, 256)
+    low = np.zeros(255, np.int64)  # bits of positive floats are ordered as the floats are
+    high = np.full(255, np.float32(1).view(np.int32), np.int64)
+    while (high - low > 1).any():
+        middle = (low + high) // 2
+        reached = to_bytes(linear_to_srgb(middle.astype(np.int32).view(np.float32))) >= codes
+        low, high = np.where(reached, low, middle), np.where(reached, middle, high)
+    steps = np.concatenate([[0], high.astype(np.int32).view(np.float32), [np.inf]]).astype(np.float32)
+    start = int(_LOWEST.view(np.int32)) >> _SHIFT
+    cells = np.arange(start, (int(_ONE.view(np.int32)) >> _SHIFT) + 1, dtype=np.int64) << _SHIFT
+    starts = cells.astype(np.int32).view(np.float32)
+    first = np.searchsorted(steps, starts, side="right") - 1
+    assert (np.diff(first) <= 1).all()
+    return steps, first.astype(np.uint8)
+
+
+@njit(inline="always")
+def _code(x, steps, first):  # type: ignore[no-untyped-def]
+    """The code of x: NaN and what is negative give 0, what is above one 255."""
+    if not x >= _LOWEST:
+        return np.uint8(0)
+    x = np.float32(min(x, _ONE))
+    bits = x.view(np.int32)
+    code = np.int64(first[(bits >> _SHIFT) - _START])
+    return np.uint8(code + (1 if x >= steps[code + 1] else 0))
+
+
+_START = int(_LOWEST.view(np.int32)) >> _SHIFT
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def tone_map_on_black(radiance, alpha, tables):  # type: ignore[no-untyped-def]
+    """``tone_map`` over black, with ``tone_tables``."""
+    image = np.empty(radiance.shape, np.uint8)
+    steps, first = tables
+    _tone_map(radiance, alpha, np.zeros((1, 3), np.float32), steps, first, image)
+    return image
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-untyped-def]
+    height, width = alpha.shape
+    one_colour = len(behind) == 1
+    empty = np.empty(3 * width, np.uint8)  # a row of nothing but the one colour
+    for c in range(3):
+        empty[c::3] = _code(behind[0, c], steps, first)
+    rows = image.reshape(height, 3 * width)
+    for y in prange(height):
+        if one_colour:
+            for k in range(3 * width):
+                rows[y, k] = empty[k]
+        for x in range(width):
+            left = _ONE - alpha[y, x]
+            at = 0 if one_colour else y * width + x
+            if one_colour and left == _ONE:
+                continue
+            for c in range(3):
+                image[y, x, c] = _code(radiance[y, x, c] + left * behind[at, c], steps, first)
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _tone_map_straight(radiance, alpha, steps, first, image):  # type: ignore[no-untyped-def]
+    height, width = alpha.shape
+    for y in prange(height):
+        for x in range(width):
+            a = alpha[y, x]
+            if not a > _ZERO:
+                a = _ONE
+            for c in range(3):
+                image[y, x, c] = _code(radiance[y, x, c] / a, steps, first)
+            image[y, x, 3] = np.uint8(np.floor(min(max(alpha[y, x], _ZERO), _ONE) * np.float32(255) + np.float32(0.5)))

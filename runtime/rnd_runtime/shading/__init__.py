@@ -1,0 +1,1 @@
+"""Light probes, the BRDF, shadows and the shading modes."""

@@ -1,0 +1,126 @@
+"""The cheapest shading: a light of sixteen harmonics and one number of occlusion per Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import floats, mask
+from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.core.sh import SH_DEGREES, compiled_sh_columns, sh_basis, sh_rotation
+from rnd_runtime.core.simd import WIDTH, aligned_floats, lanes, load, store
+
+from .lanes import (
+    ALBEDO,
+    CHUNK,
+    FREE,
+    NORMAL,
+    RADIANCE,
+    VIEW,
+    ZERO,
+    at_least,
+    enter,
+    leave,
+    lobes_in_lanes,
+    mean_direction,
+    no_number,
+    three,
+    transposed,
+    unit,
+    visibility_in_lanes,
+)
+from .light import Light, texel_directions, texel_solid_angles
+from .specular_lobe import lobe_rows
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+# max(cos, 0)/π leaves of degree 0 to 2 (Ramamoorthi, Hanrahan 2001); of degree 3 it leaves nothing
+_COSINE = np.array([1, 2 / 3, 1 / 4], np.float32)[SH_DEGREES[:9]]
+
+
+@dataclass(frozen=True, eq=False)
+class AmbientLight:
+    """A light probe as spherical harmonics of degree 3.
+
+    Attributes:
+        coefficients: [16, 3] linear radiance, in the light probe's frame.
+    """
+
+    coefficients: Floats
+
+    @classmethod
+    def project(cls, light: Light, texels: tuple[int, int]) -> AmbientLight:
+        """From ``light`` downsized to ``texels`` (height, width)."""
+        flux = light.resized(*texels).radiance * texel_solid_angles(*texels)[..., None]
+        return cls(np.einsum("hwj,hwc->jc", sh_basis(texel_directions(*texels)), flux))
+
+    def shade(
+        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
+    ) -> Floats32:
+        """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + specular of the bare light) · occlusion.
+
+        Occlusion is the visibility's mean over the upper hemisphere, weighted by the cosine. Both it and E(n)
+        are exact up to degree 2 and know nothing of each other: light from the open side counts no more than
+        from the blocked one. 0 where not ``seen``.
+        """
+        root = np.asarray(gaussians.root_rotation, np.float64)
+        in_root = sh_rotation(root.T @ light_to_world) @ self.coefficients
+        radiance = np.zeros((len(gaussians.means), 3), np.float32)
+        arrays = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
+        _ambient(
+            tuple(floats(array) for array in arrays),
+            np.array(camera_position, np.float32),
+            np.array(root, np.float32, order="C"),
+            (np.array(in_root, np.float32, order="C"), lobe_rows()),
+            mask(seen, len(radiance)),
+            radiance,
+        )
+        return radiance
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: ignore[no-untyped-def]
+    """As ``.shading_lookup.look_up``, with ``tables`` the light [16, 3] in the root's frame and the lobes."""
+    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+        members, room = np.empty(WIDTH, np.int64), aligned_floats(FREE)
+        rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        while i < last:
+            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            if count > 0:
+                _shade_sixteen(members, surfaces[4], root_rotation, tables, room, rows, columns)
+                leave(count, members, room, radiance)
+
+
+@njit(error_model="numpy")
+def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, columns):  # type: ignore[no-untyped-def]
+    """Radiance over the albedo in ``room``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+    light, lobes = tables
+    normal = transposed(root_rotation, three(room, NORMAL))
+    view = unit(transposed(root_rotation, three(room, VIEW)))
+    n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+    lobes_in_lanes(lobes, n_dot_v, room, rows, columns)
+    energy, shrink = load(columns, 0), three(columns, 4 * WIDTH)
+    at_lobe = compiled_sh_columns(*mean_direction(columns, normal, view, n_dot_v))
+    at_normal = compiled_sh_columns(*normal)
+    visibility_in_lanes(members, visibility, rows, columns)
+    broken = no_number(room, columns)
+
+    occlusion = lanes(ZERO)
+    for j in range(9):
+        occlusion += _COSINE[j] * (at_normal[j] * load(columns, j * WIDTH))
+    occlusion = at_least(occlusion, ZERO)
+    for channel in range(3):
+        diffuse, shine = lanes(ZERO), at_lobe[0] * light[0, channel]
+        for j in range(9):
+            diffuse += _COSINE[j] * light[j, channel] * at_normal[j]
+        for j in range(1, 16):
+            left = shrink[0] if j < 4 else (shrink[1] if j < 9 else shrink[2])
+            shine += left * (at_lobe[j] * light[j, channel])
+        at = channel * WIDTH
+        matt = load(room, ALBEDO + at) * at_least(diffuse, ZERO)
+        store(room, RADIANCE + at, occlusion * (matt + energy * at_least(shine, ZERO)) + broken)

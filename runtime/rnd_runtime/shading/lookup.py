@@ -1,0 +1,181 @@
+"""Shading from tables, sixteen Gaussians at a time (numba over sixteen lanes); the tables: ``.shading_tables``."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from rnd_runtime.core.sh import compiled_sh_columns
+from rnd_runtime.core.simd import (
+    WIDTH,
+    aligned_floats,
+    lanes,
+    load,
+    magnitude,
+    select,
+    spread,
+    store,
+    total,
+    transpose,
+    whole,
+)
+
+from .lanes import (
+    ALBEDO,
+    CHUNK,
+    COLUMN,
+    FREE,
+    NORMAL,
+    ONE,
+    ONE_OVER_PI,
+    RADIANCE,
+    ROW,
+    TINY,
+    VIEW,
+    ZERO,
+    S,
+    T,
+    at_least,
+    clamped,
+    enter,
+    four_corners,
+    leave,
+    lobes_in_lanes,
+    mean_direction,
+    no_number,
+    store_cell,
+    three,
+    transposed,
+    unit,
+    visibility_in_lanes,
+)
+
+DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
+SPECULAR_SIZE = 49
+
+# A row of the specular table: RGB and nothing, of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1) in (s, t). A
+# corner's share is (s or 1 − s)(t or 1 − t): constant plus slope times s, times the same of t.
+_SIGNS = np.array([-1, 1], np.float32)
+_S_SLOPE = np.tile(np.repeat(_SIGNS, 4), 2)
+_T_SLOPE = np.repeat(_SIGNS, 8)
+_S_CONSTANT, _T_CONSTANT = np.maximum(-_S_SLOPE, 0), np.maximum(-_T_SLOPE, 0)
+
+(_LEVEL, _UP) = (FREE, FREE + WIDTH)  # rows of a thread's working memory
+_IRRADIANCE = FREE + 2 * WIDTH  # three
+_ROOM = FREE + 5 * WIDTH
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def look_up(surfaces, camera, rotations, tables, seen, radiance):  # type: ignore[no-untyped-def]
+    """Fill ``radiance`` [N, 3] of the Gaussians ``seen`` [N].
+
+    Args:
+        surfaces: means [N, 3] m, normals [N, 3], albedo [N, 3], roughness [N] and visibility [N, 16].
+        camera: [3] m. rotations: light → world and root → light, [3, 3] each.
+        tables: diffuse [33·33, 3·16] for visibility in the root's frame; specular [49·49, 7, 16] of cells; lobes
+            [16, 49, 16].
+    """
+    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+        members, room = np.empty(WIDTH, np.int64), aligned_floats(_ROOM)
+        rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        while i < last:
+            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            if count > 0:
+                _shade_sixteen(members, surfaces[4], rotations, tables, room, rows, columns)
+                leave(count, members, room, radiance)
+
+
+@njit(error_model="numpy")
+def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):  # type: ignore[no-untyped-def]
+    """Radiance over the albedo in ``room``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+    light_to_world, root_to_light = rotations
+    diffuse, specular, lobes = tables
+    normal = transposed(light_to_world, three(room, NORMAL))
+    view = unit(transposed(light_to_world, three(room, VIEW)))
+    n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+
+    lobes_in_lanes(lobes, n_dot_v, room, rows, columns)
+    energy, place = load(columns, 0), load(columns, 3 * WIDTH)
+    mean = mean_direction(columns, normal, view, n_dot_v)
+    shrink = three(columns, 4 * WIDTH)
+    visibility_in_lanes(members, visibility, rows, columns)
+    broken = no_number(room, columns)
+    energy = energy * at_least(_open_share(root_to_light, mean, shrink, columns), ZERO)
+
+    _place_in_square(mean[0], mean[1], mean[2], SPECULAR_SIZE, room)
+    levels = specular.shape[1]
+    level = whole(clamped(place, np.float32(levels - 2)))
+    store(room, _LEVEL, level)
+    store(room, _UP, place - level)
+    s_slope, s_constant = load(_S_SLOPE, 0), load(_S_CONSTANT, 0)
+    t_slope, t_constant = load(_T_SLOPE, 0), load(_T_CONSTANT, 0)
+    for k in range(WIDTH):
+        cell = int(room[ROW + k]) * SPECULAR_SIZE + int(room[COLUMN + k])
+        at = (cell * levels + int(room[_LEVEL + k])) * WIDTH
+        lower, upper = load(specular, at), load(specular, at + WIDTH)
+        share = (s_constant + s_slope * room[S + k]) * (t_constant + t_slope * room[T + k])
+        store(rows, k * WIDTH, share * (lower + room[_UP + k] * (upper - lower)))
+    transpose(rows, columns)
+
+    _place_in_square(normal[0], normal[1], normal[2], DIFFUSE_SIZE, room)
+    row = 3 * WIDTH  # of one node
+    for k in range(WIDTH):
+        at = (int(room[ROW + k]) * DIFFUSE_SIZE + int(room[COLUMN + k])) * row
+        coefficients = load(visibility, members[k] * WIDTH)
+        for channel in range(3):
+            met = four_corners(diffuse, at + channel * WIDTH, row, DIFFUSE_SIZE * row, room, k)
+            room[_IRRADIANCE + channel * WIDTH + k] = total(coefficients * met)
+
+    for channel in range(3):
+        at = channel * WIDTH
+        shine = load(columns, at) + load(columns, at + 4 * WIDTH)
+        shine += load(columns, at + 8 * WIDTH) + load(columns, at + 12 * WIDTH)
+        matt = load(room, ALBEDO + at) * ONE_OVER_PI * load(room, _IRRADIANCE + at)
+        store(room, RADIANCE + at, at_least(matt + energy * shine, ZERO) + broken)
+
+
+@njit(inline="always")
+def _place_in_square(x, y, z, size, room):  # type: ignore[no-untyped-def]
+    """See ``.shading_tables.octahedral_nodes``."""
+    scale = ONE / at_least(magnitude(x) + magnitude(y) + magnitude(z), TINY)
+    a, b = x * scale, y * scale
+    below = z < ZERO
+    folded_a, folded_b = ONE - magnitude(b), ONE - magnitude(a)
+    folded_a = select(a < ZERO, ZERO - folded_a, folded_a)
+    folded_b = select(b < ZERO, ZERO - folded_b, folded_b)
+    a, b = select(below, folded_a, a), select(below, folded_b, b)
+    half = np.float32(0.5 * (size - 1))
+    store_cell((b + ONE) * half, (a + ONE) * half, size, size, room)
+
+
+@njit(inline="always")
+def _open_share(root_to_light, mean, shrink, visibility):  # type: ignore[no-untyped-def]
+    """Visibility averaged over the lobe, from its coefficients [16, lanes]."""
+    basis = compiled_sh_columns(*transposed(root_to_light, mean))
+    first = load(visibility, WIDTH) * basis[1] + load(visibility, 2 * WIDTH) * basis[2]
+    first += load(visibility, 3 * WIDTH) * basis[3]
+    second = load(visibility, 4 * WIDTH) * basis[4] + load(visibility, 5 * WIDTH) * basis[5]
+    second += load(visibility, 6 * WIDTH) * basis[6] + load(visibility, 7 * WIDTH) * basis[7]
+    second += load(visibility, 8 * WIDTH) * basis[8]
+    third = load(visibility, 9 * WIDTH) * basis[9] + load(visibility, 10 * WIDTH) * basis[10]
+    third += load(visibility, 11 * WIDTH) * basis[11] + load(visibility, 12 * WIDTH) * basis[12]
+    third += load(visibility, 13 * WIDTH) * basis[13] + load(visibility, 14 * WIDTH) * basis[14]
+    third += load(visibility, 15 * WIDTH) * basis[15]
+    return load(visibility, 0) * basis[0] + shrink[0] * first + shrink[1] * second + shrink[2] * third
+
+
+@njit(parallel=True, nogil=True, cache=True)
+def turned(diffuse, turn):  # type: ignore[no-untyped-def]
+    """Diffuse tables [33·33, 3·16] that take coefficients before ``turn`` [16, 16]: 3 267 rows instead of N.
+
+    In numba, since a BLAS product would leave threads spinning that slow the look-up threefold.
+    """
+    result = np.empty_like(diffuse)
+    for i in prange(len(diffuse)):
+        for at in range(i * 3 * WIDTH, (i + 1) * 3 * WIDTH, WIDTH):
+            row = lanes(ZERO)
+            for source in range(WIDTH):
+                row += spread(diffuse, at + source) * load(turn, source * WIDTH)
+            store(result, at, row)
+    return result

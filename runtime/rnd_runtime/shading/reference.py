@@ -1,0 +1,118 @@
+"""Shading as it is defined, in plain float64: what every faster way is measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.core.sh import sh_basis
+
+from .brdf import specular
+from .light import Light, texel_directions, texel_solid_angles
+from .shader import SHADOW_RESOLUTION, shadow_radii
+from .shadow import directional_visibility
+from .sun import extract_suns
+from .sunlight import AT_SILHOUETTE, TURNED_AWAY
+
+Floats = NDArray[np.float64]
+
+_AT_A_TIME = 2**14  # pairs of a Gaussian and a texel: arrays of 128 kB, which a core's own cache holds
+
+
+def shade_reference(
+    gaussians: Gaussians, light: Light, camera_position: ArrayLike, *, texels: tuple[int, int] = (32, 64)
+) -> Floats:
+    """Linear radiance [N, 3] that each Gaussian sends to the camera, summed over every texel of the light.
+
+        L_o = max(0, Σ_k L_k Δω_k v(ω_k) f(ω_k, ω_o) max(n·ω_k, 0)),   v(ω) = Σ_j v_j Y_j(ω)
+
+    over the light downsized to ``texels`` (height, width). v is linear: it is **not** clamped to [0, 1], since
+    that costs 5 dB under an overcast sky; only the sum is clamped, at 0.
+
+    Args:
+        camera_position: [3] m, world.
+    """
+    probe = light.resized(*texels)
+    directions = texel_directions(*texels).reshape(-1, 3) @ light.rotation.T  # world
+    flux = (probe.radiance.astype(np.float64) * texel_solid_angles(*texels)[..., None]).reshape(-1, 3)
+    # rows times R: the root's frame
+    basis = sh_basis(directions @ np.asarray(gaussians.root_rotation, np.float64))
+    harmonics = np.asarray(gaussians.visibility, np.float64)
+    summed = _sum_over_texels(gaussians, directions, flux, lambda part: harmonics[part] @ basis.T, camera_position)
+    return np.maximum(summed, 0)
+
+
+def shade_reference_with_suns(
+    gaussians: Gaussians, light: Light, camera_position: ArrayLike, *, texels: tuple[int, int] = (32, 64)
+) -> Floats:
+    """What ``table+sun`` stands for: the sky as ``shade_reference``, and every texel of the suns in the whole map.
+
+        L_o = sky + Σ_s V_s Σ_{k in s} ΔL_k Δω_k f(ω_k, ω_o) max(n·ω_k, 0)
+
+    with ΔL what ``shading.sun.extract_suns`` takes out of the map, by the sun that lies nearest, and V_s how
+    much of a sun's middle ``shading.shader.Shader`` lets reach a Gaussian: its depth maps are no
+    approximation of the sum's, but another visibility. Arguments as of ``shade_reference``.
+    """
+    sky, suns = extract_suns(light)
+    radiance = shade_reference(gaussians, sky, camera_position, texels=texels)
+    if not suns:
+        return radiance
+    height, width = sky.radiance.shape[:2]
+    whole = light.resized(height, width).radiance.astype(np.float64) - sky.radiance
+    taken = np.abs(whole).max(axis=-1) > 0
+    local = texel_directions(height, width)[taken]
+    flux = whole[taken] * np.broadcast_to(texel_solid_angles(height, width), taken.shape)[taken][:, None]
+    middles = np.array([sun.direction for sun in suns])
+    nearest = np.argmax(local @ middles.T, axis=1)
+    reached = _reached_by_suns(gaussians, middles @ light.rotation.T, camera_position)
+    for sun in range(len(suns)):
+        own = nearest == sun
+        visibility = reached[:, sun : sun + 1].__getitem__
+        directions = local[own] @ light.rotation.T
+        radiance += _sum_over_texels(gaussians, directions, flux[own], visibility, camera_position)
+    return radiance
+
+
+def _reached_by_suns(gaussians: Gaussians, directions: Floats, camera_position: ArrayLike) -> Floats:
+    """How much of suns in world ``directions`` [S, 3] the shader lets reach each Gaussian: [N, S]."""
+    shadows = directional_visibility(
+        gaussians.means, gaussians.normals, directions, radii=shadow_radii(gaussians), resolution=SHADOW_RESOLUTION
+    )
+    n_dot_v = np.sum(np.asarray(gaussians.normals, np.float64) * _to_camera(gaussians, camera_position), axis=-1)
+    fades = np.clip((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), 0, 1)
+    return np.asarray(shadows * fades[:, None], np.float64)
+
+
+def _to_camera(gaussians: Gaussians, camera_position: ArrayLike) -> Floats:
+    towards = np.asarray(camera_position, np.float64) - gaussians.means
+    return np.asarray(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+
+
+def _sum_over_texels(
+    gaussians: Gaussians,
+    directions: Floats,
+    flux: Floats,
+    visibility: Callable[[slice], Floats],
+    camera_position: ArrayLike,
+) -> Floats:
+    """Σ_k flux_k v f max(n·ω_k, 0) [N, 3] of texels with world ``directions`` [K, 3] and L Δω ``flux`` [K, 3].
+
+    ``visibility`` of some Gaussians is [n, K] or [n, 1].
+    """
+    to_camera = _to_camera(gaussians, camera_position)
+    radiance = np.empty((len(gaussians.means), 3))
+    chunk = max(1, _AT_A_TIME // len(directions))
+    for start in range(0, len(radiance), chunk):
+        part = slice(start, start + chunk)
+        normals = np.asarray(gaussians.normals[part], np.float64)
+        n_dot_l, l_dot_v = normals @ directions.T, to_camera[part] @ directions.T  # [chunk, K]
+        n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)
+        roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
+        arriving = visibility(part) * np.maximum(n_dot_l, 0)
+        # f is albedo/π and the specular term, which three channels share
+        shine = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
+        radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + shine @ flux
+    return radiance

@@ -1,0 +1,256 @@
+"""Which points of a body a distant light reaches: depth maps splatted from the points themselves.
+
+No mesh and no capsules: any cloud of points with normals on closed surfaces will do, so clothing and other
+skeletons need nothing of their own. Per direction, every point that faces the light is drawn as a small disc
+in its tangent plane into an orthographic map that keeps what lies nearest to the light; then every point
+looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its
+own tangent plane, so that a slope casts no shadow on itself. Visibility is a continuous function of the places, if a
+steep one.
+
+Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). Threads share the work of
+each direction; their number changes no bit.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import floats, mask
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.simd import WIDTH, aligned_floats, block_x, block_y, lanes, larger, load, store
+
+Floats32 = NDArray[np.float32]
+
+# How far a blocker must rise above a point's tangent plane, in disc radii: a disc of radius r beside it on a
+# surface of curvature 1/R rises r²/2R. 0.5 is enough for exact normals; those of a trained avatar disagree by some
+# 10° and speckled its limbs (28.9 dB instead of 29.0 on relit pictures). More loses shadows where limbs touch.
+CLEARANCE = np.float32(1.0)
+# ... and no less than this many texels, which is what rounding to the map's grid costs on curved surfaces.
+CLEARANCE_TEXELS = np.float32(0.35)
+# Nothing here is a step, else the rounding of a place, or a hair's motion, would switch a texel. A plane falls by DROP
+# metres, which no body rises, over RIM_TEXELS beyond its disc; it sinks by as much while the cosine of its normal goes
+# from EDGE_ON to 0; and light fades while what rises above a point's plane does so by from 1 − SOFTNESS to 1 + SOFTNESS
+# clearances.
+DROP, RIM_TEXELS = np.float32(2), np.float32(0.5)
+EDGE_ON = np.float32(0.02)
+SOFTNESS = np.float32(0.25)
+SLOPE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
+_FAR = np.float32(np.inf)
+_EMPTY = -_FAR
+_NOWHERE = (_FAR, _FAR, -_FAR, -_FAR)  # the least and the greatest x and y of no points
+_ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
+BLOCK_SHIFT = 2
+BLOCK = 1 << BLOCK_SHIFT  # texels; a block is one value of sixteen lanes
+_CHUNK = 1024  # points turned at a time
+
+
+def directional_visibility(
+    points: ArrayLike,
+    normals: ArrayLike,
+    directions: ArrayLike,
+    *,
+    radii: ArrayLike,
+    resolution: int = 256,
+    receivers: ArrayLike | None = None,
+) -> Floats32:
+    """How much of a distant light in each direction reaches each point past all other points, in [0, 1].
+
+    Args:
+        points: [N, 3] m, on closed surfaces.
+        normals: [N, 3] unit, outward, in the frame of the points.
+        directions: [K, 3] unit, **towards** the lights, in the same frame.
+        radii: [N] m or one for all: the distance between neighbours on a lattice, 1.25 times the mean spacing
+            where points are scattered at random (1.0 leaves 4 % of the surface open). A point of radius 0
+            casts no shadow and still receives them.
+        resolution: texels along the longer side of a depth map, which is cut to the points' bounds.
+        receivers: [N] the points whose visibility is wanted; all cast shadows. By default all.
+
+    Returns:
+        [N, K]; 0 where the point faces away from the light or is no receiver. Points that are not finite get 0 and
+        cast nothing.
+    """
+    points, normals, directions = floats(points), floats(normals), floats(directions)
+    if not (points.ndim == 2 and points.shape[1] == 3 and normals.shape == points.shape):
+        raise InputError(
+            "points and normals of a shadow", expected="[N, 3] both", got=f"{points.shape}, {normals.shape}"
+        )
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise InputError("directions of a shadow", expected="[K, 3]", got=directions.shape)
+    if not 8 <= resolution <= 8192:
+        raise InputError("resolution of a depth map", expected="8 to 8192 texels", got=resolution)
+    arrays = points, normals, np.full(len(points), radii, np.float32), mask(receivers, len(points))
+    visibility: Floats32 = cast_shadows(arrays, directions, resolution, numba.get_num_threads())
+    return visibility
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def cast_shadows(arrays, directions, resolution, threads):  # type: ignore[no-untyped-def]
+    """``directional_visibility`` [N, K] of points, normals, radii and receivers."""
+    visibility = np.zeros((len(directions), len(arrays[0])), np.float32)
+    for k in range(len(directions)):
+        _one_direction(arrays, axes_towards(directions[k]), resolution, threads, visibility[k])
+    return np.ascontiguousarray(visibility.T)
+
+
+@numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ignore[no-untyped-def]
+    points, _, radii, receivers = arrays
+    count = len(points)
+    chunks = (count + _CHUNK - 1) // _CHUNK
+    position = np.empty((count, 3), np.float32)  # x, y in the map's plane, z towards the light
+    normal = np.empty((count, 3), np.float32)
+    bounds = np.empty((chunks, 4), np.float32)
+    for chunk in numba.prange(chunks):
+        first, last = chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)
+        _turn(arrays, frame, first, last, position, normal, bounds[chunk])
+    left, bottom, right, top = _NOWHERE
+    for chunk in range(chunks):
+        left, bottom = min(left, bounds[chunk, 0]), min(bottom, bounds[chunk, 1])
+        right, top = max(right, bounds[chunk, 2]), max(top, bounds[chunk, 3])
+    extent = max(right - left, top - bottom)
+    if not extent > 0:  # a single point, or none: nothing to cast
+        extent = np.float32(1)
+    # texel centres lie at integers; empty rows around serve the lookup of the outermost points, a last one in case that
+    # rounding puts them on the next integer
+    texel = extent / np.float32(resolution - 3)
+    width = int((right - left) / texel) + 4 if right >= left else 4
+    height = int((top - bottom) / texel) + 4 if right >= left else 4
+    across, down = (width + BLOCK - 1) // BLOCK, (height + BLOCK - 1) // BLOCK
+    depth = aligned_floats(across * down * WIDTH)  # block by block
+    depth[:] = _EMPTY
+    for i in numba.prange(count):
+        if normal[i, 2] > 0:
+            position[i, 0] = (position[i, 0] - left) / texel + 1
+            position[i, 1] = (position[i, 1] - bottom) / texel + 1
+    # each thread draws rows of its own, and about as many discs as the others
+    edges = _bands(position, normal, down, threads)
+    for band in numba.prange(len(edges) - 1):
+        for i in range(count):
+            if normal[i, 2] > 0 and radii[i] > 0:
+                _draw_disc(depth, across, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
+    for i in numba.prange(count):
+        if normal[i, 2] > 0 and receivers[i]:
+            visibility[i] = _look_up(depth, across, position, normal, i, radii[i], texel)
+
+
+@numba.njit(error_model="numpy")
+def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
+    """Rows first … last − 1 in the axes of ``frame``, and the least and greatest x and y among them."""
+    points, normals, radii, _ = arrays
+    left, bottom, right, top = _NOWHERE
+    for i in range(first, last):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        if not np.isfinite(px + py + pz + nx + ny + nz + radii[i]):
+            normal[i, 2] = -1  # faces away: neither casts nor receives
+            continue
+        for axis in range(3):
+            fx, fy, fz = frame[axis, 0], frame[axis, 1], frame[axis, 2]
+            position[i, axis] = fx * px + fy * py + fz * pz
+            normal[i, axis] = fx * nx + fy * ny + fz * nz
+        left, right = min(left, position[i, 0]), max(right, position[i, 0])
+        bottom, top = min(bottom, position[i, 1]), max(top, position[i, 1])
+    bounds[0], bounds[1], bounds[2], bounds[3] = left, bottom, right, top
+
+
+@numba.njit(error_model="numpy")
+def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
+    """Rows of blocks [bands + 1] that cut a map into bands with about equally many points that face the light."""
+    points = np.zeros(height + 1, np.int64)
+    for i in range(len(position)):
+        if normal[i, 2] > 0:
+            points[(int(position[i, 1]) >> BLOCK_SHIFT) + 1] += 1
+    for row in range(height):
+        points[row + 1] += points[row]
+    edges = np.empty(bands + 1, np.int64)
+    for band in range(bands):
+        edges[band] = np.searchsorted(points[: height + 1], points[height] * band // bands)
+    edges[0], edges[bands] = 0, height
+    return edges
+
+
+@numba.njit(cache=True)
+def axes_towards(direction):  # type: ignore[no-untyped-def]
+    """Rows: two axes across ``direction`` and the direction itself, a right-handed orthonormal frame."""
+    frame = np.zeros((3, 3), np.float32)
+    x, y, z = frame[0], frame[1], frame[2]
+    _normalized(direction, z)
+    least = 0
+    for axis in range(1, 3):
+        least = axis if abs(z[axis]) < abs(z[least]) else least
+    y[least] = 1
+    _cross(y, z, x)
+    _normalized(x, x)
+    _cross(z, x, y)
+    return frame
+
+
+@numba.njit(inline="always")
+def _normalized(vector, out):  # type: ignore[no-untyped-def]
+    length = np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    for axis in range(3):
+        out[axis] = vector[axis] / length
+
+
+@numba.njit(inline="always")
+def _cross(a, b, out):  # type: ignore[no-untyped-def]
+    for axis in range(3):
+        after, last = (axis + 1) % 3, (axis + 2) % 3
+        out[axis] = a[after] * b[last] - a[last] * b[after]
+
+
+@numba.njit(error_model="numpy")
+def _slopes(normal, i, texel):  # type: ignore[no-untyped-def]
+    """Rise of point i's tangent plane towards the light, in metres a texel, along x and y."""
+    scale = -texel / max(normal[i, 2], SLOPE_FLOOR)
+    return normal[i, 0] * scale, normal[i, 1] * scale
+
+
+@numba.njit(error_model="numpy")
+def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  # type: ignore[no-untyped-def]
+    """Keep the disc's plane, and its fall around, where nearer to the light, in rows of blocks ``low`` … ``high``."""
+    x, y = position[i, 0], position[i, 1]
+    z = position[i, 2] - DROP * max(_ONE - normal[i, 2] / EDGE_ON, _ZERO)
+    slope_x, slope_y = _slopes(normal, i, texel)
+    reach = radius / texel + RIM_TEXELS
+    square, cosine = radius * radius, max(normal[i, 2], SLOPE_FLOOR)
+    fall = DROP / (reach * reach * texel * texel - square)
+    left, right = max(int(x - reach), 0) >> BLOCK_SHIFT, min((int(x + reach) >> BLOCK_SHIFT) + 1, across)
+    top, bottom = max(int(y - reach), 0) >> BLOCK_SHIFT, (int(y + reach) >> BLOCK_SHIFT) + 1
+    for row in range(max(top, low), min(bottom, high)):
+        dy = block_y() + (np.float32(row * BLOCK) - y)
+        for column in range(left, right):
+            dx = block_x() + (np.float32(column * BLOCK) - x)
+            rise = slope_x * dx + slope_y * dy
+            # beyond the circle, and beyond the ellipse that one sees of it
+            beyond = (dx * dx + dy * dy) * (texel * texel) - square
+            outside = larger(beyond, lanes(_ZERO)) + cosine * larger(beyond + rise * rise, lanes(_ZERO))
+            plane = z + rise - fall * outside
+            at = (row * across + column) * WIDTH
+            store(depth, at, larger(plane, load(depth, at)))
+
+
+@numba.njit(inline="always")
+def _place(row, column, across):  # type: ignore[no-untyped-def]
+    """Of a texel in a map that is kept as rows of ``across`` blocks of 4×4."""
+    block = (row >> BLOCK_SHIFT) * across + (column >> BLOCK_SHIFT)
+    return block * WIDTH + (row & BLOCK - 1) * BLOCK + (column & BLOCK - 1)
+
+
+@numba.njit(error_model="numpy")
+def _look_up(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
+    """Bilinear share of the four texels around a point that lies open: what rises above its plane hides it."""
+    x, y, z = position[i, 0], position[i, 1], position[i, 2]
+    slope_x, slope_y = _slopes(normal, i, texel)
+    clearance = max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
+    top, span = (_ONE + SOFTNESS) * clearance, _ONE / (_TWO * SOFTNESS * clearance)
+    column, row = int(x), int(y)  # positive, and one texel short of the far edge
+    lit = np.float32(0)
+    for corner in range(4):
+        c, r = column + (corner & 1), row + (corner >> 1)
+        dx, dy = np.float32(c) - x, np.float32(r) - y
+        open_share = (z + slope_x * dx + slope_y * dy + top - depth[_place(r, c, across)]) * span
+        lit += (1 - abs(dx)) * (1 - abs(dy)) * min(max(open_share, _ZERO), _ONE)
+    return min(lit, np.float32(1))

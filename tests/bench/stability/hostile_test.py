@@ -1,0 +1,87 @@
+"""Broken files, kills and threads: short runs of what ``rnd-bench --stability`` does for hours."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from rnd_bench.stability.commands import environment
+from rnd_bench.stability.determinism import backends_agree, frames_agree
+from rnd_bench.stability.fuzz import READERS, fuzz, prepare
+from rnd_bench.stability.kill import half_files
+
+INPUTS = 40
+
+
+@pytest.fixture(scope="module")
+def honest(subject):
+    """One honest file of every kind."""
+    folder = subject.work / "fuzz"
+    prepare(folder, subject.avatar_file, subject.checkpoint, subject.capture.folder)
+    return folder
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_broken_files_are_refused_or_read(reader, honest):
+    figures, record = fuzz(honest, INPUTS, (reader,))
+    assert record[reader]["inputs"] == INPUTS and record[reader]["refused"] > 0
+    assert [figure for figure in figures if not figure.passes] == []
+
+
+def test_batches_that_were_fed_are_not_fed_again(honest, monkeypatch):
+    from rnd_bench.stability import fuzz as module
+
+    monkeypatch.setattr(module, "BATCH", 6)
+    fed, batch = [], module._batch
+    monkeypatch.setattr(module, "_batch", lambda *words: fed.append(words) or batch(*words))
+    first = fuzz(honest, 12, ("hdr",))[1]
+    again = fuzz(honest, 20, ("hdr",))[1]
+    assert [(seed, size) for _, _, seed, size in fed] == [(0, 6), (1, 6), (2, 6), (3, 2)]
+    assert first["hdr"]["inputs"] == 12 and again["hdr"]["inputs"] == 20
+    assert again["hdr"]["refused"] >= first["hdr"]["refused"]
+
+
+_WRITER = """
+import itertools, sys
+from pathlib import Path
+import numpy as np
+from rnd_runtime.images import write_image
+from rnd_runtime.npz import save_npz
+folder, noise = Path(sys.argv[1]), np.random.default_rng(0).integers(0, 255, (200, 200, 3)).astype(np.uint8)
+print("ready", flush=True)
+for number in itertools.count():
+    write_image(folder / f"{number % 3}.png", noise)
+    save_npz(folder / "numbers.npz", {"values": np.arange(50_000.0) + number})
+"""
+
+
+def test_a_killed_writer_leaves_whole_files_under_final_names(tmp_path):
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        process = subprocess.Popen(
+            [sys.executable, "-c", _WRITER, str(tmp_path)], env=environment(), stdout=subprocess.PIPE, text=True
+        )
+        with process:
+            assert process.stdout is not None and process.stdout.readline() == "ready\n"
+            time.sleep(float(rng.uniform(0.05, 0.3)))
+            process.send_signal(signal.SIGKILL)
+        assert half_files(tmp_path) == []
+        if (tmp_path / "numbers.npz").exists():
+            values = np.load(tmp_path / "numbers.npz")["values"]
+            assert len(values) == 50_000 and np.all(np.diff(values) == 1)
+    assert list(tmp_path.glob("[0-2].png"))
+
+
+def test_half_a_file_is_told_from_a_whole_one(tmp_path):
+    (tmp_path / "half.json").write_text('{"a": ')
+    (tmp_path / "whole.json").write_text("{}")
+    assert half_files(tmp_path) == ["half.json: JSONDecodeError"]
+
+
+def test_both_openglbackends_agree_draw_the_same_bits(subject):
+    assert backends_agree(subject).passes and frames_agree(subject).passes

@@ -1,0 +1,9 @@
+"""Folders that tests read from."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+"""of the clone"""
+ASSETS = ROOT / "assets"
+SHARED = ROOT.parent / "shared"
+"""beside the clone; may be absent"""

@@ -1,0 +1,155 @@
+"""Options and files that a command cannot use: one line that names them, exit code 2, and nothing is begun."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+import rnd_bench.cli
+import rnd_export.cli
+import rnd_stage.cli
+import rnd_trainer.commands.data
+import rnd_trainer.commands.eval
+import rnd_trainer.commands.train
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import existing_file, write_json
+from rnd_trainer.training.data import load_views
+from support.paths import ASSETS
+
+CAPTURE = str(ASSETS / "capture")
+COMMANDS = {
+    "rnd-train": rnd_trainer.commands.train.main,
+    "rnd-eval": rnd_trainer.commands.eval.main,
+    "rnd-export": rnd_export.cli.main,
+    "rnd-bench": rnd_bench.cli.main,
+    "rnd-data": rnd_trainer.commands.data.main,
+    "rnd-stage": rnd_stage.cli.main,
+}
+BODY, AVATAR = ASSETS / "body.npz", ASSETS / "avatar.onnx"
+MOTION = f"rnd-data motion {ASSETS / 'walk.npz'} OUT/w.npz"
+IS_READ = "output: expected another file than what is read, got"
+IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (f"rnd-train {CAPTURE} --out OUT --seed -1", "--seed: expected at least 0, got -1"),
+        (f"rnd-train {CAPTURE} --out OUT --seed {2**64}", "--seed: expected less than 2^63, got 184467"),
+        (
+            f"rnd-train {CAPTURE} --out OUT --light none --probe-channels 1",
+            "--probe-channels: expected the default, got 1 (--light none learns no light)",
+        ),
+        (
+            f"rnd-train {CAPTURE} --out OUT --light none --visibility paper",
+            "--visibility: expected the default, got paper",
+        ),
+        (f"rnd-train {CAPTURE} --out OUT --steps 0", "--steps: expected at least 1, got 0"),
+        (f"rnd-train {CAPTURE} --out OUT --image-scale 0", "--image-scale: expected more than 0, at most 1, got 0"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 0", "--seeds: expected at least 1, got 0"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --image-scale 2", "--image-scale: expected more than 0, at most 1"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8", "--gaussians: expected 64 to 1000000, got 8"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --chart x.txt", "--chart: expected .svg or .png, got x.txt"),
+        (
+            f"rnd-eval OUT {CAPTURE} --ablate --chart x.svg",
+            "--chart: expected --study lengths beside it, got ablations",
+        ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --method me", "--method: expected the default, got me"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 101", "--seeds: expected at most 100, got 101"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --shade lights:K", "shading mode: expected one of ao, table, table+sun"),
+        (f"rnd-eval OUT {CAPTURE} --seeds 2", "--seeds: expected the default, got 2"),
+        (f"rnd-eval OUT {CAPTURE} --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --study causes", "variant 'true normals': expected normal_gt"),
+        (f"rnd-train {CAPTURE} --out OUT --device mps", "--device: expected cpu, cuda or cuda:NUMBER, got mps"),
+        ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
+        ("rnd-export OUT/avatar.ckpt --cull -2", "--cull: expected a cosine, from -1 to 1, got -2"),
+        (
+            "rnd-export OUT/avatar.ckpt --target visionary --motion walk.npz --cull -0.5",
+            "--cull: expected the default, got -0.5 (is for avatars",
+        ),
+        ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected 2 to 1000, got 1"),
+        (f"rnd-export {BODY} --out {BODY}", "output: expected another file than what is read, got"),
+        (f"rnd-export {BODY} --out a.json", "--out: expected a name in .onnx, got a.json"),
+        ("rnd-export .", "avatar.ckpt: checkpoint not found"),
+        (f"rnd-export {AVATAR}", "not a checkpoint: expected an avatar.ckpt of rnd-train, got .onnx"),
+        ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
+        ("rnd-bench frame --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
+        ("rnd-bench peers --threads 999", "--threads: expected 1 to "),
+        ("rnd-bench --quick --json OUT/grid.json --chart chart.pdf", "--chart: expected .svg or .png, got chart.pdf"),
+        (f"{IMPORT} --every 0", "--every: expected at least 1, got 0"),
+        (f"{IMPORT} --held-out-every 0", "--held-out-every: expected at least 1, got 0"),
+        (f"{IMPORT} --count 0", "--count: expected at least 1, got 0"),
+        (f"{IMPORT} --start 9 --stop 3", "--stop: expected more than --start 9, got 3"),
+        (f"{IMPORT} --fps 0", "--fps: expected 0.001 to 10000, got 0"),
+        (f"{IMPORT} --fps 1e-9", "--fps: expected 0.001 to 10000, got 1e-09"),
+        (f"{MOTION} --fps 20000", "--fps: expected 0.001 to 10000, got 20000"),
+        (f"{MOTION} --source-fps 0", "--source-fps: expected 0.001 to 10000, got 0"),
+        ("rnd-data motion OUT/run.amc OUT/w.npz", "run.amc: motion not found"),
+        (f"{MOTION} --speed 1e-7", "--speed: expected 0.01 to 100, got 1e-07"),
+        (f"{MOTION} --smooth 1e4", "--smooth: expected 0.01 to 1000, got 10000"),
+        (f"rnd-eval OUT {CAPTURE} --json {ASSETS}", "assets: cannot be written: it is a folder"),
+        (f"rnd-eval OUT {CAPTURE} --ablate --json {BODY}/a.json", "body.npz: output folder cannot be made"),
+        (f"rnd-export {BODY} --out {BODY}/a.onnx", "body.npz: output folder cannot be made"),
+        (f"rnd-eval OUT {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
+        (f"rnd-eval OUT/avatar.ckpt {CAPTURE} --json OUT/avatar.ckpt", IS_READ),
+        (f"rnd-eval OUT {CAPTURE} --perceptual-weights {BODY} --json {BODY}", IS_READ),
+        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8 --json {CAPTURE}/capture.json", IS_READ),
+        (f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json OUT.onnx", IS_READ),
+        (f"rnd-export {BODY} --max-mb 5 --capture {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
+        (f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json {ASSETS}", "assets: cannot be written: it is a folder"),
+        ("rnd-stage agreement OUT/a.json --step nan", "--step: expected 0.001 to 0.03 m, got nan"),
+        ("rnd-stage agreement OUT/a.json --step 0", "--step: expected 0.001 to 0.03 m, got 0"),
+        (f"rnd-stage agreement {ASSETS}", "assets: cannot be written: it is a folder"),
+        (
+            "rnd-stage OUT --character X.npz --subject 2",
+            "--subject: expected the default, got 2 (--character has its own)",
+        ),
+        ("rnd-stage OUT --character X.npz --step 0.01", "--step: expected the default, got 0.01 (--character"),
+        ("rnd-stage OUT --estimate-seed -1", "--estimate-seed: expected at least 0, got -1"),
+    ],
+)
+def test_numbers_that_no_command_can_use(line, message, tmp_path, monkeypatch, capsys) -> None:
+    command, *words = line.replace("OUT", str(tmp_path / "out")).split()
+    monkeypatch.setattr("sys.argv", [command, *words])
+    with pytest.raises(SystemExit) as ended:
+        COMMANDS[command]()
+    error = capsys.readouterr().err.lstrip()  # where a progress bar had begun, it has ended its line
+    assert ended.value.code == 2 and error.startswith(command) and message in error, error
+    assert error.count("\n") == 1 and not any(tmp_path.rglob("*.*"))
+
+
+def test_rows_of_another_bench_are_not_added_to(tmp_path, monkeypatch, capsys) -> None:
+    rows = tmp_path / "raster.json"
+    rows.write_text(json.dumps([{"n": 3, "machine": "this one"}]))
+    monkeypatch.setattr("sys.argv", ["rnd-bench", "--quick", "--json", str(rows)])
+    with pytest.raises(SystemExit) as ended:
+        rnd_bench.cli.main()
+    assert ended.value.code == 2 and "expected rows of rnd-bench, got another file" in capsys.readouterr().err
+
+
+def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch) -> None:
+    file = tmp_path / "avatar.onnx"
+    file.write_bytes(b"secret")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # whoever runs the tests
+    with pytest.raises(InputError, match=r"avatar\.onnx: avatar cannot be read: got no permission"):
+        existing_file(file, what="avatar")
+
+
+def test_json_has_no_nan(tmp_path) -> None:
+    write_json(tmp_path / "a.json", {"a": [float("nan"), (1.5, float("inf"))], "b": np.float64(np.nan)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, [1.5, None]], "b": None}
+
+
+def test_pictures_too_small_for_the_losses_are_refused(tiny_capture) -> None:
+    with pytest.raises(InputError, match=r"training pictures: expected at least 11 pixels wide and high, got \d+ x"):
+        load_views(tiny_capture, "train", 0.1)
+
+
+def test_slivers_of_a_person_keep_the_losses_window(tiny_capture) -> None:
+    """Where little of a person is in the picture, the crop is as wide as the structural term's window."""
+    camera = next(iter(tiny_capture.cameras.values()))
+    views, _ = load_views(tiny_capture, "train", 11.5 / min(camera.width, camera.height))
+    assert min(min(view.camera.width, view.camera.height) for view in views) >= 11

@@ -1,0 +1,628 @@
+"""Held-out figures: against independent metrics, on perfect and on spoilt renderings, and as rows of JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numba
+import numpy as np
+import pytest
+import torch
+from msgspec import structs
+
+import rnd_bench.studies.ablate
+import rnd_trainer.commands.eval
+import rnd_trainer.evaluation.evaluate
+import rnd_trainer.evaluation.held_out
+from rnd_bench.charts import draw_lengths
+from rnd_bench.studies.ablate import (
+    CAUSES,
+    LENGTHS,
+    VARIANTS,
+    StudyRow,
+    ablate,
+    check_needs,
+    chosen,
+    encoder_cost,
+    summarise,
+    time_encoders,
+)
+from rnd_runtime.capture.capture import Capture, load_capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import sha256_of, write_json
+from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear
+from rnd_runtime.shading.light import Light
+from rnd_runtime.shading.shader import Shader
+from rnd_trainer.commands.eval import EvalOptions, _is_of, evaluate_run
+from rnd_trainer.config import ModelConfig, to_dict
+from rnd_trainer.evaluation.evaluate import Judge, albedo_scale, evaluate, flicker
+from rnd_trainer.evaluation.evaluator import Rendered, render_runtime
+from rnd_trainer.evaluation.held_out import picture_names, playback, score
+from rnd_trainer.evaluation.scores import frame_scores, normal_picture, outline_length, silhouette, to_srgb8
+from rnd_trainer.losses.metrics import psnr, ssim_map
+from rnd_trainer.model.checkpoint import load_checkpoint, write_tensors
+from rnd_trainer.model.model import AvatarModel
+from rnd_trainer.model.template import sample_template
+from rnd_trainer.training.data import pose_input
+from rnd_trainer.training.state import STATE_FILE, STATE_SCHEMA
+from rnd_trainer.training.training import Training
+from support.tiny import ASSETS
+
+OUTLINE = 0.02  # central differences of an edge one pixel wide: 1.4 % too long
+CV2_SSIM = 2e-3  # OpenCV filters 8-bit levels at float32 and keeps the border; its window is the same
+
+
+def _truth(capture):
+    return capture.load_frame(capture.split("train")[0])
+
+
+def _perfect(truth) -> Rendered:
+    normal = truth.normal if truth.normal_gt is None else truth.normal_gt
+    linear = torch.from_numpy(srgb_to_linear(truth.image_srgb)).float()
+    mask = torch.from_numpy(truth.mask)
+    return Rendered(linear, torch.from_numpy(normal) * mask[..., None], linear, mask)
+
+
+def test_a_perfect_rendering_is_perfect_in_every_figure(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    scores = frame_scores(_perfect(truth), truth)
+    assert scores["psnr"] == scores["psnr_box"] == math.inf
+    assert scores["psnr_n"] > 120  # normals are scaled to unit length once more
+    assert scores["ssim"] == pytest.approx(1) and scores["ssim_n"] == pytest.approx(1)
+    assert scores["normal_deg"] == pytest.approx(0, abs=0.1) and scores["outline_px"] == 0
+
+
+def test_an_albedo_is_compared_after_its_scale(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    perfect = dataclasses.replace(truth, albedo_srgb=truth.image_srgb)
+    scale = torch.tensor([2.0, 1.5, 4.0])
+    half = dataclasses.replace(_perfect(truth), albedo=_perfect(truth).image / scale)
+    assert (
+        frame_scores(half, perfect, scale=scale)["psnr_albedo"] > 60 > 20 > frame_scores(half, perfect)["psnr_albedo"]
+    )
+
+
+def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
+    truth = _truth(tiny_capture)
+    perfect = _perfect(truth)
+    spoilt = dataclasses.replace(perfect, image=0.7 * perfect.image)
+    scores = frame_scores(spoilt, truth)
+    rows, columns = np.nonzero(truth.mask > 0)
+    box = (slice(max(rows.min() - 8, 0), rows.max() + 9), slice(max(columns.min() - 8, 0), columns.max() + 9))
+    target = torch.from_numpy(truth.image_srgb)
+    assert scores["psnr_box"] == pytest.approx(psnr(to_srgb8(spoilt.image)[box], target[box]))
+    assert scores["psnr_box"] < scores["psnr"] < 60
+
+
+def test_an_outline_is_off_by_as_much_as_a_disc_is_too_wide(tiny_capture) -> None:
+    row, column = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
+    distance = torch.hypot(row - 127.3, column - 127.9)
+
+    def disc(radius: float) -> torch.Tensor:
+        return (radius + 0.5 - distance).clamp(0, 1)  # a soft edge, one pixel wide
+
+    assert outline_length(disc(100)) == pytest.approx(2 * math.pi * 100, rel=OUTLINE)
+    truth = dataclasses.replace(
+        _truth(tiny_capture),
+        image_srgb=np.zeros((256, 256, 3), np.float32),
+        mask=disc(100).numpy(),
+        normal=None,
+        normal_gt=None,
+        albedo_srgb=None,
+    )
+    black = torch.zeros(256, 256, 3)
+    for wider in (0.25, -0.25):
+        scores = frame_scores(Rendered(black, black, black, disc(100 + wider)), truth)
+        assert scores["outline_px"] == pytest.approx(0.25, rel=OUTLINE)
+    everywhere = dataclasses.replace(truth, mask=np.ones((256, 256), np.float32))
+    assert "outline_px" not in frame_scores(Rendered(black, black, black, disc(100)), everywhere)
+
+
+@pytest.mark.parametrize(("wrong", "degrees"), [("hole", 0.0), ("beside", math.degrees(math.acos(1 / 3)))])
+def test_normals_without_data_are_not_scored(tiny_capture, wrong, degrees) -> None:
+    """Where the truth has no normal ours may be anything: it counts neither as wrong nor as right."""
+    truth = _truth(tiny_capture)
+    tilted = np.full_like(truth.image_srgb, [-(3**-0.5)] * 3)
+    turned = tilted * [1, 1, -1]
+    normal, half = tilted.copy(), len(tilted) // 2
+    normal[:half] = 0
+    ours = tilted.copy()
+    rows = slice(half) if wrong == "hole" else slice(half, None)
+    ours[rows] = turned[rows]
+    rendered = dataclasses.replace(_perfect(truth), normals=torch.from_numpy(ours))
+    scores = frame_scores(rendered, dataclasses.replace(truth, normal=normal, normal_gt=None))
+    assert scores["normal_deg"] == pytest.approx(degrees, abs=0.1)
+    assert (scores["psnr_n"] > 120) is (scores["ssim_n"] > 0.9999) is (wrong == "hole")
+
+
+def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
+    first, second = (torch.from_numpy(tiny_capture.load_frame(f).image_srgb) for f in tiny_capture.split("train")[:2])
+    a, b = (np.round(x.numpy() * 255).astype(np.uint8) for x in (first, second))
+    expected = cv2.quality.QualityPSNR_compute(a, b)[0][:3]
+    mean_square = np.mean(10 ** (-np.array(expected) / 10))
+    assert psnr(first, second) == pytest.approx(-10 * math.log10(mean_square), abs=1e-3)
+    _, similarity = cv2.quality.QualitySSIM_compute(a, b)
+    ours = ssim_map(first, second).numpy()
+    assert np.abs(ours - similarity[5:-5, 5:-5, :3]).mean() < CV2_SSIM
+
+
+@pytest.mark.parametrize(("visibility", "shadows"), [("pose", True), ("paper", False), ("none", False)])
+def test_a_model_that_learned_without_shadows_is_judged_without(tiny_capture, monkeypatch, visibility, shadows):
+    body = tiny_capture.body
+    config = ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, visibility=visibility)
+    model = AvatarModel(config, sample_template(body, 800, 200, seed=1))
+    overhead = np.zeros((32, 64, 3), np.float32)
+    overhead[1] = 1e3  # the head's shadow falls on the shoulders
+    shader = Shader(Light(overhead), "table+sun")
+    assert shader.suns
+
+    def picture() -> torch.Tensor:
+        pose = pose_input(tiny_capture.motion, body.skeleton, 0.0, config)
+        return render_runtime(model, pose, tiny_capture.cameras["front"], shader).image
+
+    played = picture()
+    monkeypatch.setattr(
+        "rnd_runtime.shading.shader.directional_visibility",
+        lambda points, normals, ways, **_: np.ones((len(points), len(ways)), np.float32),
+    )
+    assert torch.equal(played, picture()) is not shadows
+
+
+def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_capture) -> None:
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    frame = tiny_capture.split("train")[0]
+    whole, all_of_it, *fewer = (
+        Judge(checkpoint, tiny_capture, cull=cull).render(frame).image for cull in (None, -1.0, -0.5, 0.0, 1.0)
+    )
+    assert torch.equal(whole, all_of_it) and fewer[-1].abs().max() == 0
+    backs, backs_and_sides, everything = (float(torch.mean((image - whole) ** 2)) for image in fewer)
+    assert 0 < backs < backs_and_sides < 0.1 * everything
+
+
+def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
+    judge, original = (Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture), type(tiny_capture).load_frame)
+    first = tiny_capture.split("novel_view")[0]
+
+    def with_mask(columns: slice):
+        def load(capture, frame):
+            images = original(capture, frame)
+            mask = np.zeros_like(images.mask)
+            mask[:, columns] = 1
+            return dataclasses.replace(images, mask=mask) if frame == first else images
+
+        return load
+
+    monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 2)))
+    scores = evaluate(judge, "novel_view")
+    assert scores.frames == len(tiny_capture.split("novel_view")) and "ssim_box" in scores.scores
+    assert not np.isnan(list(scores.scores.values())).any()
+    assert scores.scores["normal_deg"] > 0  # of the other frames: nothing of this one's is in the sliver
+    monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 0)))
+    assert evaluate(judge, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
+
+
+def test_normal_pictures_are_black_where_nothing_is() -> None:
+    normals = torch.tensor([[[0.0, 0.0, -0.5], [0.0, 0.0, -2.0]]])
+    picture = normal_picture(normals, torch.tensor([[0.01, 0.5]]))
+    assert torch.equal(picture, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
+
+
+def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
+    mask = torch.zeros(40, 40)
+    mask[12:28, 12:28] = 1
+    mask[12:28, 28] = 0.4  # less than half: still outside
+    band = silhouette(mask)[..., 0]
+    outside, inside = torch.zeros(40, 40), torch.zeros(40, 40)
+    outside[8:32, 8:32] = 1  # four pixels on either side
+    inside[16:24, 16:24] = 1
+    assert torch.equal(band, (outside - inside) > 0)
+
+
+def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_path) -> None:
+    rows = score(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture, method="m", pictures=tmp_path)
+    assert [row["split"] for row in rows] == ["novel_view"]
+    row = json.loads(json.dumps(rows[0]))
+    wanted = {"psnr", "ssim", "psnr_n", "ssim_n", "normal_deg", "psnr_box", "method", "seed", "minutes"}
+    assert wanted <= set(row) and row["frames"] == 2 and "lpips" not in row
+    assert (tmp_path / "novel_view.png").exists() and len(list((tmp_path / "novel_view").glob("*.png"))) == 2
+
+
+def test_strips_have_names_of_their_own_and_are_no_jpegs() -> None:
+    assert picture_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
+    cameras = ["cam0/000001.jpg", "cam1/000001.jpg", "cam1/000002.jpg"]
+    assert list(picture_names(cameras).values()) == ["cam0_000001", "cam1_000001", "000002"]
+
+
+def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, refine_poses=True, steps=2))
+    for _ in range(2):
+        training.step()
+    run = tmp_path / "run"
+    training.save(run)
+    scored: list[Capture] = []
+
+    def score(checkpoint, capture, **_):
+        scored.append(capture)
+        return [{"split": "novel_view", "frames": 1}]
+
+    monkeypatch.setattr(rnd_trainer.evaluation.held_out, "score", score)
+    for place, motion in ((tiny_capture.folder, None), (tiny_capture.file, None), (tiny_capture.folder, "motion.npz")):
+        evaluate_run(EvalOptions(run, place, motion=motion))
+    refined = str((run / "refined_motion.npz").resolve())
+    assert [str(capture.motion.source) for capture in scored] == [refined, refined, tiny_capture.motion.source]
+    other = tmp_path / "other" / tiny_capture.folder.name  # another capture of the same name
+    shutil.copytree(tiny_capture.folder, other)
+    (other / "capture.json").write_bytes(tiny_capture.file.read_bytes() + b"\n")
+    evaluate_run(EvalOptions(run, other))
+    assert Path(str(scored[-1].motion.source)) == other / "motion.npz"
+    (run / "refined_motion.npz").unlink()
+    evaluate_run(EvalOptions(run, tiny_capture.folder))
+    assert str(scored[-1].motion.source) == str(tiny_capture.motion.source)
+
+
+def test_rows_are_written_before_the_table_whose_title_is_the_runs_name(
+    tiny_checkpoint, tiny_capture, tmp_path, monkeypatch, capsys
+) -> None:
+    rows = [{"split": "novel_view", "frames": 1}]
+    monkeypatch.setattr(rnd_trainer.evaluation.held_out, "score", lambda *_, **__: rows)
+    monkeypatch.chdir(tmp_path)
+    Path("r[x]").mkdir()
+    shutil.copy(tiny_checkpoint, "r[x]/avatar.ckpt")
+    evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder))
+    assert "r[x]/avatar.ckpt" in capsys.readouterr().out
+
+    def closed() -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr(rnd_trainer.commands.eval, "wide_console", closed)
+    with pytest.raises(BrokenPipeError):
+        evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder, json=Path("rows.json")))
+    assert json.loads(Path("rows.json").read_text()) == rows
+
+
+def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:
+    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    seen = []
+    result = evaluate(judge, "novel_view", on_frame=lambda frame, rendered, target: seen.append((rendered, target)))
+    expected = np.mean([psnr(to_srgb8(rendered.image), target) for rendered, target in seen])
+    assert result.scores["psnr"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_run, tiny_capture) -> None:
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    moves = tiny_capture.motion
+    still = dataclasses.replace(moves, rotations=np.repeat(moves.rotations[:1], 6, axis=0))
+    assert flicker(Judge(checkpoint, tiny_capture, motion=still), "train") == 0
+    jumping = dataclasses.replace(moves, rotations=moves.rotations[[0, 1, 0, 1, 0, 1]])
+    shaken = flicker(Judge(checkpoint, tiny_capture, motion=jumping), "train")
+    assert shaken is not None and shaken > 1
+    assert flicker(Judge(checkpoint, tiny_capture), "relight") is None
+
+
+def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:
+    """A judge of grey pictures of these sRGB ``values`` by motion frame."""
+
+    def render(frame: object, index: int) -> Rendered:
+        grey = torch.full((*mask.shape, 3), float(srgb_to_linear(np.array(values[index]))))
+        return Rendered(grey, grey, grey, torch.from_numpy(mask))
+
+    capture = SimpleNamespace(split=lambda name: [SimpleNamespace(camera="0", frame=0)])
+    return SimpleNamespace(capture=capture, motion=SimpleNamespace(frame_count=len(values)), render=render)
+
+
+def test_flicker_is_what_does_not_change_evenly() -> None:
+    """Half the second difference: nothing at constant speed, the whole of a step to and fro."""
+    mask = np.ones((4, 5), np.float32)
+    assert flicker(_shown([k * 10 / 255 for k in range(8)], mask)) == pytest.approx(0, abs=1e-3)
+    assert flicker(_shown([k % 2 * 10 / 255 for k in range(8)], mask)) == pytest.approx(10, abs=1e-3)
+
+
+def test_the_training_light_is_the_learned_one_and_others_the_captures(tiny_run, tiny_capture, monkeypatch) -> None:
+    frames = tuple(
+        structs.replace(frame, light="noon" if frame.split == "train" else "dusk") for frame in tiny_capture.frames
+    )
+    capture = dataclasses.replace(tiny_capture, frames=frames)
+    monkeypatch.setattr(Capture, "load_light", lambda self, name: f"the true {name}")
+    monkeypatch.setattr(rnd_trainer.evaluation.evaluate, "Shader", lambda light, mode: light)
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    checkpoint.info["lights"] = {"noon": None}  # the capture has no map of it
+    judge = Judge(checkpoint, capture)
+    assert judge._shader("dusk") == "the true dusk"
+    for name in ("noon", None):
+        assert np.array_equal(judge._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
+
+
+def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:
+    """A renamed or edited capture keeps it; another map of the same name, in a folder of the same name, is another."""
+    shutil.copytree(ASSETS / "capture", tmp_path / "me/capture")
+    mine = load_capture(tmp_path / "me/capture")
+    training = Training(mine, dataclasses.replace(tiny_config, image_scale=0.1))
+    training.save(tmp_path)
+    name = mine.split("train")[0].light
+    checkpoint = load_checkpoint(tmp_path / "avatar.ckpt")
+    assert checkpoint.learned_under(mine) == {name}
+    shutil.copytree(tmp_path / "me/capture", tmp_path / "renamed")
+    assert checkpoint.learned_under(load_capture(tmp_path / "renamed")) == {name}
+    lights = mine.lights | {name: structs.replace(mine.lights[name], yaw=1.0)}
+    assert checkpoint.learned_under(dataclasses.replace(mine, lights=lights)) == set()
+    assert checkpoint.learned_under(dataclasses.replace(mine, lights={})) == set()
+    old = dataclasses.replace(checkpoint, info={k: v for k, v in checkpoint.info.items() if k != "lights"})
+    assert old.learned_under(mine) == {name}
+    assert old.learned_under(load_capture(tmp_path / "renamed")) == set()
+
+
+def test_the_albedos_scale_is_fitted_to_training_frames() -> None:
+    """By least squares, wherever both cover; lights that are held out say nothing about it."""
+    rng = np.random.default_rng(0)
+    ours, factor = rng.uniform(0.1, 0.3, (6, 7, 3)).astype(np.float32), np.array([1.5, 2.0, 0.5])
+    splits = {"train": 1.0, "relight": 3.0}
+    whole = np.ones((6, 7), np.float32)
+    capture = SimpleNamespace(
+        split=lambda name: [SimpleNamespace(albedo="a.png", split=name)],
+        load_frame=lambda frame: SimpleNamespace(
+            albedo_srgb=linear_to_srgb(splits[frame.split] * factor * ours), mask=whole
+        ),
+    )
+    albedo = torch.from_numpy(ours)
+    rendered = Rendered(albedo, albedo, albedo, torch.from_numpy(whole))
+    scale = albedo_scale(SimpleNamespace(capture=capture, render=lambda frame: rendered))
+    np.testing.assert_allclose(scale.numpy(), factor, rtol=1e-4)
+
+
+def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, tmp_path, monkeypatch) -> None:
+    seconds, now = iter([0.5] * 5 + [0.01] * 30 + [0.001] * 5), [0.0]
+
+    class Renderer:
+        def __init__(self, *_: object, **__: object) -> None:
+            pass
+
+        def render(self, *_: object) -> None:
+            now[0] += next(seconds)
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(rnd_trainer.evaluation.held_out, "FrameRenderer", Renderer)
+    monkeypatch.setattr(rnd_trainer.evaluation.held_out.Avatar, "load", lambda path: None)
+    monkeypatch.setattr(rnd_trainer.evaluation.held_out, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    (tmp_path / "avatar.onnx").write_bytes(bytes(3_000_000))
+    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    assert playback(tmp_path / "avatar.onnx", judge) == {"file_mb": 3.0, "fps": pytest.approx(100)}
+
+
+@pytest.mark.parametrize(
+    ("differences", "shows"),
+    [((2.0, 2.2), True), ((-2.0, -2.2), True), ((-0.1, 0.3), False), ((0.1, -0.3), False), ((2.0,), None)],
+)
+def test_a_loss_shows_as_a_gain_does(differences, shows) -> None:
+    variants = (StudyRow("ours", "", None), StudyRow("less", "", "ours"))
+    common = {"split": "novel_view", "encoder_gflop": 1.0, "encoder_ms": 1.0}
+    rows = [
+        common | {"method": name, "seed": seed, "psnr": 30 + (difference if name == "less" else 0)}
+        for seed, difference in enumerate(differences)
+        for name in ("ours", "less")
+    ]
+    assert summarise(rows, variants)[1]["novel_view"]["shows"] is shows
+
+
+def test_windows_of_the_study_are_as_dense_as_ours() -> None:
+    ours = ModelConfig()
+    step = ours.window_seconds / (ours.window_poses - 1)
+    windows = [row.model for row in VARIANTS if row.name.startswith("d = ")]
+    assert [model["window_poses"] for model in windows] == [2, 5, 20, 30]
+    for model in windows:
+        assert model["window_seconds"] == pytest.approx((model["window_poses"] - 1) * step)
+
+
+def test_ablations_are_trained_once_and_compared_seed_by_seed(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
+    calls: list[tuple[str, int, float, int]] = []
+    config = dataclasses.replace(tiny_config, steps=4)
+    read = Capture.load_frame
+
+    def with_albedo(capture, frame):
+        images = read(capture, frame)
+        return dataclasses.replace(images, albedo_srgb=images.image_srgb)
+
+    monkeypatch.setattr(Capture, "load_frame", with_albedo)
+
+    def go():
+        return ablate(
+            tiny_capture,
+            config,
+            tmp_path,
+            VARIANTS[:3],
+            seeds=(0, 1),
+            perceptual=None,
+            on_run=lambda *call: calls.append(call),
+        )
+
+    rows = go()
+    told = [done for _, _, done, _ in calls]
+    assert len({call[:2] for call in calls}) == 6 and {row["seed"] for row in rows} == {0, 1}
+    assert told == sorted(told) and {0, 0.25, 0.5, 0.75, 1, 5.5, 6} <= set(told)  # four steps each
+    written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
+    assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
+    config = dataclasses.replace(config, steps=5)
+    with pytest.raises(InputError, match="steps of a run done before: expected 5, got 4"):
+        go()
+    config = dataclasses.replace(config, steps=4)
+    poses = tiny_capture.motion
+    tiny_capture = dataclasses.replace(tiny_capture, motion=dataclasses.replace(poses, source="other.npz"))
+    with pytest.raises(InputError, match=r"motion of a run done before: expected other\.npz, got motion\.npz"):
+        go()
+    timed = time_encoders(rows, tmp_path, VARIANTS[:3], 0)
+    assert [row["encoder_gflop"] for row in timed] == [row["encoder_gflop"] for row in rows]
+    table = summarise(timed, VARIANTS[:3])
+    assert [line["method"] for line in table] == ["ours", "LBS, plain colour", "static skinning"]
+    cell = table[2]["novel_view"]
+    both = [
+        next(r["psnr"] for r in rows if r["method"] == name and r["seed"] == seed)
+        for seed in (0, 1)
+        for name in ("static skinning", "ours")
+    ]
+    assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
+    assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
+    ssim = [r["ssim"] for r in rows if (r["method"], r["split"]) == ("static skinning", "novel_view")]
+    assert cell["ssim"] == pytest.approx(sum(ssim) / 2) and "lpips" not in cell
+    assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
+    # plain colours have no albedo that could be compared
+    assert {row["method"] for row in rows if "psnr_albedo" in row} == {"ours", "static skinning"}
+    assert {row["train_threads"] for row in rows} == {numba.get_num_threads()}
+
+
+def test_runs_done_before_are_looked_at_before_any_is_trained(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
+    def train(*_: object) -> None:
+        raise AssertionError("trained")
+
+    def go() -> object:
+        return ablate(
+            tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None, on_run=lambda *call: None
+        )
+
+    monkeypatch.setattr(rnd_bench.studies.ablate, "_train", train)
+    row = {"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": 12}
+    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
+    file = tmp_path / "lbs__plain_colour-0" / "rows.json"
+    with pytest.raises(AssertionError, match="trained"):
+        go()
+    write_json(file, [row | {"steps": 4}])  # the second variant's
+    with pytest.raises(InputError, match=r"rows\.json: steps of a run done before: expected 12, got 4"):
+        go()
+    for broken in ('[{"method": "LBS', "{}", '[{"psnr": 20}]'):
+        file.write_text(broken)
+        with pytest.raises(InputError, match=r"rows\.json: a run done before: expected rows of a study, got an"):
+            go()
+    write_json(file, [row | {"capture_sha256": "of another capture.json"}])
+    with pytest.raises(InputError, match="capture_sha256 of a run done before"):
+        go()
+    for usable in ([row], [row | {"motion": "motion.npz"}], []):  # older rows do not name their motion
+        write_json(file, usable)
+        with pytest.raises(AssertionError, match="trained"):
+            go()
+
+
+def test_runs_begun_before_are_looked_at_before_any_is_trained(
+    tiny_capture, tiny_config, tmp_path, monkeypatch
+) -> None:
+    def train(*_: object) -> None:
+        raise AssertionError("trained")
+
+    def begin(steps: int, rate_residuals: float = tiny_config.rate_residuals, **more: str) -> None:
+        """A state of the second variant, LBS with plain colours, that was to have ``steps``."""
+        model = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
+        others = {"light": "none", "weight_consistency": 0.0, "unseen_fraction": 0.0, "steps": steps}
+        others["rate_residuals"] = rate_residuals
+        config = to_dict(dataclasses.replace(tiny_config, model=model, **others))
+        header = {"schema": STATE_SCHEMA, "config": config, "perceptual_sha256": None, **more}
+        folder = tmp_path / "lbs__plain_colour-0"
+        folder.mkdir(exist_ok=True)
+        write_tensors(folder / STATE_FILE, {"generator": torch.zeros(1)}, header)
+
+    def go() -> object:
+        return ablate(
+            tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None, on_run=lambda *call: None
+        )
+
+    monkeypatch.setattr(rnd_bench.studies.ablate, "_train", train)
+    begin(tiny_config.steps + 1)
+    with pytest.raises(InputError, match=r"training\.state: a run begun before: expected .* other \['steps'\]"):
+        go()
+    begin(tiny_config.steps, capture_sha256="another's")
+    with pytest.raises(InputError, match=r"training\.state: capture_sha256 of a run begun before: expected"):
+        go()
+    begin(tiny_config.steps)
+    with pytest.raises(AssertionError, match="trained"):
+        go()
+    row = {"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": tiny_config.steps}
+    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
+    write_json(tmp_path / "lbs__plain_colour-0" / "rows.json", [row])
+    begin(tiny_config.steps, rate_residuals=tiny_config.rate_residuals / 2)  # done, but at another rate
+    with pytest.raises(InputError, match=r"a run begun before: expected .* other \['rate_residuals'\]"):
+        go()
+
+
+def test_what_a_study_needs_is_looked_for_before_it_begins(tiny_capture) -> None:
+    noisy, true_light = (next(v for v in CAUSES if v.name == name) for name in ("noisy poses", "true light"))
+    with pytest.raises(InputError, match="motion_noisy"):
+        check_needs([noisy], tiny_capture)
+    with pytest.raises(InputError, match="light: expected"):
+        check_needs([true_light], dataclasses.replace(tiny_capture, lights={}))
+    first, *others = tiny_capture.frames
+    two = dataclasses.replace(tiny_capture, frames=(structs.replace(first, light="sky"), *others))
+    with pytest.raises(InputError, match="variant 'true light': expected one light in the train split, got sk"):
+        check_needs([true_light], two)
+
+
+def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, steps=8)
+    shorter = [variant for variant in LENGTHS if variant.name in ("ours", "1/4", "1/2")]
+    rows = ablate(tiny_capture, config, tmp_path, shorter, seeds=(0,), perceptual=None, on_run=lambda *call: None)
+    assert {(row["method"], row["steps"]) for row in rows} == {("ours", 8), ("1/4", 2), ("1/2", 4)}
+    draw_lengths(rows, [tmp_path / "lengths.svg"])
+    drawn = (tmp_path / "lengths.svg").read_text(encoding="utf-8")
+    for said in ("minutes of training", *{row["split"] for row in rows}, *{row["train_machine"] for row in rows}):
+        assert said in drawn
+    draw_lengths(rows, [tmp_path / "again.svg"])
+    assert (tmp_path / "again.svg").read_text(encoding="utf-8") == drawn
+
+
+def test_rows_of_a_study_are_chosen_by_name() -> None:
+    assert chosen(VARIANTS, ()) == VARIANTS
+    assert [one.name for one in chosen(VARIANTS, ("static skinning", "ours"))] == ["ours", "static skinning"]
+    with pytest.raises(InputError, match="--variants"):
+        chosen(VARIANTS, ("ours", "theirs"))
+
+
+def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_capture, tiny_config) -> None:
+    from rnd_trainer.training.training import Training
+
+    costs = {}
+    exact = tuple(structs.replace(frame, normal_gt=frame.normal) for frame in tiny_capture.frames)
+    tiny_capture = dataclasses.replace(tiny_capture, frames=exact)
+    for variant in (*VARIANTS, *CAUSES[:5]):
+        model = dataclasses.replace(tiny_config.model, **variant.model)
+        config = dataclasses.replace(tiny_config, model=model, steps=2, **variant.train)
+        training = Training(tiny_capture, config)
+        assert not any(training.step().skipped for _ in range(2)), variant.name
+        costs[variant.name] = encoder_cost(training.model)["encoder_gflop"]
+    assert costs["d = 2"] < costs["d = 5"] < costs["d = 20"] < costs["d = 30"]
+    assert costs["spatial only"] < costs["ours"]
+
+
+def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
+    tiny_checkpoint, tiny_avatar, tmp_path, capsys
+) -> None:
+    checkpoint, exported = tmp_path / "avatar.ckpt", tmp_path / "avatar.onnx"
+    checkpoint.write_bytes(tiny_checkpoint.read_bytes())
+    assert not _is_of(exported, sha256_of(checkpoint))
+    exported.write_bytes(tiny_avatar.read_bytes())
+    assert _is_of(exported, sha256_of(checkpoint)) and not capsys.readouterr().err
+    checkpoint.write_bytes(tiny_checkpoint.read_bytes() + b"later")
+    assert not _is_of(exported, sha256_of(checkpoint))
+    said = capsys.readouterr().err
+    assert said == f"{exported}: of another checkpoint: its size and speed are left out\n"
+    exported.write_bytes(b"cut")
+    assert not _is_of(exported, sha256_of(checkpoint))  # the figures of the checkpoint are there all the same
+    assert capsys.readouterr().err.startswith(f"{exported}: not a readable ONNX model")
+
+
+def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar, tiny_capture) -> None:
+    rows = score(load_checkpoint(tiny_checkpoint), tiny_capture, method="m", avatar=tiny_avatar)
+    assert rows[0]["file_mb"] == tiny_avatar.stat().st_size / 1e6
+    assert rows[0]["fps"] > 0
+
+
+def test_the_learned_light_stands_in_for_its_own_captures_alone(tiny_run, tiny_capture, tmp_path) -> None:
+    """Under another capture's training light the avatar is relit like under any other light."""
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    light = tiny_capture.split("train")[0].light
+    assert light is not None
+    foreign = dataclasses.replace(tiny_capture, folder=tmp_path)
+    own, other = (Judge(checkpoint, capture)._trained for capture in (tiny_capture, foreign))
+    assert own == {light} and other == set()

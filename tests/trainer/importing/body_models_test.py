@@ -1,0 +1,237 @@
+"""Body models from every file they come in, against the published formulas."""
+
+from __future__ import annotations
+
+import pickle  # noqa: TID251  # writes what others' programs write
+import re
+import sys
+import types
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from rnd_runtime.capture.body import Body
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.readers.arrays import SMPLH_NAMES, SMPLX_NAMES
+from rnd_runtime.motion.skeleton import SMPL_NAMES
+from rnd_trainer.importing import body_models
+from rnd_trainer.importing.body_models import convert_body_model, load_body_model
+from support.known_scene import coarse_body, smpl_arrays
+
+EXACT = 1e-5  # m: bone transforms and weights are float32
+RNG = np.random.default_rng(3)
+
+
+def _family(joints: int) -> dict[str, np.ndarray]:
+    """The members of a small SMPL-H or SMPL-X file: the scene's body with further joints at the wrists and head."""
+    if joints == 24:
+        return smpl_arrays()
+    base = smpl_arrays()
+    count = len(base["v_template"])
+    names = SMPLH_NAMES if joints == 52 else SMPLX_NAMES
+    parents = list(base["kintree_table"][0][:22].astype(int))
+    parents[0] = -1
+    for name in names[22:]:
+        if name in ("jaw", "left_eye", "right_eye"):
+            parents.append(15)
+        elif name.endswith("1"):
+            parents.append(20 if name.startswith("left") else 21)
+        else:
+            parents.append(len(parents) - 1)
+    weights = np.zeros((count, joints))
+    weights[:, :22] = base["weights"][:, :22]
+    weights[:, [20, 21]] += base["weights"][:, 22:]
+    regressor = np.concatenate([base["J_regressor"][:22], base["J_regressor"][[20] * (joints - 22)]])
+    tree = np.stack([np.array(parents) % 2**32, np.arange(joints)])
+    return {
+        **{name: base[name] for name in ("v_template", "f")},
+        "weights": weights,
+        "J_regressor": regressor,
+        "kintree_table": tree,
+        "shapedirs": RNG.normal(size=(count, 3, 16 if joints == 52 else 20)) * 0.01,
+        "posedirs": RNG.normal(size=(count, 3, 9 * (joints - 1))) * 1e-3,
+    }
+
+
+def published(arrays: dict[str, np.ndarray], betas, axis_angles, trans) -> np.ndarray:
+    """Loper et al. 2015, equations 2 to 10, one 4×4 matrix at a time: vertices [V, 3]."""
+    rotations = [axis_angle_to_matrix(a) for a in axis_angles]
+    shaped = arrays["v_template"] + arrays["shapedirs"][:, :, : len(betas)] @ betas
+    joints = arrays["J_regressor"] @ shaped
+    feature = np.concatenate([(R - np.eye(3)).ravel() for R in rotations[1:]])
+    posed = shaped + arrays["posedirs"] @ feature
+    parents = arrays["kintree_table"][0].astype(np.int64)
+    chain: list[np.ndarray] = []
+    for k, R in enumerate(rotations):
+        local = np.eye(4)
+        local[:3, :3] = R
+        local[:3, 3] = joints[k] if k == 0 else joints[k] - joints[parents[k]]
+        chain.append(local if k == 0 else chain[parents[k]] @ local)
+    result = np.zeros_like(posed)
+    for k, G in enumerate(chain):
+        moved = (posed - joints[k]) @ G[:3, :3].T + G[:3, 3]
+        result += arrays["weights"][:, k : k + 1] * moved
+    return result + trans
+
+
+class Ch:
+    """Stands for ``chumpy.ch.Ch`` while a file is written."""
+
+    def __init__(self, x):
+        self.x = x
+
+
+class Select:
+    """Stands for ``chumpy.reordering.Select``."""
+
+    def __init__(self, a, idxs, preferred_shape):
+        self.a, self.idxs, self.preferred_shape = a, idxs, preferred_shape
+
+
+class csc_matrix:
+    """Stands for ``scipy.sparse.csc.csc_matrix``, as SciPy of Python 2 pickled it."""
+
+    def __init__(self, dense):
+        from scipy.sparse import csc_matrix as sparse
+
+        made = sparse(dense)
+        self._shape, self.format, self.maxprint = made.shape, "csc", 50
+        self.data, self.indices, self.indptr = made.data, made.indices, made.indptr
+
+
+Ch.__module__, Select.__module__, csc_matrix.__module__ = "chumpy.ch", "chumpy.reordering", "scipy.sparse.csc"
+
+
+def _write_pickle(path, arrays, monkeypatch) -> None:
+    """As SMPL's .pkl: shapes in chumpy, the regressor sparse, protocol 2."""
+    monkeypatch.setitem(sys.modules, "chumpy", types.ModuleType("chumpy"))
+    for kind in (Ch, Select, csc_matrix):
+        module = types.ModuleType(kind.__module__)
+        setattr(module, kind.__name__, kind)
+        monkeypatch.setitem(sys.modules, kind.__module__, module)
+    shape_dirs = arrays["shapedirs"]
+    content = dict(arrays)
+    content["v_template"] = Ch(arrays["v_template"])
+    content["shapedirs"] = Select(Ch(shape_dirs), np.arange(shape_dirs.size), shape_dirs.shape)
+    content["J_regressor"] = csc_matrix(arrays["J_regressor"])
+    content["bs_style"], content["bs_type"] = "lbs", "lrotmin"
+    path.write_bytes(pickle.dumps(content, protocol=2))
+
+
+@pytest.mark.parametrize(
+    ("joints", "family", "names"), [(24, "SMPL", SMPL_NAMES), (52, "SMPL-H", SMPLH_NAMES), (55, "SMPL-X", SMPLX_NAMES)]
+)
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+def test_posing_agrees_with_the_published_formulas(tmp_path, monkeypatch, joints, family, names, suffix) -> None:
+    arrays = _family(joints)
+    path = tmp_path / f"model{suffix}"
+    if suffix == ".npz":
+        np.savez(path, **arrays, bs_type=np.array("lrotmin"), joint2num=np.array({"pelvis": 0}, dtype=object))
+    else:
+        _write_pickle(path, arrays, monkeypatch)
+    model = load_body_model(path)
+    assert model.family == family and model.template.skeleton.names == names
+    betas = RNG.normal(size=10)
+    axis_angles, trans = 0.5 * RNG.normal(size=(joints, 3)), np.array([0.3, -0.2, 1.5])
+    expected = published(arrays, betas, axis_angles, trans)
+    assert_allclose(model.posed(betas, axis_angle_to_matrix(axis_angles), trans), expected, atol=EXACT)
+    shaped = model.shaped(betas)
+    assert_allclose(shaped.skeleton.rest_joints, arrays["J_regressor"] @ shaped.vertices, atol=1e-9)
+
+
+@pytest.mark.parametrize(("columns", "shapes"), [(10, 10), (16, 16), (20, 10), (400, 300)])
+def test_smplx_columns_of_expressions_are_no_shape(tmp_path, columns, shapes) -> None:
+    """v1.0 holds ten of either, v1.1 300 and 100."""
+    arrays = _family(55)
+    arrays["shapedirs"] = RNG.normal(size=(len(arrays["v_template"]), 3, columns))
+    np.savez(tmp_path / "m.npz", **arrays)
+    model = load_body_model(tmp_path / "m.npz")
+    assert (model.shape_dirs == arrays["shapedirs"][..., :shapes]).all()
+
+
+def test_our_own_body_has_one_shape(tmp_path) -> None:
+    coarse_body().save(tmp_path / "body.npz")
+    model = load_body_model(tmp_path / "body.npz")
+    assert model.family == "template"
+    assert_allclose(model.shaped(np.ones(10)).vertices, coarse_body().vertices, atol=1e-6)
+
+
+def test_a_file_that_executes_something_is_refused_and_does_not(tmp_path) -> None:
+    class Bomb:
+        def __reduce__(self):
+            return (print, ("executed",))
+
+    path = tmp_path / "smpl.pkl"
+    path.write_bytes(pickle.dumps(dict(smpl_arrays(), J=Bomb())))
+    with pytest.raises(InputError, match=r"smpl.pkl.*print"):
+        load_body_model(path)
+
+
+def test_what_does_not_fit_is_named(tmp_path) -> None:
+    arrays = smpl_arrays()
+
+    def refusal(**changes) -> str:
+        np.savez(tmp_path / "m.npz", **{k: v for k, v in (arrays | changes).items() if v is not None})
+        with pytest.raises(InputError) as caught:
+            load_body_model(tmp_path / "m.npz")
+        assert "m.npz" in str(caught.value)
+        return str(caught.value)
+
+    assert "J_regressor" in refusal(J_regressor=None)
+    assert "got 23" in refusal(weights=arrays["weights"][:, :23])
+    assert "posedirs" in refusal(posedirs=arrays["posedirs"][:, :, :200])
+    model_file = tmp_path / "smpl.npz"
+    np.savez(model_file, **arrays)
+    with pytest.raises(InputError, match="at most 10"):
+        load_body_model(model_file).shaped(np.ones(12))
+    load_body_model(model_file).shaped(np.concatenate([np.ones(10), np.zeros(6)]))  # unused ones do no harm
+
+
+def test_anny_stands_in_a_t_pose() -> None:
+    pytest.importorskip("anny")
+    body = load_body_model("anny").template
+    names, joints = list(body.skeleton.names), body.skeleton.rest_joints
+    assert set(SMPL_NAMES[:22]) <= set(names)
+    for side, sign in (("left", 1), ("right", -1)):
+        arm = joints[names.index(f"{side}_wrist")] - joints[names.index(f"{side}_shoulder")]
+        assert arm[0] * sign > 0.3 and abs(arm[1]) < 0.01 and abs(arm[2]) < 0.01
+    assert 1.4 < np.ptp(body.vertices[:, 1]) < 2.0
+    toes, heel = joints[names.index("left_foot")], joints[names.index("left_ankle")]
+    assert toes[2] > heel[2]  # faces +Z
+
+
+def test_a_converted_body_is_the_shaped_one(tmp_path) -> None:
+    np.savez(tmp_path / "smpl.npz", **smpl_arrays())
+    line = convert_body_model(tmp_path / "smpl.npz", tmp_path / "body.npz", (0.8, -0.5), "mine")
+    assert "SMPL, 2340 vertices, 24 joints" in line and line.endswith("licence: mine")
+    body = Body.load(tmp_path / "body.npz")
+    expected = published(smpl_arrays(), np.array([0.8, -0.5]), np.zeros((24, 3)), np.zeros(3))
+    assert_allclose(body.vertices, expected, atol=EXACT)
+    assert body.license == "mine"
+
+
+def test_a_body_is_converted_into_another_npz(tmp_path) -> None:
+    coarse_body().save(tmp_path / "body.npz")
+    before = (tmp_path / "body.npz").read_bytes()
+    with pytest.raises(InputError, match="output: expected another file than what is read"):
+        convert_body_model(tmp_path / "body.npz", tmp_path / "body.npz")
+    assert (tmp_path / "body.npz").read_bytes() == before
+    with pytest.raises(InputError, match=r"output: expected a name that ends in \.npz, got body\.txt"):
+        convert_body_model(tmp_path / "body.npz", tmp_path / "body.txt")
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_betas_that_would_change_nothing_are_refused(tmp_path, monkeypatch) -> None:
+    coarse_body().save(tmp_path / "body.npz")
+    out = tmp_path / "out.npz"
+    said = re.escape(f"--betas: expected none, as {tmp_path / 'body.npz'} has one shape, got 0.5 -0.2")
+    with pytest.raises(InputError, match=said):
+        convert_body_model(tmp_path / "body.npz", out, (0.5, -0.2))
+    monkeypatch.setattr(body_models, "anny_body", coarse_body)
+    with pytest.raises(InputError, match="--betas: expected none, as anny has one shape, got 1"):
+        convert_body_model("anny", out, (1.0,))
+    assert not out.exists()
+    convert_body_model(tmp_path / "body.npz", out)
+    assert out.exists()

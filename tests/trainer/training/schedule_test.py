@@ -1,0 +1,35 @@
+"""How rates fall over a training."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from rnd_trainer.config import from_dict, preset, to_dict
+from rnd_trainer.training.schedule import Schedule
+
+
+@pytest.mark.parametrize("name", ["quick", "standard", "full"])
+def test_rates_stay_high_until_the_last_steps_and_never_rise(name) -> None:
+    config = preset(name)
+    schedule, steps = Schedule(config), config.steps
+    rates = [schedule.decay(step) for step in range(steps)]
+    assert rates[0] == 1 and rates == sorted(rates, reverse=True)
+    begun = round((1 - config.cooling_fraction) * steps)
+    assert rates[begun] == pytest.approx(config.rate_kept ** (begun / steps))
+    assert rates[-1] == pytest.approx(config.rate_kept * config.rate_cooled, rel=0.02)
+    third = [schedule.decay(step) for step in range(steps, schedule.total)]
+    assert third[0] == 1 and third == sorted(third, reverse=True)
+    assert third[-1] == pytest.approx(0.1, rel=0.02)
+
+
+def test_rates_of_a_configuration_from_before_fall_to_a_tenth() -> None:
+    before = {name: value for name, value in to_dict(preset("standard")).items() if not name.startswith("rate_")}
+    schedule = Schedule(from_dict(before))
+    assert [schedule.decay(step) for step in (0, 3000)] == pytest.approx([1, 0.1**0.5])
+
+
+def test_rates_may_fall_without_an_end_of_their_own() -> None:
+    schedule = Schedule(dataclasses.replace(preset("standard"), cooling_fraction=0.0))
+    assert schedule.decay(5999) == pytest.approx(0.5, rel=1e-3)

@@ -1,0 +1,458 @@
+"""The training loop on a tiny capture: it learns, it resumes on the same curve, it survives what it may meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from msgspec.structs import replace
+from safetensors import SafetensorError
+from safetensors.torch import save_file
+
+import rnd_trainer.commands.train
+import rnd_trainer.model.checkpoint
+import rnd_trainer.training.training
+from rnd_runtime.capture.capture import load_capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.images import write_image
+from rnd_trainer.commands.eval import EvalOptions, evaluate_run
+from rnd_trainer.config import from_dict
+from rnd_trainer.losses.losses import linear_to_srgb
+from rnd_trainer.losses.perceptual import load_features, load_lpips
+from rnd_trainer.losses.perceptual_nets import BACKBONES
+from rnd_trainer.model.checkpoint import load_checkpoint, read_tensors, write_tensors
+from rnd_trainer.render.probe import LightProbe
+from rnd_trainer.training.objective import Objective
+from rnd_trainer.training.run import run
+from rnd_trainer.training.state import STATE_SCHEMA
+from rnd_trainer.training.training import MAX_BAD_STEPS, Training
+from trainer.losses.perceptual_test import write_alexnet
+
+
+def _nothing(*_: object) -> None:
+    pass
+
+
+@pytest.fixture
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
+    config = dataclasses.replace(tiny_config, steps=120, stage1_fraction=0.5)
+    training = Training(tiny_capture, config)
+    losses = [training.step().terms["image"] for _ in range(config.steps)]
+    first, stage1, end = (np.mean(part) for part in (losses[:6], losses[54:60], losses[-6:]))
+    assert stage1 < 0.6 * first
+    assert end < 0.6 * first  # shaded: the light is learned from white in sixty steps
+
+
+def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_config) -> None:
+    objective = Objective(tiny_config, LightProbe(), None, None, None, torch.Generator().manual_seed(0))
+    drawn = torch.stack([objective._background() for _ in range(400)])
+    black = (drawn == 0).all(dim=1)
+    assert 0.4 < black.float().mean() < 0.6
+    deciles = linear_to_srgb(drawn[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
+    torch.testing.assert_close(deciles, torch.linspace(0.1, 0.9, 9), atol=0.06, rtol=0)
+    assert from_dict({}).black_backgrounds == 0  # a configuration from before
+
+
+def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
+    rows = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == list(range(14))
+    assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
+    assert "grey" in rows[11] and "grey" not in rows[0]
+    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges", "smooth"}
+    assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
+
+
+def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    """And is not lit again by a training that goes on from there."""
+    training = Training(tiny_capture, tiny_config)
+    while training.step_index < 6:
+        assert not training.lit
+        training.step()
+    training.save(tmp_path)
+    saved = load_checkpoint(tmp_path / "avatar.ckpt").model.appearance_residual
+    colour, albedo = saved[:, :3], saved[:, 3:6]
+    assert colour.any() and torch.equal(albedo, colour)  # the first stage learns colours alone
+    resumed = Training(tiny_capture, tiny_config)
+    resumed.resume(tmp_path / "training.state")
+    assert training.lit and resumed.lit and resumed.step().terms == training.step().terms
+
+
+def test_a_rehearsal_takes_every_term_and_changes_nothing(tiny_capture, tiny_config, one_thread, monkeypatch) -> None:
+    plain, rehearsed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
+    asked = []
+
+    def spy(*given):
+        asked.append(rehearsed_objective(*given))
+        return asked[-1]
+
+    rehearsed_objective = rehearsed.objective
+    monkeypatch.setattr(rehearsed, "objective", spy)
+    rehearsed.rehearse()
+    monkeypatch.undo()
+    assert {"image", "mask", "visibility", "grey", "sky"} <= set(asked[0])
+    assert rehearsed.step_index == 0 and rehearsed.seconds > 0
+    assert [plain.step().terms for _ in range(8)] == [rehearsed.step().terms for _ in range(8)]
+
+
+def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    whole = Training(tiny_capture, tiny_config)
+    expected = [whole.step().terms for _ in range(14)]
+    half = Training(tiny_capture, tiny_config)
+    for stop in (7, 13):  # in the second stage, in the third
+        while half.step_index < stop:
+            half.step()
+        half.save(tmp_path)
+        resumed = Training(tiny_capture, tiny_config)
+        resumed.resume(tmp_path / "training.state")
+        assert [resumed.step().terms for _ in range(stop, 14)] == expected[stop:]
+        for ours, theirs in zip(whole.model.parameters(), resumed.model.parameters()):
+            assert torch.equal(ours, theirs)
+
+
+def test_a_training_without_its_third_stage_can_have_it_later(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    whole = Training(tiny_capture, tiny_config)
+    run(whole, tmp_path / "whole", on_step=_nothing, on_preview=_nothing)
+    without = dataclasses.replace(tiny_config, unseen_fraction=0.0)
+    run(Training(tiny_capture, without), tmp_path / "without", on_step=_nothing, on_preview=_nothing)
+    later = Training(tiny_capture, tiny_config)
+    later.resume(tmp_path / "without/training.state")
+    assert later.step_index == 12
+    later.step(), later.step()
+    for ours, theirs in zip(whole.model.parameters(), later.model.parameters()):
+        assert torch.equal(ours, theirs)
+    with pytest.raises(InputError, match=r"got other \['unseen_fraction'\]"):  # nor back again
+        Training(tiny_capture, without).resume(tmp_path / "whole/training.state")
+
+
+@pytest.mark.parametrize("light", ["learn", "none"])
+def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, light) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, light=light))
+    while training.stage < 3:
+        training.step()
+    before = {name: p.detach().clone() for name, p in training.model.named_parameters()}
+    probe = training.probe.raw.detach().clone()
+    while training.step_index < training.schedule.total:
+        training.step()
+    changed = {name.split(".")[0] for name, p in training.model.named_parameters() if not torch.equal(p, before[name])}
+    assert changed == {"skinning"} and torch.equal(probe, training.probe.raw)
+
+
+def test_skinning_that_is_not_learned_has_no_third_stage(tiny_capture, tiny_config) -> None:
+    still = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
+    assert Training(tiny_capture, dataclasses.replace(tiny_config, model=still)).schedule.total == 12
+
+
+def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
+    other = Training(tiny_capture, dataclasses.replace(tiny_config, seed=5))
+    with pytest.raises(InputError, match=r"--resume: expected the configuration .* got other \['seed'\]"):
+        other.resume(tiny_run / "training.state")
+
+
+def test_resuming_on_other_pictures_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
+    moved = dataclasses.replace(tiny_capture.motion, translations=tiny_capture.motion.translations + 0.01)
+    fewer = tuple(frame for frame in tiny_capture.frames if frame.frame != tiny_capture.frames[0].frame)
+    first, second, *others = tiny_capture.frames
+    swapped = (replace(first, frame=second.frame), replace(second, frame=first.frame), *others)
+    bodies = tiny_capture.body
+    wider = dataclasses.replace(bodies, vertices=bodies.vertices * [1.01, 1, 1])
+    for other in ({"motion": moved}, {"frames": fewer}, {"frames": swapped}, {"body": wider}):
+        training = Training(dataclasses.replace(tiny_capture, **other), tiny_config)
+        with pytest.raises(InputError, match="expected the pictures and poses it was started with, got others"):
+            training.resume(tiny_run / "training.state")
+
+
+def test_resuming_under_another_light_of_the_capture_is_refused(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, light="capture")
+    Training(tiny_capture, config).save(tmp_path)
+    Training(tiny_capture, config).resume(tmp_path / "training.state")
+    white = tiny_capture.lights["white"]
+    brighter = {"white": replace(white, scale=(2.0, 2.0, 2.0))}
+    with pytest.raises(InputError, match="expected the pictures and poses it was started with, got others"):
+        Training(dataclasses.replace(tiny_capture, lights=brighter), config).resume(tmp_path / "training.state")
+
+
+def test_a_last_bit_of_another_machines_sine_is_no_other_motion(tiny_run, tiny_capture, tiny_config) -> None:
+    moves = tiny_capture.motion
+    near = dataclasses.replace(moves, rotations=np.nextafter(moves.rotations, 2))
+    Training(dataclasses.replace(tiny_capture, motion=near), tiny_config).resume(tiny_run / "training.state")
+
+
+def test_states_from_before_the_digest_are_resumed(tiny_run, tiny_capture, tiny_config, tmp_path) -> None:
+    tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
+    del header["learned_from_sha256"]
+    write_tensors(tmp_path / "older.state", tensors, header | {"seen_sha256": "of float64 bits"})
+    training = Training(tiny_capture, tiny_config)
+    training.resume(tmp_path / "older.state")
+    assert training.step_index == 14
+
+
+def test_how_often_a_state_is_saved_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
+    config = dataclasses.replace(tiny_config, save_every=3, preview_every=5)
+    Training(tiny_capture, config).resume(tiny_run / "training.state")
+
+
+def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config) -> None:
+    """A limb at the picture's edge must not end a training of hours."""
+
+    class Demanding:
+        smallest = 10**4
+
+        def to(self, device):
+            return self
+
+    training = Training(tiny_capture, tiny_config, Demanding())
+    terms = training.objective(training.model, training.views[0], training.poses[0], 0, 1)
+    assert "image" in terms and "lpips" not in terms and "consistency" not in terms
+
+
+def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config, tmp_path) -> None:
+    """A network's first blocks do for it; another one does not go on with the same training."""
+    tensors = {name: torch.randn(shape) / 30 for name, shape in BACKBONES[-1].shapes(2).items()}
+    for name in ("a", "b"):
+        save_file({k: v + (name == "b") for k, v in tensors.items()}, tmp_path / f"{name}.safetensors")
+    blocks, others = (load_features(tmp_path / f"{name}.safetensors") for name in ("a", "b"))
+    config = dataclasses.replace(tiny_config, image_scale=1.0)
+    training = Training(tiny_capture, config, consistency=blocks)
+    given = (training.model, training.views[0], training.poses[0], 0, 2)
+    assert "consistency" in training.objective(*given) and "lpips" not in training.objective(*given)
+    assert "consistency" not in Training(tiny_capture, config).objective(*given)
+    training.save(tmp_path)
+    assert load_checkpoint(tmp_path / "avatar.ckpt").info["consistency"] == "vgg16[:2]"
+    Training(tiny_capture, config, consistency=blocks).resume(tmp_path / "training.state")
+    with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
+        Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
+
+
+def test_a_training_on_shrunk_pictures_is_resumed_where_a_byte_of_them_differs(
+    tiny_capture, tiny_config, tmp_path
+) -> None:
+    """Another CPU may round a sum's last bit otherwise."""
+    config = dataclasses.replace(tiny_config, image_scale=0.5)
+    Training(tiny_capture, config).save(tmp_path)
+    other = Training(tiny_capture, config)
+    other.views[0].image[0, 0, 0] += 1
+    other.resume(tmp_path / "training.state")
+    whole = Training(tiny_capture, tiny_config)
+    whole.save(tmp_path)
+    other = Training(tiny_capture, tiny_config)
+    other.views[0].image[0, 0, 0] += 1
+    with pytest.raises(InputError, match="expected the pictures and poses it was started with"):
+        other.resume(tmp_path / "training.state")
+
+
+def test_a_state_that_the_disk_does_not_take_is_one_line(tmp_path, monkeypatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(rnd_trainer.model.checkpoint, "save_file", full)
+    with pytest.raises(InputError, match=r"a\.ckpt: cannot be written: got .*No space left on device"):
+        write_tensors(tmp_path / "a.ckpt", {"a": torch.zeros(1)}, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_training_with_lpips_and_its_features_is_resumed(tiny_capture, tiny_config, tmp_path) -> None:
+    """One network in both roles, as --perceptual-weights gives it."""
+    write_alexnet(tmp_path / "alexnet.safetensors")
+    network = load_lpips(tmp_path / "alexnet.safetensors")
+    Training(tiny_capture, tiny_config, network).save(tmp_path)
+    Training(tiny_capture, tiny_config, network).resume(tmp_path / "training.state")
+    for other in ({}, {"perceptual": network, "consistency": load_features(_half_of(tmp_path))}):
+        with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
+            Training(tiny_capture, tiny_config, **other).resume(tmp_path / "training.state")
+
+
+def _half_of(folder: Path) -> Path:
+    """Another network's first blocks."""
+    tensors = {name: torch.randn(shape) / 30 for name, shape in BACKBONES[-1].shapes(2).items()}
+    save_file(tensors, folder / "blocks.safetensors")
+    return folder / "blocks.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("changes", "motion"),
+    [({}, None), ({"motion": "b.npz"}, "b.npz"), ({"refine_poses": True}, "OUT/refined_motion.npz")],
+)
+def test_a_training_is_scored_in_its_own_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
+    scored: list[EvalOptions] = []
+    monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
+    options = rnd_trainer.commands.train.TrainOptions(Path("capture"), **changes)
+    rnd_trainer.commands.train._score_after_training(SimpleNamespace(capture=tiny_capture), tmp_path, options)
+    assert scored[0].motion == (motion and motion.replace("OUT", str(tmp_path)))
+
+
+def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refused(
+    tiny_run, tiny_capture, tiny_config, tmp_path
+) -> None:
+    tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
+    older = {key: value for key, value in header["config"].items() if key != "light_search"}
+    write_tensors(tmp_path / "older.state", tensors, header | {"config": older})
+    training = Training(tiny_capture, tiny_config)
+    training.resume(tmp_path / "older.state")
+    assert training.step_index == 14
+    for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, [], None):
+        write_tensors(tmp_path / "broken.state", tensors, header | {"config": broken})
+        with pytest.raises(InputError, match=r"broken\.state: not a training state"):
+            training.resume(tmp_path / "broken.state")
+
+
+def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path) -> None:
+    def press(step: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    training = Training(tiny_capture, tiny_config)
+    assert run(training, tmp_path, on_step=press, on_preview=_nothing)
+    assert training.step_index == 1
+    assert load_checkpoint(tmp_path / "avatar.ckpt").info["step"] == 1
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ctrl_c_in_the_last_step_leaves_nothing_to_resume(tiny_capture, tiny_config, tmp_path) -> None:
+    config = dataclasses.replace(tiny_config, steps=2, unseen_fraction=0.0)
+
+    def press(step: object) -> None:
+        if step.index == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    assert not run(Training(tiny_capture, config), tmp_path, on_step=press, on_preview=_nothing)
+
+
+def test_the_log_forgets_steps_that_are_done_again(tiny_capture, tiny_config, tmp_path) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, steps=2))
+    (tmp_path / "metrics.jsonl").write_text(
+        '{"step": 0}\n{"step": 0, "ima\n[0]\n3\n{"steps": 0}\n{"step": "0"}\n{}}\n{"step": 1}\n{"step": 2}\n{"st'
+    )
+    training.step_index = 1
+    run(training, tmp_path, on_step=_nothing, on_preview=_nothing)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [0, 1]
+    assert "image" in rows[1]
+
+
+def test_steps_that_are_not_finite_are_skipped_and_end_the_run(tiny_capture, tiny_config) -> None:
+    training = Training(tiny_capture, tiny_config)
+    training.step()
+    with torch.no_grad():
+        training.model.appearance_residual[0, 0] = float("nan")
+    kept = training.model.geometry_residual.detach().clone()
+    assert training.step().skipped
+    assert torch.equal(training.model.geometry_residual, kept)
+    with pytest.raises(InputError, match=f"{MAX_BAD_STEPS} steps in a row were not finite"):
+        for _ in range(MAX_BAD_STEPS):
+            training.step()
+
+
+def test_empty_masks_are_counted_and_too_many_stop(tiny_capture, tiny_config, tmp_path) -> None:
+    import shutil
+
+    folder = tmp_path / "capture"
+    shutil.copytree(tiny_capture.folder, folder)
+    frames = tiny_capture.split("train")
+    empty = np.zeros((64, 64, 1), np.uint8)
+    write_image(folder / frames[2].mask, empty)
+    training = Training(load_capture(folder), tiny_config)
+    assert training.bad_masks == [2] and len(training.views) == 5
+    write_image(folder / frames[4].mask, empty + 255)
+    with pytest.raises(InputError, match="masks: expected at most 20% empty or full, got 2 of 6"):
+        Training(load_capture(folder), tiny_config)
+
+
+def test_training_under_the_captures_light_keeps_it(tiny_capture, tiny_config) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, light="capture"))
+    for _ in range(12):
+        training.step()
+    assert torch.allclose(training.light(), torch.ones(32, 64, 3), atol=1e-5)
+
+
+def test_a_device_that_is_not_there_is_refused() -> None:
+    from rnd_trainer.commands.train import _device
+
+    assert _device("cpu") == "cpu"
+    with pytest.raises(InputError, match="--device: expected cpu, cuda or cuda:NUMBER, got teapot"):
+        _device("teapot")
+
+
+def test_a_device_is_named_as_torch_names_it(monkeypatch) -> None:
+    from rnd_trainer.commands.train import _device
+
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=None))
+    assert [_device(name) for name in ("cuda", "cuda:0", "cuda:1")] == ["cuda", "cuda:0", "cuda:1"]
+    for typo in ("cuda:", "cuda0", "cuda:00", "cuda:01", "cuda:٠", "cuda:0\n"):
+        with pytest.raises(InputError, match="--device: expected cpu, cuda or cuda:NUMBER, got"):
+            _device(typo)
+    with pytest.raises(InputError, match="expected a GPU that this torch can use, got 2 of them"):
+        _device("cuda:2")
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    with pytest.raises(InputError, match=r"gsplat cannot be imported: .*rnd-avatar\[cuda\]"):
+        _device("cuda")
+
+
+def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(tiny_capture, tmp_path, monkeypatch, capsys) -> None:
+    def step(self: Training) -> Any:
+        if self.step_index == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+        return one_step(self)
+
+    one_step = Training.step
+    monkeypatch.setattr(Training, "step", step)
+    sizes = ["--preset", "quick", "--gaussians", "200", "--steps", "5", "--save-every", "2"]
+    out = tmp_path / "run"
+    monkeypatch.setattr(sys, "argv", ["rnd-train", str(tiny_capture.folder), "--out", str(out), *sizes])
+    with pytest.raises(SystemExit) as leaving:
+        rnd_trainer.commands.train.main()
+    said = capsys.readouterr().err.splitlines()
+    assert leaving.value.code == 2
+    assert said[-1].startswith("rnd-train: --device: expected enough memory, got a GPU that is full (fewer")
+    assert load_checkpoint(out / "avatar.ckpt").info["step"] == 2
+
+
+def test_a_training_that_was_stopped_early_says_so(tiny_capture, tiny_config, tmp_path, capsys) -> None:
+    training = Training(tiny_capture, tiny_config)
+    training.step()
+    training.save(tmp_path)
+    note = load_checkpoint(tmp_path / "avatar.ckpt").note()
+    assert note is not None and "stopped at step 1 of 14, before light and albedo were learned" in note
+    evaluate_run(EvalOptions(tmp_path, tiny_capture.folder))
+    assert note in capsys.readouterr().err
+
+
+def test_a_finished_training_has_nothing_to_say(tiny_run) -> None:
+    assert load_checkpoint(tiny_run / "avatar.ckpt").note() is None
+
+
+def test_plain_colours_learn_no_visibility(tiny_capture, tiny_config) -> None:
+    plain = Training(tiny_capture, dataclasses.replace(tiny_config, light="none"))
+    assert "visibility" not in plain.step().terms
+    assert "visibility" in Training(tiny_capture, tiny_config).step().terms
+
+
+def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, monkeypatch) -> None:
+    training = Training(tiny_capture, dataclasses.replace(tiny_config, refine_poses=True))
+    assert training.refinement is not None
+    with torch.no_grad():
+        for raw in training.refinement.raw:
+            raw += 0.3
+    training.step_index, given = tiny_config.steps, []
+    monkeypatch.setattr(rnd_trainer.training.training, "SHAKEN_SHARE", 0)
+    monkeypatch.setattr(training, "_unseen", lambda: lambda model, pose, step: given.append(pose) or {})
+    training._unseen_terms(training.views[0], training.poses[0])
+    expected = training.refinement.bones(training.views[0].frame.frame)
+    assert torch.equal(given[0].bones, expected) and not given[0].bones.requires_grad
+    assert not torch.equal(expected, training.poses[0].bones)

@@ -1,0 +1,511 @@
+"""The command rnd-play: files it leaves, refusals, Ctrl-C. The avatar is a fake; the rest is real."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import rnd_viewer.play.play
+from rnd_runtime.core.images import read_image, write_image
+from rnd_runtime.core.kernels import COMPILING
+from rnd_runtime.motion.motion import save_motion
+from rnd_runtime.playback.doctor import Finding
+from rnd_viewer.play.cli import main
+from rnd_viewer.play.player import Player
+from rnd_viewer.view.governor import Governor
+from support.paths import ROOT
+from support.play_fakes import FakeAvatar, fake_motion
+from support.tiny import ASSETS
+
+FRAMES = 6
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch) -> dict[str, Path]:
+    """Input files, and an avatar that needs none."""
+    monkeypatch.setattr(rnd_viewer.play.play.Avatar, "load", lambda path, **_: FakeAvatar())
+    monkeypatch.setattr(rnd_viewer.play.play, "kernels_are_cold", lambda: False)  # whatever ran before
+    save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
+    rng = np.random.default_rng(0)
+    write_image(tmp_path / "sky.exr", rng.uniform(0.2, 1, (16, 32, 3)).astype(np.float32))
+    write_image(tmp_path / "black.exr", np.zeros((16, 32, 3), np.float32))
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    (tmp_path / "torn.exr").write_bytes((tmp_path / "sky.exr").read_bytes()[:200])
+    poses = {"poses": np.full((4, 72), np.nan), "trans": np.zeros((4, 3)), "mocap_framerate": 30.0}
+    np.savez(tmp_path / "nan.npz", **poses)
+    return {file.name: file for file in tmp_path.iterdir()}
+
+
+def _arguments(files: dict[str, Path], folder: Path, **changes: object) -> list[str]:
+    inputs = {"motion": files["walk.npz"], "hdr": files["sky.exr"], "out": folder}
+    options: dict[str, object] = inputs | {"size": 48, "raster": "cpu"}
+    options |= {"shade": "ao", "format": "png"} | changes
+    named = [(f"--{key.replace('_', '-')}", str(value)) for key, value in options.items() if value is not None]
+    return ["avatar.onnx", *(word for pair in named for word in pair)]
+
+
+def _tree(folder: Path) -> dict[str, bytes]:
+    """What is there, without the mark that says whose folder it is."""
+    files = (file for file in folder.rglob("*") if file.is_file() and not file.name.startswith(".run-"))
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def test_gl_draws_what_the_cpu_draws(files, tmp_path):
+    pictures = {}
+    for raster in ("cpu", "gl"):
+        out = tmp_path / raster
+        assert main(_arguments(files, out, raster=raster, shade="table", frames="0:2")) == 0
+        pictures[raster] = [read_image(out / f"frames/{k:06d}.png").astype(int) for k in range(2)]
+    report = json.loads(next((tmp_path / "gl").glob("play*.json")).read_text())
+    assert report["raster"].startswith("gl (") and {"shading", "read-back"} <= set(report["times"])
+    for cpu, gl in zip(pictures["cpu"], pictures["gl"]):
+        assert cpu.max() > 100 and np.abs(cpu - gl).max() <= 2
+
+
+def test_a_run_leaves_pictures_video_and_a_report(files, tmp_path, capsys):
+    arguments = _arguments(files, tmp_path / "out", format="png,exr,mp4,webp", aov="normal,depth")
+    assert main(arguments) == 0
+    names = {f"{k:06d}" for k in range(FRAMES)}
+    expected = {f"frames/{name}.png" for name in names} | {f"frames_exr/{name}.exr" for name in names}
+    expected |= {f"aov/{aov}/{name}.png" for aov in ("normal", "depth") for name in names}
+    assert set(_tree(tmp_path / "out")) == expected | {"play.mp4", "play.webp", "play.json"}
+    report = json.loads((tmp_path / "out/play.json").read_text())
+    assert report["frames"] == [0, FRAMES] and report["size"] == [48, 48] and report["fps"] == 30
+    assert {"load", "encoders", "shading", "tonemap", "write"} <= set(report["times"])
+    assert report["times"]["encoders"]["runs"] == FRAMES
+    printed = capsys.readouterr()
+    assert "median ms" in printed.out and "p95 ms" in printed.out and "frames/s" in printed.out
+    assert printed.err == ""  # no terminal, no progress bar, nothing to warn of
+
+
+def test_the_same_run_gives_the_same_bytes(files, tmp_path):
+    trees = []
+    for name in ("a", "b"):
+        assert main(_arguments(files, tmp_path / name, format="png,exr,mp4,webp", camera="orbit")) == 0
+        tree = _tree(tmp_path / name)
+        report = json.loads(tree.pop("play.json"))
+        del report["times"]
+        trees.append((tree, report))
+    assert trees[0] == trees[1]
+
+
+def test_a_part_of_a_run_has_the_pixels_of_the_whole(files, tmp_path):
+    options = {"camera": "orbit", "orbit_seconds": "0.4", "background": "hdr", "fps": "45", "shade": "table+sun"}
+    assert main(_arguments(files, tmp_path / "whole", **options)) == 0
+    assert main(_arguments(files, tmp_path / "part", frames="3:5", **options)) == 0
+    whole, part = _tree(tmp_path / "whole"), _tree(tmp_path / "part")
+    assert len([name for name in whole if name.startswith("frames/")]) == 8  # 5/30 s at 45 frames/s
+    pictures = {name for name in part if name.startswith("frames/")}
+    assert pictures == {"frames/000003.png", "frames/000004.png"}
+    assert all(part[name] == whole[name] for name in pictures)
+    assert part["frames/000003.png"] != part["frames/000004.png"]
+
+
+@pytest.mark.parametrize(("background", "shade"), [("hdr", "table+sun"), ("none", "ao")])
+def test_a_light_that_turns_stands_in_each_frame_as_hdr_yaw_says(files, tmp_path, background, shade):
+    turning = {"background": background, "shade": shade, "hdr_yaw": "30", "hdr_turn": "-0.5"}
+    assert main(_arguments(files, tmp_path / "turning", **turning)) == 0
+    pictures = []
+    for number in (0, 4):
+        still = turning | {"hdr_turn": None, "hdr_yaw": str(30 - 360 * number / 30 / 0.5)}
+        assert main(_arguments(files, tmp_path / "still", frames=f"{number}:{number + 1}", **still)) == 0
+        pictures.append(read_image(tmp_path / f"still/frames/{number:06d}.png").astype(int))
+        turned = read_image(tmp_path / f"turning/frames/{number:06d}.png").astype(int)
+        assert np.abs(turned - pictures[-1]).max() <= 1  # degrees and radians round apart
+    assert np.abs(pictures[1] - pictures[0]).max() > 5
+
+
+def test_one_thread_and_three_leave_the_same_files(files, tmp_path):
+    trees = []
+    for flag in ("--pipeline", "--no-pipeline"):
+        folder = tmp_path / flag.strip("-")
+        assert main([*_arguments(files, folder, format="png,exr,mp4,webp", aov="normal"), flag]) == 0
+        trees.append(_tree(folder))
+        del trees[-1]["play.json"]  # has the flag and the times
+    assert trees[0] == trees[1] and len(trees[0]) == 3 * FRAMES + 2
+
+
+def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
+    """Real processes, at the same time, over the frames of another, longer run."""
+    stale = _arguments(files, tmp_path / "out", fps="60", background="#ff0000")
+    assert main(stale) == 0 and (tmp_path / "out/frames/000010.png").exists()
+    (tmp_path / "out/frames/mine.png").write_bytes(b"a user's own")
+    assert main(_arguments(files, tmp_path / "whole")) == 0
+    code = "import sys; sys.path.insert(0, 'tests'); import play_fakes, rnd_viewer.play.play, rnd_viewer.play.cli\n"
+    code += "rnd_viewer.play.play.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
+    code += "sys.exit(rnd_viewer.play.cli.main(sys.argv[1:]))"
+    parts = [_arguments(files, tmp_path / "out", frames=part) for part in (":2", "2:")]
+    root = ROOT
+    processes = [subprocess.Popen([sys.executable, "-c", code, *part], cwd=root) for part in parts]
+    assert [process.wait(120) for process in processes] == [0, 0]
+    whole, parts = _tree(tmp_path / "whole"), _tree(tmp_path / "out")
+    names = {f"frames/{k:06d}.png" for k in range(FRAMES)}
+    assert {name for name in parts if name.startswith("frames/")} == names | {"frames/mine.png"}
+    assert all(parts[name] == whole[name] for name in names)
+    assert {"play_000000-000002.json", "play_000002-000006.json"} <= parts.keys()
+
+
+def test_parts_share_a_folder_inside_the_motions(files, tmp_path, capsys):
+    motion, out = tmp_path / "smpl", tmp_path / "smpl/out"
+    motion.mkdir()
+    person = {"id": 0, "Rh": [[1.57, 0, 0]], "Th": [[0, 0, 1]], "poses": [[0] * 72], "shapes": [[0] * 10]}
+    for frame in range(4):
+        (motion / f"{frame:06d}.json").write_text(json.dumps([person]))
+    for part in ("0:2", "2:4"):
+        assert main(_arguments(files, out, motion=motion, frames=part)) == 0
+    pictures = {name for name in _tree(out) if name.startswith("frames/")}
+    assert pictures == {f"frames/{k:06d}.png" for k in range(4)}
+    assert main(_arguments(files, motion, motion=motion)) == 2  # whose play.json would be one of its files
+    assert "--out: expected another folder than the motion's" in capsys.readouterr().err
+
+
+def test_parts_that_spell_a_path_or_choose_a_rasterizer_their_own_way_are_of_one_run(
+    files, tmp_path, monkeypatch, capsys
+):
+    camera = {"width": 48, "height": 48, "K": [[50, 0, 24], [0, 50, 24], [0, 0, 1]]}
+    camera["world_to_camera"] = [[1, 0, 0, 0], [0, -1, 0, 1], [0, 0, -1, 4], [0, 0, 0, 1]]
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": {"a": camera}}))
+    monkeypatch.chdir(tmp_path)
+    for part, folder, raster in (("0:2", Path(), "cpu"), ("2:6", tmp_path, "auto")):
+        named = {"motion": folder / "walk.npz", "hdr": folder / "sky.exr", "camera": f"{folder / 'cameras.json'}:a"}
+        arguments = _arguments(files, folder / "out", frames=part, raster=raster, size=None, **named)
+        assert main(arguments) == 0
+    assert len(list((tmp_path / "out/frames").iterdir())) == FRAMES and not capsys.readouterr().err
+    assert main(_arguments(files, tmp_path / "out")) == 0
+    left = f"{FRAMES + 2} files that another run had left in {tmp_path / 'out'} were removed"
+    assert left in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("parallel") is None, reason="needs GNU parallel")
+def test_the_readmes_line_for_a_queue_makes_the_whole(tmp_path):
+    readme = (ASSETS.parent / "README.md").read_text(encoding="utf-8")
+    line = re.search(r"^(parallel rnd-play .+) 0:30 30:60$", readme, re.MULTILINE).group(1)
+    line = line.replace("rnd-play", str(Path(sys.executable).with_name("rnd-play")), 1).replace("assets/", f"{ASSETS}/")
+    small = line.replace("--frames", "--size 64 --format png --frames").replace("--out out", "--out {}")
+    whole = small.removeprefix("parallel ").partition(" :::")[0].format(tmp_path / "whole")
+    parts = small.format(tmp_path / "parts")
+    for command in (f"{whole} 0:4", f"{parts} 0:2 2:4"):
+        subprocess.run(command, shell=True, check=True, timeout=300, capture_output=True)
+    wholes, shared = _tree(tmp_path / "whole"), _tree(tmp_path / "parts")
+    names = {name for name in wholes if name.startswith("frames/")}
+    assert len(names) == 4 and all(shared[name] == wholes[name] for name in names)
+
+
+def test_a_floor_that_is_not_held_lowers_the_quality_and_drops_no_frame(files, tmp_path, monkeypatch, capsys):
+    observe = Governor.observe  # a quiet machine draws some of these few pixels within the millisecond
+    monkeypatch.setattr(Governor, "observe", lambda self, seconds: observe(self, seconds + 0.01))
+    assert main(_arguments(files, tmp_path / "out", fps_floor=1000)) == 0
+    assert len([name for name in _tree(tmp_path / "out") if name.startswith("frames/")]) == FRAMES
+    assert "2 of 6 frames at less than full quality, for 1000 frames/s" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out/play.json").read_text())["notes"][0].startswith("2 of 6 frames")
+
+
+def test_a_floor_is_refused_beside_aovs_which_it_cannot_make_cheaper(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", fps_floor=30, aov="depth")) == 2
+    assert "--fps-floor: expected no --aov beside it, got depth" in capsys.readouterr().err
+
+
+def test_what_faces_away_is_left_out_on_every_path(files, tmp_path, capsys):
+    """By the CPU, by OpenGL, and beside AOVs, which are drawn another way."""
+    pictures = {}
+    for name, changes in {
+        "whole": {"cull": None},
+        "cpu": {},
+        "gl": {"raster": "gl"},
+        "aov": {"aov": "normal", "format": "png,exr"},
+    }.items():
+        options = {"shade": "table", "frames": "0:1", "cull": 0.3} | changes
+        assert main(_arguments(files, tmp_path / name, **options)) == 0
+        pictures[name] = read_image(tmp_path / name / "frames/000000.png").astype(int)
+    assert np.abs(pictures["cpu"] - pictures["whole"]).max() > 20
+    assert np.abs(pictures["cpu"] - pictures["gl"]).max() <= 2
+    np.testing.assert_array_equal(pictures["aov"], pictures["cpu"])
+    assert main(_arguments(files, tmp_path / "no", cull=2)) == 2
+    assert "--cull: expected a cosine, from -1 to 1, got 2" in capsys.readouterr().err
+
+
+def test_the_same_run_again_takes_nothing_away(files, tmp_path):
+    assert main(_arguments(files, tmp_path / "out", frames=":2")) == 0
+    assert main(_arguments(files, tmp_path / "out", frames="4:")) == 0
+    assert {f"frames/{k:06d}.png" for k in (0, 1, 4, 5)} <= _tree(tmp_path / "out").keys()
+    assert main(_arguments(files, tmp_path / "out", frames="2:3", exposure=1)) == 0
+    assert {name for name in _tree(tmp_path / "out") if name.startswith("frames/")} == {"frames/000002.png"}
+
+
+def test_without_hdr_the_light_of_the_avatar_shines(files, tmp_path):
+    for name, changes in (("a", {}), ("b", {"exposure": "-1"})):
+        assert main(_arguments(files, tmp_path / name, hdr=None, frames=":1", **changes)) == 0
+    bright, dark = (read_image(tmp_path / name / "frames/000000.png") for name in ("a", "b"))
+    assert 0 < dark[..., :3].max() < bright[..., :3].max()
+    assert json.loads((tmp_path / "b/play_000000-000001.json").read_text())["light"]["maximum"] == 0.25
+
+
+def test_light_options_reach_the_light(files, tmp_path):
+    half = np.zeros((16, 32, 3), np.float32)
+    half[:, 8:24] = 1.0  # shines from +X, the right of what a front camera sees
+    write_image(tmp_path / "half.exr", half)
+    pictures, maxima = {}, {}
+    for name, value in (("exposure", "0"), ("exposure", "1"), ("hdr_yaw", "180"), ("hdr_up", "z")):
+        folder = tmp_path / f"{name}{value}"
+        options = {"hdr": tmp_path / "half.exr", "frames": ":1", "background": "0,0,0", name: value}
+        assert main(_arguments(files, folder, **options)) == 0
+        pictures[folder.name] = read_image(folder / "frames/000000.png").astype(int).sum(axis=2)
+        maxima[folder.name] = json.loads((folder / "play_000000-000001.json").read_text())["light"]["maximum"]
+    assert maxima == {"exposure0": 1, "exposure1": 2, "hdr_yaw180": 1, "hdr_upz": 1}
+    assert (pictures["exposure1"] >= pictures["exposure0"]).all()
+    columns = {name: picture.sum(axis=0) @ np.arange(48) / picture.sum() for name, picture in pictures.items()}
+    assert columns["hdr_yaw180"] < columns["exposure0"] - 0.1  # lit from the picture's right, then from its left
+    assert (pictures["hdr_upz"] != pictures["exposure0"]).any()
+
+
+@pytest.mark.parametrize(("flag", "seconds"), [("--pipeline", 1), ("--no-pipeline", 2)])
+def test_a_floor_goes_by_what_a_frame_takes(files, tmp_path, monkeypatch, flag, seconds):
+    """By a clock that ticks when it is read, both take a second; where they overlap, a frame takes one."""
+    ticks = threading.local()
+
+    def clock() -> float:
+        ticks.now = getattr(ticks, "now", 0) + 1
+        return ticks.now
+
+    observed = []
+    monkeypatch.setattr(rnd_viewer.play.play, "perf_counter", clock)
+    monkeypatch.setattr(rnd_viewer.play.play.Governor, "observe", lambda self, took: observed.append(took))
+    assert main([*_arguments(files, tmp_path / "out", fps_floor=30), flag]) == 0
+    assert observed == [seconds] * FRAMES
+
+
+def test_background_colour_fills_the_corner(files, tmp_path):
+    assert main(_arguments(files, tmp_path / "out", background="#204060", frames=":1")) == 0
+    picture = read_image(tmp_path / "out/frames/000000.png")
+    assert picture.shape == (48, 48, 3) and picture[0, 0].tolist() == [0x20, 0x40, 0x60]
+
+
+def test_warnings_name_what_was_found(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", hdr=files["nan.exr"], frames=":1")) == 0
+    assert "1 texels of the light were NaN" in capsys.readouterr().err
+    assert main(_arguments(files, tmp_path / "out", hdr=files["black.exr"], frames=":1")) == 0
+    assert "the light is dark: its largest radiance is 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"motion": "none.npz"}, "none.npz"),
+        ({"motion": "nan.npz"}, "nan.npz"),
+        ({"hdr": "none.exr"}, "none.exr"),
+        ({"hdr": "torn.exr"}, "torn.exr"),
+        ({"shade": "fancy"}, "fancy"),
+        ({"frames": "4:4"}, "--frames: expected START:END within 0:6"),
+        ({"frames": "4:40"}, "--frames"),
+        ({"size": "0"}, "--size"),
+        ({"fov": "180"}, "--fov"),
+        ({"fps": "nan"}, "--fps"),
+        ({"orbit_seconds": "0"}, "--orbit-seconds"),
+        ({"hdr_turn": "0"}, "--hdr-turn: expected not 0, got 0"),
+        ({"orbit_seconds": "4"}, "--orbit-seconds: expected the default, got 4.0 (needs --camera orbit)"),
+        ({"camera": "a.json", "fov": "40"}, "--fov: expected the default, got 40.0 (the camera's file"),
+        ({"hdr": None, "hdr_up": "z"}, "--hdr-up: expected the default, got z (needs --hdr)"),
+        ({"motion_fps": "inf"}, "--motion-fps: expected 0.001 to 10000, got inf"),
+        ({"background": "blue"}, "--background"),
+        ({"aov": "albedo,beauty"}, "--aov"),
+        ({"format": "gif"}, "--format"),
+        ({"camera": "above"}, "--camera"),
+        ({"camera": "none.json"}, "camera file not found"),
+        ({"threads": "0"}, "--threads"),
+        ({"motion": None, "out": None}, "missing --motion, --out"),
+    ],
+)
+def test_unusable_input_is_one_line_and_exit_2(files, tmp_path, capsys, changes, message):
+    here = {name: tmp_path / value for name, value in changes.items() if name in ("motion", "hdr") and value}
+    assert main(_arguments(files, tmp_path / "out", **(changes | here))) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("rnd-play: ") and message in printed.err
+    assert printed.err.count("\n") == 1 and printed.out == ""
+    assert not _tree(tmp_path / "out")
+
+
+def test_kernels_that_are_not_compiled_yet_are_said_before_they_are_needed(files, tmp_path, monkeypatch, capsys):
+    def compiling(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(rnd_viewer.play.play, "kernels_are_cold", lambda: True)
+    monkeypatch.setattr(rnd_viewer.play.play, "Shader", compiling)
+    main(_arguments(files, tmp_path / "out"))
+    assert capsys.readouterr().err.splitlines() == [f"rnd-play: {COMPILING}", "rnd-play: interrupted"]
+
+
+def test_avatar_that_is_not_there(tmp_path, capsys):
+    assert main([str(tmp_path / "a.onnx"), "--motion", "x.npz", "--out", str(tmp_path / "out")]) == 2
+    assert "a.onnx: avatar not found" in capsys.readouterr().err
+
+
+def test_output_folder_that_cannot_be_written(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("rnd_runtime.core.files.os.access", lambda path, mode: False)  # root may write everywhere
+    assert main(_arguments(files, tmp_path / "out")) == 2
+    assert "out: output folder cannot be written" in capsys.readouterr().err
+
+
+def test_output_folder_that_is_a_file(files, tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert main(_arguments(files, tmp_path / "out")) == 2
+    assert "out: output folder cannot be made" in capsys.readouterr().err
+
+
+def test_avatar_out_of_view_is_an_error_that_says_so(files, tmp_path, capsys):
+    camera = {"width": 32, "height": 32, "K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]]}
+    camera["world_to_camera"] = np.eye(4).tolist()  # at the feet, looking past the body
+    camera["world_to_camera"][2][3] = -4.0
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    assert main(_arguments(files, tmp_path / "out", camera=tmp_path / "camera.json", size=None)) == 2
+    assert "frame 0: nothing of the avatar is in view in the first frame" in capsys.readouterr().err
+    assert not _tree(tmp_path / "out")
+
+
+def _cameras_that_lose_the_body(folder: Path, seen: int, size: int = 48) -> Path:
+    """A camera file for all frames: the body is in view in the first ``seen`` and behind the camera afterwards."""
+    cameras = []
+    for frame in range(FRAMES):
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV: looking along −Z
+        pose[:3, 3] = [0, 1, 4 if frame < seen else -4]
+        intrinsics = [[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]]
+        record = {"width": size, "height": size, "K": intrinsics, "world_to_camera": pose.tolist()}
+        cameras.append(record)
+    file = folder / "walking.json"
+    file.write_text(json.dumps({"cameras": cameras}))
+    return file
+
+
+def test_a_run_that_fails_at_once_leaves_the_frames_of_the_last(files, tmp_path):
+    out = tmp_path / "out"
+    assert main(_arguments(files, out)) == 0
+    before = _tree(out)
+    away = _cameras_that_lose_the_body(tmp_path, seen=0)
+    assert main(_arguments(files, out, camera=away, size=None)) == 2
+    assert _tree(out) == before and len(before) == FRAMES + 1
+
+
+def test_a_size_that_an_encoder_refuses_leaves_the_frames_of_the_last(files, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(_arguments(files, out, frames="0:2", format="png,mp4")) == 0
+    before = _tree(out)
+    for format in ("webp", "png,webp"):
+        assert main(_arguments(files, out, frames="0:2", format=format, size="1x16384")) == 2
+        assert "webp encoder refuses 1x16384" in capsys.readouterr().err
+    assert _tree(out) == before and len(list(out.glob(".run-*"))) == 1
+
+
+def test_what_a_run_took_away_is_said_where_it_fails_later_too(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", frames="0:2")) == 0
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    document = json.loads(walking.read_text())
+    document["cameras"][2] |= {"width": 64, "height": 64}
+    walking.write_text(json.dumps(document))
+    assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
+    assert f"3 files that another run had left in {tmp_path / 'out'} were removed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("hdr", "frames_exr/000000.exr"), ("hdr", "aov/normal/000003.exr"), ("camera", "play_000000-000001.json")],
+)
+def test_a_file_that_runs_write_is_no_input_of_one_beside_it(files, tmp_path, capsys, option, name):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    file = tmp_path / "out" / name
+    file.parent.mkdir(parents=True)
+    shutil.copy(files["sky.exr"] if option == "hdr" else walking, file)
+    before = file.read_bytes()
+    changes = {option: file} | ({"size": None} if option == "camera" else {})
+    assert main(_arguments(files, tmp_path / "out", frames="0:1", **changes)) == 2
+    assert f"{file}: cannot be an input: runs write such files into --out" in capsys.readouterr().err
+    assert _tree(tmp_path / "out") == {name: before}
+    assert main(_arguments(files, tmp_path / "other", frames="0:1", **changes)) == 0
+
+
+def test_an_empty_out_is_no_folder(files, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(_arguments(files, "", frames="0:1")) == 2
+    assert "--out: expected a path, got nothing" in capsys.readouterr().err
+    assert not (tmp_path / "frames").exists()
+
+
+def test_a_part_without_the_body_is_no_mistake(files, tmp_path, capsys):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=2)
+    out = tmp_path / "out"
+    for part in ("0:2", f"2:{FRAMES}"):
+        assert main(_arguments(files, out, camera=walking, size=None, frames=part)) == 0
+    assert "nothing of the avatar is in view in any of these frames" in capsys.readouterr().err
+    assert len([name for name in _tree(out) if name.startswith("frames/")]) == FRAMES
+
+
+def test_another_camera_file_is_another_run(files, tmp_path):
+    out, walking = tmp_path / "out", _cameras_that_lose_the_body(tmp_path, seen=2)
+    assert main(_arguments(files, out, camera=walking, size=None, frames=f"0:{FRAMES - 1}")) == 0
+    _cameras_that_lose_the_body(tmp_path, seen=3)
+    assert main(_arguments(files, out, camera=walking, size=None, frames="0:1")) == 0
+    assert sorted(_tree(out)) == ["frames/000000.png", "play_000000-000001.json"]
+
+
+def test_mp4_of_cameras_of_several_sizes_is_refused(files, tmp_path, capsys):
+    walking = _cameras_that_lose_the_body(tmp_path, seen=FRAMES)
+    document = json.loads(walking.read_text())
+    document["cameras"][2] |= {"width": 64, "height": 64}
+    walking.write_text(json.dumps(document))
+    assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
+    assert "mp4: expected pictures of one size, 48x48, got 64x64" in capsys.readouterr().err
+
+
+def test_a_webp_of_a_fast_run_says_that_it_keeps_fewer_frames(files, tmp_path, capsys):
+    assert main(_arguments(files, tmp_path / "out", format="webp", fps=120, frames="0:3")) == 0
+    assert "warning: the WebP keeps one frame in 2, 60 a second" in capsys.readouterr().err
+    with Image.open(tmp_path / "out" / "play_000000-000003.webp") as clip:
+        assert clip.n_frames == 2
+
+
+def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
+    rendered = []
+
+    def draw(self, encoded, camera, quality):
+        rendered.append(camera)
+        if len(rendered) == 3:
+            raise KeyboardInterrupt
+        return original(self, encoded, camera, quality)
+
+    original = Player.draw
+    monkeypatch.setattr(Player, "draw", draw)
+    assert main(_arguments(files, tmp_path / "out", format="png,exr,mp4,webp")) == 130
+    assert "interrupted" in capsys.readouterr().err
+    left = _tree(tmp_path / "out")
+    assert set(left) == {
+        f"{folder}/{k:06d}.{kind}" for folder, kind in (("frames", "png"), ("frames_exr", "exr")) for k in (0, 1)
+    }
+    for name in left:
+        assert read_image(tmp_path / "out" / name).shape[:2] == (48, 48)
+
+
+def test_help_explains_every_option(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    for option in ("--hdr-yaw", "--exposure", "--aov", "--frames", "--shade", "--raster", "--doctor"):
+        assert option in text
+
+
+def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):
+    found = [Finding("rasteriser", "cpu", None), Finding("OpenGL, EGL", "missing", "apt install libegl1")]
+    monkeypatch.setattr("rnd_runtime.playback.doctor.report", lambda: found)
+    assert main(["--doctor"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[:3] == [["rasteriser", "cpu"], ["OpenGL,", "EGL", "missing"], ["→", "apt", "install", "libegl1"]]
+    assert lines[3][:3] == ["PyAV", "(mp4,", "webp)"]

@@ -1,0 +1,106 @@
+"""The page for static hosts poses as the compiled pass does, to the bit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from llvmlite.binding import get_host_cpu_features
+from numpy.testing import assert_allclose, assert_array_equal
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.posing.posing import Posed, RestPose
+from runtime.posing.posing_test import ROUNDING, posing_scene
+from support.paths import ROOT
+
+NODE = shutil.which("node")
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="needs Node.js")
+
+_POSE = """
+import { readFileSync, writeFileSync } from "node:fs";
+const [source, folder] = process.argv.slice(1);
+const { RestPose } = await import(source + "/posing.js");
+const { names, integers } = JSON.parse(readFileSync(folder + "/names.json"));
+const [count, ...arrays] = names.map((name) => {
+    const { buffer, byteOffset, byteLength } = readFileSync(`${folder}/${name}`);
+    const bytes = buffer.slice(byteOffset, byteOffset + byteLength);
+    return integers.includes(name) ? new Int32Array(bytes) : new Float32Array(bytes);
+});
+const bones = arrays.pop();
+new RestPose(count[0], arrays.slice(0, 8)).pose(arrays.slice(8), bones)
+    .forEach((values, k) => writeFileSync(`${folder}/posed${k}`, values));
+"""
+
+
+def _page(folder: Path, rest: RestPose, logits: Any, *fields: Any) -> Posed:
+    """What the page's code makes of it, in Node.js."""
+    assert NODE is not None
+    *nodes, bones = fields
+    count = len(rest.points)
+    arrays = {
+        "count": np.int32([count]),
+        "neighbours": rest.neighbours,
+        "weights": rest.neighbour_weights,
+        "template": rest.log_template,
+        "points": rest.points,
+        "factors": rest.factors,
+        "normals": rest.normals,
+        "limbs": rest.limbs,
+        "limits": np.float32([rest.max_offset, rest.floor, rest.fallback]),
+        "offsets": nodes[0],
+        "visibility": nodes[1],
+        **({} if logits is None else {"logits": logits}),
+        "bones": bones,
+    }
+    for name, values in arrays.items():
+        (folder / name).write_bytes(np.ascontiguousarray(values).tobytes())
+    (folder / "names.json").write_text(json.dumps({"names": list(arrays), "integers": ["count", "neighbours"]}))
+    source = (ROOT / "viewer/web/src").as_uri()
+    subprocess.run([NODE, "--input-type=module", "--eval", _POSE, source, str(folder)], check=True, timeout=60)
+    made = (np.fromfile(folder / f"posed{k}", np.float32).reshape(count, -1) for k in range(4))
+    return Posed(*made)
+
+
+def _assert_equal(ours: Posed, theirs: Posed) -> None:
+    for a, b in zip(ours, theirs):
+        # the others round a product before it is added
+        if get_host_cpu_features().get("fma"):
+            assert_array_equal(a, b)
+        assert_allclose(a, b, rtol=0, atol=ROUNDING * np.nanmax(np.abs(b)))
+
+
+@pytest.mark.parametrize(("joints", "harmonics"), [(24, 16), (2, 1), (55, 9)])
+def test_it_poses_to_the_bit(tmp_path, joints, harmonics):
+    rest, inputs = posing_scene(joints, harmonics=harmonics)
+    _assert_equal(_page(tmp_path, rest, *inputs), rest.pose(*inputs))
+
+
+def test_without_logits_the_template_decides(tmp_path):
+    rest, (_, *inputs) = posing_scene(24)
+    _assert_equal(_page(tmp_path, rest, None, *inputs), rest.pose(None, *inputs))
+
+
+def test_what_is_not_finite_stays_with_its_gaussians(tmp_path):
+    rest, (logits, offsets, *others) = posing_scene(24)
+    rest.points[3, 1], rest.factors[7, 2], rest.normals[11, 0] = np.nan, np.inf, np.nan
+    logits[5, 2], offsets[9, 4] = np.nan, np.inf
+    expected = rest.pose(logits, offsets, *others)
+    assert 0 < np.isnan(expected.means).any(axis=1).mean() < 0.5
+    _assert_equal(_page(tmp_path, rest, logits, offsets, *others), expected)
+
+
+def test_an_avatar_in_motion_is_posed_to_the_bit(tmp_path):
+    avatar = Avatar.load(ROOT / "assets/avatar.onnx")
+    motion = load_motion(ROOT / "assets/walk.npz", avatar.skeleton)
+    for time in (0.0, 0.31, 1.7):
+        given = avatar.unposed(avatar.encode(motion, time))
+        assert given is not None
+        inputs = given.logits, given.offsets, given.visibility, given.bones
+        _assert_equal(_page(tmp_path, given.rest, *inputs), given.rest.pose(*inputs))

@@ -1,0 +1,1 @@
+"""The laboratory: benchmarks, the stability suite and studies."""

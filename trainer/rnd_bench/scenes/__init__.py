@@ -1,0 +1,1 @@
+"""Subjects, lights and avatars that benchmarks and the stability suite share."""

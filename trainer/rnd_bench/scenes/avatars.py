@@ -1,0 +1,155 @@
+"""Avatars to measure: a trained one, or untrained ones of any size that cost as much and look like something.
+
+**The seeded avatar** stands on the embedded body. Its networks are drawn at random, their highest frequencies damped
+as in trained ones, and scaled so that they say what trained ones say: weights that move a few per cent, offsets of
+millimetres, visibility around 1. Its albedo follows from the place by a formula (stripes and patches), opacities are
+those of a training's start. It is no likeness of anybody. Its frames cost what a trained avatar's cost, and
+err alike by shading and rasteriser; by encoder they err less (the static one by 1 mm where the trained dancer's errs by
+17), as its networks say less.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.util
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rnd_runtime import __version__
+from rnd_runtime.capture.body import Body
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.config import TrainConfig, resized
+
+SEED = 7
+# out layers of the networks, as multiples of their usual start: set by eye on trained ones
+LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
+OPACITY = 2.5  # raw: 0.99 after the sigmoid of model.py, as trained avatars come out
+KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", "sun_*.exr")
+"""what rnd-bench keeps between runs; the key of its inputs (``content_key``) is in every name"""
+
+
+@dataclass(frozen=True)
+class Encoders:
+    """What of an avatar's encoders a file holds; options of ``rnd-export``.
+
+    ``encoder`` may also be ``rates``: everything, but skinning at a quarter of the nodes, offsets at an eighth.
+    """
+
+    encoder: str = "full"
+    precision: str = "f32"
+    window: int | None = None
+
+    def words(self, checkpoint: Path) -> list[str]:
+        """As on the command line, for an avatar.ckpt."""
+        words = ["--encoder", self.encoder, "--precision", self.precision]
+        if self.encoder == "rates":
+            nodes = checkpoint_model(checkpoint)["nodes"]
+            words[1] = "full"
+            words += ["--skinning-nodes", str(nodes // 4), "--offset-nodes", str(nodes // 8)]
+        return words + (["--window-poses", str(self.window)] if self.window is not None else [])
+
+
+def content_key(*parts: Path | str) -> str:
+    """16 hexadecimal digits for the content of files, for strings, their order and the package's version."""
+    digest = hashlib.sha256(__version__.encode())
+    for part in parts:
+        content = part.read_bytes() if isinstance(part, Path) else part.encode()
+        digest.update(hashlib.sha256(content).digest())
+    return digest.hexdigest()[:16]
+
+
+def forget(folder: Path) -> None:
+    """Delete what rnd-bench keeps in ``folder``, and nothing else: it may hold files of the user's."""
+    for pattern in KEPT:
+        for kept in folder.glob(pattern):
+            kept.unlink()
+
+
+def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
+    """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless this exporter has made it."""
+    key = content_key(checkpoint, *sources("rnd_export"))
+    words = encoders.words(checkpoint)
+    name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
+    out = folder / f"{name}.onnx"
+    if not out.exists():
+        code = "from rnd_export.cli import main; main()"
+        line = [sys.executable, "-c", code, str(checkpoint), "--out", str(out), "--frames", "2", "--cull", "-1", *words]
+        done = subprocess.run(line, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError("rnd-export", got=(done.stderr.strip().splitlines() or ["failed"])[-1])
+    return out
+
+
+def checkpoint_model(checkpoint: Path) -> dict[str, Any]:
+    """The fields of its ``rnd_trainer.config.ModelConfig``, by name."""
+    from rnd_trainer.model.checkpoint import SCHEMA, read_tensors
+
+    model: dict[str, Any] = read_tensors(checkpoint, SCHEMA)[1]["config"]["model"]
+    return model
+
+
+def sources(package: str) -> list[Path]:
+    """The source files of ``package``, found without importing it; none where it is not installed."""
+    found = importlib.util.find_spec(package)
+    folders = () if found is None else found.submodule_search_locations or ()
+    return sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
+
+
+def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
+    """avatar.ckpt of the seeded avatar with ``count`` Gaussians on the body of ``body_file``, made once."""
+    config = resized(TrainConfig(), count, None)
+    out = folder / f"seeded_{count}_{content_key(body_file, repr(config.model))}.ckpt"
+    if out.exists():
+        return out
+    import torch
+
+    from rnd_trainer.model.checkpoint import save_checkpoint
+    from rnd_trainer.model.model import AvatarModel
+    from rnd_trainer.model.template import sample_template
+
+    body = Body.load(body_file)
+    torch.manual_seed(SEED)
+    model = AvatarModel(config.model, sample_template(body, count, config.model.nodes, seed=SEED))
+    with torch.no_grad():
+        _speak(model)
+        appearance = model.appearance_residual
+        appearance[:, 3:6] = torch.from_numpy(_albedo(model.points.numpy()))
+        model.geometry_residual[:, 0] = OPACITY
+    light = torch.ones(32, 64, 3)
+    info = {"body_license": body.license, "made": "rnd-bench, untrained"}
+    save_checkpoint(out, model, light, body.skeleton, dataclasses.replace(config, seed=SEED), info)
+    return out
+
+
+def _speak(model: object) -> None:
+    """Let networks that are silent at the start of a training say something."""
+    import torch
+
+    frequencies = model.config.frequencies  # type: ignore[attr-defined]
+    damping = torch.ones(3 + 6 * frequencies)
+    for band in range(frequencies):
+        for start in (3, 3 + 3 * frequencies):
+            damping[start + 3 * band : start + 3 * band + 3] = 0.5**band
+    for name, strength in (("skinning", LOGITS), ("offsets", OFFSETS), ("visibility", VISIBILITY)):
+        network = getattr(model, name)
+        network.position.hidden.weight.mul_(damping)
+        last = network.logits if name == "skinning" else network.out
+        last.weight.copy_(strength * torch.randn_like(last.weight) / last.weight.shape[1])
+
+
+def _albedo(points: np.ndarray) -> np.ndarray:
+    """Raw albedo [N, 3] before the sigmoid: a striped shirt, plain trousers, light skin."""
+    height, side = points[:, 1:2], points[:, :1]
+    stripes = np.tanh(8 * np.sin(70 * height))
+    shirt = np.array([[0.9, -0.4, -0.9]]) + stripes * np.array([[0.3, 0.9, 0.8]])
+    trousers = np.array([[-1.2, -0.8, 0.4]]) + 0.4 * np.sin(40 * side)
+    skin = np.array([[1.8, 1.0, 0.5]]) + 0.2 * np.sin(90 * height) * np.sin(90 * side)
+    covered = np.where(height > 0.95, shirt, trousers)
+    bare = (height > 1.42) | (np.abs(side) > 0.45) | (height < 0.1)
+    return np.where(bare, skin, covered).astype(np.float32)

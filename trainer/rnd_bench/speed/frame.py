@@ -1,0 +1,170 @@
+"""One point of the speed–accuracy chart: frames of an avatar, timed in a process of their own.
+
+The process that draws imports no torch and computes no reference, so that its memory and its time are a player's.
+Motion and light both change from frame to frame.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_bench.scenes.scenes import USUAL, bench_camera
+from rnd_runtime.core.errors import InputError
+
+from .clock import summary
+
+Floats32 = NDArray[np.float32]
+
+WARMUP = 5
+STEP_S = 1 / 30  # of the motion, from frame to frame
+TURN = 0.02  # radians that the light turns from frame to frame
+COMPARED = (8, 19, 30, 41, 52, 63, 74, 85)  # frames whose pixels and places are compared with the reference
+DEADLINE_S = 300.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames.
+
+    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``, ``view`` as of ``bench_scenes.bench_camera``.
+    """
+
+    avatar: str
+    motion: str
+    hdr: str
+    size: int = 512
+    shade: str = "table+sun"
+    raster: str = "cpu"
+    threads: int = 2
+    frames: int = 90
+    seconds: float = 6.0
+    cull: float | None = None
+    view: str = USUAL
+
+
+class Drawn(NamedTuple):
+    """Times of a point, and what it drew at the frames ``COMPARED``.
+
+    ``row``: ms_median, ms_p95, stages (median ms), stages_p95, cold_start_ms (from the start of the process to its
+    first frame), peak_mb, file_mb, frames, renderer (what drew). ``radiance`` [K, H, W, 3] linear, premultiplied;
+    ``means`` [K, N, 3] m.
+    """
+
+    row: dict[str, Any]
+    radiance: Floats32
+    means: Floats32
+
+
+def measure(point: Point) -> Drawn:
+    """Run ``point`` in a process of its own. Raises ``InputError`` where it cannot be drawn here."""
+    environment = os.environ | {
+        "NUMBA_NUM_THREADS": str(point.threads),
+        "OMP_NUM_THREADS": str(point.threads),
+        "OMP_WAIT_POLICY": "PASSIVE",
+    }
+    # of a player that was used before not only the kernels are compiled: some machines forbid it, for tidiness
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
+        code = "import sys; from rnd_bench.speed.frame import draw; draw(sys.argv[1], float(sys.argv[2]))"
+        line = [sys.executable, "-c", code, folder, repr(time.monotonic())]
+        what = f"{point.raster}, {point.shade}"
+        try:
+            done = subprocess.run(
+                line, env=environment, capture_output=True, text=True, check=False, timeout=DEADLINE_S
+            )
+        except subprocess.TimeoutExpired as error:
+            raise InputError(what, expected=f"an answer within {DEADLINE_S:g} s", got="none") from error
+        if done.returncode:
+            why = (done.stderr.strip().splitlines() or ["no answer"])[-1]
+            why = why.removeprefix(f"{InputError.__module__}.{InputError.__qualname__}: ")
+            raise InputError(what, got=why[:200])
+        row = json.loads((out / "row.json").read_text("utf-8"))
+        with np.load(out / "drawn.npz") as drawn:
+            return Drawn(row, drawn["radiance"], drawn["means"])
+
+
+def draw(folder: str, spawned: float) -> None:
+    """What the process does: reads point.json, leaves row.json and drawn.npz.
+
+    ``spawned`` is the parent's monotonic clock, which processes share, when it started this one.
+    """
+    from rnd_runtime.playback.start import quick_start
+
+    out = Path(folder)
+    point = Point(**json.loads((out / "point.json").read_text("utf-8")))
+    with quick_start(point.avatar, point.threads) as ahead:  # as rnd-play does
+        _draw(point, out, spawned, ahead)
+
+
+def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
+    from rnd_runtime.avatar.avatar import Avatar
+    from rnd_runtime.motion.motion import load_motion
+    from rnd_runtime.playback.frame import FrameRenderer
+    from rnd_runtime.playback.start import settle
+    from rnd_runtime.shading.light import load_light
+
+    avatar = Avatar.load(point.avatar, threads=point.threads, ahead=ahead)
+    motion = load_motion(Path(point.motion), avatar.skeleton)
+    light = load_light(Path(point.hdr))
+    raster: Any = point.raster
+    camera = bench_camera(point.size, point.view)
+    renderer = FrameRenderer(avatar, light, camera, shade=point.shade, raster=raster, cull=point.cull)
+
+    def frame(number: int) -> Any:
+        renderer.turn(TURN * number)
+        return renderer.render(motion, STEP_S * number)
+
+    frame(0)
+    cold_ms = 1e3 * (time.monotonic() - spawned)
+    settle()
+    for number in range(1, WARMUP):
+        frame(number)
+    taken: list[float] = []
+    stages: dict[str, list[float]] = {}
+    until = time.perf_counter() + point.seconds
+    while len(taken) < point.frames and (len(taken) < 5 or time.perf_counter() < until):
+        before = time.perf_counter()
+        drawn = frame(WARMUP + len(taken))
+        taken.append(1e3 * (time.perf_counter() - before))
+        for name, seconds in drawn.stage_seconds.items():
+            stages.setdefault(name, []).append(1e3 * seconds)
+    peak_mb = _peak_mb()
+    compared = [frame(number).radiance for number in COMPARED]
+    means = [avatar.pose(motion, STEP_S * number).means for number in COMPARED]
+    row = {
+        **summary(taken),
+        "stages": {name: float(np.median(values)) for name, values in stages.items()},
+        "stages_p95": {name: float(np.percentile(values, 95)) for name, values in stages.items()},
+        "cold_start_ms": cold_ms,
+        "peak_mb": peak_mb,
+        "file_mb": Path(point.avatar).stat().st_size / 1e6,
+        "frames": len(taken),
+        "warmup": WARMUP,
+        "renderer": renderer.draws_with,
+    }
+    (out / "row.json").write_text(json.dumps(row), encoding="utf-8")
+    np.savez(out / "drawn.npz", radiance=np.array(compared), means=np.array(means))
+    renderer.close()
+
+
+def _peak_mb() -> float:
+    import resource
+
+    try:  # this program's own peak; ru_maxrss would also hold that of the parent it was forked from
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+        return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

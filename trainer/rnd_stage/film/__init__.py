@@ -1,0 +1,1 @@
+"""Cameras, lights and motions, and the capture that is written."""

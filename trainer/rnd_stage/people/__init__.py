@@ -1,0 +1,1 @@
+"""Bodies, garments and materials."""

@@ -1,0 +1,95 @@
+"""Which of Mitsuba's back ends works here: a wrong LLVM aborts the whole process, so a child process tries it first."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, get_args
+
+from rnd_runtime.core.errors import InputError
+
+Variant = Literal["auto", "scalar_rgb", "llvm_ad_rgb"]
+
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+OLDEST_LLVM = 16  # 14 and 15 cannot select instructions that Dr.Jit asks for on AVX-512, and abort
+PROBE_SECONDS = 120.0
+_FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
+_PROBE = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from rnd_trainer.stage.render import probe
+probe()
+"""
+
+
+def need_extra() -> None:
+    """Refuse to go on, naming the extra to install, where Mitsuba or what meshes the subjects is missing."""
+    from importlib.util import find_spec
+
+    for module, package in (("mitsuba", "mitsuba"), ("skimage", "scikit-image"), ("scipy", "scipy"), ("cv2", "opencv")):
+        if find_spec(module) is None:
+            raise InputError(
+                f"{package} is not installed",
+                hint='needs the extra: pip install "rnd-avatar[stage]", in a clone ".[stage]"',
+            )
+
+
+def use_variant(wanted: Variant = "auto") -> str:
+    """Switch Mitsuba to ``wanted`` and return its name; "auto" takes LLVM where a child process rendered with it.
+
+    Raises:
+        InputError: no such variant, or "llvm_ad_rgb" and no library that works.
+    """
+    if wanted not in get_args(Variant):
+        raise InputError("--variant", expected=", ".join(get_args(Variant)), got=wanted)
+    name = "scalar_rgb"
+    if wanted != "scalar_rgb":
+        library = working_llvm()
+        if library is None and wanted == "llvm_ad_rgb":
+            raise InputError(
+                "no LLVM that works for Mitsuba",
+                hint=f"install libllvm19 or newer, or point {LIBRARY_VARIABLE} at its libLLVM.so",
+            )
+        if library is not None:
+            name = "llvm_ad_rgb"
+            os.environ[LIBRARY_VARIABLE] = library
+    import mitsuba as mi
+
+    mi.set_variant(name)
+    mi.set_log_level(mi.LogLevel.Error)  # samplers tell that they round sample counts up
+    return name
+
+
+def working_llvm() -> str | None:
+    """The first LLVM library with which a child process renders a picture; None where there is none."""
+    return next((library for library in _candidates() if _renders(library)), None)
+
+
+def _candidates() -> Iterator[str]:
+    """What the user named, and nothing else; otherwise the system's libraries, the newest first."""
+    named = os.environ.get(LIBRARY_VARIABLE)
+    if named:
+        yield named
+        return
+    found: dict[int, str] = {}
+    for folder in map(Path, _FOLDERS):
+        for path in [*folder.glob("libLLVM*"), *folder.glob("*/libLLVM*"), *folder.glob("llvm*/lib/libLLVM*")]:
+            version = re.search(r"libLLVM(?:-|\.so\.|\.)(\d+)", path.name)
+            if version and int(version[1]) >= OLDEST_LLVM and path.is_file():
+                found.setdefault(int(version[1]), str(path))
+    yield from (found[version] for version in sorted(found, reverse=True))
+
+
+def _renders(library: str) -> bool:
+    environment = {**os.environ, LIBRARY_VARIABLE: library, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, timeout=PROBE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return child.returncode == 0

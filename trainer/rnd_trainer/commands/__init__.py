@@ -1,0 +1,1 @@
+"""rnd-train, rnd-eval and rnd-data."""

@@ -1,0 +1,107 @@
+"""Pictures of a model by the runtime's shading and rasteriser, so that what is judged is what is played."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rnd_runtime.core.camera import Camera, Floats
+from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.motion.skeleton import taken_along
+from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.raster.in_view import in_view
+from rnd_runtime.raster.outline import sharpened
+from rnd_runtime.shading.shader import Shader
+from rnd_trainer.model.encoders import SH_DC_OF_ONE
+from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+from rnd_trainer.render.shading import view_visibility
+
+
+@torch.no_grad()
+def to_gaussians(posed: Posed, pose: PoseInput) -> Gaussians:
+    """Posed Gaussians as the runtime's arrays."""
+    static = posed.attributes
+    tensors = (
+        posed.means,
+        posed.covariances,
+        static.opacity,
+        posed.normals,
+        static.albedo,
+        static.roughness,
+        posed.visibility,
+        pose.bones[0, :, :3],
+    )
+    return Gaussians(*(np.ascontiguousarray(t.cpu().numpy(), np.float32) for t in tensors))
+
+
+@dataclass
+class Rendered:
+    """What the player would show, before any background; all but ``alpha`` [H, W] is premultiplied by it.
+
+    ``image`` [H, W, 3] linear radiance, ``normals`` [H, W, 3] in the camera's axes, ``albedo`` [H, W, 3] linear.
+    """
+
+    image: Tensor
+    normals: Tensor
+    albedo: Tensor
+    alpha: Tensor
+
+
+@torch.no_grad()
+def render_runtime(
+    model: AvatarModel,
+    pose: PoseInput,
+    camera: Camera,
+    shader: Shader | None,
+    albedo_scale: Tensor | None = None,
+    cull: float | None = None,
+) -> Rendered:
+    """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional.
+
+    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``.
+    """
+    pose, root = _in_root_frame(pose)
+    camera = camera.in_frame(root)
+    posed = model(pose)
+    gaussians = to_gaussians(posed, pose)
+    if albedo_scale is not None:
+        gaussians = replace(gaussians, albedo=gaussians.albedo * albedo_scale.numpy())
+    radiance = posed.attributes.colour.cpu().numpy()
+    if shader is not None:
+        radiance = _shade(model, gaussians, posed, pose, camera, shader.in_frame(root[:3, :3]))
+    normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
+    features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
+    splats = gaussians.means, gaussians.covariances, gaussians.opacities
+    seen = None if cull is None else in_view(*splats, camera, normals=gaussians.normals, cull=cull)
+    raster = sharpened(rasterize(*splats, features, camera, seen=seen))
+    image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
+    return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
+
+
+def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
+    """``pose`` in the frame in which playback poses, and that frame → world [4, 4]."""
+    bones = pose.bones.detach().cpu().numpy()
+    root = np.vstack([bones[0].astype(np.float64), [0, 0, 0, 1]])
+    local = taken_along(bones, np.linalg.inv(root))
+    return replace(pose, bones=torch.from_numpy(local).to(pose.bones)), root
+
+
+def _shade(
+    model: AvatarModel, gaussians: Gaussians, posed: Posed, pose: PoseInput, camera: Camera, shader: Shader
+) -> NDArray[np.float32]:
+    """Radiance [N, 3]; the ablated kinds of visibility see no shadows, and the paper's dims by direction."""
+    kind = model.config.visibility
+    if kind == "pose":
+        return shader.shade(gaussians, camera.position)
+    everywhere = np.zeros_like(gaussians.visibility)
+    everywhere[:, 0] = SH_DC_OF_ONE
+    radiance = shader.shade(replace(gaussians, visibility=everywhere), camera.position, sun_shadows=False)
+    if kind == "paper":
+        eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
+        view = torch.nn.functional.normalize(eye - posed.means, dim=-1)
+        radiance = radiance * view_visibility(posed.visibility, view, pose.bones[0, :, :3]).cpu().numpy()
+    return radiance

@@ -1,0 +1,170 @@
+"""Every figure of a trained avatar on the held-out splits of a capture, as rows for a table or a JSON file."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numba
+from torch import Tensor
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.capture.capture import Capture
+from rnd_runtime.capture.format import Split
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import sha256_of
+from rnd_runtime.core.images import write_image
+from rnd_runtime.playback.doctor import machine
+from rnd_runtime.playback.frame import FrameRenderer
+from rnd_runtime.shading.light import Light
+from rnd_trainer.losses.perceptual import Perceptual
+from rnd_trainer.model.checkpoint import Checkpoint
+
+from .evaluate import HELD_OUT, Judge, albedo_scale, evaluate, flicker
+from .preview import contact_sheet, strip
+
+PLAYED = 40
+"""frames that playback is timed on"""
+
+
+def score(
+    checkpoint: Checkpoint,
+    capture: Capture,
+    *,
+    method: str,
+    mode: str = "table+sun",
+    pictures: Path | None = None,
+    perceptual: Perceptual | None = None,
+    avatar: Path | None = None,
+    cull: float | None = None,
+) -> list[dict[str, Any]]:
+    """Rows of every held-out split that the capture has, relighting raw and with the albedo scaled.
+
+    Args:
+        method: name of the rows.
+        mode: shading of the runtime.
+        pictures: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
+        perceptual: adds LPIPS.
+        avatar: the exported file; adds its size and its frames a second.
+        cull: as of the player.
+
+    Raises:
+        InputError: the capture has no held-out split.
+    """
+    judge = Judge(checkpoint, capture, mode, cull=cull)
+    lit = checkpoint.config.light != "none"  # else there is no albedo: colours that no light changes
+    scale = albedo_scale(judge) if lit else None
+    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
+    if scale is not None and capture.split("relight"):
+        jobs.append(("relight", scale))
+    if not jobs:
+        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)
+    whole = {
+        "flicker": flicker(judge),
+        "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
+        "shade": mode,
+        "cull": cull,
+        "lpips_weights": None if perceptual is None else perceptual.backbone,
+        "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+        **({} if avatar is None else playback(avatar, judge)),
+        "size": sizes(capture),
+        "scored_on": capture.folder.resolve().name,
+        "capture_sha256": sha256_of(capture.file),
+        "motion": Path(judge.motion.source).name,
+        **_provenance(checkpoint),
+    }
+    names = picture_names([frame.image for split, _ in jobs for frame in capture.split(split)])
+    rows = []
+    for split, factor in jobs:
+        name = split if factor is None else f"{split}, albedo scaled"
+        folder = None if pictures is None else pictures / name.replace(", ", "_").replace(" ", "_")
+        strips: list[Any] = []
+
+        def keep(frame: Any, rendered: Any, target: Any, folder: Path | None = folder, kept: Any = strips) -> None:
+            if folder is not None:
+                kept.append(strip(rendered, target.numpy()))
+                write_image(folder / f"{names[frame.image]}.png", kept[-1])
+
+        result = evaluate(judge, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep)
+        if not lit:
+            result.scores.pop("psnr_albedo", None)
+        if folder is not None:
+            contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
+        exact = all(frame.normal_gt is not None for frame in capture.split(split))
+        rows.append(
+            {
+                "split": name,
+                "method": method,
+                "frames": result.frames,
+                **result.scores,
+                "normals": "exact" if exact else "estimated",
+                **whole,
+            }
+        )
+    return rows
+
+
+def picture_names(images: Iterable[str]) -> dict[str, str]:
+    """A name without folder and suffix for each of ``images``, paths in a capture.
+
+    The picture's own where no other has it, else with the folders before it.
+    """
+    paths = {image: PurePosixPath(image).with_suffix("") for image in images}
+    stems = Counter(path.name for path in paths.values())
+    return {image: path.name if stems[path.name] == 1 else "_".join(path.parts) for image, path in paths.items()}
+
+
+def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
+    """Size of an exported avatar in MB, and frames a second of the runtime from pose to pixels in memory.
+
+    Under the learned light, shaded as it is judged, seen by the first held-out camera, over ``PLAYED`` consecutive
+    poses; the median.
+    """
+    frame = next(frame for split in HELD_OUT for frame in judge.capture.split(split))
+    renderer = FrameRenderer(
+        Avatar.load(avatar),
+        Light(judge.checkpoint.probe.numpy()),
+        judge.capture.cameras[frame.camera],
+        shade=judge.mode,
+        cull=judge.cull,
+    )
+    seconds = []
+    for k in range(PLAYED):
+        started = time.perf_counter()
+        renderer.render(judge.motion, (k % judge.motion.frame_count) / judge.motion.fps)
+        seconds.append(time.perf_counter() - started)
+    renderer.close()
+    return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}
+
+
+def sizes(capture: Capture, splits: Iterable[Split] = HELD_OUT) -> list[tuple[int, int]]:
+    """Widths and heights in pixels of the pictures of ``splits``, each once."""
+    cameras = (capture.cameras[frame.camera] for split in splits for frame in capture.split(split))
+    return sorted({(camera.width, camera.height) for camera in cameras})
+
+
+def _provenance(checkpoint: Any) -> dict[str, Any]:
+    info, config = checkpoint.info, checkpoint.config
+    return {
+        "minutes": info.get("minutes"),
+        "train_threads": info.get("threads"),
+        "train_machine": info.get("machine"),
+        "train_device": info.get("device"),
+        "capture": info.get("capture"),
+        "train_motion": info.get("motion"),
+        "steps": config.steps,
+        "step": info.get("step"),
+        "seed": config.seed,
+        "gaussians": config.model.gaussians,
+        "image_scale": config.image_scale,
+        "light": config.light,
+        "train_perceptual": info.get("perceptual"),
+        "consistency_sha256": info.get("consistency_sha256"),
+        "refine_poses": config.refine_poses,
+        "threads": numba.get_num_threads(),
+        "machine": machine(),
+    }

@@ -1,0 +1,67 @@
+"""PeopleSnapshot as its authors ship it: a video, its lens, masks and fitted poses."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.readers.unpickle import read_pickle
+from rnd_trainer.importing.frames import Film
+from rnd_trainer.importing.images import Bytes, camera_of
+from rnd_trainer.importing.recording import Lens, Recording, Shot, smpl_poses
+
+
+def detect(source: Path) -> str | None:
+    """ "camera.pkl" beside "masks.hdf5" and "reconstructed_poses.hdf5"."""
+    needed = ("camera.pkl", "masks.hdf5", "reconstructed_poses.hdf5")
+    return ", ".join(needed) if all((source / name).is_file() for name in needed) else None
+
+
+def read(source: Path) -> Recording:
+    """Read the raw layout. Where there are more poses than masks, the last ones belong to the masks."""
+    camera = read_pickle(source / "camera.pkl", what="camera")
+    try:
+        f, c, k, rt, t = (
+            np.asarray(camera[f"camera_{key}"], np.float64).reshape(-1) for key in ("f", "c", "k", "rt", "t")
+        )
+        size = int(camera["width"]), int(camera["height"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            "camera", expected="camera_f, _c, _k, _rt, _t, width, height", file=source / "camera.pkl"
+        ) from error
+    K = np.array([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]])
+    lens = Lens(camera_of(K, axis_angle_to_matrix(rt), t, size), tuple(k.tolist()))
+    masks = _hdf5(source / "masks.hdf5", "masks")
+    pose, trans, betas = (_hdf5(source / "reconstructed_poses.hdf5", key)[:] for key in ("pose", "trans", "betas"))
+    count = len(masks)
+    if len(pose) < count:
+        raise InputError("poses", expected=f"one for each of {count} masks", got=len(pose), file=source)
+    videos = sorted(source.glob("*.mp4"))
+    if len(videos) != 1:
+        raise InputError("video", expected="one .mp4", got=len(videos), file=source)
+    film = Film(videos[0])
+    poses = smpl_poses(range(count), pose[-count:], trans[-count:], betas)
+    shots = [Shot("0", k, partial(film.frame, k), partial(_mask, masks, k)) for k in range(min(count, film.count))]
+    notes = (f"{len(pose)} poses for {count} masks: the last {count} used",) if len(pose) > count else ()
+    return Recording("PeopleSnapshot", {"0": lens}, shots, poses, film.fps, notes)
+
+
+def _mask(masks: Any, frame: int) -> Bytes:
+    return np.where(np.asarray(masks[frame]) > 0, 255, 0).astype(np.uint8)
+
+
+def _hdf5(path: Path, name: str) -> Any:
+    if importlib.util.find_spec("h5py") is None:
+        raise InputError("h5py is not installed", hint='pip install "rnd-avatar[data]", in a clone ".[data]"')
+    import h5py
+
+    try:
+        return h5py.File(path, "r")[name]
+    except (OSError, KeyError) as error:
+        raise InputError(name, expected="a data set of an HDF5 file", got=str(error), file=path) from error

@@ -1,0 +1,1 @@
+"""Masks and normals, made where a data set has none."""

@@ -1,0 +1,237 @@
+"""Masks for a plain video with nothing else: rough, and for a static camera best.
+
+Where the body's poses are known, the posed template says where the person roughly is; GrabCut (Rother et al. 2004)
+then finds the outline by colour, and a guided filter (He et al. 2013) lets it follow edges finer than a pixel. A
+static camera also shows what is behind the person: pixels that look like their own median over the frames in which
+the template is elsewhere are background. A segmentation network, where the user has one, takes the template's place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.errors import InputError
+
+from .networks import ImageNetwork
+
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+# Shares of the silhouette's height; a person of 1.7 m makes them centimetres
+_SURE_INSIDE = 0.015  # 2.5 cm: farther inside the template is the person
+_CLEARANCE = 0.04  # 7 cm: farther outside is background, for learning what it looks like
+_REACH = 0.08  # 14 cm: as far may clothes, hair and badly fitted poses stand out, where the background is known
+_BLIND_REACH = 0.05  # 8.5 cm: the same where it is not, and colours alone must decide
+_WORK_SIDE = 320  # pixels: GrabCut's time grows with the area, and the guided filter brings the edge back
+_GRABCUT_ROUNDS = 2  # more forget where the template was
+_BACKGROUND_FRAMES = 40
+_STRIP = 64  # rows at a time: forty frames of a large video as floats would be gigabytes
+_BINS = 4  # of a histogram, for each 8-bit step
+_LEAST_NOISE = 5.0  # 8-bit steps: what a lossy video codec does to a still wall
+_STATIC_NOISE = 12.0  # median difference above which the camera must have moved
+
+
+def make_masks(
+    pictures: Sequence[Picture], silhouettes: Sequence[Mask] | None = None, *, net: Path | None = None
+) -> Iterator[Picture]:
+    """Rough masks [H, W] uint8 (coverage, 255 is the person), one after the other.
+
+    Both sequences may be lazy: they are read by index, one picture at a time, some of them twice.
+
+    Args:
+        pictures: [H, W, 3] uint8 sRGB, all of one size; more than one where neither of the others is given.
+        silhouettes: [H, W] where the posed template is, as ``silhouette.draw`` has it.
+        net: a segmentation network in ONNX (layouts: ``networks.ImageNetwork``), used in their place.
+
+    Raises:
+        InputError: where there is nothing to go by: neither poses nor network, and nothing moves.
+    """
+    if len(pictures) == 0:
+        return
+    network = None if net is None else ImageNetwork(net, outputs=(1, 2))
+    background = _learn_background(pictures, silhouettes)
+    if network is None and silhouettes is None and background is None:
+        raise InputError(
+            "masks", expected="body poses, a static camera with somebody moving, or --mask-net", got="none of them"
+        )
+    for frame in range(len(pictures)):
+        picture = pictures[frame]
+        silhouette = None if silhouettes is None else silhouettes[frame]
+        if network is not None:
+            person = _network_says(network, picture, silhouette)
+        elif silhouette is not None:
+            person = silhouette
+        else:
+            assert background is not None
+            person = _what_moved(picture, background)
+        blind = network is None and background is None
+        yield _refine(picture, _seeds(person, silhouette, picture, background, _BLIND_REACH if blind else _REACH))
+
+
+class _Background:
+    """What a static camera sees behind the person.
+
+    Attributes:
+        colour: [H, W, 3] median over the frames that show it.
+        seen: [H, W] whether enough of them do.
+        noise: 8-bit steps within which a pixel counts as background.
+    """
+
+    def __init__(self, colour: NDArray[np.float32], seen: Mask, noise: float) -> None:
+        self.colour, self.seen, self.noise = colour, seen, noise
+
+    def differs(self, picture: Picture) -> Mask:
+        """[H, W] where ``picture`` shows something else, a mere shadow not counted."""
+        difference = np.abs(picture - self.colour).max(-1)
+        ratio = (picture + 1.0) / (self.colour + 1.0)
+        shadow = (ratio.max(-1) < 1.05) & (ratio.min(-1) > 0.45) & (np.ptp(ratio, axis=-1) < 0.12)
+        differs: Mask = (difference > self.noise) & ~shadow
+        return differs
+
+
+def _learn_background(pictures: Sequence[Picture], silhouettes: Sequence[Mask] | None) -> _Background | None:
+    """The background, or None where the camera moves or nothing is ever uncovered."""
+    count = len(pictures)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _BACKGROUND_FRAMES)).astype(int))
+    if len(chosen) < 3:
+        return None
+    stack = np.stack([pictures[frame] for frame in chosen])
+    hidden = np.zeros(stack.shape[:3], bool)
+    if silhouettes is not None:
+        hidden = np.stack([_dilated(silhouettes[frame], _CLEARANCE) for frame in chosen])
+    seen = (~hidden).sum(0) >= min(3, len(chosen))
+    colour = np.zeros(stack.shape[1:], np.float32)
+    differences = np.zeros(255 * _BINS + 1, np.int64)  # how often each difference occurs
+    for top in range(0, len(seen), _STRIP):
+        rows = slice(top, top + _STRIP)
+        shown = np.where(hidden[:, rows, :, None], np.float32(np.nan), stack[:, rows])[:, seen[rows]]
+        if shown.size:
+            colour[rows][seen[rows]] = np.nanmedian(shown, axis=0)
+            apart = np.abs(shown - colour[rows][seen[rows]]).max(-1)
+            steps = (apart[np.isfinite(apart)] * _BINS).astype(np.int64)
+            differences += np.bincount(steps, minlength=len(differences))
+    if not differences.any():
+        return None
+    below = np.cumsum(differences) / differences.sum()
+    spread = float(np.searchsorted(below, 0.5)) / _BINS
+    noise = max(_LEAST_NOISE, 4 * spread)
+    moves = 1 - below[min(int(noise * _BINS), 255 * _BINS)]
+    if spread > _STATIC_NOISE or (silhouettes is None and moves < 1e-3):
+        return None
+    return _Background(colour, seen, noise)
+
+
+def _seeds(
+    person: Mask, silhouette: Mask | None, picture: Picture, background: _Background | None, reach: float
+) -> Picture:
+    """GrabCut's labels [H, W]: ``person`` is probable; well inside it and the template, and by the background, sure."""
+    seeds = np.full(person.shape, cv2.GC_BGD, np.uint8)
+    template = person if silhouette is None else silhouette
+    if not template.any():
+        return seeds
+    near = _dilated(template, reach)
+    seeds[near] = cv2.GC_PR_BGD
+    seeds[near & person] = cv2.GC_PR_FGD
+    if background is not None:
+        differs = background.differs(picture)
+        seeds[near & background.seen & differs] = cv2.GC_FGD
+        seeds[near & background.seen & ~differs] = cv2.GC_PR_BGD
+        seeds[near & ~template & background.seen & ~differs] = cv2.GC_BGD
+    inside = cv2.distanceTransform((template & person).astype(np.uint8), cv2.DIST_L2, 3)
+    seeds[inside > _SURE_INSIDE * _height(template)] = cv2.GC_FGD
+    return seeds
+
+
+def _what_moved(picture: Picture, background: _Background) -> Mask:
+    """Where ``picture`` differs from the background, without specks and with small gaps closed."""
+    differs = (background.differs(picture) & background.seen).astype(np.uint8)
+    side = max(3, 2 * (min(differs.shape) // 120) + 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, kernel)
+    return _large_parts(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel, iterations=2))
+
+
+def _network_says(network: ImageNetwork, picture: Picture, silhouette: Mask | None) -> Mask:
+    """Where a network finds the person; it looks at the template's surroundings where those are known."""
+    height, width = picture.shape[:2]
+    rows, columns = slice(0, height), slice(0, width)
+    if silhouette is not None and silhouette.any():
+        rows, columns = _box(silhouette, 1.5 * _REACH)
+    output = network(picture[rows, columns])
+    if output.shape[2] == 2:  # scores of background and person
+        likely = output[..., 1] > output[..., 0]
+    else:
+        logits = output.min() < -1e-3 or output.max() > 1 + 1e-3
+        likely = output[..., 0] > (0 if logits else 0.5)
+    person = np.zeros((height, width), bool)
+    person[rows, columns] = likely
+    return _large_parts(person)
+
+
+def _refine(picture: Picture, seeds: Picture) -> Picture:
+    """Coverage [H, W]: GrabCut from ``seeds`` at working size, its outline fitted to the picture's edges."""
+    coverage = np.zeros(seeds.shape, np.uint8)
+    possible = seeds != cv2.GC_BGD
+    if not possible.any():
+        return coverage
+    rows, columns = _box(possible, 0.05)
+    crop, labels = np.ascontiguousarray(picture[rows, columns]), seeds[rows, columns]
+    scale = min(1.0, _WORK_SIDE / max(labels.shape))
+    small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small_labels = cv2.resize(labels, small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    rough = cv2.resize(
+        _grabcut(small, small_labels).astype(np.float32), crop.shape[1::-1], interpolation=cv2.INTER_LINEAR
+    )
+    radius = max(2, round(1.5 / scale))
+    soft = cv2.ximgproc.guidedFilter(crop.astype(np.float32) / 255, rough, radius, 1e-4)
+    soft = np.clip((soft - 0.15) / 0.7, 0, 1)  # the filter leaves haze on both sides of the edge
+    coverage[rows, columns] = np.round(255 * soft)
+    return coverage
+
+
+def _grabcut(picture: Picture, labels: Picture) -> Mask:
+    """Where the person is; what is surely there by ``labels`` where colours say nothing."""
+    person = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    if not person.any() or person.all():
+        return _large_parts(person)
+    cv2.setRNGSeed(0)  # its clusters start at random: equal pictures give equal masks
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    refined, *_ = cv2.grabCut(picture, labels.copy(), None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    return _large_parts(np.isin(refined, (cv2.GC_FGD, cv2.GC_PR_FGD)))
+
+
+def _large_parts(mask: NDArray[np.generic]) -> Mask:
+    """``mask`` without the islands below a twentieth of its largest one."""
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    areas = statistics[1:, cv2.CC_STAT_AREA]
+    large: Mask = np.isin(labels, 1 + np.flatnonzero(areas > 0.05 * areas.max())) if count > 1 else labels > 0
+    return large
+
+
+def _height(mask: Mask) -> int:
+    rows = np.flatnonzero(mask.any(1))
+    return int(rows[-1] - rows[0] + 1)
+
+
+def _dilated(mask: Mask, share: float) -> Mask:
+    """``mask`` grown by ``share`` of its height."""
+    if not mask.any():
+        return mask
+    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
+    grown: Mask = outside <= share * _height(mask)
+    return grown
+
+
+def _box(mask: Mask, share: float) -> tuple[slice, slice]:
+    """Rows and columns around ``mask``, grown by ``share`` of its height."""
+    margin = int(np.ceil(share * _height(mask))) + 2
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return (
+        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + 1 + margin),
+        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + 1 + margin),
+    )

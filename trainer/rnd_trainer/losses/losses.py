@@ -1,0 +1,90 @@
+"""Loss terms, each a scalar; their weights live in ``config``."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from rnd_trainer.model.model import Posed
+from rnd_trainer.render.probe import luminance, natural_sky
+
+from .metrics import SSIM_WINDOW, ssim_map
+
+ALLOWED_STRETCH = 1.7
+"""ratio of lengths that costs nothing: skin does stretch"""
+
+
+def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, scales: int = 1) -> Tensor:
+    """L1 plus weighted 1 − SSIM of two sRGB images [H, W, 3], averaged over ``scales`` halvings of both."""
+    l1 = (image_srgb - target_srgb).abs().mean()
+    if weight_dssim == 0:
+        return l1
+    return l1 + weight_dssim * multiscale_dssim(image_srgb, target_srgb, scales)
+
+
+def multiscale_dssim(image_srgb: Tensor, target_srgb: Tensor, scales: int) -> Tensor:
+    """Mean of 1 − SSIM at full size, half, quarter …, as long as the 11-pixel window fits."""
+    terms = []
+    for scale in range(scales):
+        if scale:
+            image_srgb, target_srgb = _halved(image_srgb), _halved(target_srgb)
+            if min(image_srgb.shape[:2]) < SSIM_WINDOW:
+                break
+        terms.append(1 - ssim_map(image_srgb, target_srgb).mean())
+    return torch.stack(terms).mean()
+
+
+def _halved(image: Tensor) -> Tensor:
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
+
+
+def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:
+    """KL(W ‖ W_template) [N, J] averaged over the Gaussians."""
+    return (weights * (weights.clamp(min=1e-12).log() - log_template)).sum(-1).mean()
+
+
+def stretch_penalty(stretch: Tensor) -> Tensor:
+    """Mean of max(0, stretch − 1.7)² over edges [E] of given stretch (length over length at rest); 0 of none.
+
+    What as-isometric-as-possible deformation (Kilian et al. 2007) holds against lengths, beyond what skin does.
+    """
+    return torch.relu(stretch - ALLOWED_STRETCH).square().sum() / max(len(stretch), 1)
+
+
+def geometry_prior(posed: Posed, weight_offset: float, weight_residual: float) -> Tensor:
+    """Mean squares of the pose offset (in units of its bound) and of the geometric residuals."""
+    residual = posed.attributes.raw_geometry_residual
+    return weight_offset * posed.offset.square().mean() + weight_residual * residual.square().mean()
+
+
+def grey_prior(radiance: Tensor, solid_angles: Tensor) -> Tensor:
+    """Mean absolute chroma of the light of a probe [32, 64, 3] as a whole, relative to its level.
+
+    Colour of light and albedo are known up to a factor per channel, which "white on average" chooses. Single
+    directions stay free: under a low sun the shadows are blue.
+    """
+    mean = (radiance * (solid_angles / solid_angles.sum())[..., None]).sum((0, 1))
+    return ((mean - mean.mean()).abs() / mean.mean()).mean()
+
+
+def sky_prior(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Tensor:
+    """Mean of d² / (1 + d²), d the logarithm of a probe [32, 64, 3] beside a natural sky of the same median.
+
+    Geman and McClure's function: a sun, which is far from any sky, is left alone, and near the level nothing holds
+    the sky back when all of it darkens beside the sun (an absolute value would).
+    """
+    off = torch.log(luminance(radiance)) - torch.log(natural_sky(directions[..., 1]))
+    square = (off - off.detach().median()).square()
+    return (square / (1 + square) * solid_angles).sum() / solid_angles.sum()
+
+
+def linear_to_srgb(linear: Tensor) -> Tensor:
+    """The runtime's transfer function with a gradient everywhere: values above 1 keep a hundredth of theirs.
+
+    Pictures are clipped at 1; a highlight that is far too bright must still feel it.
+    """
+    x = linear.clamp(min=0)
+    x = torch.where(x > 1, 1 + 0.01 * (x - 1), x)
+    low = 12.92 * x
+    high = 1.055 * x.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(x <= 0.0031308, low, high)

@@ -1,0 +1,73 @@
+"""Image and normal metrics on held-out pictures."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from .blur import SeparableFilter
+
+SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
+"""of Wang et al. 2004, as scikit-image with gaussian_weights=True, use_sample_covariance=False"""
+
+
+def psnr(image: Tensor, target: Tensor, where: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB for values in 0…1, over the pixels ``where`` [H, W] if given."""
+    error = (image - target).square()
+    mean = float((error if where is None else error[where]).mean())
+    return math.inf if mean == 0 else -10 * math.log10(mean)
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity [H', W', C] of [H, W, C] images in 0…1, where the window lies inside the image.
+
+    Wang et al. 2004, eq. 13, Gaussian window of σ 1.5. Images smaller than the window are an error of ours.
+    """
+    assert min(image.shape[:2]) >= SSIM_WINDOW, "SSIM needs at least 11 × 11 pixels"
+    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)  # [C, H, W]
+    stack = torch.cat([x, y, x * x, y * y, x * y])
+    ramp = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
+    window = torch.exp(-0.5 * (ramp / SSIM_SIGMA) ** 2)
+    window = window / window.sum()
+    mean_x, mean_y, xx, yy, xy = _blur(stack, window).chunk(5)
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_x * mean_y + c1) * (2 * (xy - mean_x * mean_y) + c2)
+    similarity = similarity / ((mean_x**2 + mean_y**2 + c1) * ((xx - mean_x**2) + (yy - mean_y**2) + c2))
+    return similarity.permute(1, 2, 0)
+
+
+def _blur(images: Tensor, taps: Tensor) -> Tensor:
+    """[C, H, W] filtered along both axes by ``taps``, where they fit."""
+    if not images.is_cuda and images.dtype == torch.float32:
+        return SeparableFilter.apply(images, taps)
+    blurred = torch.nn.functional.conv2d(images[:, None], taps[None, None, :, None])
+    return torch.nn.functional.conv2d(blurred, taps[None, None, None, :])[:, 0]
+
+
+def ssim(image: Tensor, target: Tensor) -> float:
+    """Mean of ``ssim_map``."""
+    return float(ssim_map(image, target).mean())
+
+
+def normal_degrees(normals: Tensor, target: Tensor, where: Tensor) -> float:
+    """Mean angle in degrees between two normal maps [H, W, 3] over the pixels ``where`` [H, W]."""
+    a = torch.nn.functional.normalize(normals[where], dim=-1)
+    b = torch.nn.functional.normalize(target[where], dim=-1)
+    return float(torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1))).mean())
+
+
+def mask_box(mask: Tensor, margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of the smallest box around a mask's [H, W] non-zero pixels, grown by ``margin``."""
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    if len(rows) == 0:
+        return slice(0, mask.shape[0]), slice(0, mask.shape[1])
+    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
+    return slice(top, int(rows[-1]) + 1 + margin), slice(left, int(columns[-1]) + 1 + margin)
+
+
+def widened(span: slice, size: int) -> slice:
+    """``span`` within 0 … ``size``, and as wide as SSIM's window: of a person there may be a sliver."""
+    start = max(min(span.start, size - SSIM_WINDOW), 0)
+    return slice(start, min(max(span.stop, start + SSIM_WINDOW), size))

@@ -1,0 +1,1 @@
+"""The avatar as torch modules, its template and its checkpoint."""

@@ -1,0 +1,154 @@
+"""Checkpoints in safetensors: tensors and one JSON string, nothing that could be executed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from rnd_runtime.capture.capture import Capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path, existing_file, sha256_of
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_trainer.config import TrainConfig, from_dict, to_dict
+
+from .model import AvatarModel
+from .template import Template
+from .twist import twist_frames
+
+SCHEMA = "rnd-checkpoint/1"
+_KEY = "rnd_checkpoint"
+
+
+@dataclass
+class Checkpoint:
+    """A trained avatar: the model, the probe it was lit by, its skeleton, and where it came from.
+
+    Attributes:
+        probe: [32, 64, 3] linear radiance.
+        info: what the training says of itself, see ``training.training.Training.info``.
+        file, sha256: what it was read from.
+    """
+
+    model: AvatarModel
+    probe: Tensor
+    skeleton: Skeleton
+    config: TrainConfig
+    info: dict[str, Any]
+    file: Path
+    sha256: str
+
+    def learned_from(self, capture: Path) -> bool:
+        """Whether this is the capture.json that the avatar was trained on."""
+        digest = self.info.get("capture_sha256")
+        if digest is None:  # checkpoints of before have none
+            return self._learned_in(capture.parent)
+        return bool(digest == sha256_of(capture))
+
+    def learned_under(self, capture: Capture) -> set[str | None]:
+        """Which lights of ``capture`` the avatar was trained under, by their maps; where there is none by their names.
+
+        A capture may have been renamed or edited since.
+        """
+        lights = self.info.get("lights")
+        if lights is None:  # in checkpoints of before: a capture whose folder has the name is taken for theirs
+            return {f.light for f in capture.split("train")} if self._learned_in(capture.folder) else set()
+        return {name for name, digest in lights.items() if capture.light_sha256(name) == digest}
+
+    def _learned_in(self, folder: Path) -> bool:
+        return bool(self.info.get("capture") == folder.resolve().name)
+
+    def note(self) -> str | None:
+        """What a user should know of an avatar whose training was stopped before there was a light; else None."""
+        if self.config.light == "none" or self.info.get("lit", True):
+            return None
+        stopped = f"step {self.info.get('step')} of {self.info.get('steps_planned')}"
+        return f"{self.file}: stopped at {stopped}, before light and albedo were learned; rnd-train --resume goes on"
+
+
+def save_checkpoint(
+    path: Path, model: AvatarModel, probe: Tensor, skeleton: Skeleton, config: TrainConfig, info: dict[str, Any]
+) -> None:
+    """Write ``avatar.ckpt`` atomically: ``probe`` [32, 64, 3]; ``info``: step, capture and such, JSON values."""
+    tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
+    tensors["probe"] = probe.detach().cpu().contiguous()
+    tensors["skeleton.rest_joints"] = torch.as_tensor(np.asarray(skeleton.rest_joints), dtype=torch.float64)
+    header = {
+        "schema": SCHEMA,
+        "config": to_dict(config),
+        "skeleton": {"names": list(skeleton.names), "parents": [int(p) for p in skeleton.parents]},
+        "info": info,
+    }
+    write_tensors(path, tensors, header)
+
+
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read ``avatar.ckpt``; anything missing, cut short, unknown or of a newer schema is an InputError."""
+    tensors, header = read_tensors(path, SCHEMA)
+    try:
+        config = from_dict(header["config"])
+        tree = header["skeleton"]
+        skeleton = Skeleton(
+            tuple(tree["names"]), np.array(tree["parents"]), tensors["skeleton.rest_joints"].numpy().astype(np.float64)
+        )
+        state = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
+        model = rebuild_model(config, state, skeleton)
+        probe = tensors["probe"]
+    except (KeyError, TypeError, RuntimeError, IndexError, ValueError, AttributeError) as error:
+        raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
+    if not all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point()):
+        raise InputError("checkpoint", expected="finite numbers", got="NaN or infinity", file=path)
+    return Checkpoint(model, probe, skeleton, config, header.get("info", {}), Path(path), sha256_of(path))
+
+
+def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:
+    """A model of ``config`` with the tensors of ``state``."""
+    neighbours = state["interpolate.neighbours"]
+    if int(neighbours.min()) < 0 or int(neighbours.max()) >= config.model.nodes:
+        raise ValueError("interpolation neighbours out of range")
+    points, weights = state["points"].double().numpy(), state["log_weights"].double().exp().numpy()
+    template = Template(
+        points=points,
+        normals=state["rest_normals"].numpy(),
+        codes=state["codes"].numpy(),
+        weights=weights,
+        spacing=float(state["spacing"]),
+        neighbours=neighbours.numpy(),
+        neighbour_weights=state["interpolate.weights"].numpy(),
+        limbs=twist_frames(points, weights, skeleton),
+        nodes=config.model.nodes,
+    )
+    model = AvatarModel(config.model, template)
+    model.load_state_dict(state)
+    return model.eval()
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
+    """One safetensors file with ``header`` as JSON, under a temporary name until it is whole."""
+    with atomic_path(path) as temporary:
+        try:
+            save_file(tensors, temporary, metadata={_KEY: json.dumps(header, sort_keys=True)})
+        except SafetensorError as error:  # which a full disk is
+            raise InputError("cannot be written", got=str(error).splitlines()[0], file=path) from error
+
+
+def read_tensors(path: str | Path, schema: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and JSON header of one of our safetensors files, its schema checked."""
+    path = existing_file(path, what="checkpoint")
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get(_KEY, "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, json.JSONDecodeError, OSError, ValueError, RecursionError) as error:
+        raise InputError("not a whole safetensors file", got=str(error).splitlines()[0], file=path) from error
+    found = header.get("schema") if isinstance(header, dict) else None
+    if found != schema:
+        raise InputError("schema", expected=schema, got=found, file=path)
+    return tensors, header

@@ -1,0 +1,236 @@
+"""The avatar as a torch module: everything between a pose and posed Gaussians with their material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from rnd_runtime.shading.brdf import ROUGHNESS_RANGE
+from rnd_trainer.config import ModelConfig
+
+from .encoders import AttributeEncoder, DynamicSkinning, PoseConditioned, Visibility, encoded_size, positional_encoding
+from .interpolate import NodeInterpolation
+from .posing import pose_gaussians
+from .skinning import blend_transforms, tangent_frames, transform_normals
+from .template import WEIGHT_FLOOR, Template
+from .twist import TwistFrames
+
+ALBEDO_RANGE = (0.03, 0.80)
+"""of natural diffuse materials; holds the albedo–light scale in a plausible place"""
+TANGENT_SCALE = (0.25, 2.0)
+"""standard deviations along the surface, in units of the spacing: neither gaps nor needles"""
+NORMAL_SCALE = (0.05, 0.5)
+"""and across it: a disc"""
+START_OPACITY = 2.2
+"""raw opacity at the start; sigmoid gives 0.90"""
+
+GEOMETRY_COLUMNS = {"opacity": 1, "rotation": 3, "scale": 3, "normal": 3, "offset": 3}
+LIMB_BUFFERS = ("limb_axes", "limb_levers", "limb_shares")
+APPEARANCE_COLUMNS = {"colour": 3, "albedo": 3, "roughness": 1}
+GLOSSIEST_RESIDUAL = -0.6
+"""how much glossier than the networks say a Gaussian may be played, before the sigmoid: where no picture shows the
+light's reflection, nothing keeps gloss from drifting. Bounded in training as well it is worth less (docs/tried.md)"""
+
+
+@dataclass
+class PoseInput:
+    """What the networks need to know of a moment: motion window [d, J−1, 6], velocity [J−1, 3], bones [J, 3, 4]."""
+
+    window: Tensor
+    velocity: Tensor
+    bones: Tensor
+
+    def to(self, device: torch.device) -> PoseInput:
+        """The same on ``device``."""
+        return PoseInput(self.window.to(device), self.velocity.to(device), self.bones.to(device))
+
+
+@dataclass
+class Attributes:
+    """Activated attributes in the rest pose: valid for any weights of the networks.
+
+    opacity [N], rotation [N, 3] (R as a rotation vector in the tangent frame), scales [N, 3] m, normals [N, 3]
+    unit, points [N, 3] m with the static offset, colour / albedo [N, 3] linear, roughness [N].
+    """
+
+    opacity: Tensor
+    rotation: Tensor
+    scales: Tensor
+    normals: Tensor
+    points: Tensor
+    colour: Tensor
+    albedo: Tensor
+    roughness: Tensor
+    raw_geometry_residual: Tensor
+
+
+@dataclass
+class Posed:
+    """Posed Gaussians, world frame: means [N, 3] m, covariances [N, 6] m², normals [N, 3] unit.
+
+    visibility [N, 16] in the root's frame; skinning weights [N, J] and the pose's offset [N, 3] m feed the
+    regularisers.
+    """
+
+    means: Tensor
+    covariances: Tensor
+    normals: Tensor
+    visibility: Tensor
+    weights: Tensor
+    offset: Tensor
+    attributes: Attributes
+
+
+class AvatarModel(nn.Module):
+    """N Gaussians on a template, driven by networks at M nodes.
+
+    A Gaussian's raw attribute is the nodes' value interpolated at it plus a residual of its own, zero at the
+    start: the networks carry what is smooth and reach places that no picture shows, the residuals carry
+    texture at the Gaussians' full resolution.
+    """
+
+    points: Tensor
+    rest_normals: Tensor
+    codes: Tensor
+    log_weights: Tensor
+    spacing: Tensor
+    tangents: Tensor
+    limb_axes: Tensor
+    limb_levers: Tensor
+    limb_shares: Tensor
+
+    def __init__(self, config: ModelConfig, template: Template) -> None:
+        super().__init__()
+        self.config = config
+        joints = template.weights.shape[1]
+        buffers = {
+            "points": template.points,
+            "rest_normals": template.normals,
+            "codes": template.codes,
+            "log_weights": _log_weights(template.weights),
+            "tangents": tangent_frames(torch.as_tensor(template.normals)),
+            "spacing": template.spacing,
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32))
+        for name, value in zip(LIMB_BUFFERS, template.limbs):  # follow from what is saved
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
+        self.interpolate = NodeInterpolation(
+            torch.as_tensor(template.neighbours),
+            torch.as_tensor(template.neighbour_weights, dtype=torch.float32),
+            config.nodes,
+        )
+
+        inputs = encoded_size(config.frequencies)
+        geometry, appearance = sum(GEOMETRY_COLUMNS.values()), sum(APPEARANCE_COLUMNS.values())
+        self.geometry = AttributeEncoder(inputs, config.attribute_width, geometry)
+        self.appearance = AttributeEncoder(inputs, config.attribute_width, appearance)
+        self.geometry_residual = nn.Parameter(torch.zeros(len(template.points), geometry))
+        self.appearance_residual = nn.Parameter(torch.zeros(len(template.points), appearance))
+        temporal = config.motion_encoder == "full"
+        self.skinning = DynamicSkinning(inputs, joints, config.window_poses, config.width, config.heads, temporal)
+        self.offsets = PoseConditioned(inputs, joints, config.width, outputs=6)
+        self.visibility = Visibility(inputs, joints, config.width)
+
+    def encoded_nodes(self) -> Tensor:
+        """Positional encoding [M, E] of the nodes in the spread pose."""
+        return positional_encoding(self.codes[: self.config.nodes], self.config.frequencies)
+
+    def attributes(self, encoded: Tensor) -> Attributes:
+        """D_g and D_a with residuals, activated.
+
+        The surface as a whole may leave the template by ``max_static_offset``; a Gaussian may stray from that
+        surface by one spacing and no more: farther ones would show as spikes and as speckled shadows.
+        In evaluation mode the residual of roughness, the last column, is ``GLOSSIEST_RESIDUAL`` at least.
+        """
+        columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
+        smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
+        residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
+        if not self.training:
+            residual = torch.cat([residual[:, :-1], residual[:, -1:].clamp(min=GLOSSIEST_RESIDUAL)], dim=-1)
+        part = _by_name(smooth + residual, columns)
+        place = _by_name(smooth, columns)["offset"]
+        tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0
+        normals = nn.functional.normalize(self.rest_normals + tilt, dim=-1)
+        tangents, across = part["scale"].split([2, 1], dim=-1)
+        scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
+        offset = self.config.max_static_offset * torch.tanh(place) + self.strays()
+        low, high = ALBEDO_RANGE
+        glossy, rough = ROUGHNESS_RANGE
+        return Attributes(
+            opacity=torch.sigmoid(part["opacity"][:, 0] + START_OPACITY),
+            rotation=torch.tanh(part["rotation"]),
+            scales=self.spacing * scales,
+            normals=normals,
+            points=self.points + offset,
+            colour=torch.sigmoid(part["colour"]),
+            albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # 0.24 at the start
+            roughness=glossy + (rough - glossy) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
+            raw_geometry_residual=self.geometry_residual,
+        )
+
+    def strays(self) -> Tensor:
+        """How far each Gaussian's own residual takes it from the surface [N, 3] m."""
+        return self.spacing * torch.tanh(_by_name(self.geometry_residual, GEOMETRY_COLUMNS)["offset"])
+
+    def forward(self, pose: PoseInput) -> Posed:
+        """Pose the avatar; see ``Posed``."""
+        encoded = self.encoded_nodes()
+        nodes = len(encoded)
+        static = self.attributes(encoded)
+        flat = pose.window[-1].flatten()
+        logits = (
+            self.skinning(encoded, pose.window, pose.velocity)
+            if self.config.dynamic_skinning
+            else torch.zeros_like(self.log_weights[:nodes])
+        )
+        node_normals = self._node_normals(static.normals[:nodes].detach(), pose.bones.detach())
+        seen = flat if self.config.visibility == "pose" else torch.zeros_like(flat)
+        fields = torch.cat([logits, self.offsets(encoded, flat), self.visibility(encoded, seen, node_normals)], dim=-1)
+        logits, offset, turn, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
+
+        weights = torch.softmax(self.log_weights + logits, dim=-1)
+        offset = torch.tanh(offset)
+        means, upper, normals = pose_gaussians(
+            weights,
+            pose.bones,
+            static.points + self.config.max_offset * offset,
+            torch.tanh(turn),
+            self.tangents,
+            static.rotation,
+            static.scales,
+            static.normals,
+            TwistFrames(self.limb_axes, self.limb_levers, self.limb_shares),
+        )
+        return Posed(
+            means=means,
+            covariances=upper,
+            normals=normals,
+            visibility=visibility,
+            weights=weights,
+            offset=offset,
+            attributes=static,
+        )
+
+    def _node_normals(self, normals: Tensor, bones: Tensor) -> Tensor:
+        """Posed normals of the nodes [M, 3] in the root's frame, by the template's skinning."""
+        weights = torch.softmax(self.log_weights[: len(normals)], dim=-1)
+        return transform_normals(blend_transforms(weights, bones), normals) @ bones[0, :, :3]
+
+
+def _by_name(values: Tensor, columns: dict[str, int]) -> dict[str, Tensor]:
+    """[N, C] cut into named columns."""
+    return dict(zip(columns, values.split(list(columns.values()), dim=-1)))
+
+
+def _log_weights(weights) -> Tensor:
+    floored = torch.as_tensor(weights, dtype=torch.float64).clamp(min=WEIGHT_FLOOR)
+    return torch.log(floored / floored.sum(dim=-1, keepdim=True))
+
+
+def _between(raw: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """Log-uniform between ``bounds``: the geometric mean at raw = 0."""
+    low, high = bounds
+    return low * (high / low) ** torch.sigmoid(raw)

@@ -1,0 +1,389 @@
+"""Posing of all Gaussians in one pass, forward and backward: the compiled twin of ``model.skinning``.
+
+Written with tuples of nine scalars for 3×3 matrices: they live in registers, where torch would move dozens of
+[N, 3, 3] arrays through memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from .skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
+from .twist import SMALLEST_SQUARE, STEPS
+
+_FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
+_inline = numba.njit(fastmath=_FAST, error_model="numpy")  # LLVM inlines these; numba's own inlining chokes on tuples
+
+
+class PoseGaussians(torch.autograd.Function):
+    """Means [N, 3], covariances [N, 6] and unit normals [N, 3] of posed Gaussians.
+
+    Arguments: weights [N, J], bones [J, 3, 4], points [N, 3] with all offsets, turn [N, 3] (Δr as
+    a rotation vector), tangents [N, 3, 3] (no gradient), rotation [N, 3] (r_c in the tangent frame, a rotation
+    vector), scales [N, 3], normals [N, 3]; then axes [N, 3], levers [N, 3] and shares [N] of
+    ``model.twist.TwistFrames`` (no gradient).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.arrays = tuple(np.ascontiguousarray(t.detach().numpy(), np.float32) for t in tensors)
+        return tuple(torch.from_numpy(a) for a in _pose(*ctx.arrays))  # type: ignore[return-value]
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, ...]:
+        grads = _pose_backward(*ctx.arrays, *(np.ascontiguousarray(g.numpy()) for g in incoming))
+        weights, blend, points, turn, rotation, scales, normals = (torch.from_numpy(g) for g in grads)
+        bones = None
+        if ctx.needs_input_grad[1]:
+            bones = (torch.from_numpy(ctx.arrays[0]).T @ blend).view(ctx.arrays[1].shape)
+        return weights, bones, points, turn, None, rotation, scales, normals, None, None, None
+
+
+@_inline
+def _row(x, y, z, b):
+    """(x, y, z) B."""
+    return (x * b[0] + y * b[3] + z * b[6], x * b[1] + y * b[4] + z * b[7], x * b[2] + y * b[5] + z * b[8])
+
+
+@_inline
+def _multiply(a, b):
+    """A B."""
+    p, q, r = _row(a[0], a[1], a[2], b), _row(a[3], a[4], a[5], b), _row(a[6], a[7], a[8], b)
+    return (p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2])
+
+
+@_inline
+def _transpose(a):
+    return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
+
+
+@_inline
+def _apply(a, x, y, z):
+    """A (x, y, z)."""
+    return (a[0] * x + a[1] * y + a[2] * z, a[3] * x + a[4] * y + a[5] * z, a[6] * x + a[7] * y + a[8] * z)
+
+
+@_inline
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@_inline
+def _quaternion(x, y, z):
+    """normalize(1, v/2) and the length before normalising."""
+    half = np.float32(0.5)
+    x, y, z = half * x, half * y, half * z
+    length = np.sqrt(np.float32(1) + x * x + y * y + z * z)
+    return (np.float32(1) / length, x / length, y / length, z / length), length
+
+
+@_inline
+def _rotation(q):
+    s, x, y, z = q
+    one, two = np.float32(1), np.float32(2)
+    return (
+        one - two * (y * y + z * z),
+        two * (x * y - s * z),
+        two * (x * z + s * y),
+        two * (x * y + s * z),
+        one - two * (x * x + z * z),
+        two * (y * z - s * x),
+        two * (x * z - s * y),
+        two * (y * z + s * x),
+        one - two * (x * x + y * y),
+    )
+
+
+@_inline
+def _rotation_backward(q, length, h):
+    """Gradient by the rotation vector, from the gradient h by the matrix of ``_rotation(_quaternion(v))``."""
+    s, x, y, z = q
+    two = np.float32(2)
+    by_s = two * (-z * h[1] + y * h[2] + z * h[3] - x * h[5] - y * h[6] + x * h[7])
+    by_x = two * (y * (h[1] + h[3]) + z * (h[2] + h[6]) - two * x * (h[4] + h[8]) + s * (h[7] - h[5]))
+    by_y = two * (x * (h[1] + h[3]) + z * (h[5] + h[7]) - two * y * (h[0] + h[8]) + s * (h[2] - h[6]))
+    by_z = two * (x * (h[2] + h[6]) + y * (h[5] + h[7]) - two * z * (h[0] + h[4]) + s * (h[3] - h[1]))
+    along = s * by_s + x * by_x + y * by_y + z * by_z
+    factor = np.float32(0.5) / length
+    return (factor * (by_x - x * along), factor * (by_y - y * along), factor * (by_z - z * along))
+
+
+@_inline
+def _normal_matrix(m):
+    """cofactor(M) + ε M."""
+    a, b, c = (m[0], m[1], m[2]), (m[3], m[4], m[5]), (m[6], m[7], m[8])
+    first, second, third = _cross(b, c), _cross(c, a), _cross(a, b)
+    e = np.float32(NORMAL_FALLBACK)
+    return (
+        first[0] + e * m[0],
+        first[1] + e * m[1],
+        first[2] + e * m[2],
+        second[0] + e * m[3],
+        second[1] + e * m[4],
+        second[2] + e * m[5],
+        third[0] + e * m[6],
+        third[1] + e * m[7],
+        third[2] + e * m[8],
+    )
+
+
+@_inline
+def _normal_matrix_backward(m, g):
+    """Gradient by M, from the gradient g by ``_normal_matrix(M)``."""
+    a, b, c = (m[0], m[1], m[2]), (m[3], m[4], m[5]), (m[6], m[7], m[8])
+    first, second, third = (g[0], g[1], g[2]), (g[3], g[4], g[5]), (g[6], g[7], g[8])
+    a1, a2 = _cross(second, c), _cross(b, third)
+    b1, b2 = _cross(c, first), _cross(third, a)
+    c1, c2 = _cross(first, b), _cross(a, second)
+    e = np.float32(NORMAL_FALLBACK)
+    return (
+        a1[0] + a2[0] + e * g[0],
+        a1[1] + a2[1] + e * g[1],
+        a1[2] + a2[2] + e * g[2],
+        b1[0] + b2[0] + e * g[3],
+        b1[1] + b2[1] + e * g[4],
+        b1[2] + b2[2] + e * g[5],
+        c1[0] + c2[0] + e * g[6],
+        c1[1] + c2[1] + e * g[7],
+        c1[2] + c2[2] + e * g[8],
+    )
+
+
+@_inline
+def _blend(weights, bones, n):
+    """A = Σ_j W_j B_j: the 3×3 part and the translation."""
+    zero = np.float32(0)
+    a = (zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    x = y = z = zero
+    for j in range(weights.shape[1]):
+        w, b = weights[n, j], bones[j]
+        a = (
+            a[0] + w * b[0, 0],
+            a[1] + w * b[0, 1],
+            a[2] + w * b[0, 2],
+            a[3] + w * b[1, 0],
+            a[4] + w * b[1, 1],
+            a[5] + w * b[1, 2],
+            a[6] + w * b[2, 0],
+            a[7] + w * b[2, 1],
+            a[8] + w * b[2, 2],
+        )
+        x, y, z = x + w * b[0, 3], y + w * b[1, 3], z + w * b[2, 3]
+    return a, (x, y, z)
+
+
+@_inline
+def _excess(linear, axes, shares, n):
+    """``model.twist.excess``."""
+    x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
+    a, b, c = _apply(linear, x, y, z)
+    length_squared = max(a * a + b * b + c * c, np.float32(SMALLEST_SQUARE))
+    first, second, third = (linear[0], linear[1], linear[2]), (linear[3], linear[4], linear[5]), linear[6:]
+    p, q, r = _cross(second, third), _cross(third, first), _cross(first, second)
+    a, b, c = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
+    kept = min(np.sqrt(a * a + b * b + c * c) / length_squared, np.float32(1))
+    factor = np.float32(1)
+    for _ in range(STEPS):
+        step = np.float32(0.5) * (np.float32(3) - kept)
+        factor, kept = factor * step, kept * step * step
+    return shares[n] * (factor - np.float32(1))
+
+
+@_inline
+def _widened(m, axes, kappa, n):
+    """C M with C = (1 + κ) I − κ u uᵀ."""
+    x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
+    k = np.float32(1) + kappa
+    a = kappa * (x * m[0] + y * m[3] + z * m[6])
+    b = kappa * (x * m[1] + y * m[4] + z * m[7])
+    c = kappa * (x * m[2] + y * m[5] + z * m[8])
+    return (
+        k * m[0] - x * a,
+        k * m[1] - x * b,
+        k * m[2] - x * c,
+        k * m[3] - y * a,
+        k * m[4] - y * b,
+        k * m[5] - y * c,
+        k * m[6] - z * a,
+        k * m[7] - z * b,
+        k * m[8] - z * c,
+    )
+
+
+@_inline
+def _steepened(x, y, z, axes, kappa, n):
+    """n + κ u (u·n)."""
+    along = kappa * (axes[n, 0] * x + axes[n, 1] * y + axes[n, 2] * z)
+    return (x + axes[n, 0] * along, y + axes[n, 1] * along, z + axes[n, 2] * along)
+
+
+@_inline
+def _load(matrices, n):
+    m = matrices[n]
+    return (m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2])
+
+
+@_inline
+def _scaled(m, scales, n):
+    """M diag(s)."""
+    s, t, u = scales[n, 0], scales[n, 1], scales[n, 2]
+    return (m[0] * s, m[1] * t, m[2] * u, m[3] * s, m[4] * t, m[5] * u, m[6] * s, m[7] * t, m[8] * u)
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+def _pose(weights, bones, points, turn, tangents, rotation, scales, normals, axes, levers, shares):
+    count = len(points)
+    means = np.empty((count, 3), np.float32)
+    covariances = np.empty((count, 6), np.float32)
+    posed_normals = np.empty((count, 3), np.float32)
+    floor = np.float32(THICKNESS_FLOOR**2)
+    for n in numba.prange(count):
+        linear, shift = _blend(weights, bones, n)
+        kappa = _excess(linear, axes, shares, n)
+        x, y, z = _apply(
+            linear,
+            points[n, 0] + kappa * levers[n, 0],
+            points[n, 1] + kappa * levers[n, 1],
+            points[n, 2] + kappa * levers[n, 2],
+        )
+        means[n, 0], means[n, 1], means[n, 2] = x + shift[0], y + shift[1], z + shift[2]
+
+        own, _ = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
+        added, _ = _quaternion(turn[n, 0], turn[n, 1], turn[n, 2])
+        frame = _scaled(_multiply(_load(tangents, n), _rotation(own)), scales, n)
+        g = _multiply(linear, _widened(_multiply(_rotation(added), frame), axes, kappa, n))
+        covariances[n, 0] = g[0] * g[0] + g[1] * g[1] + g[2] * g[2] + floor
+        covariances[n, 1] = g[0] * g[3] + g[1] * g[4] + g[2] * g[5]
+        covariances[n, 2] = g[0] * g[6] + g[1] * g[7] + g[2] * g[8]
+        covariances[n, 3] = g[3] * g[3] + g[4] * g[4] + g[5] * g[5] + floor
+        covariances[n, 4] = g[3] * g[6] + g[4] * g[7] + g[5] * g[8]
+        covariances[n, 5] = g[6] * g[6] + g[7] * g[7] + g[8] * g[8] + floor
+
+        x, y, z = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
+        x, y, z = _apply(_normal_matrix(linear), x, y, z)
+        length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
+        posed_normals[n, 0], posed_normals[n, 1], posed_normals[n, 2] = x / length, y / length, z / length
+    return means, covariances, posed_normals
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+def _pose_backward(
+    weights,
+    bones,
+    points,
+    turn,
+    tangents,
+    rotation,
+    scales,
+    normals,
+    axes,
+    levers,
+    shares,
+    by_mean,
+    by_covariance,
+    by_normal,
+):
+    count, joints = weights.shape
+    by_weights, by_blend = np.empty((count, joints), np.float32), np.empty((count, 12), np.float32)
+    by_points, by_turn = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    by_rotation, by_scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    by_rest_normals = np.empty((count, 3), np.float32)
+    two = np.float32(2)
+    for n in numba.prange(count):
+        linear, _ = _blend(weights, bones, n)
+        upright = _transpose(linear)
+        mx, my, mz = by_mean[n, 0], by_mean[n, 1], by_mean[n, 2]
+        kappa = _excess(linear, axes, shares, n)
+        px, py, pz = (
+            points[n, 0] + kappa * levers[n, 0],
+            points[n, 1] + kappa * levers[n, 1],
+            points[n, 2] + kappa * levers[n, 2],
+        )
+        by_points[n, 0], by_points[n, 1], by_points[n, 2] = _apply(upright, mx, my, mz)
+
+        own, own_length = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
+        added, added_length = _quaternion(turn[n, 0], turn[n, 1], turn[n, 2])
+        added_matrix = _rotation(added)
+        frame = _multiply(_load(tangents, n), _rotation(own))
+        scaled = _scaled(frame, scales, n)
+        turned = _widened(_multiply(added_matrix, scaled), axes, kappa, n)
+        g = _multiply(linear, turned)
+        c = by_covariance[n]
+        symmetric = (
+            two * c[0],
+            c[1],
+            c[2],
+            c[1],
+            two * c[3],
+            c[4],
+            c[2],
+            c[4],
+            two * c[5],
+        )  # twice the gradient by the full matrix, whose off-diagonal entries share one number
+        by_g = _multiply(symmetric, g)
+        by_linear = _multiply(by_g, _transpose(turned))
+        by_turned = _widened(_multiply(upright, by_g), axes, kappa, n)
+        by_added = _multiply(by_turned, _transpose(scaled))
+        u = _rotation_backward(added, added_length, by_added)
+        by_turn[n, 0], by_turn[n, 1], by_turn[n, 2] = u
+        by_scaled = _multiply(_transpose(added_matrix), by_turned)
+        by_scales[n, 0] = frame[0] * by_scaled[0] + frame[3] * by_scaled[3] + frame[6] * by_scaled[6]
+        by_scales[n, 1] = frame[1] * by_scaled[1] + frame[4] * by_scaled[4] + frame[7] * by_scaled[7]
+        by_scales[n, 2] = frame[2] * by_scaled[2] + frame[5] * by_scaled[5] + frame[8] * by_scaled[8]
+        by_frame = _scaled(by_scaled, scales, n)
+        by_own = _multiply(_transpose(_load(tangents, n)), by_frame)
+        r = _rotation_backward(own, own_length, by_own)
+        by_rotation[n, 0], by_rotation[n, 1], by_rotation[n, 2] = r
+
+        matrix = _normal_matrix(linear)
+        nx, ny, nz = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
+        x, y, z = _apply(matrix, nx, ny, nz)
+        length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
+        x, y, z = x / length, y / length, z / length
+        gx, gy, gz = by_normal[n, 0], by_normal[n, 1], by_normal[n, 2]
+        along = x * gx + y * gy + z * gz
+        gx, gy, gz = (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
+        x, y, z = _apply(_transpose(matrix), gx, gy, gz)
+        x, y, z = _steepened(x, y, z, axes, kappa, n)
+        by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = x, y, z
+        outer = (gx * nx, gx * ny, gx * nz, gy * nx, gy * ny, gy * nz, gz * nx, gz * ny, gz * nz)
+        k = _normal_matrix_backward(linear, outer)
+
+        a = (
+            by_linear[0] + k[0] + mx * px,
+            by_linear[1] + k[1] + mx * py,
+            by_linear[2] + k[2] + mx * pz,
+            by_linear[3] + k[3] + my * px,
+            by_linear[4] + k[4] + my * py,
+            by_linear[5] + k[5] + my * pz,
+            by_linear[6] + k[6] + mz * px,
+            by_linear[7] + k[7] + mz * py,
+            by_linear[8] + k[8] + mz * pz,
+        )
+        for row in range(3):
+            for column in range(3):
+                by_blend[n, 4 * row + column] = a[3 * row + column]
+        by_blend[n, 3], by_blend[n, 7], by_blend[n, 11] = mx, my, mz
+        for j in range(joints):
+            b = bones[j]
+            by_weights[n, j] = (
+                a[0] * b[0, 0]
+                + a[1] * b[0, 1]
+                + a[2] * b[0, 2]
+                + mx * b[0, 3]
+                + a[3] * b[1, 0]
+                + a[4] * b[1, 1]
+                + a[5] * b[1, 2]
+                + my * b[1, 3]
+                + a[6] * b[2, 0]
+                + a[7] * b[2, 1]
+                + a[8] * b[2, 2]
+                + mz * b[2, 3]
+            )
+    return by_weights, by_blend, by_points, by_turn, by_rotation, by_scales, by_rest_normals

@@ -1,0 +1,1 @@
+"""Differentiable shading and splatting."""

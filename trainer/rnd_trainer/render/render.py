@@ -1,0 +1,60 @@
+"""The differentiable picture of a training step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rnd_runtime.core.camera import Camera
+from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+
+from .probe import Texels
+from .raster import rasterize
+from .shading import light_visibility, shade, traced_visibility, view_visibility, visible_towards
+
+
+@dataclass
+class Splat:
+    """A differentiable picture: image [H, W, 3] linear premultiplied, normals [H, W, 3] camera axes, alpha [H, W]."""
+
+    image: Tensor
+    normals: Tensor
+    alpha: Tensor
+
+
+def splat(posed: Posed, radiance: Tensor, camera: Camera) -> Splat:
+    """Rasterise linear ``radiance`` [N, 3] and the normals of posed Gaussians in one pass."""
+    rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
+    features = torch.cat([radiance, posed.normals @ rotation.T], dim=-1)
+    image, alpha, _ = rasterize(posed.means, posed.covariances, posed.attributes.opacity, features, camera)
+    return Splat(image[..., :3], image[..., 3:], alpha)
+
+
+def shade_visible(
+    posed: Posed, pose: PoseInput, texels: Texels, camera: Camera, model: AvatarModel, traced_texels: int
+) -> Tensor:
+    """Radiance [N, 3] of the Gaussians that may be seen; zero for those facing away.
+
+    The first ``traced_texels`` directions (the brightest) get traced shadows. No gradient flows into the
+    visibility: it is what the geometry says, and must not be bent to explain a colour. The paper's reading
+    (``visibility="paper"``) is one number a Gaussian, of the direction to the camera, that pictures do train.
+    """
+    eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
+    front, view = visible_towards(posed.normals, posed.means, eye)
+    static, root = posed.attributes, pose.bones[0, :, :3].detach()
+    kind = model.config.visibility
+    if kind == "pose":
+        traced = None
+        if traced_texels:
+            suns = texels.directions[:traced_texels]
+            traced = traced_visibility(posed.means, posed.normals, suns, float(model.spacing))[front]
+        with torch.no_grad():
+            visibility = light_visibility(posed.visibility[front], texels.directions, root, traced)
+    else:
+        visibility = view.new_ones(len(front), len(texels.directions))
+    shaded = shade(posed.normals[front], view, static.albedo[front], static.roughness[front], visibility, texels)
+    if kind == "paper":
+        shaded = shaded * view_visibility(posed.visibility[front], view, root)
+    return torch.zeros_like(posed.means).index_copy(0, front, shaded)

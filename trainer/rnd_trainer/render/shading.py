@@ -1,0 +1,76 @@
+"""Physically based shading of the visible Gaussians under drawn texels, differentiable in everything but visibility."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rnd_runtime.core.sh import sh_columns
+from rnd_runtime.shading.brdf import specular
+from rnd_runtime.shading.shadow import directional_visibility
+
+from .probe import Texels
+from .shading_kernel import FusedShade
+
+BACK_FACING = -0.2
+"""cosine between normal and view below which a Gaussian is not shaded: it lies behind the silhouette"""
+SHADOW_RADIUS = 1.2
+"""radius of a Gaussian in a shadow map, in units of the spacing: closes the surface without thickening limbs"""
+
+
+def sh_basis(directions: Tensor) -> Tensor:
+    """The runtime's 16 spherical harmonics [..., 16] of unit directions [..., 3]."""
+    return torch.stack(sh_columns(*directions.unbind(-1)), dim=-1)
+
+
+def visible_towards(normals: Tensor, means: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Indices of the Gaussians that may be seen from ``eye`` [3], and unit directions [n, 3] towards it."""
+    view = torch.nn.functional.normalize(eye - means.detach(), dim=-1)
+    front = ((normals.detach() * view).sum(-1) > BACK_FACING).nonzero()[:, 0]
+    return front, view[front]
+
+
+def light_visibility(
+    coefficients: Tensor, texels: Tensor, root_rotation: Tensor, traced: Tensor | None = None
+) -> Tensor:
+    """v(x, ω) [n, K] at texel directions [K, 3] from root-frame harmonics [n, 16].
+
+    ``traced`` [n, T] replaces the first T columns: suns, whose shadows harmonics of degree 3 cannot hold.
+    """
+    visibility = coefficients @ sh_basis(texels @ root_rotation).T
+    if traced is not None:
+        visibility = torch.cat([traced, visibility[:, traced.shape[1] :]], dim=1)
+    return visibility
+
+
+def view_visibility(coefficients: Tensor, view: Tensor, root_rotation: Tensor) -> Tensor:
+    """The paper's visibility [n, 1]: root-frame harmonics [n, 16] at the direction [n, 3] to the camera, ≥ 0."""
+    return (coefficients * sh_basis(view @ root_rotation)).sum(-1, keepdim=True).clamp(min=0)
+
+
+def shade(
+    normals: Tensor, view: Tensor, albedo: Tensor, roughness: Tensor, visibility: Tensor, texels: Texels
+) -> Tensor:
+    """Outgoing linear radiance [n, 3]: Σ_k v_k f(ω_k, ω_o) max(n·ω_k, 0) power_k (paper, eq. 3 and 4).
+
+    normals, view [n, 3] unit; albedo [n, 3]; roughness [n]; visibility [n, K]. Float32 on the CPU takes the
+    compiled kernel, which has no gradient by view and visibility.
+    """
+    if not normals.is_cuda and normals.dtype == torch.float32:
+        return FusedShade.apply(normals, view, albedo, roughness, visibility, texels.directions, texels.power)
+    n_dot_l = normals @ texels.directions.T  # [n, K]; nothing here is ever [n, K, 3]
+    arriving = visibility * n_dot_l.clamp(min=0)
+    n_dot_v = (normals * view).sum(-1, keepdim=True)
+    glossy = specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
+    radiance = albedo * (arriving @ texels.power) / math.pi + (arriving * glossy) @ texels.power
+    return radiance.clamp(min=0)
+
+
+def traced_visibility(means: Tensor, normals: Tensor, directions: Tensor, spacing: float) -> Tensor:
+    """Shadow-mapped visibility [n, K] of points towards ``directions`` [K, 3]; no gradient."""
+    arrays = [np.ascontiguousarray(t.detach().cpu().numpy()) for t in (means, normals, directions)]
+    radii = np.full(len(means), SHADOW_RADIUS * spacing, np.float32)
+    return torch.from_numpy(directional_visibility(*arrays, radii=radii)).to(means)

@@ -1,0 +1,177 @@
+"""The training step's shading sum in one pass over (Gaussian, texel) pairs, forward and backward.
+
+The torch version (``render.shading.shade``) makes about forty [n, K] arrays and reads them all back;
+this one keeps every pair in registers. Same formula (``rnd_runtime.shading.brdf``), same result to float32 rounding.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from rnd_runtime.shading.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
+
+CHUNKS = 16
+"""parts of the Gaussians whose sums over texels are kept apart: the same bits for any number of threads"""
+_FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
+
+
+class FusedShade(torch.autograd.Function):
+    """Outgoing radiance [n, 3]; arguments as ``render.shading.shade``, texels as two tensors.
+
+    Differentiable in normals, albedo, roughness and power; view, visibility and directions are constants.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        normals: Tensor,  # [n, 3]
+        view: Tensor,  # [n, 3]
+        albedo: Tensor,  # [n, 3]
+        roughness: Tensor,  # [n]
+        visibility: Tensor,  # [n, K]
+        directions: Tensor,  # [K, 3]
+        power: Tensor,  # [K, 3]
+    ) -> Tensor:
+        tensors = (normals, view, albedo, roughness, visibility, directions, power)
+        n, v, ctx.albedo, gamma, visible, towards, strength = (
+            np.ascontiguousarray(t.detach().numpy(), np.float32) for t in tensors
+        )
+        half_squared = np.maximum(2 + 2 * (v @ towards.T), np.float32(1e-8))  # light and camera may be opposite
+        ctx.scene = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
+        ctx.diffuse, glossy = _sum(*ctx.scene)
+        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + glossy
+        ctx.lit = radiance > 0
+        return torch.from_numpy(np.maximum(radiance, 0))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        incoming = np.ascontiguousarray(grad.numpy() * ctx.lit)
+        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.scene, ctx.albedo, incoming)
+        grad_albedo = incoming * ctx.diffuse * np.float32(1 / np.pi)
+        results = (grad_normals, None, grad_albedo, grad_roughness, None, None, grad_power)
+        return tuple(None if r is None else torch.from_numpy(r) for r in results)
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _specular(alpha_squared, n_dot_l, n_dot_v, half_squared):
+    """Value of the specular term, and its logarithm's derivatives by α², n·l and n·v."""
+    one, two, zero, floor = np.float32(1), np.float32(2), np.float32(0), np.float32(COSINE_FLOOR)
+    n_dot_h = n_dot_l + n_dot_v
+    sine_squared = max(one - n_dot_h * n_dot_h / half_squared, zero)
+    lobe = sine_squared + alpha_squared * (one - sine_squared)
+    light, view = max(n_dot_l, floor), max(n_dot_v, floor)
+    rest = one - alpha_squared
+    root_view = np.sqrt(alpha_squared + rest * view * view)
+    root_light = np.sqrt(alpha_squared + rest * light * light)
+    shadowing, masking = light + root_light, view + root_view
+    grazing = max(one - np.float32(0.5) * np.sqrt(half_squared), zero)
+    fresnel = np.float32(F0) + np.float32(1 - F0) * grazing * grazing * grazing * grazing * grazing
+    value = np.float32(1 / np.pi) * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
+
+    by_sine = -two * rest / lobe
+    sine_by_cosine = -two * n_dot_h / half_squared if sine_squared > zero else zero
+    by_alpha = (
+        one / alpha_squared
+        - two * (one - sine_squared) / lobe
+        - np.float32(0.5) * (one - light * light) / (root_light * shadowing)
+        - np.float32(0.5) * (one - view * view) / (root_view * masking)
+    )
+    by_light = by_sine * sine_by_cosine
+    by_view = by_light
+    if n_dot_l > floor:
+        by_light -= (one + rest * light / root_light) / shadowing
+    if n_dot_v > floor:
+        by_view -= (one + rest * view / root_view) / masking
+    return value, by_alpha, by_light, by_view
+
+
+@numba.njit(inline="always")
+def _alpha_squared(roughness):
+    low, high = np.float32(ROUGHNESS_RANGE[0]), np.float32(ROUGHNESS_RANGE[1])
+    alpha = min(max(roughness, low), high) ** 2
+    return alpha * alpha
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+def _sum(normals, view, roughness, visibility, directions, power, half_squared):
+    """Σ_k v (n·l) power and Σ_k v (n·l) specular power, each [n, 3].
+
+    directions and power come as [3, K]; half_squared [n, K] is |l + v|².
+    """
+    count, texels = visibility.shape
+    zero = np.float32(0)
+    diffuse, glossy = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    for i in numba.prange(count):
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        n_dot_v = nx * view[i, 0] + ny * view[i, 1] + nz * view[i, 2]
+        alpha_squared = _alpha_squared(roughness[i])
+        d0 = d1 = d2 = s0 = s1 = s2 = zero
+        for k in range(texels):
+            n_dot_l = nx * directions[0, k] + ny * directions[1, k] + nz * directions[2, k]
+            arriving = visibility[i, k] * max(n_dot_l, zero)
+            value, _, _, _ = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
+            d0 += arriving * power[0, k]
+            d1 += arriving * power[1, k]
+            d2 += arriving * power[2, k]
+            s0 += arriving * value * power[0, k]
+            s1 += arriving * value * power[1, k]
+            s2 += arriving * value * power[2, k]
+        diffuse[i, 0], diffuse[i, 1], diffuse[i, 2] = d0, d1, d2
+        glossy[i, 0], glossy[i, 1], glossy[i, 2] = s0, s1, s2
+    return diffuse, glossy
+
+
+@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+def _sum_backward(normals, view, roughness, visibility, directions, power, half_squared, albedo, grad):
+    """Gradients by normals [n, 3], roughness [n] and power [K, 3], given that of the radiance."""
+    count, texels = visibility.shape
+    zero, over_pi = np.float32(0), np.float32(1 / np.pi)
+    low, high = np.float32(ROUGHNESS_RANGE[0]), np.float32(ROUGHNESS_RANGE[1])
+    by_normal, by_roughness = np.empty((count, 3), np.float32), np.empty(count, np.float32)
+    by_power = np.zeros((CHUNKS, 3, texels), np.float32)
+    for chunk in numba.prange(CHUNKS):
+        partial = by_power[chunk]
+        for i in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
+            nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+            n_dot_v = nx * view[i, 0] + ny * view[i, 1] + nz * view[i, 2]
+            alpha_squared = _alpha_squared(roughness[i])
+            g0, g1, g2 = grad[i, 0], grad[i, 1], grad[i, 2]
+            a0, a1, a2 = g0 * albedo[i, 0] * over_pi, g1 * albedo[i, 1] * over_pi, g2 * albedo[i, 2] * over_pi
+            gx = gy = gz = by_view_sum = by_alpha_sum = zero
+            for k in range(texels):
+                lx, ly, lz = directions[0, k], directions[1, k], directions[2, k]
+                n_dot_l = nx * lx + ny * ly + nz * lz
+                cosine = max(n_dot_l, zero)
+                arriving = visibility[i, k] * cosine
+                value, by_alpha, by_light, by_view = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
+                p0, p1, p2 = power[0, k], power[1, k], power[2, k]
+                gloss = g0 * p0 + g1 * p1 + g2 * p2
+                matt = a0 * p0 + a1 * p1 + a2 * p2
+                by_value = arriving * gloss * value
+                by_alpha_sum += by_value * by_alpha
+                by_view_sum += by_value * by_view
+                # where the light is below the horizon `arriving` is zero and so is all of this
+                facing = visibility[i, k] if n_dot_l > zero else zero
+                by_cosine = by_value * by_light + facing * (matt + gloss * value)
+                gx += by_cosine * lx
+                gy += by_cosine * ly
+                gz += by_cosine * lz
+                partial[0, k] += arriving * (a0 + g0 * value)
+                partial[1, k] += arriving * (a1 + g1 * value)
+                partial[2, k] += arriving * (a2 + g2 * value)
+            by_normal[i, 0] = gx + by_view_sum * view[i, 0]
+            by_normal[i, 1] = gy + by_view_sum * view[i, 1]
+            by_normal[i, 2] = gz + by_view_sum * view[i, 2]
+            gamma = roughness[i]
+            inside = low < gamma < high
+            by_roughness[i] = np.float32(4) * gamma * gamma * gamma * by_alpha_sum if inside else zero
+    total = np.zeros((texels, 3), np.float32)
+    for chunk in range(CHUNKS):
+        total += by_power[chunk].T
+    return by_normal, by_roughness, total

@@ -1,0 +1,40 @@
+"""Which Gaussians a camera sees: in front of it, inside its picture, turned towards it, behind nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.raster.cpu import rasterize
+from rnd_trainer.model.model import Posed
+
+
+@torch.no_grad()
+def sight(
+    posed: Posed, camera: Camera, count: int, *, facing: float, occlusion: float
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Which of the first ``count`` Gaussians the camera sees [count], and their pixels [count, 2].
+
+    Args:
+        facing: least cosine between a Gaussian's normal and its direction to the camera.
+        occlusion: metres by which it may lie behind the first surface and still be the one that is seen.
+
+    Pixels are x, y with centres at +0.5, 0 for what lies outside the picture.
+    """
+    arrays = (posed.means, posed.covariances, posed.attributes.opacity, posed.normals)
+    means, covariances, opacities, normals = (x.detach().cpu().numpy() for x in arrays)
+    nothing = np.zeros((len(means), 1), np.float32)
+    raster = rasterize(means, covariances, opacities, nothing, camera, depth=True)
+    means, normals = means[:count], normals[:count]
+    local = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+    inside = (local[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    pixels = np.where(inside[:, None], pixels, 0)
+    column, row = pixels.astype(int).T
+    depth = raster.depth[row, column] / np.maximum(raster.alpha[row, column], 1e-6)
+    towards = camera.position - means
+    turned = (normals * towards).sum(1) > facing * np.linalg.norm(towards, axis=1)
+    return inside & turned & (local[:, 2] < depth + occlusion), pixels

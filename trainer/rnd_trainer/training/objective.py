@@ -1,0 +1,204 @@
+"""What a training step minimises: the weighted loss terms of one picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.images import srgb_to_linear
+from rnd_trainer.config import TrainConfig
+from rnd_trainer.losses.consistency import POINTS, consistency_loss, covisible, project, virtual_camera
+from rnd_trainer.losses.losses import (
+    geometry_prior,
+    grey_prior,
+    image_loss,
+    linear_to_srgb,
+    skinning_divergence,
+    sky_prior,
+)
+from rnd_trainer.losses.perceptual import Perceptual
+from rnd_trainer.losses.repulsion import repulsion
+from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+from rnd_trainer.render.probe import LightProbe, Texels, all_texels, draw_texels
+from rnd_trainer.render.render import Splat, shade_visible, splat
+from rnd_trainer.render.shading import sh_basis, traced_visibility
+
+from .data import TrainingView
+
+LEAST_MATCHES = 16
+"""points that two views must share for the consistency term to mean anything"""
+
+
+class Objective:
+    """The loss of a picture in either stage.
+
+    Args:
+        config: weights and schedule.
+        probe: the learned light.
+        fixed_light: [32, 64, 3] a known light to use instead, or None.
+        perceptual: network of the LPIPS term; without one that is off, and the structural term looks at several
+            scales instead.
+        consistency: network whose features L_gc compares; without one that is off.
+        generator: of all random draws.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        probe: LightProbe,
+        fixed_light: Tensor | None,
+        perceptual: Perceptual | None,
+        consistency: Perceptual | None,
+        generator: torch.Generator,
+    ) -> None:
+        self.config, self.probe, self.fixed_light = config, probe, fixed_light
+        self.perceptual, self.consistency, self.generator = perceptual, consistency, generator
+
+    def light(self) -> Tensor:
+        """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
+        return self.probe.radiance() if self.fixed_light is None else self.fixed_light
+
+    def __call__(
+        self, model: AvatarModel, view: TrainingView, pose: PoseInput, step: int, stage: int
+    ) -> dict[str, Tensor]:
+        """Weighted loss terms of one picture by name; their sum is minimised."""
+        config = self.config
+        posed = model(pose)
+        like_template = config.weight_skinning * 0.1 ** (step / config.steps)
+        terms = {
+            "skinning": like_template * skinning_divergence(posed.weights, model.log_weights),
+            "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
+        }
+        if _due(step, config.weight_repulsion, config.repulsion_every):
+            terms["repulsion"] = config.repulsion_every * config.weight_repulsion * self._crowding(model, posed)
+        if config.model.visibility == "pose" and config.light != "none":  # which is never shaded
+            terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
+        texels = None if stage == 1 else self._texels(step)
+        if stage == 2 and self.fixed_light is None:
+            light, probe = self.light(), self.probe
+            terms["grey"] = config.weight_light_grey * grey_prior(light, probe.solid_angles)
+            terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
+        picture = self._picture(model, posed, pose, texels, view.camera)
+        device = posed.means.device
+        background = self._background()
+        target, mask = (x.to(device) for x in view.target(background))
+        background = background.to(device)
+        image_srgb, target_srgb = _over(picture, background), linear_to_srgb(target)
+        terms |= self._image_terms(image_srgb, target_srgb, step)
+        terms["mask"] = config.weight_mask * (picture.alpha - mask).abs().mean()
+        estimate = view.normals()
+        if estimate is not None:
+            normals, known = (x.to(device) for x in estimate)
+            terms["normal"] = config.weight_normal * ((picture.normals - normals).abs() * known).mean()
+        due = _due(step, config.weight_consistency, config.consistency_every)
+        network = _if_large(self.consistency, target)
+        if due and texels is not None and network is not None:
+            seen = (view.camera, image_srgb, background)
+            agreement = self._agreement(network, model, posed, pose, texels, *seen)
+            if agreement is not None:
+                terms["consistency"] = config.consistency_every * config.weight_consistency * agreement
+        return terms
+
+    def _background(self) -> Tensor:
+        """Linear [3]: black, as pictures are judged, or any colour that sRGB codes, each as likely as the others."""
+        drawn = torch.rand(4, generator=self.generator)
+        if drawn[3] < self.config.black_backgrounds:
+            return torch.zeros(3)
+        return torch.from_numpy(srgb_to_linear(drawn[:3].numpy()))
+
+    def _picture(
+        self, model: AvatarModel, posed: Posed, pose: PoseInput, texels: Texels | None, camera: Camera
+    ) -> Splat:
+        """The posed avatar from ``camera``: plain colours, or shaded under ``texels``."""
+        if texels is None:
+            return splat(posed, posed.attributes.colour, camera)
+        traced = self.config.traced_texels
+        return splat(posed, shade_visible(posed, pose, texels, camera, model, traced), camera)
+
+    def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
+        """L1 with a structural term; LPIPS where there is a network and the picture is large enough for it."""
+        config = self.config
+        seen = _if_large(self.perceptual, target_srgb)
+        scales = 1 if seen is not None else config.dssim_scales
+        terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
+        if seen is not None and _due(step, config.weight_lpips, config.lpips_every):
+            distance = seen(image_srgb.clamp(max=1), target_srgb)
+            terms["lpips"] = config.lpips_every * config.weight_lpips * distance
+        return terms
+
+    def _texels(self, step: int) -> Texels:
+        config = self.config
+        maps = (self.light(), self.probe.directions, self.probe.solid_angles)
+        if step >= config.steps * (1 - config.full_light_fraction):
+            return all_texels(*maps)
+        return draw_texels(*maps, config.light_texels, self.generator)
+
+    def _agreement(
+        self,
+        network: Perceptual,
+        model: AvatarModel,
+        posed: Posed,
+        pose: PoseInput,
+        texels: Texels,
+        camera: Camera,
+        image_srgb: Tensor,
+        background: Tensor,
+    ) -> Tensor | None:
+        """L_gc between this picture and one from a virtual camera nearby; None where they share too little."""
+        nodes = self.config.model.nodes
+        centre = posed.means[:nodes].detach().mean(dim=0)
+        virtual = virtual_camera(camera, centre, self.generator)
+        shared = covisible(posed, camera, virtual, nodes)
+        if len(shared) < LEAST_MATCHES:
+            return None
+        drawn = shared[torch.randperm(len(shared), generator=self.generator)[:POINTS].to(shared.device)]
+        second = _over(self._picture(model, posed, pose, texels, virtual), background)
+        points = posed.means[drawn].detach()
+        pixels = project(points, camera), project(points, virtual)
+        return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, network)
+
+    def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
+        """Repulsion of the points, which moves each by its own residual alone: where it also moved the network that
+        all of them share, held-out pictures lost 0.1 to 0.2 dB (docs/tried.md)."""
+        strays = model.strays()
+        points = posed.attributes.points.detach() + strays - strays.detach()
+        return repulsion(points, self.config.least_distance * float(model.spacing))
+
+    def _visibility_loss(self, model: AvatarModel, posed: Posed, pose: PoseInput) -> Tensor:
+        """Square error of the harmonics against shadow-mapped visibility at the nodes, in random directions."""
+        nodes = self.config.model.nodes
+        directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
+        directions = torch.nn.functional.normalize(directions, dim=-1).to(posed.means.device)
+        spacing = float(model.spacing) * math.sqrt(self.config.model.gaussians / nodes)
+        means, normals = posed.means[:nodes], posed.normals[:nodes]
+        truth = traced_visibility(means, normals, directions, spacing)
+        above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
+        predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3].detach()).T
+        return (above * (predicted - truth).square()).mean()
+
+
+def _if_large(network: Perceptual | None, image: Tensor) -> Perceptual | None:
+    """``network``, where there is one and ``image`` [h, w, 3] is large enough for it."""
+    large = network is not None and min(image.shape[:2]) >= network.smallest
+    return network if large else None
+
+
+def _due(step: int, weight: float, every: int) -> bool:
+    """Whether a term that is computed every so many steps is due; it then counts that many times."""
+    return weight > 0 and step % every == 0
+
+
+def noisy(pose: PoseInput, sigma: float, generator: torch.Generator) -> PoseInput:
+    """The encoders' input with noise of ``sigma`` radians; the bones, which place the picture, stay as they are."""
+    noise = (sigma * torch.randn(pose.window.shape[1:], generator=generator)).to(pose.window)
+    shake = (10 * sigma * torch.randn(pose.velocity.shape, generator=generator)).to(pose.velocity)
+    return dataclasses.replace(pose, window=pose.window + noise, velocity=pose.velocity + shake)
+
+
+def _over(picture: Splat, background: Tensor) -> Tensor:
+    """sRGB picture [H, W, 3] over a linear background [3]."""
+    return linear_to_srgb(picture.image + (1 - picture.alpha[..., None]) * background)

@@ -1,0 +1,120 @@
+"""A training that was saved: which one it is, and its tensors by part."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from rnd_runtime.capture.capture import Capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import sha256_of
+from rnd_runtime.shading.light import Light
+from rnd_trainer.config import TrainConfig, from_dict, to_dict
+from rnd_trainer.model.checkpoint import read_tensors
+
+from .data import TrainingView
+
+STATE_SCHEMA = "rnd-training/1"
+STATE_FILE = "training.state"
+"""in a run's folder"""
+_OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges", "weight_smooth"}
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """What ``training.training.Training.save`` wrote: ``tensors`` by dotted name, the first word their part."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    header: dict[str, Any]
+
+    def part(self, name: str) -> dict[str, Tensor]:
+        """Tensors of one part, by the rest of their names."""
+        prefix = f"{name}."
+        return {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
+
+    def refuse_other(
+        self, config: TrainConfig, networks: dict[str, str | None], *, what: str = "--resume", hint: str | None = None
+    ) -> None:
+        """Raise ``InputError`` where another configuration, or other perceptual weights, began this training.
+
+        What concerns the third stage alone may differ before that has begun. ``networks`` as of
+        ``losses.perceptual.networks_by_role``; ``what`` and ``hint`` as of the error.
+        """
+        try:
+            before = to_dict(from_dict(self.header["config"]))
+        except (KeyError, TypeError, InputError) as error:
+            got = str(error)
+            raise InputError("not a training state of this version", got=got, file=self.path) from error
+        free = {"save_every", "preview_every"} | (set() if self.part("taught") else _OF_THE_THIRD_STAGE)
+        now = _flat(to_dict(config))
+        wrong = sorted(name for name, value in _flat(before).items() if now[name] != value and name not in free)
+        if wrong:
+            expected = "the configuration it was started with"
+            raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
+        if "networks" in self.header:
+            begun, given = _in_words(self.header["networks"]), _in_words(networks)
+        else:  # states of before: all networks in one line, each once
+            begun = self.header.get("perceptual_sha256") or "none"
+            given = " ".join(dict.fromkeys(filter(None, networks.values()))) or "none"
+        if begun != given:
+            expected = f"the perceptual weights {begun}"
+            raise InputError(what, expected=expected, got=given, file=self.path, hint=hint)
+
+
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    """The model's fields among the others: no two have one name."""
+    return {**{name: value for name, value in config.items() if name != "model"}, **config["model"]}
+
+
+def _in_words(networks: dict[str, str | None]) -> str:
+    return ", ".join(f"{digest} for {role}" for role, digest in sorted(networks.items()) if digest) or "none"
+
+
+def read_state(path: Path) -> TrainingState:
+    """The state in ``path``. Raises ``InputError`` where it is none."""
+    return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
+
+
+def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, light: tuple[str, Light] | None) -> str:
+    """Of all that a capture teaches: pictures, cameras, which pose is whose, poses, body, and a ``light`` if given.
+
+    The same on every CPU: what was computed is rounded, since a sine may differ in its last bit, and of pictures that
+    were shrunk to ``scale`` it is their files.
+    """
+    digest = hashlib.sha256()
+
+    def add(*arrays: NDArray[Any] | None) -> None:
+        for array in arrays:
+            if array is not None:
+                digest.update(np.ascontiguousarray(array).data)
+
+    for view in views:
+        frame = view.frame
+        if scale == 1:
+            add(np.array(frame.frame), view.image, view.mask, view.normal)
+        else:
+            add(np.array(frame.frame))
+            for name in filter(None, (frame.image, frame.mask, frame.normal, frame.normal_gt)):
+                digest.update(sha256_of(capture.folder / name).encode())
+        add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
+    motion, body = capture.motion, capture.body
+    add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))
+    add(_rounded(body.vertices), body.faces, _rounded(body.skinning_weights))
+    add(_rounded(body.skeleton.rest_joints))
+    if light is not None:
+        name, radiance = light
+        digest.update(name.encode())
+        add(radiance.radiance, _rounded(radiance.rotation))
+    return digest.hexdigest()
+
+
+def _rounded(values: ArrayLike) -> NDArray[np.float32]:
+    """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
+    return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)

@@ -1,0 +1,1 @@
+"""rnd-convert: splats, meshes, motions."""

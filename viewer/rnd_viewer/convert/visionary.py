@@ -1,0 +1,142 @@
+"""A clip as one ONNX file that makes plain Gaussians of a time, for Visionary's WebGPU renderer.
+
+Its contract (arXiv 2512.08478, sect. 3, and the exporters beside its source): an input ``time`` [1]; outputs
+``gaussian_f32`` [N, 10] (place, opacity, covariance xx xy xz yy yz zz), ``color_rgb`` [N, 4] in the screen's coding and
+``num_points`` [1], int32. Its own avatars come in half floats, of which none is a thin Gaussian's variance of 1e-8 m².
+
+The file holds the clip's frames and picks one: time · fps, rounded down, around and around. It is written field by
+field (onnx.proto of IR version 8), so that no package for ONNX is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime import __version__
+from rnd_runtime.avatar.onnx_parts import bytes_field, number_field
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path
+
+from .splats import SH_0, Splats
+
+Floats32 = NDArray[np.float32]
+
+MOST_BYTES = 1 << 27  # of one table: WebGPU's default limit of a storage buffer
+ROW_BYTES = 40
+_IR_VERSION, _OPSET = 8, 18
+_FLOAT, _INT32, _INT64 = 1, 6, 7  # TensorProto.DataType
+_ATTRIBUTE_INT = 2  # AttributeProto.AttributeType
+_LATE = 1e-3  # of a frame: a time that is one frame's own, less rounding, picks that frame
+
+
+def packed(splats: Splats) -> tuple[Floats32, Floats32]:
+    """Rows ``gaussian`` [N, 10] and ``color`` [N, 4] of splats whose colour is one for all views."""
+    w, x, y, z = splats.quaternions.T
+    axes = np.stack(
+        [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3, 3)
+    factors = axes * splats.scales[:, None, :]
+    covariances = factors @ np.swapaxes(factors, 1, 2)
+    rows, columns = np.triu_indices(3)
+    gaussians = np.concatenate([splats.means, splats.opacities[:, None], covariances[:, rows, columns]], axis=1)
+    colours = 0.5 + SH_0 * splats.harmonics[:, 0]
+    return gaussians.astype(np.float32), np.pad(colours, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
+
+
+def check_clip(frames: int, gaussians: int, what: str = "--frames", hint: str | None = None) -> None:
+    """Refuse a clip that no WebGPU buffer holds; ``what`` says where its frames come from, ``hint`` what to do."""
+    most = MOST_BYTES // (gaussians * ROW_BYTES)
+    if frames > most:
+        raise InputError(what, expected=f"at most {most} of this avatar for visionary", got=frames, hint=hint)
+
+
+def write_visionary(path: Path, frames: Sequence[tuple[Floats32, Floats32]], fps: float) -> None:
+    """Write a clip of ``frames``, each as ``packed``.
+
+    Raises:
+        InputError: they have not as many Gaussians each.
+    """
+    counts = [len(gaussians) for gaussians, _ in frames]
+    if min(counts) < max(counts):
+        got = f"{min(counts)} to {max(counts)}"
+        raise InputError("visionary", expected="as many finite Gaussians in every frame", got=got, file=path)
+    gaussians, colours = (np.stack(parts) for parts in zip(*frames))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(_model(gaussians, colours, fps))
+
+
+def _model(gaussians: Floats32, colours: Floats32, fps: float) -> bytes:
+    count, points = gaussians.shape[:2]
+    constants: dict[str, NDArray[Any]] = {
+        "gaussian_frames": gaussians,
+        "color_frames": colours,
+        "fps": np.array([fps], np.float32),
+        "late": np.array([_LATE], np.float32),
+        "half": np.array([0.5], np.float32),
+        "frames": np.array([count], np.float32),
+        "gaussian_shape": np.array([points, 10], np.int64),
+        "color_shape": np.array([points, 4], np.int64),
+        "points": np.array([points], np.int32),
+    }
+    nodes = [
+        _node("Mul", ["time", "fps"], "place"),
+        _node("Add", ["place", "late"], "late_place"),
+        _node("Floor", ["late_place"], "frame"),
+        _node("Add", ["frame", "half"], "frame_middle"),  # whole frames: what rounding does to the ratio cannot matter
+        _node("Div", ["frame_middle", "frames"], "clips"),
+        _node("Floor", ["clips"], "whole_clips"),
+        _node("Mul", ["whole_clips", "frames"], "clip_start"),
+        _node("Sub", ["frame", "clip_start"], "frame_of_clip"),
+        _node("Cast", ["frame_of_clip"], "index", to=_INT32),
+        _node("Gather", ["gaussian_frames", "index"], "one_gaussian_frame", axis=0),
+        _node("Gather", ["color_frames", "index"], "one_color_frame", axis=0),
+        _node("Reshape", ["one_gaussian_frame", "gaussian_shape"], "gaussian_f32"),
+        _node("Reshape", ["one_color_frame", "color_shape"], "color_rgb"),
+        _node("Identity", ["points"], "num_points"),
+    ]
+    outputs = [("gaussian_f32", _FLOAT, [points, 10]), ("color_rgb", _FLOAT, [points, 4]), ("num_points", _INT32, [1])]
+    graph = [*(bytes_field(1, node) for node in nodes), _text(2, "clip")]
+    graph += [bytes_field(5, _tensor(name, values)) for name, values in constants.items()]
+    graph.append(bytes_field(11, _value("time", _FLOAT, [1])))
+    graph += [bytes_field(12, _value(*output)) for output in outputs]
+    opset = bytes_field(8, _text(1, "") + number_field(2, _OPSET))
+    head = number_field(1, _IR_VERSION) + _text(2, "rnd-avatar") + _text(3, __version__)
+    return head + bytes_field(7, b"".join(graph)) + opset
+
+
+def _text(number: int, text: str) -> bytes:
+    return bytes_field(number, text.encode())
+
+
+def _node(kind: str, inputs: Sequence[str], output: str, **attributes: int) -> bytes:
+    """A NodeProto."""
+    parts = [*(_text(1, name) for name in inputs), _text(2, output), _text(3, output), _text(4, kind)]
+    for name, value in attributes.items():
+        attribute = _text(1, name) + number_field(3, value) + number_field(20, _ATTRIBUTE_INT)
+        parts.append(bytes_field(5, attribute))
+    return b"".join(parts)
+
+
+def _tensor(name: str, values: NDArray[Any]) -> bytes:
+    """A TensorProto."""
+    kind = {"f": _FLOAT, "i": _INT32 if values.itemsize == 4 else _INT64}[values.dtype.kind]
+    shape = b"".join(number_field(1, size) for size in values.shape)
+    raw = values.astype(values.dtype.newbyteorder("<")).tobytes()
+    return shape + number_field(2, kind) + _text(8, name) + bytes_field(9, raw)
+
+
+def _value(name: str, kind: int, shape: Sequence[int]) -> bytes:
+    """A ValueInfoProto."""
+    sizes = b"".join(bytes_field(1, number_field(1, size)) for size in shape)
+    tensor = number_field(1, kind) + bytes_field(2, sizes)
+    return _text(1, name) + bytes_field(2, bytes_field(1, tensor))

@@ -1,0 +1,23 @@
+"""The light that a command's options name."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.shading.light import Light, Up, load_light
+
+
+def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, exposure: float) -> Light:
+    """The light in ``probe``, or the one that was learnt with ``avatar``.
+
+    Args:
+        up: which axis points up in the probe's file; the learnt light is Y up.
+        yaw: degrees, from +X towards +Z.
+        exposure: stops by which it is made brighter.
+    """
+    turn = math.radians(yaw)
+    if probe is None:
+        return Light(avatar.trained_light).scaled(2.0**exposure).turned(turn)
+    return load_light(probe, up=up, yaw=turn, exposure=exposure)

@@ -1,0 +1,1 @@
+"""rnd-play: frames and clips."""

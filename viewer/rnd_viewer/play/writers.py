@@ -1,0 +1,116 @@
+"""What a run leaves in its folder. Every file is whole or absent, also after Ctrl-C.
+
+::
+
+    out/frames/000010.png        the picture: 8-bit sRGB, with straight alpha when there is no background
+    out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV
+    out/aov/normal/000010.png    AOVs to look at
+    out/play.mp4, out/play.webp      clips; the WebP is transparent where the PNG is
+    out/play.json                settings, what was found in the inputs, stage times
+    out/play_000010-000050.*     the same of a part of a run, see ``play.run_folder``
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import output_folder, write_json
+from rnd_runtime.core.images import write_image
+
+from .aov import CHANNELS, aov_picture
+from .player import Frame
+from .timing import StageTimes
+from .video import CLIPS, clip_writer, load_pyav
+
+FORMATS = ("png", "exr", *CLIPS)
+TRANSPARENT = {"png", "webp"}  # where nothing stands behind the avatar
+FrameWriter = Callable[[int, Frame, tuple[float, float]], None]
+
+
+def parse_formats(text: str | None) -> tuple[str, ...]:
+    """``png,exr`` → names; None → png and, where PyAV is installed, mp4."""
+    if text is None:
+        return ("png", "mp4") if importlib.util.find_spec("av") else ("png",)
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    if not names or names - set(FORMATS):
+        raise InputError("--format", expected=f"some of {','.join(FORMATS)}", got=text or "nothing")
+    if names & set(CLIPS):
+        load_pyav(", or --format png")
+    return tuple(name for name in FORMATS if name in names)
+
+
+def tone_map_for(formats: tuple[str, ...], frame: Frame) -> None:
+    """Let ``frame`` make the pixels that ``formats`` need, which it keeps: before it goes to a writer's thread."""
+    for name in formats:
+        if name != "exr":
+            _pixels(name, frame)
+
+
+def _pixels(name: str, frame: Frame) -> NDArray[np.uint8]:
+    """The pixels of ``frame`` for one of the formats that have 8 bits."""
+    return frame.srgb_alpha if name in TRANSPARENT and frame.behind is None else frame.srgb
+
+
+@contextmanager
+def frame_writer(
+    folder: Path,
+    formats: tuple[str, ...],
+    *,
+    name: str = "play",
+    fps: float,
+    times: StageTimes,
+    begin: Callable[[int], None] = lambda number: None,
+) -> Iterator[FrameWriter]:
+    """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
+
+    ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
+    one, and into pictures of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
+    at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse, and before any
+    file of it is written.
+    """
+    output_folder(folder)
+    with ExitStack() as clips:
+        append = {
+            kind: clips.enter_context(clip_writer(folder / f"{name}.{kind}", fps=fps))
+            for kind in formats
+            if kind in CLIPS
+        }
+
+        def write(number: int, frame: Frame, reach: tuple[float, float]) -> None:
+            files: dict[Path, NDArray[np.uint8]] = {}
+            number_name = f"{number:06d}"
+            with times.stage("write"):
+                for kind, add in append.items():
+                    add(_pixels(kind, frame))
+                begin(number)
+                if "png" in formats:
+                    files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
+                if "png" in formats or "exr" not in formats:
+                    for aov, values in frame.aovs.items():
+                        picture = aov_picture(aov, values, frame.alpha, reach)
+                        files[folder / f"aov/{aov}/{number_name}.png"] = picture
+                for path, pixels in files.items():
+                    write_image(path, pixels)
+                if "exr" in formats:
+                    _write_exr(folder / f"frames_exr/{number_name}.exr", frame)
+
+        yield write
+
+
+def _write_exr(path: Path, frame: Frame) -> None:
+    layers = [frame.linear(), *frame.aovs.values()]
+    names = ("R", "G", "B", "A", *(channel for aov in frame.aovs for channel in CHANNELS[aov]))
+    write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)
+
+
+def write_report(file: Path, report: dict[str, Any]) -> None:
+    """Write ``play.json``, under the name of its part of a run."""
+    write_json(file, report)

@@ -1,0 +1,1 @@
+"""rnd-report: a training on one page."""

@@ -1,0 +1,92 @@
+"""What a report shows of the avatar itself: a turntable clip, and the same pose under turned and other lights."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.shading.light import Light, Up, light_notes, load_light
+from rnd_runtime.shading.shader import Shader
+from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
+from rnd_viewer.play.aov import aov_picture
+from rnd_viewer.play.player import Player
+from rnd_viewer.play.video import clip_writer
+
+Bytes = NDArray[np.uint8]
+SIDE, FPS, SECONDS = 448, 24, 5.0
+YAWS = (0, 90, 180, 270)  # degrees: the learned light from all sides
+AOVS = ("albedo", "normal", "roughness", "visibility")
+MODE = "table+sun"
+
+
+class Shots:
+    """An avatar in one motion (the rest pose where none is given), ready to be filmed.
+
+    Attributes:
+        notes: what is to be said of the motion, and of every light that was read.
+    """
+
+    def __init__(self, avatar_file: Path, read_motion: Callable[[Skeleton], Motion] | None) -> None:
+        self.avatar = Avatar.load(avatar_file)
+        skeleton = self.avatar.skeleton
+        self.motion = (
+            Motion(np.tile(np.eye(3), (1, len(skeleton), 1, 1)), np.zeros((1, 3)), FPS, skeleton.names)
+            if read_motion is None
+            else read_motion(skeleton)
+        )
+        self.notes = list(self.motion.notes)
+        view = CameraOptions(SIDE, SIDE)
+        framing = frame_motion(skeleton, self.motion)
+        self._orbit = orbit_path(framing, view, SECONDS)
+        self._front = front_path(framing, view)
+        self._learned = Light(self.avatar.trained_light)
+
+    def turntable(self) -> bytes:
+        """An mp4 of one turn while the motion plays, under the learned light. Needs PyAV (else InputError)."""
+        with tempfile.TemporaryDirectory() as folder, make_rasterizer("auto") as rasterizer:
+            player = Player(self.avatar, self._learned, Shader(self._learned, MODE), rasterizer)
+            path = Path(folder) / "turntable.mp4"
+            with clip_writer(path, fps=FPS) as append:
+                for number in range(round(SECONDS * FPS)):
+                    time_s = number / FPS
+                    append(player.render(self.motion, time_s, self._orbit(number, time_s)).srgb)
+            return path.read_bytes()
+
+    def relights(self, hdrs: tuple[Path, ...], up: Up) -> Iterator[tuple[str, Bytes]]:
+        """Captions and pictures of the motion's middle: the learned light turned, then each of ``hdrs``.
+
+        ``up`` is the axis that points up in their files.
+        """
+        lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
+        lights += [(hdr.stem, self._read_light(hdr, up)) for hdr in hdrs]
+        time_s = self.motion.duration / 2
+        camera = self._front(0, time_s)
+        with make_rasterizer("auto") as rasterizer:
+            for caption, light in lights:
+                player = Player(self.avatar, light, Shader(light, MODE), rasterizer)
+                yield caption, player.render(self.motion, time_s, camera).srgb
+
+    def _read_light(self, hdr: Path, up: Up) -> Light:
+        light = load_light(hdr, up=up)
+        self.notes += [f"{hdr.name}: {note}" for note in light_notes(light)]
+        return light
+
+    def materials(self) -> Iterator[tuple[str, Bytes]]:
+        """Captions and pictures of what the light is taken from: albedo, normals, roughness, visibility."""
+        time_s = self.motion.duration / 2
+        with make_rasterizer("auto") as rasterizer:
+            shader = Shader(self._learned, "ao")
+            player = Player(self.avatar, self._learned, shader, rasterizer, aovs=AOVS)
+            frame = player.render(self.motion, time_s, self._front(0, time_s))
+        for name, values in frame.aovs.items():
+            picture = aov_picture(name, values, frame.alpha, (0.0, 1.0))
+            yield name, np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)))

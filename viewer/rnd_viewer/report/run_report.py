@@ -1,0 +1,231 @@
+"""``rnd-report``: everything about a training run on one HTML page that needs no network and no other file."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Sequence
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar.file import metadata_of
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path, sha256_of
+from rnd_runtime.core.images import read_image
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.shading.light import Up
+from rnd_viewer.play.video import INSTALL
+
+from .bench import bench_section
+from .html_parts import compare, curve, data_uri, figure, missing, png, table
+from .renders import Shots
+from .run_files import read_config, read_losses, read_scores
+
+Bytes = NDArray[np.uint8]
+TILES = ("truth", "render", "normals", "albedo", "error")  # side by side in rnd-eval's strips
+MARGIN = 8  # pixels kept around the person
+DARK = 8  # of 255; what is brighter in any tile is the person
+# Columns of rnd-eval's rows, and what else a row says of the run as a whole.
+METRICS = {
+    "split": ("split", "{}"),
+    "frames": ("frames", "{}"),
+    "psnr": ("PSNR, dB", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_box": ("PSNR in the box, dB", "{:.2f}"),
+    "psnr_n": ("PSNR of normals, dB", "{:.2f}"),
+    "normal_deg": ("normals off by, °", "{:.1f}"),
+    "psnr_albedo": ("PSNR of albedo, dB", "{:.2f}"),
+    "outline_px": ("outline off by, px", "{:.2f}"),
+}
+FACTS = {
+    "capture": "trained on {}",
+    "gaussians": "{} Gaussians",
+    "steps": "{}",
+    "minutes": "{:.1f} minutes",
+    "seed": "seed {}",
+    "file_mb": "avatar.onnx {:.1f} MB",
+    "fps": "plays at {:.0f} frames a second",
+    "flicker": "flicker {:.2f} of 255 (what jumps from frame to frame; most of it is moving texture)",
+    "machine": "{}",
+}
+SCALED = "relight_albedo_scaled"  # rnd-eval's folder of relight once more
+WORDS = ("split", "capture", "machine")  # of these, those that are no numbers
+
+
+def write_run_report(
+    run: Path,
+    out: Path,
+    *,
+    motion: Callable[[Skeleton], Motion] | None = None,
+    hdrs: tuple[Path, ...] = (),
+    hdr_up: Up = "y",
+    bench: Path | None = None,
+    pictures: int = 3,
+) -> list[str]:
+    """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
+
+    What is to be said of the avatar, its motion and its lights, which the page says too.
+
+    Args:
+        motion: played in the turntable, read for the avatar's skeleton.
+        hdrs, hdr_up: relit under these; which axis points up in their files.
+        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; see ``.find_bench``.
+        pictures: shown of each held-out split.
+
+    Raises:
+        InputError: ``run`` holds no training, or a file of it is damaged.
+    """
+    config = read_config(run)
+    rows = read_scores(run, WORDS, ({"step"} | METRICS.keys() | FACTS.keys()) - {*WORDS})
+    name = run.resolve().name
+    # before the avatar is filmed: what is damaged is found at once
+    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run))]
+    read += [bench_section(bench, run), _configuration(config)]
+    if why_not := why_no_avatar(run, config):
+        avatar, notes = missing("The avatar", why_not), [why_not]
+    else:
+        shots = Shots(run / "avatar.onnx", motion)
+        avatar, notes = _turntable_and_relights(shots, hdrs, hdr_up), shots.notes
+    sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
+    page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
+    with atomic_path(out) as temporary:
+        text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # names that are not UTF-8
+    return notes
+
+
+def _facts(rows: Sequence[dict[str, Any]]) -> str:
+    row = rows[0] | {"steps": _steps(rows[0])} if rows else {}
+    facts = [form.format(row[key]) for key, form in FACTS.items() if row.get(key) is not None]
+    return f'<p class="facts">{escape(" · ".join(facts))}</p>' if facts else ""
+
+
+def _steps(row: dict[str, Any]) -> str | None:
+    """Steps with a picture are what is asked for; ``step`` counts those without one too, where it is known."""
+    asked, taken = row.get("steps"), row.get("step")
+    if asked is None or taken in (None, asked):
+        return None if asked is None else f"{asked} steps"
+    return f"{taken} of {asked} steps" if taken < asked else f"{taken} steps, {asked} of them with a picture"
+
+
+def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
+    """Why the avatar is not shown; empty where it is."""
+    avatar, checkpoint = run / "avatar.onnx", run / "avatar.ckpt"
+    if not avatar.is_file():
+        ablated = config.get("light") == "none"
+        how = "--light none is not exported" if ablated else f"rnd-export {checkpoint} makes it"
+        return f"no avatar.onnx in the run: {how}"
+    if checkpoint.is_file() and metadata_of(avatar).checkpoint_sha256 != sha256_of(checkpoint):
+        return f"avatar.onnx is of another checkpoint than avatar.ckpt: rnd-export {checkpoint} makes it anew"
+    return ""
+
+
+def _turntable_and_relights(shots: Shots, hdrs: tuple[Path, ...], hdr_up: Up) -> str:
+    """The section of the avatar, with the notes that it ends with."""
+    cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs, hdr_up)]
+    if importlib.util.find_spec("av"):
+        clip = data_uri(shots.turntable(), "video/mp4")
+        video = f'<video src="{clip}" autoplay loop muted playsinline controls></video>'
+        cells.insert(0, figure(video, "turntable, learned light"))
+    else:
+        cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
+    materials = [figure(png(picture, caption), caption) for caption, picture in shots.materials()]
+    html = (
+        f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
+        f'<h3>What the light falls on</h3><div class="grid tiles">{"".join(materials)}</div>'
+    )
+    return html + "".join(f"<p>Note: {escape(note)}</p>" for note in shots.notes)
+
+
+def _metrics(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return missing("Held-out quality", "no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json")
+    names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
+    cells = [["" if row.get(name) is None else METRICS[name][1].format(row[name]) for name in names] for row in rows]
+    box = "<p>In the box: in the rectangle around the person alone.</p>" if "psnr_box" in names else ""
+    return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells) + box
+
+
+def _comparisons(folder: Path, count: int) -> str:
+    if count == 0:
+        return ""
+    splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if not splits:
+        return missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
+    how = "Drag across a picture: truth to the left, render to the right; then normals, albedo, error × 4."
+    parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
+    seen = set()
+    for split in splits:
+        strips = sorted(split.glob("*.png"))
+        shown = min(count, len(strips))
+        chosen = [strips[k * len(strips) // shown] for k in range(shown)]
+        pictures = tuple((strip.name, sha256_of(strip)) for strip in chosen)
+        if pictures in seen:
+            continue
+        seen.add(pictures)
+        title, note = split.name.replace("_", " "), ""
+        if split.name == SCALED:
+            title = "relight, albedo scaled"
+            note = "<p>The same frames, with the learned albedo brought to the scale of the true one.</p>"
+        shots = "".join(_shot(strip) for strip in chosen)
+        parts.append(f'<h3>{escape(title)}</h3>{note}<div class="grid shots">{shots}</div>')
+    return "".join(parts)
+
+
+def _shot(strip: Path) -> str:
+    """One strip of rnd-eval, cropped to the person: a slider between truth and render, then the other tiles."""
+    pixels = read_image(strip)[..., :3]
+    if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
+        raise InputError("picture of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
+    tiles: list[Bytes] = np.split(pixels.astype(np.uint8), len(TILES), axis=1)
+    rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > DARK)
+    if len(rows):
+        window = tuple(
+            slice(max(int(places.min()) - MARGIN, 0), int(places.max()) + 1 + MARGIN) for places in (rows, columns)
+        )
+        tiles = [np.ascontiguousarray(tile[window]) for tile in tiles]
+    truth, render, *others = (png(tile, f"{what}, {strip.stem}") for what, tile in zip(TILES, tiles))
+    pair = compare(truth, render, f"truth or render of {strip.stem}")
+    return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
+
+
+def _curves(rows: Sequence[dict[str, Any]]) -> str:
+    if not rows:
+        return missing("Losses", "no metrics.jsonl in the run")
+    terms = dict.fromkeys(name for row in rows for name in row)
+    terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
+    for name in ("step", "stage", "seconds", "skipped"):
+        terms.pop(name, None)
+    mark = next((row["step"] for row in rows if row.get("stage") == 2), None)
+    figures = []
+    for term in terms:
+        having = [row for row in rows if row.get(term) is not None]
+        if having:
+            figures.append(curve([row["step"] for row in having], [row[term] for row in having], term, mark))
+    skipped = sum(bool(row.get("skipped")) for row in rows)
+    note = f" {skipped} steps were not finite and were skipped." if skipped else ""
+    dashed = "" if mark is None else "; the dashed line is where the second stage, the light, begins"
+    return (
+        f"<h2>Losses</h2><p>Weighted terms of what is minimised, on a logarithmic scale{dashed}.{note}</p>"
+        f'<div class="grid curves">{"".join(figures)}</div>'
+    )
+
+
+def _configuration(config: dict[str, Any]) -> str:
+    flat = {key: value for key, value in config.items() if not isinstance(value, dict)}
+    nested = {
+        f"{outer}.{key}": value
+        for outer, inner in config.items()
+        if isinstance(inner, dict)
+        for key, value in inner.items()
+    }
+    rows = [(key, str(value)) for key, value in (flat | nested).items()]
+    content = table(("option", "value"), rows, words=(0, 1))
+    return f"<h2>Configuration</h2><details><summary>{len(rows)} options</summary>{content}</details>"

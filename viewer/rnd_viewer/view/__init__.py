@@ -1,0 +1,1 @@
+"""rnd-view: a live view in the browser."""

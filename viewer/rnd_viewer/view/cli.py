@@ -1,0 +1,62 @@
+"""The command ``rnd-view``."""
+
+from __future__ import annotations
+
+import secrets
+import sys
+import webbrowser
+from collections.abc import Sequence
+from threading import Thread
+
+import tyro
+from rich.console import Console
+
+from rnd_runtime.core.console import print_plain
+from rnd_runtime.core.errors import parse_options, run_command
+from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
+from rnd_runtime.core.threads import set_threads
+from rnd_runtime.playback.start import quick_start, settle
+
+from .options import ViewOptions
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rnd-view`` with ``arguments`` (the process's own when None) until Ctrl-C; 2 for unusable input."""
+
+    def command() -> int:
+        options = parse_options(lambda: tyro.cli(ViewOptions, prog="rnd-view", args=arguments))
+        return view(options)
+
+    return run_command("rnd-view", command)
+
+
+def view(options: ViewOptions) -> int:
+    """Serve the scene that ``options`` describe until the process is interrupted.
+
+    Raises:
+        InputError: for whatever cannot be used.
+    """
+    with quick_start(options.avatar, options.threads) as ahead:
+        from .scene import Scene  # here, so that --help works where a library does not load
+        from .server import load_websockets, serve
+
+        load_websockets()
+        set_threads(options.threads)
+        console = Console(highlight=False)
+        cold = kernels_are_cold()
+        with console.status("loading"):
+            scene = Scene(options, ahead)
+            if cold:
+                print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
+            scene.warm_up()
+            settle()
+        try:
+            token = None if options.local else secrets.token_urlsafe(16)
+            with serve(scene, options.host, options.port, token) as (server, url):
+                print_plain(console, f"rnd-view: {url}")
+                if options.browser and options.local:
+                    Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
+                server.serve_forever()
+        finally:
+            scene.close()
+    return 0

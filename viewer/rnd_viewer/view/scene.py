@@ -1,0 +1,302 @@
+"""What ``rnd-view`` shows: an avatar, a motion, lights, a capture; and one picture of it for each state."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.avatar.networks import Networks
+from rnd_runtime.capture.capture import Capture, load_capture
+from rnd_runtime.core.camera import Camera, Floats
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import existing_file
+from rnd_runtime.core.gaussians import Gaussians, Raster
+from rnd_runtime.motion.edit import edit_motion
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.playback.frame import as_seen_from, chosen_cull, draw
+from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.raster.in_view import opacities_of, seen_of
+from rnd_runtime.raster.outline import sharpened
+from rnd_runtime.raster.tone import tone_map
+from rnd_runtime.shading.light import Light, downsize, light_notes, load_light
+from rnd_runtime.shading.shader import Shader
+from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
+from rnd_viewer.play.aov import aov_picture, aov_values, splat_features
+
+from .options import SIZES, ViewOptions
+from .state import ViewState
+
+Floats32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
+SHADERS_KEPT = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
+LARGEST_SKY = 1024  # rows of a map that is shown behind the avatar and kept: 25 MB
+
+
+class Picture:
+    """One rendered view.
+
+    Attributes:
+        srgb: [H, W, 3] uint8.
+        joints: [J, 3] px, px and z in metres; what lies behind the camera has z ≤ 0.
+        seconds: time of each stage.
+    """
+
+    def __init__(self, srgb: Bytes, joints: Floats32, seconds: dict[str, float]) -> None:
+        self.srgb, self.joints, self.seconds = srgb, joints, seconds
+
+
+class Scene:
+    """Loads everything that ``options`` name; renders any ``ViewState``, one at a time.
+
+    Args:
+        ahead: the avatar's networks, where they are being loaded already.
+
+    Raises:
+        InputError: for whatever cannot be used.
+    """
+
+    def __init__(self, options: ViewOptions, ahead: Future[Networks] | None = None) -> None:
+        self.avatar = Avatar.load(options.avatar, threads=options.threads, ahead=ahead)
+        self.capture: Capture | None = load_capture(options.capture) if options.capture else None
+        self.motion = self._motion(options)
+        self._files, self._up = _probes(options.hdr), options.hdr_up
+        self.rasterizer = make_rasterizer(options.raster)
+        self._cull = chosen_cull(self.avatar, None)
+        self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
+        self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
+        self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
+        self._sky = lru_cache(SHADERS_KEPT // 2)(self._smaller_light)
+        self._light_notes: dict[str | Path | None, list[str]] = {}
+        self._behind: tuple[tuple[Any, ...], Floats32] | None = None
+        self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
+
+    def description(self) -> dict[str, Any]:
+        """What a page needs to know before it asks for pictures."""
+        framing = frame_motion(self.avatar.skeleton, self.motion)
+        view = CameraOptions(self.size, self.size)
+        home = front_path(framing, view)(0, 0.0)
+        return {
+            "avatar": self.name,
+            "gaussians": self.avatar.gaussians,
+            "parents": self.avatar.skeleton.parents.tolist(),
+            "motion": {"name": Path(self.motion.source).name, "duration": self.motion.duration, "fps": self.motion.fps},
+            "lights": ["the avatar's own", *(file.name for file in self._files)],
+            "light": 1 if self._files else 0,
+            "size": self.size,
+            "sizes": SIZES,
+            "raster": self.rasterizer.name,
+            "view": {
+                "azimuth": framing.facing,
+                "elevation": view.elevation,
+                "distance": float(np.linalg.norm(home.position - framing.centre)),
+                "target": tuple(framing.centre.tolist()),
+                "fov": view.fov_y,
+            },
+            "truths": self._truths(),
+            "notes": list(self.motion.notes),
+        }
+
+    def warm_up(self) -> None:
+        """Draw the first view once: a first run compiles the kernels, up to two minutes."""
+        about = self.description()
+        self.render(ViewState(time=0.0, width=self.size, height=self.size, light=about["light"], **about["view"]))
+
+    def render(self, state: ViewState) -> Picture:
+        """The picture of ``state`` with the time that each stage took."""
+        seconds: dict[str, float] = {}
+        if state.truth is not None:
+            state = structs.replace(state, yaw=0.0, exposure=0.0)
+        camera, motion, time_s = self._view(state)
+        gaussians, root = self._pose(motion, time_s, seconds)
+        gaussians = _fewer(gaussians, state.gaussians)
+        shader, beside = as_seen_from(root, self._turned_shader(state), camera)
+        if state.output in ("lit", "light"):
+            raster = self._draw_lit(state, gaussians, shader, beside)
+        else:
+            raster = self._draw_material(state.output, gaussians, beside)
+        started = perf_counter()
+        if state.output in ("lit", "light", "albedo"):
+            srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))
+        else:
+            values = aov_values(state.output, raster.image, raster.alpha)
+            shown = aov_picture(state.output, values, raster.alpha, (0, 1))
+            srgb = np.broadcast_to(shown, (*raster.alpha.shape, 3))
+        seconds |= {**raster.seconds, "tone map": perf_counter() - started}
+        return Picture(srgb, self._joints(motion, time_s, camera), seconds)
+
+    def notes_of_light(self, state: ViewState) -> list[str]:
+        """What the user should know of the light of a ``state`` that was drawn."""
+        return self._light_notes[self._light_name(state)]
+
+    def truth_file(self, index: int) -> Path:
+        """The capture's picture ``index``."""
+        capture, frame = self._capture_frame(index)
+        return existing_file(capture.folder / frame.image, what="picture of the capture")
+
+    def close(self) -> None:
+        self.rasterizer.close()
+
+    def _motion(self, options: ViewOptions) -> Motion:
+        if options.motion:
+            return options.read_motion(options.motion, self.avatar.skeleton)
+        if self.capture:
+            return edit_motion(self._captured_motion, options.edits)
+        joints = len(self.avatar.skeleton)
+        rest = np.broadcast_to(np.eye(3), (1, joints, 3, 3))
+        return Motion(rest, np.zeros((1, 3)), 30.0, self.avatar.skeleton.names, "at rest")
+
+    @cached_property
+    def _captured_motion(self) -> Motion:
+        assert self.capture
+        return self.capture.motion_for(self.avatar.skeleton)
+
+    def _truths(self) -> list[dict[str, Any]]:
+        if not self.capture:
+            return []
+        return [
+            {
+                "label": " · ".join(filter(None, [frame.split, frame.camera, f"frame {frame.frame}", frame.light])),
+                "time": frame.frame / self.capture.fps,
+                "width": self.capture.cameras[frame.camera].width,
+                "height": self.capture.cameras[frame.camera].height,
+            }
+            for frame in self.capture.frames
+        ]
+
+    def _capture_frame(self, index: int) -> tuple[Capture, Any]:
+        if self.capture is None or index >= len(self.capture.frames):
+            raise InputError("truth", expected="a picture of --capture", got=index)
+        return self.capture, self.capture.frames[index]
+
+    def _view(self, state: ViewState) -> tuple[Camera, Motion, float]:
+        if state.truth is None:
+            return state.camera(), self.motion, float(np.clip(state.time, 0, self.motion.duration))
+        capture, frame = self._capture_frame(state.truth)
+        camera = capture.cameras[frame.camera]
+        scale = min(state.width / camera.width, state.height / camera.height)
+        size = (max(round(side * scale), 1) for side in (camera.width, camera.height))
+        return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
+
+    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> tuple[Gaussians, Floats]:
+        """The avatar in its root's frame, and that frame → world [4, 4]; kept while only camera and light move."""
+        if self._posed is None or self._posed[0] is not motion or self._posed[1] != time_s:
+            started = perf_counter()
+            encoded = self.avatar.encode(motion, time_s)
+            known = perf_counter()
+            self._posed = motion, time_s, self.avatar.posed(encoded), encoded.root
+            seconds |= {"encoders": known - started, "posing": perf_counter() - known}
+        return self._posed[2:]
+
+    def _turned_shader(self, state: ViewState) -> Shader:
+        shader = self._shader(self._light_name(state), state.shade)
+        return shader.turned(shader.light.yaw + state.yaw)
+
+    def _draw_lit(self, state: ViewState, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
+        if state.output == "light":
+            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
+        raster = draw(gaussians, shader, camera, self.rasterizer, cull=self._cull)
+        if state.exposure == 0:
+            return raster
+        return replace(raster, image=raster.image * np.float32(2.0**state.exposure))
+
+    def _draw_material(self, output: str, gaussians: Gaussians, camera: Camera) -> Raster:
+        features = splat_features((output,), gaussians, camera)[0].astype(np.float32)
+        opacities = opacities_of(gaussians, seen_of(gaussians, camera, self._cull))
+        arrays = gaussians.means, gaussians.covariances, opacities, features
+        return sharpened(self.rasterizer(*arrays, camera, depth=False))
+
+    def _light_name(self, state: ViewState) -> str | Path | None:
+        """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""
+        if state.truth is not None:
+            light = self._capture_frame(state.truth)[1].light
+            return str(light) if light else None
+        if state.light > len(self._files):
+            raise InputError("light", expected=f"0 to {len(self._files)}", got=state.light)
+        return self._files[state.light - 1] if state.light else None
+
+    def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
+        shader = Shader(self._light(name), shade)
+        # from here on it is only turned: its texels need not stay
+        shader.light = replace(shader.light, radiance=np.zeros((1, 2, 3), np.float32))
+        self._light.cache_clear()
+        return shader
+
+    def _load_light(self, name: str | Path | None) -> Light:
+        light = self._read_light(name)
+        self._light_notes[name] = light_notes(light)
+        return light
+
+    def _read_light(self, name: str | Path | None) -> Light:
+        if name is None:
+            return Light(self.avatar.trained_light)
+        if isinstance(name, Path):
+            return load_light(name, up=self._up)
+        assert self.capture
+        return self.capture.load_light(name)
+
+    def _smaller_light(self, name: str | Path | None) -> Light:
+        light = self._light(name)
+        self._light.cache_clear()
+        if len(light.radiance) <= LARGEST_SKY:
+            return light
+        return replace(light, radiance=downsize(light.radiance, LARGEST_SKY, 2 * LARGEST_SKY))
+
+    def _radiance_behind(self, state: ViewState, camera: Camera) -> Floats32:
+        """The background; a map's is kept for as long as neither it nor the camera moves."""
+        background = Background.parse(state.background)
+        if background.kind != "hdr":
+            return np.array(background.colour, np.float32)
+        name = self._light_name(state)
+        size = camera.width, camera.height
+        key = (name, state.yaw, size, camera.K.tobytes(), camera.world_to_camera.tobytes())
+        if self._behind is None or self._behind[0] != key:
+            light = self._sky(name)
+            turned = light.turned(light.yaw + state.yaw)
+            self._behind = key, background.radiance(camera, turned)
+        return self._behind[1] * np.float32(2.0**state.exposure)
+
+    def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
+        now = motion.at([time_s])
+        world = self.avatar.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]
+        seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        depth = np.where(np.abs(seen[:, 2:]) > 1e-6, seen[:, 2:], 1e-6)
+        pixels = (seen / depth) @ camera.K.T
+        return np.column_stack([pixels[:, :2], seen[:, 2]]).astype(np.float32)
+
+
+def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
+    """``count`` at even steps through the file, whose neighbours are the body's, grown to cover the same area."""
+    total = len(gaussians.means)
+    if count is None or count >= total:
+        return gaussians
+    kept = np.arange(count) * total // count
+    fewer = gaussians.only(kept)
+    return replace(fewer, covariances=fewer.covariances * np.float32(total / count))
+
+
+def _probes(paths: tuple[Path, ...]) -> list[Path]:
+    """The light probes among ``paths``, folders opened."""
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in (".exr", ".hdr"))
+            if not inside:
+                raise InputError("--hdr", expected="light probes, .exr or .hdr", got="none", file=path)
+            files += inside
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise InputError("light probe not found", file=path)
+    return files

@@ -1,0 +1,321 @@
+"""The page and its websocket on one port, for this machine alone unless told otherwise.
+
+A page in the same browser must not be able to reach the viewer behind its user's back, so on a loopback address
+only requests that name that address as their host are answered (against DNS rebinding), and a websocket only when
+its origin is the very host it connects to. On any other address everything asks for a token, given once in the
+page's URL and kept in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from errno import EACCES, EADDRINUSE
+from http import HTTPStatus
+from importlib import resources
+from io import BytesIO
+from pathlib import Path
+from socket import AF_INET, AF_INET6, SHUT_RDWR, SOCK_DGRAM, gethostname, socket
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from types import ModuleType
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+from weakref import WeakSet
+
+import numpy as np
+from msgspec.structs import replace
+
+from rnd_runtime.core.errors import InputError, withheld
+from rnd_runtime.core.threads import set_threads
+from rnd_viewer.play.video import clip_writer
+
+from .scene import Bytes, Picture, Scene
+from .state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, TruthRequest, parse_request
+
+INSTALL = "pip install 'rnd-avatar[view]'"
+COOKIE = "rnd_view_token"
+JPEG_QUALITY = 90
+HTTP_PORT = 80  # which browsers leave out of the host's name
+_ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one, for examples, that lies elsewhere
+MOST_BYTES_IN = 1 << 16  # a request is a few hundred
+GOODBYE_S = 1.0  # in which a page that still reads hears that the viewer ends
+CONTENT_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+# Nothing from elsewhere runs in the page, and nobody frames it.
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may talk to the server.
+
+    Attributes:
+        token: what every request must bring; None on a loopback address.
+        hosts: names by which a browser on this machine may call it; None for any, with the token.
+    """
+
+    token: str | None
+    hosts: frozenset[str] | None
+
+    @classmethod
+    def local(cls, host: str, port: int) -> Access:
+        """For a loopback ``host``: no token, but nobody else's name for it."""
+        names = {"localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host}
+        called = {f"{name}:{port}" for name in names}
+        return cls(None, frozenset(called | names if port == HTTP_PORT else called))
+
+    def refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
+        """Why a request is not answered, or None if it is."""
+        try:
+            return self._refusal(path, headers)
+        except (ValueError, LookupError):  # an address that is none, a header that is there twice
+            return HTTPStatus.BAD_REQUEST, "not a request that rnd-view understands\n"
+
+    def _refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
+        query = urlsplit(path).query
+        host, origin = headers.get("Host", "").lower(), headers.get("Origin")
+        if self.hosts is not None and host not in self.hosts:
+            return HTTPStatus.FORBIDDEN, "rnd-view answers to this machine's own address only\n"
+        if origin is not None and urlsplit(origin).netloc.lower() != host:
+            return HTTPStatus.FORBIDDEN, "another site's page may not use rnd-view\n"
+        if self.token is not None and not self._has_token(query, headers):
+            return HTTPStatus.UNAUTHORIZED, "open the address that rnd-view printed, token included\n"
+        return None
+
+    def _has_token(self, query: str, headers: Any) -> bool:
+        assert self.token is not None
+        # By hand: Python's own parser stops at the first cookie, of whatever other program, that it does not like.
+        cookies = (cookie.strip().partition("=") for cookie in headers.get("Cookie", "").split(";"))
+        given = parse_qs(query).get("token", []) + [value for name, _, value in cookies if name == COOKIE]
+        return any(hmac.compare_digest(text.encode(), self.token.encode()) for text in given)
+
+
+def load_websockets() -> ModuleType:
+    """Import websockets' server or say which extra brings it."""
+    try:
+        import websockets.sync.server
+    except ImportError as error:
+        raise InputError("websockets is not installed", hint=INSTALL) from error
+    return websockets.sync.server
+
+
+@contextmanager
+def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tuple[Any, str]]:
+    """Yield a listening server, to be run by its ``serve_forever``, and the URL to open.
+
+    Raises:
+        InputError: websockets is missing, or nothing can listen there.
+    """
+    server_module = load_websockets()
+    visitor = _Visitor(scene)
+    access: list[Access] = []  # known once the port is
+    connections: WeakSet[Any] = WeakSet()  # also those that have asked for nothing yet
+
+    def connect(*arguments: Any, **options: Any) -> Any:
+        connection = server_module.ServerConnection(*arguments, **options)
+        connections.add(connection)
+        return connection
+
+    def answer(connection: Any, request: Any) -> Any:
+        refusal = access[0].refusal(request.path, request.headers)
+        if refusal is not None:
+            return connection.respond(*refusal)
+        path = urlsplit(request.path).path
+        return None if path == "/socket" else _static(connection, path, access[0])
+
+    try:
+        server = server_module.serve(
+            visitor.talk,
+            host,
+            port,
+            process_request=answer,
+            compression=None,
+            max_size=MOST_BYTES_IN,
+            max_queue=None,  # behind a full queue pings wait too, and the page is taken for gone
+            create_connection=connect,
+            server_header=None,
+            logger=_quiet_logger(),
+            family=AF_INET6 if ":" in host else AF_INET,
+        )
+    except OSError as error:
+        taken = error.errno in (EADDRINUSE, EACCES)
+        hint = "--port picks another" if taken else "--host takes an address of this machine"
+        raise InputError("cannot listen", got=f"{error.strerror} on {host}:{port}", hint=hint) from error
+    try:
+        port = server.socket.getsockname()[1]
+        access.append(Access(token, None) if token else Access.local(host, port))
+        name = _name_from_elsewhere(host)
+        yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+    finally:
+        server.socket.close()
+        # Where nobody has served yet, shutdown would wait for ever; with its socket closed serving ends at once.
+        if not server.socket_closed.is_set():
+            server.serve_forever()
+        hanging_up = threading.Timer(GOODBYE_S, _hang_up, [connections])
+        hanging_up.start()
+        server.shutdown()
+        hanging_up.cancel()
+
+
+def _hang_up(connections: Iterable[Any]) -> None:
+    """End what waits for a page that reads no more, or for one that never asked for anything."""
+    for connection in list(connections):
+        with suppress(OSError):  # closed already
+            connection.socket.shutdown(SHUT_RDWR)
+
+
+def _name_from_elsewhere(host: str) -> str:
+    """What stands for ``host`` in an address; where that is all of this machine's addresses, one of them."""
+    family = AF_INET6 if ":" in host else AF_INET
+    if host in _ALL_ADDRESSES:
+        with socket(family, SOCK_DGRAM) as unused:
+            try:
+                # nothing is sent: it only picks our own address
+                unused.connect((_ALL_ADDRESSES[host], HTTP_PORT))
+                host = unused.getsockname()[0]
+            except OSError:  # no network
+                host = gethostname()
+    return f"[{host}]" if ":" in host else host
+
+
+def _static(connection: Any, path: str, access: Access) -> Any:
+    """A file of the page."""
+    folder = resources.files(__package__) / "page"
+    name = path.removeprefix("/") or "index.html"
+    known = {file.name for file in folder.iterdir()}
+    suffix = Path(name).suffix
+    if name not in known or suffix not in CONTENT_TYPES:
+        return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
+    response = connection.respond(HTTPStatus.OK, "")
+    response.body = (folder / name).read_bytes()
+    del response.headers["Content-Length"], response.headers["Content-Type"]
+    response.headers["Content-Length"] = str(len(response.body))
+    response.headers["Content-Type"] = CONTENT_TYPES[suffix]
+    for header, value in HEADERS.items():
+        response.headers[header] = value
+    if access.token:
+        response.headers["Set-Cookie"] = f"{COOKIE}={access.token}; Path=/; HttpOnly; SameSite=Strict"
+    return response
+
+
+def _quiet_logger() -> logging.Logger:
+    """websockets reports every connection that breaks; only our own mistakes are worth a traceback."""
+    logger = logging.getLogger("rnd_viewer.websockets")
+    logger.setLevel(logging.ERROR)
+    logger.filters = [lambda record: record.msg == "connection handler failed"]
+    return logger
+
+
+class _Visitor:
+    """Answers pages; several may look at one scene, which draws for one at a time."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._drawing = threading.Lock()
+
+    def talk(self, socket: Any) -> None:
+        """Serve one websocket until it closes. A request that cannot be met is answered with the reason."""
+        from websockets.exceptions import ConnectionClosed
+
+        set_threads(self._scene.threads)  # each visitor has a thread, and each thread a number of its own
+        with suppress(ConnectionClosed):  # while a picture was on its way
+            self._send(socket, {"kind": "scene", "scene": self._scene.description()})
+            for message in socket:
+                try:
+                    self._answer(socket, parse_request(message))
+                except InputError as error:
+                    self._send(socket, {"kind": "error", "message": str(error)})
+                except OSError as error:
+                    if (reason := withheld(error)) is None:
+                        raise
+                    self._send(socket, {"kind": "error", "message": reason})
+
+    def _answer(self, socket: Any, request: Request) -> None:
+        if isinstance(request, RenderRequest):
+            self._render(socket, request)
+        elif isinstance(request, ClipRequest):
+            self._clip(socket, request)
+        else:
+            self._truth(socket, request)
+
+    def _render(self, socket: Any, request: RenderRequest) -> None:
+        with self._drawing:
+            picture = self._scene.render(request.state)
+            notes = self._scene.notes_of_light(request.state)
+        pixels, encoding_ms = encode(picture, request.state.encoding)
+        header = {
+            "kind": "picture",
+            "number": request.number,
+            "width": picture.srgb.shape[1],
+            "height": picture.srgb.shape[0],
+            "encoding": request.state.encoding,
+            "joints": picture.joints.astype(np.float64).round(2).tolist(),
+            "notes": notes,
+            "times": {name: 1e3 * seconds for name, seconds in picture.seconds.items()} | {"encoding": encoding_ms},
+        }
+        self._send(socket, header, pixels)
+
+    def _clip(self, socket: Any, request: ClipRequest) -> None:
+        motion, state = self._scene.motion, replace(request.state, truth=None)
+        frames = motion.frames_at(request.fps)
+        if frames > MOST_CLIP_FRAMES:
+            raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "clip.mp4"
+            with clip_writer(file, fps=request.fps) as append:
+                for number in range(frames):
+                    azimuth = state.azimuth + request.turn * number / frames
+                    now = replace(state, time=number / request.fps, azimuth=azimuth)
+                    with self._drawing:
+                        append(np.ascontiguousarray(self._scene.render(now).srgb))
+                    self._send(socket, {"kind": "progress", "done": number + 1, "of": frames})
+            notes = motion.loop_notes(request.fps)
+            self._send(socket, {"kind": "clip", "notes": notes}, file.read_bytes())
+
+    def _truth(self, socket: Any, request: TruthRequest) -> None:
+        data = self._scene.truth_file(request.index).read_bytes()
+        self._send(socket, {"kind": "truth", "index": request.index}, data)
+
+    @staticmethod
+    def _send(socket: Any, header: dict[str, Any], body: bytes | Bytes | None = None) -> None:
+        """A header as JSON text; what it announces follows in a binary message of its own."""
+        socket.send(json.dumps(header))
+        if body is not None:
+            socket.send(body if isinstance(body, bytes) else body.data.cast("B"))
+
+
+def encode(picture: Picture, encoding: str) -> tuple[bytes | Bytes, float]:
+    """The pixels as ``raw`` RGBA [H, W, 4] or as ``jpeg``, and the milliseconds that took."""
+    started = perf_counter()
+    data: bytes | Bytes
+    if encoding == "jpeg":
+        data = _jpeg(picture.srgb)
+    else:
+        data = np.full((*picture.srgb.shape[:2], 4), 255, np.uint8)
+        data[..., :3] = picture.srgb
+    return data, 1e3 * (perf_counter() - started)
+
+
+def _jpeg(srgb: Bytes) -> bytes:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise InputError("JPEG needs Pillow, which is not installed", hint=INSTALL) from error
+    stream = BytesIO()
+    Image.fromarray(srgb).save(stream, "jpeg", quality=JPEG_QUALITY)
+    return stream.getvalue()

@@ -1,0 +1,98 @@
+"""What a page may ask of ``rnd-view``: one message for each picture, one for each clip."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError
+
+from .options import SIZES
+
+Output = Literal["lit", "light", "albedo", "normal", "roughness", "visibility"]
+MOST_CLIP_FRAMES = 3600
+
+_Side = Annotated[int, Meta(ge=SIZES[0], le=SIZES[1])]
+_Angle = Annotated[float, Meta(ge=-1e4, le=1e4)]
+_Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
+
+
+class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that one picture depends on.
+
+    Attributes:
+        time: s into the motion. width, height: px.
+        azimuth, elevation: rad; where the camera stands as seen from ``target`` [3] m, ``distance`` m away.
+        fov: vertical field of view, rad.
+        truth: index of a picture of the capture, which then decides camera, pose and light, neither turned nor
+            exposed; None for none of them.
+        light: index among the scene's lights. yaw: rad. exposure: stops.
+        output: the lit picture, the light alone (on a body of one colour), or one of its materials.
+        background: as ``rnd-play --background``, ``none`` being black.
+        gaussians: how many to draw; fewer are drawn larger.
+        encoding: of the pixels in the answer.
+    """
+
+    time: float
+    width: _Side
+    height: _Side
+    azimuth: _Angle
+    elevation: _Angle
+    distance: Annotated[float, Meta(gt=0, le=1e4)]
+    target: tuple[_Metres, _Metres, _Metres]
+    fov: Annotated[float, Meta(gt=0.01, lt=3.0)]
+    light: Annotated[int, Meta(ge=0)] = 0
+    yaw: _Angle = 0.0
+    exposure: Annotated[float, Meta(ge=-30, le=30)] = 0.0
+    shade: str = "table+sun"
+    output: Output = "lit"
+    background: str = "none"
+    gaussians: Annotated[int, Meta(ge=1)] | None = None
+    truth: Annotated[int, Meta(ge=0)] | None = None
+    encoding: Literal["raw", "jpeg"] = "raw"
+
+    def camera(self) -> Camera:
+        """The camera on its orbit."""
+        flat = np.cos(self.elevation)
+        direction = np.array([flat * np.sin(self.azimuth), np.sin(self.elevation), flat * np.cos(self.azimuth)])
+        target = np.array(self.target)
+        return Camera.look_at(
+            target + self.distance * direction, target, width=self.width, height=self.height, fov_y=self.fov
+        )
+
+
+class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="render", tag_field="ask"):
+    """One picture. ``number`` comes back with it."""
+
+    number: int
+    state: ViewState
+
+
+class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="clip", tag_field="ask"):
+    """The whole motion as an mp4, seen as ``state`` says; ``turn``: rad that the camera goes round meanwhile."""
+
+    state: ViewState
+    fps: Annotated[float, Meta(ge=1, le=240)]
+    turn: _Angle = 0.0
+
+
+class TruthRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="truth", tag_field="ask"):
+    """The capture's picture ``index`` as its file has it."""
+
+    index: Annotated[int, Meta(ge=0)]
+
+
+Request = RenderRequest | ClipRequest | TruthRequest
+_decoder = msgspec.json.Decoder(Request)
+
+
+def parse_request(message: str | bytes) -> Request:
+    """Decode one message of a page, or raise InputError."""
+    try:
+        return _decoder.decode(message)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError("request", got=str(error)) from error
