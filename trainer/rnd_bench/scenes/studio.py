@@ -120,8 +120,8 @@ class _Film:
             albedo=f"albedo/{name}",
             camera=camera_name,
             frame=frame,
-            split=split,
-            light=light,  # type: ignore[arg-type]
+            split=split,  # type: ignore[arg-type]
+            light=light,
         )
 
 
