@@ -21,7 +21,7 @@ _FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/
 _PROBE = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from rnd_trainer.stage.render import probe
+from rnd_stage.render import probe
 probe()
 """
 

@@ -17,7 +17,7 @@ PACKAGES = ("numpy", "numba", "onnxruntime", "moderngl", "OpenImageIO")
 
 # Run by another interpreter each: a broken GL driver may take its process down.
 _GL_PROBE = """
-from rnd_runtime.gl_context import create_context
+from rnd_runtime.gl.context import create_context
 info = create_context({backend!r}).info
 print(info["GL_RENDERER"], "|", info["GL_VERSION"])
 """

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from rnd_bench.stability.commands import environment
+from rnd_bench.stability.processes import environment
 from rnd_bench.stability.determinism import backends_agree, frames_agree
 from rnd_bench.stability.fuzz import READERS, fuzz, prepare
 from rnd_bench.stability.kill import half_files
@@ -50,8 +50,8 @@ _WRITER = """
 import itertools, sys
 from pathlib import Path
 import numpy as np
-from rnd_runtime.images import write_image
-from rnd_runtime.npz import save_npz
+from rnd_runtime.core.images import write_image
+from rnd_runtime.core.npz import save_npz
 folder, noise = Path(sys.argv[1]), np.random.default_rng(0).integers(0, 255, (200, 200, 3)).astype(np.uint8)
 print("ready", flush=True)
 for number in itertools.count():

@@ -168,8 +168,8 @@ def test_a_reader_who_has_gone_ends_the_command_in_silence(lines, ending):
 
 _COMMAND = """
 import os, signal, sys, time
-from rnd_runtime.errors import run_command
-from rnd_runtime.files import atomic_path
+from rnd_runtime.core.errors import run_command
+from rnd_runtime.core.files import atomic_path
 
 def main():
     with atomic_path(sys.argv[1]) as file:

@@ -114,7 +114,7 @@ def test_where_numba_keeps_kernels_is_where_they_are_looked_for(clone, tmp_path)
 def test_a_players_start_loads_neither_scipy_nor_opengl_nor_other_readers(tiny_avatar, tmp_path):
     code = f"""
 import sys
-from rnd_viewer.cli import main
+from rnd_viewer.play.cli import main
 assert main([{str(tiny_avatar)!r}, "--motion", {str(ASSETS / "walk.npz")!r}, "--hdr", {str(ASSETS / "sky.exr")!r},
              "--size", "16", "--frames", "0:1", "--raster", "cpu", "--out", {str(tmp_path / "out")!r}]) == 0
 unneeded = ["scipy.linalg",
