@@ -22,7 +22,7 @@ info = create_context({backend!r}).info
 print(info["GL_RENDERER"], "|", info["GL_VERSION"])
 """
 _CHOICE_PROBE = """
-from rnd_runtime.raster import make_rasterizer
+from rnd_runtime.playback.rasterizer import make_rasterizer
 print(make_rasterizer("auto").name)
 """
 _NUMBA_PROBE = """
