@@ -6,7 +6,7 @@ import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
 const here = dirname(fileURLToPath(import.meta.url));
-const dist = join(here, "dist"), page = join(here, "../rnd_viewer/page");
+const dist = join(here, "dist"), page = join(here, "../rnd_viewer/view/page");
 const ort = join(here, "node_modules/onnxruntime-web/dist");
 const ORT_FILES = ["ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"];
 

@@ -94,7 +94,7 @@ def write_run_report(
         shots = Shots(run / "avatar.onnx", motion)
         avatar, notes = _turntable_and_relights(shots, hdrs, hdr_up), shots.notes
     sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
-    page = Template(files("rnd_viewer").joinpath("report_page.html").read_text(encoding="utf-8"))
+    page = Template(files("rnd_viewer.report").joinpath("page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
         text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # names that are not UTF-8

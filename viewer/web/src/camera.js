@@ -1,6 +1,6 @@
 // Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/core/camera.py, rnd_viewer/inputs/cameras.py).
 
-import { jointsAt } from "./avatar.js";
+import { jointsAt } from "./posing/avatar.js";
 import { multiply, rotate, transposed } from "./rotations.js";
 
 const PADDING = 0.14;  // of the skeleton's height: what the body reaches beyond its joints

@@ -1,16 +1,16 @@
 // Everything but the page: reads the files, makes pictures of states; the same states and answers as rnd-view's.
 
-import { Avatar } from "./avatar.js";
+import { Avatar } from "./posing/avatar.js";
 import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
-import { downsize, lightNotes, readLight } from "./light.js";
-import { fitMotion, restMotion } from "./motion.js";
-import { readMotionFile } from "./motion_files.js";
-import { project } from "./project.js";
+import { downsize, lightNotes, readLight } from "./shading/light.js";
+import { fitMotion, restMotion } from "./motion/motion.js";
+import { readMotionFile } from "./files/motion_files.js";
+import { project } from "./raster/project.js";
 import { multiply, transposed } from "./rotations.js";
-import { shBasis } from "./sh.js";
-import { makeShader } from "./shading.js";
-import { Splatter } from "./splat.js";
+import { shBasis } from "./shading/sh.js";
+import { makeShader } from "./shading/shader.js";
+import { Splatter } from "./raster/splat.js";
 
 const CLAY = 0.8;  // albedo of a body that shows the light alone
 const LARGEST_SKY = 1024;  // rows behind the avatar

@@ -1,9 +1,9 @@
 // Motions: a file's poses on an avatar's skeleton (rnd_runtime/motion/motion.py), and the window its skinning looks at (window.py).
 
-import { refusal } from "./errors.js";
+import { refusal } from "../errors.js";
 import { pointAt, rotationsAt } from "./interpolation.js";
-import { SMPL_REST_ROOT } from "./motion_names.js";
-import { matrixToAxisAngle, multiply, transposedTimes } from "./rotations.js";
+import { SMPL_REST_ROOT } from "../files/motion_names.js";
+import { matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
 
 // SMPL's hands are one joint each; files with fingers drive them by the index finger's base.
 const STAND_INS = { left_hand: "left_index1", right_hand: "right_index1" };

@@ -1,7 +1,7 @@
 // Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/shading/light.py).
 
-import { refusal, short } from "./errors.js";
-import { readExr } from "./exr.js";
+import { refusal, short } from "../errors.js";
+import { readExr } from "../files/exr.js";
 
 const LARGEST_FLOAT = 3.4028234663852886e38;
 const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];  // x and y of red, green, blue and white

@@ -1,6 +1,6 @@
 // Forearms that share a twist between elbow and wrist (rnd_runtime/posing/forearm.py, which has the formulas).
 
-import { axisAngleToMatrix, multiply, transposed } from "./rotations.js";
+import { axisAngleToMatrix, multiply, transposed } from "../rotations.js";
 
 const FREE = Math.PI / 3, MOST = Math.PI / 3;  // radians
 const SIDES = ["left", "right"];

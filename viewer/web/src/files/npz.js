@@ -2,7 +2,7 @@
 
 import { unzipSync } from "fflate";
 import { crc32, crcs } from "./crc.js";
-import { refusal, short } from "./errors.js";
+import { refusal, short } from "../errors.js";
 
 const READERS = {  // bytes, and the number at a place of a view
   f8: [8, (view, at, little) => view.getFloat64(at, little)], f4: [4, (view, at, little) => view.getFloat32(at, little)],

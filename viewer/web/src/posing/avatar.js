@@ -1,13 +1,13 @@
 // avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar/file.py, avatar.py, skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
-import { LARGEST_ALBEDO } from "./brdf.js";
-import { refusal } from "./errors.js";
+import { LARGEST_ALBEDO } from "../shading/brdf.js";
+import { refusal } from "../errors.js";
 import { shareTwists } from "./forearm.js";
-import { motionWindow, poseAt } from "./motion.js";
-import { OnnxFile } from "./onnx.js";
+import { motionWindow, poseAt } from "../motion/motion.js";
+import { OnnxFile } from "../files/onnx.js";
 import { RestPose } from "./posing.js";
-import { multiply, rotate } from "./rotations.js";
+import { multiply, rotate } from "../rotations.js";
 
 const SCHEMA = "rnd-avatar/1";
 const POSED = ["means", "covariances", "normals", "visibility"], CONSTANT = ["opacities", "albedo", "roughness"];

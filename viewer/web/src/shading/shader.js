@@ -1,10 +1,10 @@
 // Relighting posed Gaussians: the modes of rnd_runtime/shading/shader.py.
 
 import { buildAmbient, shadeAmbient } from "./ambient.js";
-import { allTexels, medianCut, shadeLights } from "./lights.js";
-import { rotate } from "./rotations.js";
+import { allTexels, medianCut, shadeLights } from "./sum.js";
+import { rotate } from "../rotations.js";
 import { addSuns } from "./shadow.js";
-import { buildSky, shadeSky } from "./sky.js";
+import { buildSky, shadeSky } from "./tables.js";
 import { extractSuns } from "./sun.js";
 
 /**

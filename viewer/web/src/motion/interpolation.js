@@ -1,6 +1,6 @@
 // Poses between the frames of a recording: cubic Hermite paths (rnd_runtime/motion/interpolation.py says which and why).
 
-import { axisAngleToMatrix, matrixToAxisAngle, multiply, transposedTimes } from "./rotations.js";
+import { axisAngleToMatrix, matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
 
 const LARGEST_STEP = 1, LARGEST_MOVE = 1;  // rad, m
 const turn = new Float64Array(9);

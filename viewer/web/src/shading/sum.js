@@ -2,7 +2,7 @@
 
 import { clampRoughness, ggx } from "./brdf.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
-import { rotate } from "./rotations.js";
+import { rotate } from "../rotations.js";
 import { shBasis } from "./sh.js";
 
 const TEXELS = [32, 64], CUT_TEXELS = [128, 256], HALF_FLOOR = 1e-8;

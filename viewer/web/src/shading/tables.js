@@ -2,7 +2,7 @@
 
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
 import { WIDTHS, lobeAt, lobeTable } from "./lobe.js";
-import { transposed } from "./rotations.js";
+import { transposed } from "../rotations.js";
 import { shBasis, shRotation } from "./sh.js";
 
 const TEXELS = [32, 64], DIFFUSE = 33, SPECULAR = 49;

@@ -1,6 +1,6 @@
 // WebGL2: each pixel of the picture goes through the Gaussians of its tile.
 
-import pictureFragment from "./picture.frag";
+import pictureFragment from "./blend.frag";
 import { ROW_GAUSSIANS, ROW_PAIRS, TEXELS, TILE } from "./project.js";
 
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler2D;\n";

@@ -1,9 +1,9 @@
 // The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion/readers/arrays.py).
 
-import { refusal, short, sizes } from "./errors.js";
+import { refusal, short, sizes } from "../errors.js";
 import { NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT } from "./motion_names.js";
 import { Npz } from "./npz.js";
-import { axisAngleToMatrix, multiply, rotate } from "./rotations.js";
+import { axisAngleToMatrix, multiply, rotate } from "../rotations.js";
 
 // What AMASS' SMPL-X files hold beside the split poses, and nobody else's
 const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length"];

@@ -2,7 +2,7 @@
 // reads rightly, the pixels are parse-exr's.
 
 import parseExr from "parse-exr";
-import { refusal } from "./errors.js";
+import { refusal } from "../errors.js";
 
 const MAGIC = 20000630, TILED = 0x200, DEEP = 0x800, PARTS = 0x1000;
 const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
