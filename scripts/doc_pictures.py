@@ -15,15 +15,12 @@ from rnd_runtime.core.images import write_image
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.motion.skeleton import bone_transforms
-from rnd_runtime.playback.frame import draw
-from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.playback.aov import aov_image
+from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
 from rnd_runtime.raster.cpu import rasterize
-from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.light import Light, load_light
-from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
-from rnd_viewer.play.aov import aov_picture
 from rnd_viewer.play.player import Player
 
 ROOT = Path(__file__).parent.parent
@@ -41,16 +38,16 @@ def main() -> None:
     moment = walk.at([TIME_S])
     camera = front_path(frame_motion(avatar.skeleton, moment), CameraOptions(SIDE, SIDE))(0, 0.0)
 
-    frame = Player(avatar, sky, Shader(sky), rasterize, aovs=AOVS).render(walk, TIME_S, camera)
+    frame = FrameRenderer(avatar, sky).render(walk, TIME_S, camera, aovs=AOVS)
     tiles = [frame.srgb]
     for name in AOVS:
-        tile = aov_picture(name, frame.aovs[name], frame.alpha, (0, 1))
+        tile = aov_image(name, frame.aovs[name], frame.alpha)
         tiles.append(np.broadcast_to(tile, (SIDE, SIDE, 3)))
     _write("materials.png", tiles)
 
     learned = Light(avatar.trained_light)
     lights = [learned, *(replace(sky, yaw=math.radians(yaw)) for yaw in (0, 120, 240))]
-    _write("relight.png", [Player(avatar, x, Shader(x), rasterize).render(walk, TIME_S, camera).srgb for x in lights])
+    _write("relight.png", [FrameRenderer(avatar, x).render(walk, TIME_S, camera).srgb for x in lights])
 
     rest = Motion(np.tile(np.eye(3), (1, len(avatar.skeleton), 1, 1)), np.zeros((1, 3)), 30, avatar.skeleton.names)
     tiles = []
@@ -67,7 +64,7 @@ def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
     tiles = []
     for k in range(6):
         light = replace(sky, yaw=math.radians(50 * k - 20))
-        player = Player(avatar, light, Shader(light), rasterize, Background("hdr"))
+        player = Player(FrameRenderer(avatar, light), Background("hdr"))
         tiles.append(player.render(walk, TIME_S + CYCLE_S * k / 6, orbit(0, (k - 2) / 6)).srgb)
     write_image(ROOT / "assets/bench/demo.png", np.ascontiguousarray(np.concatenate(tiles, axis=1)))
 
@@ -104,8 +101,8 @@ def _forearm(avatar: Avatar, rest: Motion, sky: Light) -> None:
     alone = shared._replace(bones=bone_transforms(avatar.skeleton, turned[0], np.zeros(3)))
     tiles = []
     for encoded in (avatar.encode(rest, 0.0), alone, shared):
-        raster = draw(avatar.posed(encoded), Shader(sky), camera, make_rasterizer("cpu"))
-        tiles.append(tone_map(raster.image, raster.alpha))
+        posed = PosedAvatar(avatar.posed(encoded), np.eye(4))
+        tiles.append(FrameRenderer(avatar, sky, camera, cull=-1).draw(posed).srgb)
     _write("forearm.png", tiles)
 
 

@@ -36,6 +36,7 @@ class Encoded(NamedTuple):
     motion: Motion
     time: float
     root: np.ndarray  # it is posed in the world
+    seconds: dict[str, float] = {}
 
 
 @dataclass(frozen=True)

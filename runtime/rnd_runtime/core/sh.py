@@ -20,6 +20,9 @@ SH_DEGREE = 3
 SH_COUNT = (SH_DEGREE + 1) ** 2
 SH_DEGREES = np.repeat(np.arange(SH_DEGREE + 1), 2 * np.arange(SH_DEGREE + 1) + 1)  # the degree of each function
 
+COSINE_LOBE = np.array([1, 2 / 3, 1 / 4, 0], np.float32)[SH_DEGREES]
+"""What max(cos, 0)/π leaves of each function (Ramamoorthi, Hanrahan 2001)."""
+
 _C0 = sqrt(1 / (4 * pi))
 _C1 = sqrt(3 / (4 * pi))
 _C2_SIDE, _C2_ZONAL = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi))

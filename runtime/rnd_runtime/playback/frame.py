@@ -1,16 +1,18 @@
-"""One picture of an avatar from a motion, a light and a camera: all of playback behind one call.
+"""The one facade that renders a frame of an avatar: pose, shade, splat, tone map.
 
 ::
 
     renderer = FrameRenderer(Avatar.load("avatar.onnx"), load_light("sky.exr"), camera)
-    frame = renderer.render(motion, 0.5)   # frame.image: 8-bit sRGB; frame.stage_seconds: where the time went
+    frame = renderer.render(motion, 0.5)   # frame.srgb: 8-bit image; frame.stage_seconds: where the time went
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,181 +22,231 @@ from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.gaussians import Floats32, Gaussians, Raster, Rasterizer
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
+from rnd_runtime.raster.enlarge import enlarged
 from rnd_runtime.raster.in_view import opacities_of, seen_of
 from rnd_runtime.raster.outline import sharpened
-from rnd_runtime.raster.tone import tone_map
+from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 
 from . import frame_cpu
+from .aov import aov_layers, splat_features
 from .rasterizer import ChosenRasterizer, Kind, make_rasterizer
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """One rendered picture.
+class RenderedFrame:
+    """One rendered frame.
 
     Attributes:
-        image: [H, W, 3] 8-bit sRGB, over black.
         radiance: [H, W, 3] linear Rec.709, premultiplied by alpha.
         alpha: [H, W].
-        stage_seconds: how long each stage took, in the order in which they ran; they add up to the frame.
+        aovs: [H, W, C] for each name, as ``playback.aov`` says.
+        stage_seconds: duration of each stage in their order; they add up to the frame.
+        background: linear radiance, [H, W, 3] or [3]; None leaves the frame transparent.
+        srgb_on_black: [H, W, 3] 8-bit sRGB without the background, where it was made with the rest.
     """
 
-    image: NDArray[np.uint8]
     radiance: Floats32
     alpha: Floats32
-    stage_seconds: Mapping[str, float]
+    aovs: Mapping[str, Floats32] = field(default_factory=dict)
+    stage_seconds: Mapping[str, float] = field(default_factory=dict)
+    background: Floats32 | None = None
+    srgb_on_black: NDArray[np.uint8] | None = None
+
+    @cached_property
+    def srgb(self) -> NDArray[np.uint8]:
+        """8-bit sRGB [H, W, 3] over the background, or over black without one."""
+        if self.background is None and self.srgb_on_black is not None:
+            return self.srgb_on_black
+        return tone_map(self.radiance, self.alpha, self.background)
+
+    @cached_property
+    def srgb_alpha(self) -> NDArray[np.uint8]:
+        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied, as PNG has it."""
+        return tone_map_straight(self.radiance, self.alpha)
+
+    def linear(self) -> Floats32:
+        """Linear R, G, B, A [H, W, 4], premultiplied; over a background alpha is 1."""
+        if self.background is None:
+            return np.dstack([self.radiance, self.alpha])
+        over = self.radiance + (1 - self.alpha)[..., None] * self.background
+        return np.dstack([over, np.ones_like(self.alpha)])
+
+
+class PosedAvatar(NamedTuple):
+    """Gaussians in their root's frame, and that frame → world [4, 4] (rigid, m)."""
+
+    gaussians: Gaussians
+    root: Floats
 
 
 class FrameRenderer:
-    """Renders one avatar; frames depend on the arguments and on ``camera`` and the light alone.
+    """Renders one avatar; frames depend on the arguments, ``camera``, ``shader`` and ``cull`` alone.
 
-    Only Gaussians that reach the picture are shaded. With OpenGL everything after the encoders is done on its device:
-    see ``gl.frame``.
+    Only Gaussians that reach the image are shaded. With OpenGL everything after the encoders is done on its device.
 
     Args:
-        avatar: as ``avatar.avatar.Avatar.load`` gives it, with the threads chosen there.
-        light: the probe; ``turn`` and ``relight`` change it between frames.
-        camera: the view; assign ``renderer.camera`` to move it between frames.
-        shade: one of ``shading.shader.SHADE_MODES``.
-        raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see ``playback.rasterizer.make_rasterizer``.
-        cull: leave out the back of the body: Gaussians whose n·v is below this cosine, such as −0.5; −1 draws all. What
-            that costs stands in ``raster.in_view.in_view``. By default as the avatar's file advises.
+        avatar: its threads are those chosen in ``Avatar.load``.
+        light: the probe, or a ``Shader`` of it; ``turn`` and ``relight`` change it between frames.
+        camera: the view, where the calls below name none; assign ``renderer.camera`` to move it.
+        shade: one of ``shading.shader.SHADE_MODES``, where ``light`` is no shader.
+        raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see ``make_rasterizer``; or a rasteriser.
+        cull: leaves out Gaussians whose n·v is below this cosine, such as −0.5; −1 draws all. By default as the
+            avatar's file advises. See ``raster.in_view.in_view``.
     """
 
     def __init__(
         self,
         avatar: Avatar,
-        light: Light,
-        camera: Camera,
+        light: Light | Shader,
+        camera: Camera | None = None,
         *,
         shade: str = "table+sun",
-        raster: Kind = "cpu",
+        raster: Kind | Rasterizer = "cpu",
         cull: float | None = None,
     ) -> None:
-        self.avatar, self.camera, self.cull = avatar, camera, chosen_cull(avatar, cull)
-        self._shader = Shader(light, shade)
-        self._rasterizer = make_rasterizer(raster)
+        self.avatar, self.camera = avatar, camera
+        self.cull = avatar.advice.cull if cull is None else cull
+        self.shader = Shader(light, shade) if isinstance(light, Light) else light
+        self.rasterizer: Rasterizer = make_rasterizer(raster) if isinstance(raster, str) else raster
+
+    @property
+    def light(self) -> Light:
+        return self.shader.light
 
     @property
     def draws_with(self) -> str:
         """The rasteriser's name: ``cpu``, or one with OpenGL's backend and device."""
-        return self._rasterizer.name
+        return str(getattr(self.rasterizer, "name", "custom"))
 
     def turn(self, yaw: float) -> None:
-        """Turn the light to ``yaw`` radians (as ``shading.light.Light``); costs nothing."""
-        self._shader = self._shader.turned(yaw)
+        """Turn the light to ``yaw`` radians (as ``shading.light.Light``); builds no table."""
+        if yaw != self.light.yaw:
+            self.shader = self.shader.turned(yaw)
 
     def relight(self, light: Light) -> None:
-        """Another light from now on; its tables are built here."""
-        self._shader = Shader(light, self._shader.mode)
+        """Use another light from now on; its tables are built here."""
+        self.shader = Shader(light, self.shader.mode)
 
-    def render(self, motion: Motion, time: float) -> Frame:
+    def render(
+        self, motion: Motion, time: float, camera: Camera | None = None, *, aovs: Sequence[str] = ()
+    ) -> RenderedFrame:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton)."""
         encoded = self.avatar.encode(motion, time)
-        raster = draw_encoded(self.avatar, encoded, self._shader, self.camera, self._rasterizer, cull=self.cull)
+        frame = self.draw(encoded, camera, aovs=aovs)
+        return replace(frame, stage_seconds={**encoded.seconds, **frame.stage_seconds})
+
+    def draw(
+        self,
+        body: Encoded | PosedAvatar,
+        camera: Camera | None = None,
+        *,
+        aovs: Sequence[str] = (),
+        lit: bool = True,
+        srgb: bool = True,
+        scale: float = 1.0,
+    ) -> RenderedFrame:
+        """Render what is encoded or posed already.
+
+        Args:
+            aovs: names of ``playback.aov.CHANNELS``.
+            lit: False leaves the radiance zero, for frames of AOVs alone.
+            srgb: make the 8-bit image at once.
+            scale: share of the camera's width and height that is rendered and then enlarged. AOVs are rendered in full.
+        """
+        camera = camera or self.camera
+        assert camera is not None
+        rendered = camera
+        if scale != 1 and not aovs:
+            rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
+        raster = self._raster(body, rendered, aovs, lit, srgb and rendered is camera)
+        seconds = dict(raster.seconds)
+        layers = aov_layers(aovs, raster, 3 if lit else 0)
+        radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
+        alpha, codes = raster.alpha, raster.srgb
         started = perf_counter()
-        image = tone_map(raster.image, raster.alpha) if raster.srgb is None else raster.srgb
-        seconds = {**encoded.seconds, **raster.seconds}
-        seconds.setdefault("tone map", perf_counter() - started)  # unless that was done where the rest was
-        return Frame(image, raster.image, raster.alpha, seconds)
+        if rendered is not camera:
+            image = enlarged(np.dstack([radiance, alpha]), camera.height, camera.width)
+            radiance, alpha, codes = image[..., :3], image[..., 3], None
+            seconds["enlarging"] = perf_counter() - started
+            started = perf_counter()
+        if srgb and codes is None:
+            codes = tone_map(radiance, alpha)
+            seconds["tone map"] = perf_counter() - started
+        return RenderedFrame(radiance, alpha, layers, seconds, srgb_on_black=codes)
 
     def close(self) -> None:
         """Release the rasteriser."""
-        self._rasterizer.close()
+        if isinstance(self.rasterizer, ChosenRasterizer):
+            self.rasterizer.close()
+
+    def __enter__(self) -> FrameRenderer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _raster(
+        self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool, srgb: bool
+    ) -> Raster:
+        """On OpenGL's device or in one call of the CPU's where that can be, else stage by stage."""
+        shader, camera = in_root_frame(body.root, self.shader, camera)
+        cull = None if self.cull is None or self.cull <= -1 else self.cull
+        if isinstance(body, PosedAvatar):
+            return draw_gaussians(body.gaussians, shader, camera, self.rasterizer, cull=cull, aovs=aovs, lit=lit)
+        if lit and not aovs and isinstance(self.rasterizer, ChosenRasterizer):
+            unposed, device = self.avatar.unposed(body), self.rasterizer.renderer
+            if unposed is not None and device is not None:
+                return device.draw(unposed, shader, camera, cull=cull)
+            if unposed is not None and frame_cpu.draws(shader):
+                return frame_cpu.draw(unposed, shader, camera, cull=cull, coded=srgb)
+        started = perf_counter()
+        gaussians = self.avatar.posed(body)
+        posing = perf_counter() - started
+        raster = draw_gaussians(gaussians, shader, camera, self.rasterizer, cull=cull, aovs=aovs, lit=lit)
+        return replace(raster, seconds={"posing": posing, **raster.seconds})
 
 
-def chosen_cull(avatar: Avatar, cull: float | None) -> float | None:
-    """For ``draw``, of what a player was asked for: None is what ``avatar``'s file advises, −1 to draw all."""
-    chosen = avatar.advice.cull if cull is None else cull
-    return None if chosen is None or chosen <= -1 else chosen
+def in_root_frame(root: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:
+    """Light and camera in the frame that ``root`` [4, 4] (rigid, m) takes to the world."""
+    return shader.in_frame(root[:3, :3]), camera.in_frame(root)
 
 
-def draw_encoded(
-    avatar: Avatar,
-    encoded: Encoded,
-    shader: Shader,
-    camera: Camera,
-    rasterizer: Rasterizer,
-    *,
-    cull: float | None = None,
-    coded: bool = True,
-) -> Raster:
-    """Pose and ``draw``: where the avatar's file allows it all on OpenGL's device, or in one call of the CPU's.
-
-    That call is for shading by tables. With ``coded`` it makes ``srgb`` too, as a device always does. The raster's
-    ``seconds`` have "posing" and what else was done.
-    """
-    shader, camera = as_seen_from(encoded.root, shader, camera)
-    unposed = avatar.unposed(encoded)
-    if unposed is not None and isinstance(rasterizer, ChosenRasterizer):
-        if rasterizer.renderer is not None:
-            return rasterizer.renderer.draw(unposed, shader, camera, cull=cull)
-        if frame_cpu.draws(shader):
-            return frame_cpu.draw(unposed, shader, camera, cull=cull, coded=coded)
-    started = perf_counter()
-    gaussians = avatar.posed(encoded)
-    posing = perf_counter() - started
-    raster = draw(gaussians, shader, camera, rasterizer, cull=cull)
-    return replace(raster, seconds={"posing": posing, **raster.seconds})
-
-
-def drawn_at_once(shader: Shader, rasterizer: Rasterizer) -> bool:
-    """Whether ``draw_encoded`` poses, shades and splats an avatar of ours in one go: on a device, or by tables."""
-    return isinstance(rasterizer, ChosenRasterizer) and (rasterizer.renderer is not None or frame_cpu.draws(shader))
-
-
-def as_seen_from(frame_to_world: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:
-    """Light and camera for what is posed in the frame that ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
-    return shader.in_frame(frame_to_world[:3, :3]), camera.in_frame(frame_to_world)
-
-
-def draw(
+def draw_gaussians(
     gaussians: Gaussians,
     shader: Shader,
     camera: Camera,
     rasterizer: Rasterizer,
     *,
     cull: float | None = None,
-    kept: KeptRadiance | None = None,
+    aovs: Sequence[str] = (),
+    lit: bool = True,
 ) -> Raster:
-    """Shade what can be seen, splat it and sharpen outlines: linear radiance [H, W, 3], without depth.
+    """Shade Gaussians in view, splat them and sharpen outlines.
 
-    ``cull`` as of ``in_view``. With ``kept``, only Gaussians are shaded that were not seen since it was made. The
-    raster's ``seconds`` have "shading" beside its own stages. OpenGL shades on its device, but for ``kept`` radiance,
-    which is the CPU's.
+    Args:
+        cull: as of ``raster.in_view.in_view``; None draws all.
+        aovs: whose features follow the radiance in the image, see ``aov_layers``.
+        lit: False leaves the radiance out.
+
+    Returns:
+        Linear radiance [H, W, 3] and AOVs; ``seconds`` have "shading" beside the rasteriser's stages.
     """
-    if isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None and kept is None:
+    if lit and not aovs and isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
     seen = seen_of(gaussians, camera, cull)
-    radiance = _shade(gaussians, shader, camera, seen, kept)
-    seconds = {"shading": perf_counter() - started}
+    features = [shader.shade(gaussians, camera.position, seen)] if lit else []
+    features += splat_features(aovs, gaussians, camera)
+    attributes = features[0] if len(features) == 1 else np.concatenate(features, axis=1)
+    shading, depth = perf_counter() - started, "depth" in aovs
+    arrays = gaussians.means, gaussians.covariances
     if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
-        arrays = gaussians.means, gaussians.covariances, gaussians.opacities, radiance
-        raster = raster_cpu.rasterize(*arrays, camera, depth=False, outlines=True, seen=seen)
+        raster = raster_cpu.rasterize(
+            *arrays, gaussians.opacities, attributes, camera, depth=depth, outlines=True, seen=seen
+        )
     else:
-        arrays = gaussians.means, gaussians.covariances, opacities_of(gaussians, seen), radiance
-        raster = sharpened(rasterizer(*arrays, camera, depth=False))
-    return replace(raster, seconds={**seconds, **raster.seconds})
-
-
-class KeptRadiance:
-    """Radiance of some frames ago, of the Gaussians that were seen since."""
-
-    def __init__(self, count: int) -> None:
-        self.radiance = np.zeros((count, 3), np.float32)
-        self.known = np.zeros(count, np.bool_)
-
-
-def _shade(
-    gaussians: Gaussians, shader: Shader, camera: Camera, seen: NDArray[np.bool_], kept: KeptRadiance | None
-) -> Floats32:
-    if kept is None:
-        return shader.shade(gaussians, camera.position, seen)
-    fresh = seen & ~kept.known
-    if fresh.any():
-        kept.radiance[fresh] = shader.shade(gaussians, camera.position, fresh)[fresh]
-        kept.known |= fresh
-    return kept.radiance
+        opacities = opacities_of(gaussians, seen)
+        raster = sharpened(rasterizer(*arrays, opacities, attributes.astype(np.float32), camera, depth=depth))
+    return replace(raster, seconds={"shading": shading, **raster.seconds})

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import SH_DEGREES, compiled_sh_columns, sh_basis, sh_rotation
+from rnd_runtime.core.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
 from rnd_runtime.core.simd import WIDTH, aligned_floats, lanes, load, store
 
 from .lanes import (
@@ -37,9 +37,6 @@ from .specular_lobe import lobe_rows
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-
-# max(cos, 0)/π leaves of degree 0 to 2 (Ramamoorthi, Hanrahan 2001); of degree 3 it leaves nothing
-_COSINE = np.array([1, 2 / 3, 1 / 4], np.float32)[SH_DEGREES[:9]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +109,12 @@ def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, colum
 
     occlusion = lanes(ZERO)
     for j in range(9):
-        occlusion += _COSINE[j] * (at_normal[j] * load(columns, j * WIDTH))
+        occlusion += COSINE_LOBE[j] * (at_normal[j] * load(columns, j * WIDTH))
     occlusion = at_least(occlusion, ZERO)
     for channel in range(3):
         diffuse, shine = lanes(ZERO), at_lobe[0] * light[0, channel]
         for j in range(9):
-            diffuse += _COSINE[j] * light[j, channel] * at_normal[j]
+            diffuse += COSINE_LOBE[j] * light[j, channel] * at_normal[j]
         for j in range(1, 16):
             left = shrink[0] if j < 4 else (shrink[1] if j < 9 else shrink[2])
             shine += left * (at_lobe[j] * light[j, channel])

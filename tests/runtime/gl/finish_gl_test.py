@@ -103,5 +103,5 @@ def test_a_frame_takes_the_devices_codes(raster, monkeypatch):
     renderer = FrameRenderer(avatar, sky, camera, raster=raster)
     frame = renderer.render(motion, 0.3)
     renderer.close()
-    assert frame.image.max() > 100
-    np.testing.assert_array_equal(frame.image, tone_map(frame.radiance, frame.alpha))
+    assert frame.srgb.max() > 100
+    np.testing.assert_array_equal(frame.srgb, tone_map(frame.radiance, frame.alpha))

@@ -11,7 +11,7 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.playback.frame import FrameRenderer, KeptRadiance, draw
+from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.light import load_light
@@ -71,8 +71,8 @@ def _left_out(gl, cpu):
 def test_gaussians_posed_on_the_cpu_give_its_picture(avatar, motion, sky, rasterizer, mode):
     gaussians, shader = avatar.pose(motion, 0.3), Shader(sky, mode)
     with make_rasterizer("cpu") as cpu:
-        expected = draw(gaussians, shader, CAMERA, cpu)
-    got = draw(gaussians, shader, CAMERA, rasterizer)
+        expected = draw_gaussians(gaussians, shader, CAMERA, cpu)
+    got = draw_gaussians(gaussians, shader, CAMERA, rasterizer)
     pictures = (tone_map(raster.image, raster.alpha) for raster in (got, expected))
     _assert_same_picture(*pictures, left_out=_left_out(got, expected))
     assert got.seconds.keys() == {"upload", "projection+sort", "shading", "raster", "read-back"}
@@ -86,9 +86,9 @@ def test_a_frame_is_the_cpus(avatar, motion, sky, mode, backend):
         renderer.turn(0.8)
     for time in MOMENTS:
         cpu, gl = (renderer.render(motion, time) for renderer in renderers)
-        _assert_same_picture(gl.image, cpu.image, TIES)
+        _assert_same_picture(gl.srgb, cpu.srgb, TIES)
         allowed = MAX_CODES + _left_out(gl, cpu)
-        assert_only_ties(gl.image, cpu.image, lambda t=time: renderers[0].render(motion, t).image, allowed)
+        assert_only_ties(gl.srgb, cpu.srgb, lambda t=time: renderers[0].render(motion, t).srgb, allowed)
     for renderer in renderers:
         renderer.close()
     stages = {"motion", "encoders", "posing", "projection+sort", "shading", "raster", "read-back", "tone map"}
@@ -113,18 +113,18 @@ def test_other_views_lights_and_sizes_leave_nothing_behind(avatar, motion, sky, 
     away = Camera.look_at([0, 1, 5], [0, 1, 10], width=96, height=128, fov_y=0.6)
     close = Camera.look_at([0.2, 1.6, 1.2], [0, 1.5, 0], width=40, height=30, fov_y=0.4)
     calls = [(shader, camera) for shader in shaders for camera in (CAMERA, away, close)]
-    first = [draw(gaussians, shader, camera, rasterizer).image for shader, camera in calls]
+    first = [draw_gaussians(gaussians, shader, camera, rasterizer).image for shader, camera in calls]
     assert [bool(image.any()) for image in first] == 3 * [True, False, True]
     for k in (8, 0, 4, 2, 3, 6, 1, 5, 7, 0):
         shader, camera = calls[k]
-        np.testing.assert_array_equal(draw(gaussians, shader, camera, rasterizer).image, first[k])
+        np.testing.assert_array_equal(draw_gaussians(gaussians, shader, camera, rasterizer).image, first[k])
 
 
 def test_culling_is_the_cpus(avatar, motion, sky, rasterizer):
     gaussians, shader = avatar.pose(motion, 0.3), Shader(sky)
     with make_rasterizer("cpu") as cpu:
-        culled, whole = (draw(gaussians, shader, CAMERA, cpu, cull=cull) for cull in (0.2, None))
-    ours = draw(gaussians, shader, CAMERA, rasterizer, cull=0.2)
+        culled, whole = (draw_gaussians(gaussians, shader, CAMERA, cpu, cull=cull) for cull in (0.2, None))
+    ours = draw_gaussians(gaussians, shader, CAMERA, rasterizer, cull=0.2)
     assert np.abs(culled.image - whole.image).max() > 0.05
     assert np.abs(ours.image - whole.image).max() > 0.01
     got, expected = (tone_map(raster.image, raster.alpha) for raster in (ours, culled))
@@ -158,24 +158,15 @@ def _assert_no_trace_of_broken_ones(sky, rasterizer, mode):
     for index, (name, value) in zip(nearest, _BROKEN):
         broken[name].reshape(len(without), -1)[index, -1] = value
         without[index] = 0
-    got = draw(replace(gaussians, **broken), shader, camera, rasterizer)
-    expected = draw(replace(gaussians, opacities=without), shader, camera, rasterizer)
-    whole = draw(gaussians, shader, camera, rasterizer)
+    got = draw_gaussians(replace(gaussians, **broken), shader, camera, rasterizer)
+    expected = draw_gaussians(replace(gaussians, opacities=without), shader, camera, rasterizer)
+    whole = draw_gaussians(gaussians, shader, camera, rasterizer)
     assert np.abs(whole.alpha - expected.alpha).max() > 0.01
     assert np.abs(got.alpha - expected.alpha).max() < 1e-5
     assert np.abs(got.image - expected.image).max() < 1e-4  # a ball shadows nothing of itself
 
 
-def test_kept_radiance_is_the_cpus(avatar, motion, sky, rasterizer):
-    gaussians, shader = avatar.pose(motion, 0.3), Shader(sky)
-    kept = KeptRadiance(len(gaussians.means))
-    image = draw(gaussians, shader, CAMERA, rasterizer, kept=kept).image
-    assert kept.known.any()
-    black = Shader(replace(sky, radiance=0 * sky.radiance))
-    np.testing.assert_array_equal(draw(gaussians, black, CAMERA, rasterizer, kept=kept).image, image)
-
-
 def test_wrong_shapes_are_refused(avatar, motion, sky, rasterizer):
     gaussians = avatar.pose(motion, 0.3)
     with pytest.raises(InputError, match="covariances: expected shape"):
-        draw(replace(gaussians, covariances=gaussians.covariances[:, :5]), Shader(sky), CAMERA, rasterizer)
+        draw_gaussians(replace(gaussians, covariances=gaussians.covariances[:, :5]), Shader(sky), CAMERA, rasterizer)

@@ -11,7 +11,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, load_motion
-from rnd_runtime.playback.frame import FrameRenderer, as_seen_from, draw, draw_encoded
+from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians, in_root_frame
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.in_view import in_view
@@ -65,13 +65,13 @@ def test_a_frame_is_its_parts(avatar, motion, sky):
     frame = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3)
     encoded = avatar.encode(motion, 0.3)
     gaussians = avatar.posed(encoded)
-    shader, camera = as_seen_from(encoded.root, Shader(sky), CAMERA)
+    shader, camera = in_root_frame(encoded.root, Shader(sky), CAMERA)
     radiance = shader.shade(gaussians, camera.position)
     expected = sharpened(rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera))
     np.testing.assert_array_equal(frame.radiance, expected.image)
     np.testing.assert_array_equal(frame.alpha, expected.alpha)
-    np.testing.assert_array_equal(frame.image, to_bytes(linear_to_srgb(expected.image)))
-    assert frame.image.max() > 100 and min(frame.stage_seconds.values()) > 0
+    np.testing.assert_array_equal(frame.srgb, to_bytes(linear_to_srgb(expected.image)))
+    assert frame.srgb.max() > 100 and min(frame.stage_seconds.values()) > 0
 
 
 @pytest.mark.parametrize("mode", ["table", "table+sun", "ao", "lights:8"])
@@ -82,45 +82,43 @@ def test_one_call_draws_what_its_stages_draw(avatar, motion, sky, mode, cull):
     renderer = FrameRenderer(avatar, sky, camera, shade=mode, cull=-1 if cull is None else cull)
     renderer.turn(0.7)
     frame, encoded = renderer.render(motion, 0.3), avatar.encode(motion, 0.3)
-    shader, beside = as_seen_from(encoded.root, Shader(sky, mode).turned(0.7), camera)
+    shader, beside = in_root_frame(encoded.root, Shader(sky, mode).turned(0.7), camera)
     with make_rasterizer("cpu") as cpu:
-        parts = draw(avatar.posed(encoded), shader, beside, cpu, cull=cull)
+        parts = draw_gaussians(avatar.posed(encoded), shader, beside, cpu, cull=cull)
     np.testing.assert_array_equal(frame.radiance, parts.image)
     np.testing.assert_array_equal(frame.alpha, parts.alpha)
-    np.testing.assert_array_equal(frame.image, tone_map(parts.image, parts.alpha))
+    np.testing.assert_array_equal(frame.srgb, tone_map(parts.image, parts.alpha))
     stages = ["motion", "encoders", "posing", "shading", "projection", "sort", "raster", "tone map"]
     assert list(frame.stage_seconds) == stages
 
 
 def test_codes_are_made_where_they_are_asked_for(avatar, motion, sky):
-    encoded, shader = avatar.encode(motion, 0.3), Shader(sky, "table")
-    with make_rasterizer("cpu") as cpu:
-        coded, plain = (draw_encoded(avatar, encoded, shader, CAMERA, cpu, coded=yes) for yes in (True, False))
-    np.testing.assert_array_equal(coded.image, plain.image)
-    np.testing.assert_array_equal(coded.srgb, tone_map(coded.image, coded.alpha))
-    assert plain.srgb is None
-    assert "tone map" not in plain.seconds
+    encoded, renderer = avatar.encode(motion, 0.3), FrameRenderer(avatar, sky, CAMERA, shade="table")
+    coded, plain = (renderer.draw(encoded, srgb=yes) for yes in (True, False))
+    np.testing.assert_array_equal(coded.radiance, plain.radiance)
+    np.testing.assert_array_equal(coded.srgb, plain.srgb)
+    assert "tone map" in coded.stage_seconds and "tone map" not in plain.stage_seconds
 
 
 def test_turning_the_light_equals_another_light(avatar, motion, sky):
     turned, fresh = FrameRenderer(avatar, sky, CAMERA), FrameRenderer(avatar, sky, CAMERA)
-    still = turned.render(motion, 0.3).image
+    still = turned.render(motion, 0.3).srgb
     turned.turn(1.0)
     fresh.relight(load_light(ASSETS / "sky.exr", yaw=1.0))
-    np.testing.assert_array_equal(turned.render(motion, 0.3).image, fresh.render(motion, 0.3).image)
-    assert (turned.render(motion, 0.3).image != still).any()
+    np.testing.assert_array_equal(turned.render(motion, 0.3).srgb, fresh.render(motion, 0.3).srgb)
+    assert (turned.render(motion, 0.3).srgb != still).any()
 
 
 def test_a_turn_of_body_and_camera_changes_no_more_than_rounding(avatar, motion):
     """Shadow maps and the order of depths turn with the root; a grey sky has no sides."""
     grey = Light(np.full((16, 32, 3), 0.7, np.float32))
     renderer = FrameRenderer(avatar, grey, CAMERA, shade="table")
-    still = renderer.render(motion, 0.3).image.astype(int)
+    still = renderer.render(motion, 0.3).srgb.astype(int)
     turn = axis_angle_to_matrix([0.8, -1.1, 0.4])
     moved = np.eye(4)
     moved[:3, :3], moved[:3, 3] = turn, [300.0, -20.0, 1000.0]
     renderer.camera = CAMERA.in_frame(np.linalg.inv(moved))
-    turned = renderer.render(_taken(motion, avatar.skeleton.rest_joints[0], moved), 0.3).image
+    turned = renderer.render(_taken(motion, avatar.skeleton.rest_joints[0], moved), 0.3).srgb
     assert still.max() > 50
     assert np.abs(turned - still).max() <= 1
 
@@ -150,7 +148,7 @@ def test_only_what_is_seen_is_shaded(avatar, motion, sky):
     assert not some[~seen].any()
     expected = rasterize(*scene, everything, close, depth=False, outlines=True)
     with make_rasterizer("cpu") as cpu:
-        np.testing.assert_array_equal(draw(gaussians, shader, close, cpu).image, expected.image)
+        np.testing.assert_array_equal(draw_gaussians(gaussians, shader, close, cpu).image, expected.image)
 
 
 def test_culling_keeps_what_faces_the_camera_and_the_picture(avatar, motion, sky):
@@ -162,8 +160,8 @@ def test_culling_keeps_what_faces_the_camera_and_the_picture(avatar, motion, sky
     sure = np.abs(cosines - LEAST) > 1e-5
     np.testing.assert_array_equal(kept[sure], (everything & (cosines >= LEAST))[sure])
     assert 0.5 * everything.sum() < kept.sum() < 0.9 * everything.sum()
-    whole = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3).image.astype(float)
-    culled = FrameRenderer(avatar, sky, CAMERA, cull=LEAST).render(motion, 0.3).image
+    whole = FrameRenderer(avatar, sky, CAMERA).render(motion, 0.3).srgb.astype(float)
+    culled = FrameRenderer(avatar, sky, CAMERA, cull=LEAST).render(motion, 0.3).srgb
     assert 10 * np.log10(255**2 / np.mean((whole - culled) ** 2)) > CULLED
 
 
@@ -179,4 +177,4 @@ def test_threads_change_no_byte(avatar, motion, sky):
     finally:
         numba.set_num_threads(before)
     np.testing.assert_array_equal(images[0].radiance, images[1].radiance)
-    np.testing.assert_array_equal(images[0].image, images[1].image)
+    np.testing.assert_array_equal(images[0].srgb, images[1].srgb)

@@ -27,7 +27,7 @@ from rnd_runtime.motion.amass import write_amass
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_runtime.motion.readers.arrays import SMPLH_NAMES
 from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton
-from rnd_runtime.playback.frame import as_seen_from
+from rnd_runtime.playback.frame import FrameRenderer, in_root_frame
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.shading.light import load_light
@@ -38,7 +38,6 @@ from rnd_viewer.convert.splat_files import TRANSFORM
 from rnd_viewer.convert.splats import fixed_colour, make_splats, stored_colours, turned_over
 from rnd_viewer.convert.visionary import check_clip, packed, write_visionary
 from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
-from rnd_viewer.play.player import Player
 from support.tiny import ASSETS, body, motion
 
 AVATAR, WALK, SKY = ASSETS / "avatar.onnx", ASSETS / "walk.npz", ASSETS / "sky.exr"
@@ -120,8 +119,7 @@ def played():
     """The frame that rnd-play shows."""
     avatar = Avatar.load(AVATAR, threads=1)
     walk, light = load_motion(WALK, avatar.skeleton), load_light(SKY)
-    player = Player(avatar, light, Shader(light, "table+sun"), rasterize)
-    return player.render(walk, FRAME / walk.fps, _camera())
+    return FrameRenderer(avatar, light).render(walk, FRAME / walk.fps, _camera())
 
 
 def _splats(folder: Path, *words: str, light: tuple[str, ...] = ("--hdr", str(SKY))) -> Path:
@@ -222,7 +220,7 @@ def test_a_probe_made_for_a_z_up_world_lights_as_the_player_has_it(tmp_path):
     avatar = Avatar.load(AVATAR, threads=1)
     walk = load_motion(WALK, avatar.skeleton)
     encoded = avatar.encode(walk, FRAME / walk.fps)
-    shader, camera = as_seen_from(encoded.root, Shader(load_light(SKY, up="z"), "table+sun"), _camera())
+    shader, camera = in_root_frame(encoded.root, Shader(load_light(SKY, up="z"), "table+sun"), _camera())
     lit = shader.shade(avatar.posed(encoded), camera.position)
     stored = 0.5 + 0.28209479177387814 * np.stack([z_up[f"f_dc_{k}"] for k in range(3)], axis=-1)
     np.testing.assert_allclose(stored, lit, rtol=0, atol=1e-3)

@@ -16,14 +16,15 @@ from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.core.sh import sh_basis, sphere_quadrature
+from rnd_runtime.playback.aov import CHANNELS, ambient_visibility, parse_aovs
+from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.inputs.options import parse_frames, parse_size
 from rnd_viewer.play import run_folder
-from rnd_viewer.play.aov import CHANNELS, ambient_visibility, parse_aovs
-from rnd_viewer.play.player import Frame, Player
+from rnd_viewer.play.player import Player
 from rnd_viewer.play.run_folder import claim
 from rnd_viewer.play.timing import StageTimes
 from support.play_fakes import FakeAvatar, fake_motion, white_light
@@ -35,8 +36,8 @@ INSIDE = 0.99  # alpha above which a pixel shows the surface and nothing else
 class FlatShader:
     """Everything glows with one radiance."""
 
-    def __init__(self, radiance: float) -> None:
-        self.radiance = radiance
+    def __init__(self, radiance: float, light: Light) -> None:
+        self.radiance, self.light = radiance, light
 
     def shade(self, gaussians: Gaussians, camera_position: np.ndarray, seen=None) -> np.ndarray:
         return np.full((len(gaussians.means), 3), self.radiance, np.float32)
@@ -46,7 +47,8 @@ class FlatShader:
 
 
 def _player(radiance: float = 0.18, light: Light | None = None, **options) -> Player:
-    return Player(FakeAvatar(), light or white_light(), FlatShader(radiance), rasterize, **options)
+    shader = FlatShader(radiance, light or white_light())
+    return Player(FrameRenderer(FakeAvatar(), shader, raster=rasterize), **options)
 
 
 def _camera(width: int = 96, height: int = 80) -> Camera:
@@ -58,14 +60,14 @@ def test_grey_card_is_118():
     frame = _player().render(MOTION, 0.2, _camera())
     inside = frame.alpha > INSIDE
     assert inside.sum() > 200
-    over_itself = replace(frame, behind=np.full(3, 0.18, np.float32))
+    over_itself = replace(frame, background=np.full(3, 0.18, np.float32))
     assert set(over_itself.srgb.ravel()) == {118}
     assert set(frame.srgb[inside].ravel()) <= {117, 118}
 
 
 def test_blending_is_linear():
     frame = _player(0.9).render(MOTION, 0.2, _camera())
-    over = replace(frame, behind=np.full(3, 0.1, np.float32))
+    over = replace(frame, background=np.full(3, 0.1, np.float32))
     expected = 0.9 * frame.alpha + 0.1 * (1 - frame.alpha)
     edge = (frame.alpha > 0.2) & (frame.alpha < 0.8)
     assert edge.any()
@@ -177,7 +179,7 @@ def test_srgb_alpha_ignores_the_background():
     frame = _player().render(MOTION, 0.0, _camera())
     seen = frame.srgb_alpha[..., 3] > 20
     assert np.abs(frame.srgb_alpha[seen][:, :3].astype(int) - 118).max() <= 1
-    assert isinstance(frame, Frame)
+    assert isinstance(frame, RenderedFrame)
 
 
 def test_options_parse():

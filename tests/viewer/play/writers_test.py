@@ -12,8 +12,8 @@ from PIL import Image
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import linear_to_srgb, read_header, read_image, to_bytes
-from rnd_viewer.play.aov import aov_picture, aov_values
-from rnd_viewer.play.player import Frame
+from rnd_runtime.playback.aov import aov_image, aov_values
+from rnd_runtime.playback.frame import RenderedFrame
 from rnd_viewer.play.timing import StageTimes
 from rnd_viewer.play.video import clip_notes, clip_writer, rgb_to_yuv420
 from rnd_viewer.play.writers import frame_writer, parse_formats
@@ -121,7 +121,7 @@ def test_webp_has_no_frame_that_browsers_hold_for_ten_times_as_long(tmp_path, fp
 
 
 def test_webp_over_a_background_is_opaque(tmp_path, frame):
-    _write(tmp_path, dataclasses.replace(frame, behind=np.ones(3, np.float32)), ("webp",))
+    _write(tmp_path, dataclasses.replace(frame, background=np.ones(3, np.float32)), ("webp",))
     with Image.open(tmp_path / "play.webp") as clip:
         assert np.asarray(clip.convert("RGBA"))[..., 3].min() == 255
 
@@ -170,7 +170,7 @@ def test_formats():
 
 
 @pytest.fixture
-def frame() -> Frame:
+def frame() -> RenderedFrame:
     """A ramp of coverage from 0 to 1 over 11 columns of one colour, and a normal that faces us."""
     alpha = np.tile(np.linspace(0, 1, 11, dtype=np.float32), (4, 1))
     radiance = alpha[..., None] * np.array([0.18, 0.5, 2.0], np.float32)
@@ -180,10 +180,10 @@ def frame() -> Frame:
         name: aov_values(name, value, alpha)
         for name, value in (("albedo", radiance / 4), ("normal", normal), ("depth", depth))
     }
-    return Frame(radiance, alpha, None, aovs)
+    return RenderedFrame(radiance, alpha, aovs)
 
 
-def _write(tmp_path, frame: Frame, formats: tuple[str, ...]) -> set[str]:
+def _write(tmp_path, frame: RenderedFrame, formats: tuple[str, ...]) -> set[str]:
     with frame_writer(tmp_path, formats, fps=30, times=StageTimes()) as write:
         write(7, frame, REACH)
     return {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
@@ -224,7 +224,7 @@ def test_exr_keeps_linear_premultiplied_values_in_named_layers(tmp_path, frame):
 
 
 def test_background_is_laid_under_in_linear_light(tmp_path, frame):
-    over = Frame(frame.radiance, frame.alpha, np.array([0.4, 0.4, 0.4], np.float32), {})
+    over = RenderedFrame(frame.radiance, frame.alpha, background=np.array([0.4, 0.4, 0.4], np.float32))
     _write(tmp_path, over, ("png", "exr"))
     expected = frame.radiance + (1 - frame.alpha[..., None]) * np.float32(0.4)
     exr = read_image(tmp_path / "frames_exr/000007.exr")
@@ -235,7 +235,7 @@ def test_background_is_laid_under_in_linear_light(tmp_path, frame):
 
 
 def test_aov_pictures(frame):
-    pictures = {name: aov_picture(name, frame.aovs[name], frame.alpha, REACH)[0] for name in frame.aovs}
+    pictures = {name: aov_image(name, frame.aovs[name], frame.alpha, REACH)[0] for name in frame.aovs}
     np.testing.assert_array_equal(pictures["albedo"], to_bytes(linear_to_srgb(frame.radiance[0] / 4)))
     np.testing.assert_array_equal(pictures["normal"][1:], np.tile([128, 128, 0], (10, 1)))
     assert (pictures["depth"][1:] == to_bytes((4 - 2.5) / 2)).all()

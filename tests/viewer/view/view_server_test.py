@@ -35,7 +35,7 @@ from rnd_runtime.core.images import write_image
 from rnd_runtime.core.kernels import COMPILING
 from rnd_runtime.motion.edit import MotionEdits, edit_motion
 from rnd_runtime.motion.motion import load_motion, save_motion
-from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import load_light
 from rnd_runtime.shading.shader import Shader
@@ -137,10 +137,11 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     motion = load_motion(options.motion, avatar.skeleton)
     turn = {"yaw": changes.pop("yaw", 0.0), "exposure": changes.pop("exposure", 0.0)}
     light = load_light(options.hdr[0], up=options.hdr_up, **turn)
-    shader = Shader(light, changes.pop("shade", "table+sun"))
+    shade = changes.pop("shade", "table+sun")
     view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
-    return Player(avatar, light, shader, make_rasterizer("cpu"), **changes).render(motion, time, camera).srgb
+    renderer = FrameRenderer(avatar, light, shade=shade)
+    return Player(renderer, **changes).render(motion, time, camera).srgb
 
 
 def test_the_first_view_is_rnd_plays_to_the_bit(options):

@@ -21,10 +21,10 @@ from rnd_runtime.core.files import is_folder, output_folder
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
-from rnd_runtime.playback.rasterizer import ChosenRasterizer, make_rasterizer
+from rnd_runtime.playback.aov import parse_aovs
+from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.start import settle
 from rnd_runtime.shading.light import light_notes
-from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.cameras import (
     CameraOptions,
@@ -39,11 +39,10 @@ from rnd_viewer.inputs.cameras import (
 from rnd_viewer.inputs.console import FRAME, LATENCY, print_summary, tell, warn, with_progress
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
-from rnd_viewer.view.governor import FULL, Governor, Quality
+from rnd_viewer.view.governor import Governor
 
-from .aov import parse_aovs
 from .pipeline import run
-from .player import Frame, Player
+from .player import Player
 from .run_folder import claim, is_of_a_run, part_name
 from .timing import StageTimes
 from .video import clip_notes
@@ -102,7 +101,6 @@ class _Run:
     out: Path
     formats: tuple[str, ...]
     player: Player
-    rasterizer: ChosenRasterizer
     motion: Motion
     fps: float
     frames: range
@@ -111,7 +109,7 @@ class _Run:
     camera_at: CameraPath
     notes: list[str]
     governor: Governor | None
-    qualities: list[Quality] = field(default_factory=list)
+    scales: list[float] = field(default_factory=list)
     in_view: bool = False
 
     @classmethod
@@ -129,12 +127,11 @@ class _Run:
             light = chosen_light(avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure)
             if kernels_are_cold():
                 tell(COMPILING)
-            shader = Shader(light, mode=options.shade)
-            rasterizer = make_rasterizer(options.raster)
+            renderer = FrameRenderer(avatar, light, shade=options.shade, raster=options.raster, cull=options.cull)
         for path in _inputs(options):
             if is_of_a_run(path, out):
                 raise InputError("cannot be an input: runs write such files into --out", file=path)
-        player = Player(avatar, light, shader, rasterizer, background, aovs, times, options.cull)
+        player = Player(renderer, background, aovs, times)
         fps = options.fps or motion.fps
         count = motion.frames_at(fps)
         frames = parse_frames(options.frames, count)
@@ -144,7 +141,6 @@ class _Run:
             out=out,
             formats=formats,
             player=player,
-            rasterizer=rasterizer,
             motion=motion,
             fps=fps,
             frames=frames,
@@ -152,7 +148,7 @@ class _Run:
             framing=framing,
             camera_at=_camera_path(options, size, framing, frames),
             notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light), *clip_notes(formats, fps)],
-            governor=Governor(options.fps_floor, player.ladder) if options.fps_floor else None,
+            governor=Governor(options.fps_floor) if options.fps_floor else None,
         )
 
     @property
@@ -167,10 +163,10 @@ class _Run:
         """Leave every frame in the folder; how many seconds it took."""
         times, overlap = self.player.times, self.options.pipeline
         clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=times, begin=self._begin)
-        with self.rasterizer, clips as write:
+        with self.player.renderer, clips as write:
             started = before = perf_counter()
 
-            def put(number: int, drawn: tuple[Frame, Camera]) -> None:
+            def put(number: int, drawn: tuple[RenderedFrame, Camera]) -> None:
                 settle()
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
@@ -197,14 +193,14 @@ class _Run:
         encoded = self.player.encode(self.motion, number / self.fps)
         return _Turn(asked, perf_counter() - asked, encoded)
 
-    def _draw(self, number: int, turn: _Turn) -> tuple[Frame, Camera]:
+    def _draw(self, number: int, turn: _Turn) -> tuple[RenderedFrame, Camera]:
         started = perf_counter()
         player, camera = self.player, self.camera(number)
         if self.options.hdr_turn:
             yaw = math.radians(self.options.hdr_yaw) + math.tau * number / self.fps / self.options.hdr_turn
-            player.turn(yaw)
-        self.qualities.append(self.governor.quality if self.governor else FULL)
-        frame = player.draw(turn.encoded, camera, self.qualities[-1])
+            player.renderer.turn(yaw)
+        self.scales.append(self.governor.scale if self.governor else 1.0)
+        frame = player.draw(turn.encoded, camera, self.scales[-1])
         self.in_view = self.in_view or bool(frame.alpha.any())
         if number == 0 and not self.in_view:
             raise _out_of_view(self.framing, camera, number)
@@ -220,16 +216,16 @@ class _Run:
 
     def afterthoughts(self) -> Iterator[str]:
         """What can be said of the frames only once they are there."""
-        if lowered := sum(quality != FULL for quality in self.qualities):
+        if lowered := sum(scale < 1 for scale in self.scales):
             share = f"{lowered} of {len(self.frames)} frames"
-            yield f"{share} at less than full quality, for {self.options.fps_floor:g} frames/s"
+            yield f"{share} at less than full resolution, for {self.options.fps_floor:g} frames/s"
         if not self.in_view:
             yield "nothing of the avatar is in view in any of these frames"
 
     def report(self, seconds: float) -> None:
         """Write play.json and print the summary of a run of so many seconds."""
-        camera, light = self.camera(self.frames.stop - 1), self.player.light
-        raster, summary = self.rasterizer.name, self.player.times.summary()
+        camera, light = self.camera(self.frames.stop - 1), self.player.renderer.light
+        raster, summary = self.player.renderer.draws_with, self.player.times.summary()
         report = {
             "version": __version__,
             "settings": _settings(self.options),
@@ -237,7 +233,7 @@ class _Run:
             "fps": self.fps,
             "size": [camera.width, camera.height],
             "raster": raster,
-            "cull": self.player.cull,
+            "cull": self.player.renderer.cull,
             "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
             "notes": self.notes,
             "times": summary,

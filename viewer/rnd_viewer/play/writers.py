@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder, write_json
 from rnd_runtime.core.images import write_image
+from rnd_runtime.playback.aov import CHANNELS, aov_image
+from rnd_runtime.playback.frame import RenderedFrame
 
-from .aov import CHANNELS, aov_picture
-from .player import Frame
 from .timing import StageTimes
 from .video import CLIPS, clip_writer, load_pyav
 
 FORMATS = ("png", "exr", *CLIPS)
 TRANSPARENT = {"png", "webp"}  # where nothing stands behind the avatar
-FrameWriter = Callable[[int, Frame, tuple[float, float]], None]
+FrameWriter = Callable[[int, RenderedFrame, tuple[float, float]], None]
 
 
 def parse_formats(text: str | None) -> tuple[str, ...]:
@@ -47,16 +47,16 @@ def parse_formats(text: str | None) -> tuple[str, ...]:
     return tuple(name for name in FORMATS if name in names)
 
 
-def tone_map_for(formats: tuple[str, ...], frame: Frame) -> None:
+def tone_map_for(formats: tuple[str, ...], frame: RenderedFrame) -> None:
     """Let ``frame`` make the pixels that ``formats`` need, which it keeps: before it goes to a writer's thread."""
     for name in formats:
         if name != "exr":
             _pixels(name, frame)
 
 
-def _pixels(name: str, frame: Frame) -> NDArray[np.uint8]:
+def _pixels(name: str, frame: RenderedFrame) -> NDArray[np.uint8]:
     """The pixels of ``frame`` for one of the formats that have 8 bits."""
-    return frame.srgb_alpha if name in TRANSPARENT and frame.behind is None else frame.srgb
+    return frame.srgb_alpha if name in TRANSPARENT and frame.background is None else frame.srgb
 
 
 @contextmanager
@@ -84,7 +84,7 @@ def frame_writer(
             if kind in CLIPS
         }
 
-        def write(number: int, frame: Frame, reach: tuple[float, float]) -> None:
+        def write(number: int, frame: RenderedFrame, reach: tuple[float, float]) -> None:
             files: dict[Path, NDArray[np.uint8]] = {}
             number_name = f"{number:06d}"
             with times.stage("write"):
@@ -95,7 +95,7 @@ def frame_writer(
                     files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
                 if "png" in formats or "exr" not in formats:
                     for aov, values in frame.aovs.items():
-                        picture = aov_picture(aov, values, frame.alpha, reach)
+                        picture = aov_image(aov, values, frame.alpha, reach)
                         files[folder / f"aov/{aov}/{number_name}.png"] = picture
                 for path, pixels in files.items():
                     write_image(path, pixels)
@@ -105,7 +105,7 @@ def frame_writer(
         yield write
 
 
-def _write_exr(path: Path, frame: Frame) -> None:
+def _write_exr(path: Path, frame: RenderedFrame) -> None:
     layers = [frame.linear(), *frame.aovs.values()]
     names = ("R", "G", "B", "A", *(channel for aov in frame.aovs for channel in CHANNELS[aov]))
     write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)

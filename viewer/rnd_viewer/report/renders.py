@@ -13,12 +13,10 @@ from numpy.typing import NDArray
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
-from rnd_runtime.playback.rasterizer import make_rasterizer
+from rnd_runtime.playback.aov import aov_image
+from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.shading.light import Light, Up, light_notes, load_light
-from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
-from rnd_viewer.play.aov import aov_picture
-from rnd_viewer.play.player import Player
 from rnd_viewer.play.video import clip_writer
 
 Bytes = NDArray[np.uint8]
@@ -52,13 +50,12 @@ class Shots:
 
     def turntable(self) -> bytes:
         """An mp4 of one turn while the motion plays, under the learned light. Needs PyAV (else InputError)."""
-        with tempfile.TemporaryDirectory() as folder, make_rasterizer("auto") as rasterizer:
-            player = Player(self.avatar, self._learned, Shader(self._learned, MODE), rasterizer)
+        with tempfile.TemporaryDirectory() as folder, self._renderer(MODE) as renderer:
             path = Path(folder) / "turntable.mp4"
             with clip_writer(path, fps=FPS) as append:
                 for number in range(round(SECONDS * FPS)):
                     time_s = number / FPS
-                    append(player.render(self.motion, time_s, self._orbit(number, time_s)).srgb)
+                    append(renderer.render(self.motion, time_s, self._orbit(number, time_s)).srgb)
             return path.read_bytes()
 
     def relights(self, hdrs: tuple[Path, ...], up: Up) -> Iterator[tuple[str, Bytes]]:
@@ -70,10 +67,13 @@ class Shots:
         lights += [(hdr.stem, self._read_light(hdr, up)) for hdr in hdrs]
         time_s = self.motion.duration / 2
         camera = self._front(0, time_s)
-        with make_rasterizer("auto") as rasterizer:
+        with self._renderer(MODE) as renderer:
             for caption, light in lights:
-                player = Player(self.avatar, light, Shader(light, MODE), rasterizer)
-                yield caption, player.render(self.motion, time_s, camera).srgb
+                renderer.relight(light)
+                yield caption, renderer.render(self.motion, time_s, camera).srgb
+
+    def _renderer(self, shade: str) -> FrameRenderer:
+        return FrameRenderer(self.avatar, self._learned, shade=shade, raster="auto")
 
     def _read_light(self, hdr: Path, up: Up) -> Light:
         light = load_light(hdr, up=up)
@@ -83,10 +83,8 @@ class Shots:
     def materials(self) -> Iterator[tuple[str, Bytes]]:
         """Captions and pictures of what the light is taken from: albedo, normals, roughness, visibility."""
         time_s = self.motion.duration / 2
-        with make_rasterizer("auto") as rasterizer:
-            shader = Shader(self._learned, "ao")
-            player = Player(self.avatar, self._learned, shader, rasterizer, aovs=AOVS)
-            frame = player.render(self.motion, time_s, self._front(0, time_s))
+        with self._renderer("ao") as renderer:
+            frame = renderer.render(self.motion, time_s, self._front(0, time_s), aovs=AOVS)
         for name, values in frame.aovs.items():
-            picture = aov_picture(name, values, frame.alpha, (0.0, 1.0))
+            picture = aov_image(name, values, frame.alpha)
             yield name, np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)))

@@ -16,22 +16,19 @@ from numpy.typing import NDArray
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.capture.capture import Capture, load_capture
-from rnd_runtime.core.camera import Camera, Floats
+from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
-from rnd_runtime.core.gaussians import Gaussians, Raster
+from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.edit import edit_motion
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.playback.frame import as_seen_from, chosen_cull, draw
-from rnd_runtime.playback.rasterizer import make_rasterizer
-from rnd_runtime.raster.in_view import opacities_of, seen_of
-from rnd_runtime.raster.outline import sharpened
+from rnd_runtime.playback.aov import aov_image
+from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.light import Light, downsize, light_notes, load_light
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
-from rnd_viewer.play.aov import aov_picture, aov_values, splat_features
 
 from .options import SIZES, ViewOptions
 from .state import ViewState
@@ -72,15 +69,15 @@ class Scene:
         self.capture: Capture | None = load_capture(options.capture) if options.capture else None
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
-        self.rasterizer = make_rasterizer(options.raster)
-        self._cull = chosen_cull(self.avatar, None)
         self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
         self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
         self._sky = lru_cache(SHADERS_KEPT // 2)(self._smaller_light)
         self._light_notes: dict[str | Path | None, list[str]] = {}
         self._behind: tuple[tuple[Any, ...], Floats32] | None = None
-        self._posed: tuple[Motion, float, Gaussians, Floats] | None = None
+        self._posed: tuple[Motion, float, PosedAvatar] | None = None
+        first = self._shader(self._files[0] if self._files else None, "table+sun")
+        self.renderer = FrameRenderer(self.avatar, first, raster=options.raster)
 
     def description(self) -> dict[str, Any]:
         """What a page needs to know before it asks for pictures."""
@@ -96,7 +93,7 @@ class Scene:
             "light": 1 if self._files else 0,
             "size": self.size,
             "sizes": SIZES,
-            "raster": self.rasterizer.name,
+            "raster": self.renderer.draws_with,
             "view": {
                 "azimuth": framing.facing,
                 "elevation": view.elevation,
@@ -121,19 +118,20 @@ class Scene:
         camera, motion, time_s = self._view(state)
         gaussians, root = self._pose(motion, time_s, seconds)
         gaussians = _fewer(gaussians, state.gaussians)
-        shader, beside = as_seen_from(root, self._turned_shader(state), camera)
-        if state.output in ("lit", "light"):
-            raster = self._draw_lit(state, gaussians, shader, beside)
-        else:
-            raster = self._draw_material(state.output, gaussians, beside)
+        if state.output == "light":
+            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
+        lit = state.output in ("lit", "light")
+        aovs = () if lit else (state.output,)
+        self.renderer.shader = self._turned_shader(state)
+        frame = self.renderer.draw(PosedAvatar(gaussians, root), camera, aovs=aovs, lit=lit, srgb=False)
         started = perf_counter()
-        if state.output in ("lit", "light", "albedo"):
-            srgb = tone_map(raster.image, raster.alpha, self._radiance_behind(state, camera))
+        if lit or state.output == "albedo":
+            radiance = frame.radiance * np.float32(2.0**state.exposure) if lit else frame.aovs["albedo"]
+            srgb = tone_map(radiance, frame.alpha, self._radiance_behind(state, camera))
         else:
-            values = aov_values(state.output, raster.image, raster.alpha)
-            shown = aov_picture(state.output, values, raster.alpha, (0, 1))
-            srgb = np.broadcast_to(shown, (*raster.alpha.shape, 3))
-        seconds |= {**raster.seconds, "tone map": perf_counter() - started}
+            shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
+            srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))
+        seconds |= {**frame.stage_seconds, "tone map": perf_counter() - started}
         return Picture(srgb, self._joints(motion, time_s, camera), seconds)
 
     def notes_of_light(self, state: ViewState) -> list[str]:
@@ -146,7 +144,7 @@ class Scene:
         return existing_file(capture.folder / frame.image, what="picture of the capture")
 
     def close(self) -> None:
-        self.rasterizer.close()
+        self.renderer.close()
 
     def _motion(self, options: ViewOptions) -> Motion:
         if options.motion:
@@ -189,33 +187,19 @@ class Scene:
         size = (max(round(side * scale), 1) for side in (camera.width, camera.height))
         return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
 
-    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> tuple[Gaussians, Floats]:
-        """The avatar in its root's frame, and that frame → world [4, 4]; kept while only camera and light move."""
+    def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> PosedAvatar:
+        """Kept while only camera and light move."""
         if self._posed is None or self._posed[0] is not motion or self._posed[1] != time_s:
             started = perf_counter()
             encoded = self.avatar.encode(motion, time_s)
             known = perf_counter()
-            self._posed = motion, time_s, self.avatar.posed(encoded), encoded.root
+            self._posed = motion, time_s, PosedAvatar(self.avatar.posed(encoded), encoded.root)
             seconds |= {"encoders": known - started, "posing": perf_counter() - known}
-        return self._posed[2:]
+        return self._posed[2]
 
     def _turned_shader(self, state: ViewState) -> Shader:
         shader = self._shader(self._light_name(state), state.shade)
         return shader.turned(shader.light.yaw + state.yaw)
-
-    def _draw_lit(self, state: ViewState, gaussians: Gaussians, shader: Shader, camera: Camera) -> Raster:
-        if state.output == "light":
-            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
-        raster = draw(gaussians, shader, camera, self.rasterizer, cull=self._cull)
-        if state.exposure == 0:
-            return raster
-        return replace(raster, image=raster.image * np.float32(2.0**state.exposure))
-
-    def _draw_material(self, output: str, gaussians: Gaussians, camera: Camera) -> Raster:
-        features = splat_features((output,), gaussians, camera)[0].astype(np.float32)
-        opacities = opacities_of(gaussians, seen_of(gaussians, camera, self._cull))
-        arrays = gaussians.means, gaussians.covariances, opacities, features
-        return sharpened(self.rasterizer(*arrays, camera, depth=False))
 
     def _light_name(self, state: ViewState) -> str | Path | None:
         """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""

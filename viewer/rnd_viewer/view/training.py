@@ -1,0 +1,141 @@
+"""A folder that ``rnd-train`` writes, read while it grows: progress, losses, previews, and the avatar once it is exported."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import existing_file
+
+from .options import ViewOptions
+from .scene import Scene
+
+METRICS, STATUS, CONFIG, PREVIEWS, AVATAR = "metrics.jsonl", "status.json", "config.json", "previews", "avatar.onnx"
+POINTS = 300  # of a curve: the page has no more pixels for it
+_PREVIEW = re.compile(r"step_\d+\.png")
+_NO_LOSSES = ("step", "stage", "seconds", "skipped")
+
+
+class Training:
+    """Watches the run ``options.avatar``; several threads may ask.
+
+    Raises:
+        InputError: the folder holds no training.
+    """
+
+    def __init__(self, options: ViewOptions) -> None:
+        self.folder = options.avatar
+        self._options = replace(options, avatar=self.folder / AVATAR)
+        existing_file(self.folder / CONFIG, what="config.json of rnd-train")
+        self._rows: list[dict[str, Any]] = []
+        self._file, self._offset = 0, 0
+        self._scenes: dict[int, Scene] = {}  # by the avatar file's time of change
+        self._lock = threading.Lock()
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows: the status that rnd-train writes, one curve ``[[step, mean], …]`` a loss, file names."""
+        with self._lock:
+            rows = self._read_metrics()
+        status = _json(self.folder / STATUS)
+        last = rows[-1] if rows else {}
+        done = status.get("step", last.get("step", -1) + 1)
+        return {
+            "name": self.folder.resolve().name,
+            "phase": status.get("phase"),
+            "done": done,
+            "total": status.get("total", max(done, 1)),
+            "stage": last.get("stage"),
+            "seconds": last.get("seconds", 0),
+            "seconds_left": status.get("seconds_left"),
+            "ended": status.get("ended"),
+            "silent_s": self._silence(),
+            "skipped": sum("skipped" in row for row in rows),
+            "curves": _curves(rows),
+            "previews": self._previews(),
+            "avatar": (self.folder / AVATAR).is_file(),
+        }
+
+    def preview(self, name: str) -> bytes | None:
+        """The preview image ``name``; None where there is none of this name."""
+        file = self.folder / PREVIEWS / name
+        return file.read_bytes() if _PREVIEW.fullmatch(name) and file.is_file() else None
+
+    def scene(self) -> Scene:
+        """The avatar as it is now, loaded when it is first asked for and after each export.
+
+        Raises:
+            InputError: it is not exported yet, or something else cannot be used.
+        """
+        file = existing_file(self._options.avatar, what="avatar of the run", hint="rnd-export makes it")
+        with self._lock:
+            stamp = file.stat().st_mtime_ns
+            if stamp not in self._scenes:
+                self._scenes[stamp] = Scene(self._options)
+            return self._scenes[stamp]
+
+    def close(self) -> None:
+        for scene in self._scenes.values():
+            scene.close()
+
+    def _read_metrics(self) -> list[dict[str, Any]]:
+        """All rows so far. A line still being written waits; a file that --resume replaced is read anew."""
+        try:
+            with (self.folder / METRICS).open("rb") as stream:
+                file = os.fstat(stream.fileno()).st_ino
+                if file != self._file:
+                    self._rows, self._offset, self._file = [], 0, file
+                stream.seek(self._offset)
+                content = stream.read()
+        except FileNotFoundError:
+            return []
+        complete = content[: content.rfind(b"\n") + 1]
+        self._offset += len(complete)
+        self._rows += [row for line in complete.splitlines() if isinstance((row := _parse(line)).get("step"), int)]
+        return self._rows
+
+    def _previews(self) -> list[str]:
+        """File names, the first step first."""
+        folder = self.folder / PREVIEWS
+        return sorted(file.name for file in folder.glob("step_*.png")) if folder.is_dir() else []
+
+    def _silence(self) -> float | None:
+        """Seconds since rnd-train last wrote something."""
+        times = [file.stat().st_mtime for name in (METRICS, STATUS) if (file := self.folder / name).exists()]
+        return max(time.time() - max(times), 0) if times else None
+
+
+def _parse(text: str | bytes) -> dict[str, Any]:
+    """A JSON object; empty for whatever is none, as a line that a crash cut."""
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        return _parse(file.read_bytes())
+    except FileNotFoundError:
+        return {}
+
+
+def _curves(rows: list[dict[str, Any]]) -> dict[str, list[list[float]]]:
+    """``[[step, mean], …]`` of every loss, finite values only, at most ``POINTS`` each."""
+    width = -(-(rows[-1]["step"] + 1) // POINTS) if rows else 1
+    bins: dict[str, dict[int, list[float]]] = {}
+    for row in rows:
+        for name, value in row.items():
+            if name not in _NO_LOSSES and isinstance(value, int | float) and abs(value) < float("inf"):
+                bins.setdefault(name, {}).setdefault(row["step"] // width, []).append(value)
+    return {
+        name: [[width * k + width / 2, sum(values) / len(values)] for k, values in sorted(parts.items())]
+        for name, parts in bins.items()
+    }
