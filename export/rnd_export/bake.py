@@ -1,8 +1,7 @@
 """Everything of a model that does not depend on the pose, folded as far as it makes the file smaller.
 
-What the networks make of a node's place alone is *not* stored: it follows from the node's coordinates and a few
-small matrices, and onnxruntime computes it once, when the file is loaded (constant folding). Stored, it would be
-more than half of the file.
+What networks compute from a node's position alone is not stored: onnxruntime folds it when it loads the file. Stored,
+it would be more than half of the file.
 """
 
 from __future__ import annotations
@@ -24,10 +23,9 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class BakedAttention:
-    """A ``JointAttention`` without its query side.
+    """A ``JointAttention``: its query projection scaled by 1/√(width per head), its output fused with the next layer.
 
-    ``query`` [width, width] and ``query_bias`` [width] are scaled by 1/√(width per head); ``out`` [O, width] takes
-    the output projection and the layer after it in one; the rest is the module's.
+    query [width, width], query_bias [width], out [O, width]; ``module`` are the module's own parameters.
     """
 
     query: Floats
@@ -38,7 +36,7 @@ class BakedAttention:
 
 @dataclass(frozen=True, eq=False)
 class BakedSkinning:
-    """D_W: ``merge`` [width, width] and ``merge_bias`` take f_x to its share of the first layer after attention."""
+    """D_W; ``merge`` [width, width] and ``merge_bias`` [width] apply to f_x in the first layer after attention."""
 
     temporal: BakedAttention
     spatial: BakedAttention
@@ -50,8 +48,7 @@ class BakedSkinning:
 
 @dataclass(frozen=True)
 class Rates:
-    """At how many nodes each network is evaluated: the first so many in farthest-point order. All nodes read these as
-    Gaussians read nodes, by ``rnd_trainer.model.template.node_interpolation``."""
+    """At how many nodes, the first in farthest-point order, each network is evaluated; the others interpolate."""
 
     skinning: int
     offsets: int
@@ -60,15 +57,17 @@ class Rates:
 
 @dataclass(frozen=True, eq=False)
 class BakedAvatar:
-    """The constants of an avatar. N Gaussians, M nodes, J joints.
+    """The constants of an avatar: N Gaussians, M nodes, J joints.
 
-    ``rows`` [N] are the model's Gaussians that stand here, in whose farthest-point order any prefix covers the body;
-    ``codes`` [M, 3] m and ``node_rows`` [M] (the Gaussian that stands at a node) are in the order of the nodes,
-    ``all_codes`` [N, 3] m belong to the Gaussians;
-    ``factors`` [N, 3, 3] m is R S in the rest pose; ``offsets`` and ``visibility`` are a
-    ``PoseConditioned`` each, ``skinning`` None where the template's weights are used as they are. Skinning is
-    dynamic at the first ``dynamic_nodes`` nodes, the template's at the others. ``node_ranks`` [M] are the nodes'
-    places in the farthest-point order, by which ``rates`` counts; ``area`` is the template's, m².
+    Attributes:
+        codes: encoded positions of the nodes [M, 3] m. all_codes: of the Gaussians [N, 3] m.
+        node_rows: the Gaussian at each node [M]. node_ranks: rank of each node in farthest-point order [M].
+        rates: nodes of each network. dynamic_nodes: the first so many nodes have dynamic skinning.
+        skinning: None for the template's weights. offsets, visibility: a ``PoseConditioned`` each.
+        neighbours, neighbour_weights: nodes that a Gaussian interpolates [N, K].
+        weights: template skinning [N, J]. points: rest positions [N, 3] m. factors: R S at rest [N, 3, 3] m.
+        rows: indices of the model's Gaussians [N], whose order is farthest-point.
+        max_offset: m. area: of the template, m².
     """
 
     codes: Floats
@@ -96,6 +95,25 @@ class BakedAvatar:
     rows: NDArray[np.int64]
     max_offset: float
     area: float
+
+
+PER_GAUSSIAN = (
+    "all_codes",
+    "neighbours",
+    "neighbour_weights",
+    "weights",
+    "points",
+    "factors",
+    "normals",
+    "limb_axes",
+    "limb_levers",
+    "limb_shares",
+    "opacities",
+    "albedo",
+    "roughness",
+    "rows",
+)
+"""fields of ``BakedAvatar`` with a row per Gaussian"""
 
 
 @torch.no_grad()

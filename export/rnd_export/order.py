@@ -1,8 +1,7 @@
-"""Neighbours on the body side by side in the file: caches of whoever plays it then hold what comes next.
+"""Neighbours on the body side by side in the file, so that caches of a player hold what comes next.
 
-Gaussians and nodes stand in the order of a Z-curve (Morton 1966) through the pose in which their points are encoded.
-The farthest-point order that a checkpoint has them in, in which any prefix covers the body, puts neighbours as far
-apart as can be.
+Gaussians and nodes are stored along a Z-curve (Morton 1966) through the pose in which their positions are encoded.
+The checkpoint's farthest-point order, of which any prefix covers the body, puts neighbours far apart.
 """
 
 from __future__ import annotations
@@ -14,44 +13,27 @@ from numpy.typing import NDArray
 
 from rnd_trainer.model.template import along_curve
 
-from .bake import BakedAvatar
+from .bake import PER_GAUSSIAN, BakedAvatar
 
 Integers = NDArray[np.int64]
 
-BY_GAUSSIAN = (
-    "all_codes",
-    "neighbours",
-    "neighbour_weights",
-    "weights",
-    "points",
-    "factors",
-    "normals",
-    "limb_axes",
-    "limb_levers",
-    "limb_shares",
-    "opacities",
-    "albedo",
-    "roughness",
-    "rows",
-)
 
-
-def gaussians_by_place(baked: BakedAvatar) -> BakedAvatar:
+def order_gaussians(baked: BakedAvatar) -> BakedAvatar:
     """``baked`` with its Gaussians along the curve."""
     order = along_curve(baked.all_codes)
-    moved = {name: getattr(baked, name)[order] for name in BY_GAUSSIAN}
+    moved = {name: getattr(baked, name)[order] for name in PER_GAUSSIAN}
     return dataclasses.replace(baked, node_rows=_inverse(order)[baked.node_rows], **moved)
 
 
-def nodes_by_place(baked: BakedAvatar) -> BakedAvatar:
+def order_nodes(baked: BakedAvatar) -> BakedAvatar:
     """``baked`` with its nodes along the curve, those with dynamic skinning before the others."""
     moving = baked.dynamic_nodes
     order = [along_curve(baked.codes[:moving]), moving + along_curve(baked.codes[moving:])]
-    return nodes_in_order(baked, np.concatenate(order))
+    return permute_nodes(baked, np.concatenate(order))
 
 
-def nodes_in_order(baked: BakedAvatar, order: Integers) -> BakedAvatar:
-    """``baked`` with its nodes as ``order`` [M] names them."""
+def permute_nodes(baked: BakedAvatar, order: Integers) -> BakedAvatar:
+    """``baked`` with its nodes in ``order`` [M]."""
     return dataclasses.replace(
         baked,
         codes=baked.codes[order],
@@ -62,18 +44,17 @@ def nodes_in_order(baked: BakedAvatar, order: Integers) -> BakedAvatar:
 
 
 def node_sites(baked: BakedAvatar, count: int) -> Integers:
-    """The nodes that are the first ``count`` in farthest-point order, as they stand in the file."""
+    """Indices of the nodes that are the first ``count`` in farthest-point order."""
     return np.flatnonzero(baked.node_ranks < count)
 
 
 def moving_sites(baked: BakedAvatar) -> Integers:
-    """The nodes at which the skinning network is evaluated; between them stand the template's weights, or what is
-    interpolated."""
+    """Indices of the nodes at which the skinning network is evaluated."""
     sites = node_sites(baked, baked.rates.skinning)
     return sites[sites < baked.dynamic_nodes]
 
 
 def _inverse(order: Integers) -> Integers:
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    return place
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return rank

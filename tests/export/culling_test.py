@@ -10,9 +10,10 @@ import onnx
 import pytest
 
 from rnd_export.cli import main
-from rnd_export.export import export, random_motion
-from rnd_export.reduce.culling import COSINES, MOST_DIFFERENT, SIZE, advise, advised_cull
-from rnd_export.reduce.shots import shots_around
+from rnd_export.export import export
+from rnd_export.parity import random_motion
+from rnd_export.reduce.culling import COSINES, MAX_DIFFERENCE, SIZE, add_advice, find_cull
+from rnd_export.reduce.views import views_around
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.file import ADVICE_KEY, PlayerAdvice
 from rnd_runtime.core.camera import Camera
@@ -35,7 +36,7 @@ CULL = -0.3
 def advised(tmp_path_factory) -> Path:
     """The embedded avatar, whose file is of before there was advice, with some."""
     file = tmp_path_factory.mktemp("advised") / "avatar.onnx"
-    return _with(file, lambda model: advise(model, CULL))
+    return _with(file, lambda model: add_advice(model, CULL))
 
 
 def _with(file: Path, change) -> Path:
@@ -56,10 +57,10 @@ class _SeenThrough(Avatar):
 def test_the_most_is_left_out_that_does_not_show() -> None:
     avatar = Avatar.load(ASSETS / "avatar.onnx")
     motion = random_motion(avatar.skeleton, frames=30, seed=1)
-    found = advised_cull(avatar, motion)
+    found = find_cull(avatar, motion)
     assert found in COSINES[1:-1]
     light = Light(avatar.trained_light)
-    around = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
+    around = views_around(motion, SIZE, lambda time: avatar.pose(motion, time))
 
     def coded(cull: float) -> np.ndarray:
         """8-bit pictures as they are looked at."""
@@ -70,12 +71,12 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
     whole, nearer = coded(-1), COSINES[COSINES.index(found) - 1]
     off = [np.sqrt(np.mean((coded(cull) - whole) ** 2)) for cull in (found, nearer)]
     # rounding to 8 bits hides or adds a part of what the exporter sees
-    assert off[0] < 1.05 * MOST_DIFFERENT < 1.15 * off[1]
+    assert off[0] < 1.05 * MAX_DIFFERENCE < 1.15 * off[1]
 
 
 def test_of_what_is_seen_through_nothing_is_left_out() -> None:
     avatar = _SeenThrough.load(ASSETS / "avatar.onnx")
-    assert advised_cull(avatar, random_motion(avatar.skeleton, frames=10, seed=1)) is None
+    assert find_cull(avatar, random_motion(avatar.skeleton, frames=10, seed=1)) is None
 
 
 @pytest.mark.parametrize(("cull", "said"), [(None, COSINES), (-0.25, (-0.25,)), (-1, (None,))])

@@ -13,9 +13,11 @@ import pytest
 import torch
 
 from rnd_export import export as exports
+from rnd_export import parity
 from rnd_export.bake import bake
-from rnd_export.export import MAX_P99_M, MAX_POSITION_ERROR_M, MAX_WEIGHT_ERROR, measure_drift, random_motion, written
-from rnd_export.order import gaussians_by_place
+from rnd_export.export import build
+from rnd_export.order import order_gaussians
+from rnd_export.parity import MAX_P99_M, MAX_POSITION_ERROR_M, MAX_WEIGHT_ERROR, measure_parity, random_motion
 from rnd_export.reduce.variant import Variant, line_through, reduced
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.file import POSED_OUTPUTS, read_metadata
@@ -36,16 +38,16 @@ export = functools.partial(exports.export, cull=-1)  # tests/culling_test.py is 
 def test_onnxruntime_says_what_torch_says(tiny_avatar, tiny_checkpoint) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     moves = random_motion(checkpoint.skeleton, frames=60, seed=3)
-    drift = measure_drift(Avatar.load(tiny_avatar), checkpoint, moves, _rows(checkpoint))
-    assert drift.weights < MAX_WEIGHT_ERROR / 10
-    assert drift.position_m < MAX_POSITION_ERROR_M / 10
-    assert drift.normal < 1e-4 and drift.visibility < 1e-4
-    assert drift.covariance_relative < 1e-4
+    error = measure_parity(Avatar.load(tiny_avatar), checkpoint, moves, _rows(checkpoint))
+    assert error.weights < MAX_WEIGHT_ERROR / 10
+    assert error.position_m < MAX_POSITION_ERROR_M / 10
+    assert error.normal < 1e-4 and error.visibility < 1e-4
+    assert error.covariance_relative < 1e-4
 
 
 def _rows(checkpoint) -> np.ndarray:
     """The model's Gaussians in the file's order."""
-    return gaussians_by_place(bake(checkpoint.model)).rows
+    return order_gaussians(bake(checkpoint.model)).rows
 
 
 def test_neighbours_on_the_body_are_neighbours_in_the_file(tiny_avatar, tiny_checkpoint) -> None:
@@ -79,7 +81,7 @@ def test_the_file_is_plain_onnx(tiny_avatar) -> None:
 
 
 def test_nothing_stays_when_the_drift_is_too_large(tiny_checkpoint, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(exports, "MAX_WEIGHT_ERROR", 0.0)
+    monkeypatch.setattr(parity, "MAX_WEIGHT_ERROR", 0.0)
     with pytest.raises(InputError, match="export refused: skinning weights of onnxruntime and torch differ"):
         export(load_checkpoint(tiny_checkpoint), tmp_path / "avatar.onnx")
     assert list(tmp_path.iterdir()) == []
@@ -92,8 +94,8 @@ def test_a_static_avatar_exports_too(tiny_checkpoint, tmp_path) -> None:
     model = AvatarModel(model_config, sample_template(body(), 800, 200, seed=1))
     path = tmp_path / "static.ckpt"
     save_checkpoint(path, model, torch.ones(32, 64, 3), checkpoint.skeleton, config, {})
-    drift = export(load_checkpoint(path), tmp_path / "static.onnx", motion(body()))
-    assert drift.frames == 6 and drift.weights < 1e-6
+    error = export(load_checkpoint(path), tmp_path / "static.onnx", motion(body()))
+    assert error.frames == 6 and error.weights < 1e-6
 
 
 def test_bones_alone_move_an_avatar_rigidly(tiny_avatar) -> None:
@@ -109,8 +111,8 @@ def test_bones_alone_move_an_avatar_rigidly(tiny_avatar) -> None:
 @pytest.mark.parametrize("precision", ["f16", "int8"])
 def test_fewer_bits_make_a_smaller_file_that_drifts_little(tiny_checkpoint, tiny_avatar, tmp_path, precision) -> None:
     out = tmp_path / "small.onnx"
-    drift = export(load_checkpoint(tiny_checkpoint), out, motion(body()), Variant(precision=precision))
-    assert drift.position_m > MAX_POSITION_ERROR_M / 10 and drift.position_p99_m < MAX_P99_M[precision] / 2
+    error = export(load_checkpoint(tiny_checkpoint), out, motion(body()), Variant(precision=precision))
+    assert error.position_m > MAX_POSITION_ERROR_M / 10 and error.position_p99_m < MAX_P99_M[precision] / 2
     assert out.stat().st_size < 0.8 * tiny_avatar.stat().st_size
     assert Avatar.load(out).metadata.variant.precision == precision
     first = out.read_bytes()
@@ -129,8 +131,8 @@ def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
     """With as many nodes as the checkpoint nothing changes; with fewer, the networks say the same at those."""
     checkpoint = load_checkpoint(tiny_checkpoint)
     whole, half = tmp_path / "whole.onnx", tmp_path / "half.onnx"
-    drift = export(load_checkpoint(tiny_checkpoint), whole, motion(body()), Variant("coarse", nodes=200))
-    assert drift.position_m < MAX_POSITION_ERROR_M / 10
+    error = export(load_checkpoint(tiny_checkpoint), whole, motion(body()), Variant("coarse", nodes=200))
+    assert error.position_m < MAX_POSITION_ERROR_M / 10
     export(load_checkpoint(tiny_checkpoint), half, motion(body()), Variant("coarse"))
     variant = Avatar.load(half).metadata.variant
     assert (variant.encoder, variant.nodes) == ("coarse", 50)
@@ -176,7 +178,7 @@ def test_nodes_are_the_most_at_which_any_network_is_evaluated(
 ) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     baked = reduced(bake(checkpoint.model), checkpoint.config.model, variant)
-    stated = read_metadata(OnnxFile(written(checkpoint, baked, variant).SerializeToString())).variant
+    stated = read_metadata(OnnxFile(build(checkpoint, baked, variant).SerializeToString())).variant
     assert (stated.encoder, stated.nodes, stated.dynamic_nodes) == (encoder, nodes, dynamic_nodes)
 
 
@@ -200,7 +202,7 @@ def _weights(path, moves: Motion, checkpoint) -> np.ndarray:
 
 
 def _output(path, moves: Motion, checkpoint, name: str) -> np.ndarray:
-    pose = exports.pose_input(moves, checkpoint.skeleton, 0.1, checkpoint.config.model)
+    pose = pose_input(moves, checkpoint.skeleton, 0.1, checkpoint.config.model)
     inputs = (pose.window.numpy(), pose.velocity.numpy(), pose.bones.numpy())
     return Avatar.load(path).run(inputs, [name])[0]
 
@@ -220,12 +222,12 @@ def test_a_shorter_window_sees_a_steady_motion_alike(tiny_checkpoint, tmp_path) 
     """Poses on a line in 6D are what the interpolation assumes: a still figure is on one."""
     checkpoint = load_checkpoint(tiny_checkpoint)
     still = dataclasses.replace(motion(body()), rotations=motion(body()).rotations[[3] * 6])
-    drift = export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", still, Variant(window_poses=2))
-    assert drift.position_m < MAX_POSITION_ERROR_M / 10
+    error = export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", still, Variant(window_poses=2))
+    assert error.position_m < MAX_POSITION_ERROR_M / 10
     assert Avatar.load(tmp_path / "a.onnx").window_poses == 2
     moves = random_motion(checkpoint.skeleton, frames=4, seed=0)
     moving = export(checkpoint, tmp_path / "a.onnx", moves, Variant(window_poses=2))
-    assert moving.position_m > drift.position_m
+    assert moving.position_m > error.position_m
     assert np.allclose(line_through(5, 3), [[1, 0, 0], [0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5], [0, 0, 1]])
 
 
@@ -237,14 +239,14 @@ def test_a_lower_degree_drops_the_higher_harmonics(tiny_checkpoint, tiny_avatar,
 
 
 def test_of_a_long_motion_some_frames_are_compared_the_last_one_too(tiny_checkpoint, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("rnd_export.export.MOST_FRAMES", 4)
+    monkeypatch.setattr("rnd_export.parity.MAX_FRAMES", 4)
     checkpoint, seen = load_checkpoint(tiny_checkpoint), []
     original = checkpoint.model.forward
     monkeypatch.setattr(checkpoint.model, "forward", lambda pose: seen.append(pose) or original(pose))
     moves = motion(body(), 31)
-    drift = export(checkpoint, tmp_path / "a.onnx", moves)
+    error = export(checkpoint, tmp_path / "a.onnx", moves)
     last = pose_input(moves, checkpoint.skeleton, 30 / moves.fps, checkpoint.config.model)
-    assert drift.frames == 4 == len(seen) and torch.equal(seen[-1].bones, last.bones)
+    assert error.frames == 4 == len(seen) and torch.equal(seen[-1].bones, last.bones)
 
 
 def test_a_body_of_alike_weights_is_exported(tiny_checkpoint, tmp_path) -> None:

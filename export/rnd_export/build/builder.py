@@ -17,7 +17,7 @@ Storage = Literal["f32", "f16", "u16", "u8"]
 class GraphBuilder:
     """Collects nodes and constants; values are referred to by their names.
 
-    ``scope`` prefixes names ("skinning/temporal/keys"), so a reader of the graph sees where he is.
+    ``scope`` prefixes names ("skinning/temporal/keys").
     """
 
     def __init__(self, name: str) -> None:
@@ -49,7 +49,7 @@ class GraphBuilder:
         self._outputs.append(helper.make_tensor_value_info(name, kind, shape))
 
     def constant(self, name: str, value: Any) -> str:
-        """A constant; float64 becomes float32, everything else keeps its type."""
+        """A constant; float64 becomes float32."""
         array: NDArray[Any] = np.asarray(value)
         if array.dtype == np.float64:
             array = array.astype(np.float32)
@@ -58,9 +58,9 @@ class GraphBuilder:
         return full
 
     def stored(self, name: str, value: Any, storage: Storage) -> str:
-        """A float32 constant kept in fewer bits; onnxruntime unpacks it once, when the file is loaded.
+        """A float32 constant stored in fewer bits, which onnxruntime unpacks when it loads the file.
 
-        ``u8`` and ``u16`` cut the range of each row along the first axis of ``value`` into 2^bits − 1 steps.
+        ``u8`` and ``u16`` quantise each row along the first axis of ``value`` over its range.
         """
         array = np.asarray(value, np.float64)
         if storage == "f32":
@@ -74,14 +74,14 @@ class GraphBuilder:
         step = np.maximum((array.max(axis=others, keepdims=True) - low) / steps, 1e-12)
         packed = self.constant(f"{name}_{storage}", np.round((array - low) / step).astype(kind))
         counts = self.op("Cast", packed, name=f"{name}_counts", to=TensorProto.FLOAT)
-        spread = self.op("Mul", counts, self.constant(f"{name}_step", step), name=f"{name}_spread")
-        return self.op("Add", spread, self.constant(f"{name}_low", low), name=name)
+        scaled = self.op("Mul", counts, self.constant(f"{name}_step", step), name=f"{name}_spread")
+        return self.op("Add", scaled, self.constant(f"{name}_low", low), name=name)
 
     def packed(self, name: str, value: Any) -> str:
-        """An int32 constant of what is not negative, kept in 8 or 16 bits where they hold it."""
+        """An int32 constant of non-negative numbers, stored in the fewest bits that hold them."""
         array: NDArray[Any] = np.asarray(value)
-        least = next(kind for kind in (np.uint8, np.uint16, np.int32) if array.max() <= np.iinfo(kind).max)
-        packed = self.constant(f"{name}_packed", array.astype(least))
+        smallest = next(kind for kind in (np.uint8, np.uint16, np.int32) if array.max() <= np.iinfo(kind).max)
+        packed = self.constant(f"{name}_packed", array.astype(smallest))
         return self.op("Cast", packed, name=name, to=TensorProto.INT32)
 
     def op(self, kind: str, *inputs: str, name: str, **attributes: Any) -> str:
@@ -117,10 +117,10 @@ class GraphBuilder:
         return self.op("ConstantOfShape", size, name=name, value=filler)
 
     def model(self, metadata: dict[str, str], producer: str) -> onnx.ModelProto:
-        """The checked model; its bytes depend on nothing but what was put in."""
+        """The checked model; its bytes are deterministic."""
         graph = helper.make_graph(self._nodes, self._name, self._inputs, self._outputs, list(self._constants.values()))
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name=producer)
-        model.ir_version = 8  # of opset 18's time: the oldest runtimes that know the opset can read it
+        model.ir_version = 8  # the oldest with opset 18
         helper.set_model_props(model, metadata)
         onnx.checker.check_model(model, full_check=True)
         return model

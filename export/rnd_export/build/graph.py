@@ -55,20 +55,19 @@ def build_model(baked: BakedAvatar, precision: Precision, poses: int, metadata: 
 def _node_fields(
     graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, inputs: tuple[str, str, str], networks: Networks
 ) -> dict[str, str]:
-    """What the networks say at their nodes, by name; no logits where skinning is the template's."""
+    """Outputs of the networks at their nodes, by name; no logits for static skinning."""
     window, velocity, bones = inputs
     fields = {}
     encoded = networks.encoded(baked.codes, baked.frequencies)
 
     def at(sites: Integers) -> str:
-        """Their rows of what is encoded."""
         return encoded if len(sites) == len(baked.codes) else graph.rows(encoded, sites, "sites")
 
     if baked.skinning is not None:
         with graph.scope("skinning"):
             moving = moving_sites(baked)
             logits = networks.skinning(baked.skinning, at(moving), window, velocity)
-            if still := baked.rates.skinning - len(moving):  # the template's there, and they come last
+            if still := baked.rates.skinning - len(moving):  # the last ones have the template's weights
                 zeros = graph.filled("static_logits", (still, baked.weights.shape[1]), 0.0)
                 logits = graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
             fields["node_logits"] = logits
@@ -88,11 +87,8 @@ def _node_fields(
 def _at_all_nodes(
     graph: GraphBuilder, baked: BakedAvatar, fields: dict[str, str], sizes: dict[str, int], storage: Storage
 ) -> dict[str, str]:
-    """``fields`` at all nodes, those of networks with fewer interpolated: all that have as many together.
-
-    Shares of the interpolation are kept as ``storage``.
-    """
-    rates, whole = baked.rates, dict(fields)
+    """``fields`` at all nodes: those of networks with fewer nodes are interpolated, jointly for equal counts."""
+    rates, at_all = baked.rates, dict(fields)
     counts = {"node_logits": rates.skinning, "node_offsets": rates.offsets, "node_visibility": rates.visibility}
     for count in sorted({counts[name] for name in fields} - {len(baked.codes)}):
         with graph.scope(f"from_{count}_nodes"):
@@ -100,8 +96,8 @@ def _at_all_nodes(
             neighbours, weights = node_interpolation(baked.codes, baked.codes[sites], baked.area)
             coarse = {name: value for name, value in fields.items() if counts[name] == count}
             read, shares = graph.packed("neighbours", neighbours), graph.stored("shares", weights, storage)
-            whole |= _interpolated(graph, coarse, sizes, read, shares)
-    return whole
+            at_all |= _interpolated(graph, coarse, sizes, read, shares)
+    return at_all
 
 
 def _posed(
@@ -117,16 +113,16 @@ def _posed(
     axes, levers, shares = graph.split(limbs, {"limb_axes": 3, "limb_levers": 3, "limb_shares": 1}, axis=0)
     excess, widened = posing.widened(linear, cofactors, axes, shares)
     offsets = graph.op("Transpose", offsets, name="offsets_by_component", perm=[1, 0])
-    offset, turn = graph.split(graph.op("Tanh", offsets, name="bounded"), {"offset": 3, "turn": 3}, axis=0)
+    offset, rotation = graph.split(graph.op("Tanh", offsets, name="bounded"), {"offset": 3, "turn": 3}, axis=0)
     offset = graph.op("Mul", offset, graph.constant("max_offset", np.float32(baked.max_offset)), name="offset_m")
     points = graph.op("Add", rest.by_component("rest_points"), offset, name="points_offset")
     points = posing.outwards(points, excess, levers)
     normals = rest.by_component("rest_normals")
-    normals = posing.normals(linear, cofactors, posing.steepened(normals, excess, axes))
-    turned = posing.multiply(
-        posing.small_rotation(turn, len(baked.points)), rest.by_component("rest_factors", (3, 3)), "turned"
+    normals = posing.normals(linear, cofactors, posing.widened_normals(normals, excess, axes))
+    rotated = posing.multiply(
+        posing.small_rotation(rotation, len(baked.points)), rest.by_component("rest_factors", (3, 3)), "turned"
     )
-    covariances = posing.covariances(posing.multiply(widened, turned, "posed"))
+    covariances = posing.covariances(posing.multiply(widened, rotated, "posed"))
     return posing.points(blend, linear, points), covariances, posing.by_gaussian(normals, "normals")
 
 
@@ -137,7 +133,7 @@ def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, 
     weights = graph.op("Softmax", weights, name="weights", axis=1)
     root = graph.rows(graph.rows(bones, [0], "root_bone"), [0, 1, 2], "root_columns", axis=2)
     root = graph.reshape(root, (3, 3), "root")
-    # (Rᵀ B_j) first: a row of J small products, and the nodes' blends come out in the root's frame
+    # Rᵀ B_j before blending: J products instead of one per node
     to_root = graph.op("Transpose", root, name="to_root", perm=[1, 0])
     in_root = graph.op("MatMul", to_root, bones, name="bones_in_root")
     linear = posing.linear(posing.blend(weights, in_root))
@@ -149,18 +145,18 @@ def _interpolated(
     graph: GraphBuilder, fields: dict[str, str], sizes: dict[str, int], neighbours: str, weights: str
 ) -> dict[str, str]:
     """Σ_k weight_k · field[neighbour_k] of each field [m, size], by name: [n, size] for n rows of neighbours."""
-    joined, total = graph.op("Concat", *fields.values(), name="fields", axis=1), ""
+    joined, result = graph.op("Concat", *fields.values(), name="fields", axis=1), ""
     for k in range(NEIGHBOURS):
         row = graph.op("Gather", neighbours, graph.constant(f"k{k}", np.int64(k)), name=f"neighbour{k}", axis=1)
         weight = graph.rows(weights, [k], f"weight{k}", axis=1)
         part = graph.op("Gather", joined, row, name=f"gathered{k}", axis=0)
         part = graph.op("Mul", part, weight, name=f"weighted{k}")
-        total = graph.op("Add", total, part, name=f"sum{k}") if total else part
-    return dict(zip(fields, graph.split(total, {name: sizes[name] for name in fields}, axis=1)))
+        result = graph.op("Add", result, part, name=f"sum{k}") if result else part
+    return dict(zip(fields, graph.split(result, {name: sizes[name] for name in fields}, axis=1)))
 
 
 def _padded(graph: GraphBuilder, visibility: str, count: int, missing: int) -> str:
-    """[N, 16] with zeros for the degrees that the file leaves out."""
+    """[N, 16], zero for omitted degrees."""
     if not missing:
         return visibility
     zeros = graph.filled("no_visibility", (count, missing), 0.0)

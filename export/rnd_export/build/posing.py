@@ -1,7 +1,7 @@
 """From values at the nodes to posed Gaussians, as ONNX nodes; the mathematics of ``rnd_trainer.model.posing``.
 
-Vectors and matrices of the Gaussians are laid out by component, [3, 3, N] and not [N, 3, 3]: every operation then
-runs along N, where onnxruntime vectorises it. A batch of 30 000 products of 3×3 matrices takes it ten times as long.
+Values are laid out by component, [3, 3, N] and not [N, 3, 3]: operations then run along N, where onnxruntime
+vectorises. A batch of 30 000 products of 3×3 matrices takes ten times as long.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 
 @dataclass(frozen=True)
 class Posing:
-    """Writes the posing of Gaussians into ``graph``; all shapes by component."""
+    """Writes the posing of Gaussians into ``graph``; shapes are by component."""
 
     graph: GraphBuilder
 
@@ -46,7 +46,7 @@ class Posing:
 
     def multiply(self, a: str, b: str, name: str) -> str:
         """A B of [3, 3, N] each."""
-        graph, total = self.graph, ""
+        graph, product = self.graph, ""
         for k in range(3):
             part = graph.op(
                 "Mul",
@@ -54,8 +54,8 @@ class Posing:
                 graph.rows(b, [k], f"{name}_row{k}"),
                 name=f"{name}_part{k}",
             )
-            total = graph.op("Add", total, part, name=f"{name}_sum{k}") if total else part
-        return total
+            product = graph.op("Add", product, part, name=f"{name}_sum{k}") if product else part
+        return product
 
     def covariances(self, factors: str) -> str:
         """Upper triangles [N, 6] of F Fᵀ + floor², F [3, 3, N]."""
@@ -68,10 +68,10 @@ class Posing:
             graph.op("Add", upper, graph.constant("floor", floor), name="upper_floor"), "covariances"
         )
 
-    def small_rotation(self, turn: str, count: int) -> str:
+    def small_rotation(self, rotation: str, count: int) -> str:
         """Rotations [3, 3, N] of normalize(1, v/2) for v [3, N]: quadratic in the quaternion, over its square."""
         graph = self.graph
-        half = graph.op("Mul", turn, graph.constant("half", np.float32(0.5)), name="turn_half")
+        half = graph.op("Mul", rotation, graph.constant("half", np.float32(0.5)), name="turn_half")
         q = graph.op("Concat", graph.filled("one", (1, count), 1.0), half, name="q", axis=0)
         first = graph.rows(q, [i for i, _ in _PAIRS], "q_first")
         second = graph.rows(q, [j for _, j in _PAIRS], "q_second")
@@ -123,21 +123,21 @@ class Posing:
             return excess, graph.op("Add", linear, regained, name="widened")
 
     def _excess(self, area: str, length_squared: str) -> str:
-        """Newton–Schulz steps of ``rnd_trainer.model.twist.widening``, less 1; the running value is kept halved."""
+        """Newton–Schulz steps of ``rnd_trainer.model.twist.widening``, less 1; the iterate is stored halved."""
         graph = self.graph
-        floor, one, half, most = (
+        floor, one, half, three_halves = (
             graph.constant(name, np.float32(value))
             for name, value in (("floor", SMALLEST_SQUARE), ("one", 1), ("half", 0.5), ("most", 1.5))
         )
         length = graph.op("Max", length_squared, floor, name="length_floor")
-        kept = graph.op("Min", graph.op("Div", area, length, name="share_kept"), one, name="kept")
-        kept, factor = graph.op("Mul", kept, half, name="half_kept"), ""
+        ratio = graph.op("Min", graph.op("Div", area, length, name="share_kept"), one, name="kept")
+        iterate, factor = graph.op("Mul", ratio, half, name="half_kept"), ""
         for k in range(TWIST_STEPS):
-            step = graph.op("Sub", most, kept, name=f"step{k}")
+            step = graph.op("Sub", three_halves, iterate, name=f"step{k}")
             factor = graph.op("Mul", factor, step, name=f"factor{k}") if factor else step
             if k + 1 < TWIST_STEPS:
                 squared = graph.op("Mul", step, step, name=f"step{k}_squared")
-                kept = graph.op("Mul", kept, squared, name=f"half_kept{k}")
+                iterate = graph.op("Mul", iterate, squared, name=f"half_kept{k}")
         return graph.op("Sub", factor, one, name="more")
 
     def outwards(self, points: str, excess: str, levers: str) -> str:
@@ -146,7 +146,7 @@ class Posing:
             "Add", points, self.graph.op("Mul", excess, levers, name="outwards"), name="points_widened"
         )
 
-    def steepened(self, normals: str, excess: str, axes: str) -> str:
+    def widened_normals(self, normals: str, excess: str, axes: str) -> str:
         """n + κ u (u·n) [3, N]: cof(A_R C) n up to its length is cof(A_R) of this."""
         graph = self.graph
         share = graph.sum(graph.op("Mul", normals, axes, name="normal_products"), 0, "normal_share", keepdims=True)

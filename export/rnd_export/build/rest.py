@@ -18,16 +18,14 @@ STORAGE: dict[Precision, tuple[Storage, Storage, Storage]] = {
     "f16": ("f16", "f32", "f16"),
     "int8": ("u8", "u16", "f16"),
 }
-"""how a precision keeps most constants; lengths, of which a millimetre is a thousandth; and the networks"""
+"""storage of most constants, of lengths, and of the networks"""
 
 SMALLEST_LOG = 1e-4
-"""template weights this near to the smallest of their row are taken for it: 1e-4 of a weight of about 1e-6"""
+"""log weights this near to the smallest of their row are stored as it"""
 
 
 class RestConstants:
-    """What does not depend on the pose, by name. All of it becomes outputs of the graph, for players that pose by
-    themselves: see ``rnd_runtime.avatar.file``.
-    """
+    """Constants by name; all become outputs of the graph for players that pose by themselves (``avatar.file``)."""
 
     def __init__(self, graph: GraphBuilder, baked: BakedAvatar, precision: Precision) -> None:
         self._graph = graph
@@ -59,11 +57,11 @@ class RestConstants:
         """The constant ``name``, [N, C] or [N], as [*shape, N]."""
         graph = self._graph
         rows = graph.reshape(self[name], (self._shapes[name][0], -1), f"rest/{name}_rows")
-        turned = graph.op("Transpose", rows, name=f"rest/{name}_turned", perm=[1, 0])
-        return graph.reshape(turned, (*shape, -1), f"rest/{name}_by_component")
+        columns = graph.op("Transpose", rows, name=f"rest/{name}_turned", perm=[1, 0])
+        return graph.reshape(columns, (*shape, -1), f"rest/{name}_by_component")
 
     def to_outputs(self) -> None:
-        """Make outputs of all; the last thing to do."""
+        """Make outputs of all constants; to be called last."""
         for name, shape in self._shapes.items():
             kind = TensorProto.INT32 if name == "neighbours" else TensorProto.FLOAT
             self._graph.output(name, self[name], shape, kind)
@@ -72,7 +70,7 @@ class RestConstants:
         self._names[name], self._shapes[name] = value, shape
 
     def _stored(self, name: str, values: Any, storage: Storage) -> str:
-        """[N, …]; steps of few bits are spread over the range of each component."""
+        """``values`` [N, …]; quantisation is per component."""
         graph, name = self._graph, f"rest/{name}"
         if storage in ("f32", "f16"):
             return graph.stored(name, values, storage)
@@ -81,10 +79,7 @@ class RestConstants:
         return graph.reshape(rows, values.shape, name)
 
     def _log_template(self, weights: Any, storage: Storage) -> str:
-        """log W_template [N, J], each row less its smallest entry, from the entries that are larger than that.
-
-        Softmax does not see the shift. Places are kept as steps from one entry to the next.
-        """
+        """log W_template [N, J], each row less its minimum; stored sparsely, indices as differences."""
         graph = self._graph
         with graph.scope("rest/template"):
             logs = np.log(weights)
@@ -92,10 +87,9 @@ class RestConstants:
             entries = np.flatnonzero(flat > SMALLEST_LOG)
             if len(entries) == 0:  # one joint, or all alike
                 return graph.reshape(graph.filled("zeros", (flat.size,), 0.0), weights.shape, "log_template")
-            steps = np.diff(entries, prepend=0)
-            places = graph.packed("steps", steps)
-            places = graph.op("CumSum", places, graph.constant("step_axis", np.int64(0)), name="places")
+            indices = graph.packed("steps", np.diff(entries, prepend=0))
+            indices = graph.op("CumSum", indices, graph.constant("step_axis", np.int64(0)), name="places")
             values = graph.stored("log_weights", flat[entries], storage)
             zeros = graph.filled("zeros", (flat.size,), 0.0)
-            filled = graph.op("ScatterElements", zeros, places, values, name="filled", axis=0)
+            filled = graph.op("ScatterElements", zeros, indices, values, name="filled", axis=0)
             return graph.reshape(filled, weights.shape, "log_template")

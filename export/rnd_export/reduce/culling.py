@@ -1,4 +1,4 @@
-"""How much of a body's back its file may tell players to leave out."""
+"""Advice to players: below which n·v Gaussians of the body's far side may be left out."""
 
 from __future__ import annotations
 
@@ -13,44 +13,43 @@ from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.shading.light import Light
 
-from .shots import shots_around
+from .views import views_around
 
 COSINES = (-0.3, -0.4, -0.5, -0.6, -0.7, -0.8)
-"""n·v below which Gaussians may be left out; nearer to 0 outlines begin to fray"""
-MOST_DIFFERENT = 1 / 255
+"""candidates; nearer to 0 outlines begin to fray"""
+MAX_DIFFERENCE = 1 / 255
 """root mean square over all pixels, of sRGB from 0 to 1"""
 SIZE = 512
 
 
-def advised_cull(avatar: Avatar, motion: Motion) -> float | None:
-    """The greatest of ``COSINES`` that changes pictures of ``avatar`` by no more than ``MOST_DIFFERENT``.
+def find_cull(avatar: Avatar, motion: Motion) -> float | None:
+    """The greatest of ``COSINES`` that changes images of ``avatar`` by ``MAX_DIFFERENCE`` at most; None for none.
 
-    They are taken all along ``motion`` and from all around, of ``SIZE`` pixels that the body fills, under the light
-    that was learned. None where no cosine does: a body with holes, or one that is seen through.
+    The views are all along ``motion`` and all around, ``SIZE`` pixels wide, under the learned light.
     """
-    around = shots_around(motion, SIZE, lambda time: avatar.pose(motion, time))
-    shots = [*around.seen, *around.held_out]
-    renderer = FrameRenderer(avatar, Light(avatar.trained_light), shots[0].camera, cull=-1)
+    around = views_around(motion, SIZE, lambda time: avatar.pose(motion, time))
+    views = [*around.seen, *around.held_out]
+    renderer = FrameRenderer(avatar, Light(avatar.trained_light), views[0].camera, cull=-1)
 
-    def pictures() -> list[Floats]:
-        drawn = []
-        for shot in shots:
-            renderer.camera = shot.camera
-            radiance = renderer.render(motion, shot.time).radiance
-            drawn.append(linear_to_srgb(np.clip(radiance, 0, 1)))
-        return drawn
+    def images() -> list[Floats]:
+        rendered = []
+        for view in views:
+            renderer.camera = view.camera
+            radiance = renderer.render(motion, view.time).radiance
+            rendered.append(linear_to_srgb(np.clip(radiance, 0, 1)))
+        return rendered
 
-    whole = pictures()
+    full = images()
     for cosine in COSINES:
         renderer.cull = cosine
-        squares = [np.mean((culled - all_) ** 2) for culled, all_ in zip(pictures(), whole)]
-        if np.mean(squares) <= MOST_DIFFERENT**2:
+        squares = [np.mean((culled - reference) ** 2) for culled, reference in zip(images(), full)]
+        if np.mean(squares) <= MAX_DIFFERENCE**2:
             return cosine
     return None
 
 
-def advise(model: onnx.ModelProto, cull: float | None) -> None:
-    """Write ``cull`` into ``model`` for players; nothing is written for None or −1, which leave nothing out."""
+def add_advice(model: onnx.ModelProto, cull: float | None) -> None:
+    """Write ``cull`` into ``model``; nothing for None or −1, which leave nothing out."""
     if cull is not None and cull > -1:
         advice = msgspec.json.encode(PlayerAdvice(cull=cull)).decode()
         model.metadata_props.add(key=ADVICE_KEY, value=advice)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_export.bake import BakedAvatar, BakedSkinning, Rates
-from rnd_export.order import moving_sites, nodes_in_order
+from rnd_export.order import moving_sites, permute_nodes
 from rnd_runtime.avatar.file import EncoderKind, Precision
 from rnd_runtime.core.errors import InputError, flag
 from rnd_runtime.core.sh import SH_DEGREE
@@ -18,11 +18,10 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
 
 COARSE_SHARE = 4
-"""``coarse`` evaluates the networks at one of this many nodes: 23 mm apart become 45 mm on a person"""
-
+"""``coarse`` evaluates the networks at one of this many nodes"""
 
 OWN_NODES = {"skinning_nodes": "skinning", "offset_nodes": "offsets", "visibility_nodes": "visibility"}
-"""fields of ``Variant`` that concern one network each, and which of ``Rates`` that is"""
+"""fields of ``Variant`` → fields of ``Rates``"""
 
 
 @dataclass(frozen=True)
@@ -30,13 +29,13 @@ class Variant:
     """One way of writing an avatar; the defaults leave nothing out.
 
     Attributes:
-        encoder: ``full``; ``coarse``: the networks at ``nodes`` points, by default a quarter of the checkpoint's;
+        encoder: ``full``; ``coarse``: networks at ``nodes`` points, by default a quarter of the checkpoint's;
             ``static``: the template's skinning weights, no attention.
-        precision: how constants are stored; arithmetic is float32 always.
+        precision: of stored constants; arithmetic is float32.
         nodes: M, a prefix of the farthest-point order; for ``coarse``.
-        skinning_nodes, offset_nodes, visibility_nodes: of these M, at how many that network alone is evaluated.
-        window_poses: d; fewer poses span the same seconds, those between are interpolated.
-        visibility_degree: 0 to 3; higher coefficients are left out.
+        skinning_nodes, offset_nodes, visibility_nodes: of these M, at how many that network is evaluated.
+        window_poses: d; fewer poses span the same seconds.
+        visibility_degree: 0 to 3; higher SH coefficients are left out.
     """
 
     encoder: EncoderKind = "full"
@@ -56,27 +55,26 @@ class Variant:
 
     def rates(self, config: ModelConfig) -> Rates:
         """Nodes of each network, of the M of the file."""
-        most = self.node_count(config)
-        return Rates(**{network: getattr(self, name) or most for name, network in OWN_NODES.items()})
+        count = self.node_count(config)
+        return Rates(**{network: getattr(self, name) or count for name, network in OWN_NODES.items()})
 
     def check(self, config: ModelConfig) -> None:
         """Raise ``InputError`` for what no file of this checkpoint can be."""
-        least = {
+        low = {
             **dict.fromkeys(["nodes", *OWN_NODES], NEIGHBOURS),
             "window_poses": 2 if config.window_poses > 1 else 1,
             "visibility_degree": 0,
         }
-        most = {
+        high = {
             "nodes": config.nodes,
             **dict.fromkeys(OWN_NODES, self.node_count(config)),
             "window_poses": config.window_poses,
             "visibility_degree": SH_DEGREE,
         }
-        for name, low in least.items():
+        for name in low:
             value = getattr(self, name)
-            if value is not None and not low <= value <= most[name]:
-                option = flag(name)
-                raise InputError(option, expected=f"{low} to {most[name]}", got=value)
+            if value is not None and not low[name] <= value <= high[name]:
+                raise InputError(flag(name), expected=f"{low[name]} to {high[name]}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
         static = self.encoder == "static" or not config.dynamic_skinning
@@ -113,8 +111,8 @@ def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedA
 
 
 def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
-    """The template's skinning at the nodes ``still`` [M]; the others come first in the file's order."""
-    moved = nodes_in_order(baked, np.argsort(still, kind="stable"))
+    """``baked`` with the template's skinning at the nodes ``still`` [M], which become the last ones."""
+    moved = permute_nodes(baked, np.argsort(still, kind="stable"))
     moved = dataclasses.replace(moved, dynamic_nodes=int((~still).sum()))
     if len(moving_sites(moved)):
         return moved
@@ -122,18 +120,18 @@ def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
 
 
 def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:
-    """Tokens of ``fewer`` poses: the first layer reads the missing ones off the line between their neighbours."""
+    """``skinning`` for ``fewer`` poses: its first layer interpolates the missing ones."""
     module = dict(skinning.temporal.module)
     weight = module["embed.weight"]  # [width, poses · 6]
-    spread = line_through(poses, fewer)
-    module["embed.weight"] = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), spread).reshape(
+    interpolation = line_through(poses, fewer)
+    module["embed.weight"] = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), interpolation).reshape(
         len(weight), fewer * 6
     )
     return dataclasses.replace(skinning, temporal=dataclasses.replace(skinning.temporal, module=module))
 
 
 def line_through(poses: int, fewer: int) -> NDArray[np.float64]:
-    """[poses, fewer]: piecewise linear interpolation of evenly spaced values, ends kept."""
-    places = np.linspace(0, fewer - 1, poses)
-    weights: NDArray[np.float64] = np.maximum(0, 1 - np.abs(places[:, None] - np.arange(fewer)))
+    """[poses, fewer]: weights of the piecewise linear interpolation of evenly spaced values."""
+    positions = np.linspace(0, fewer - 1, poses)
+    weights: NDArray[np.float64] = np.maximum(0, 1 - np.abs(positions[:, None] - np.arange(fewer)))
     return weights

@@ -1,8 +1,9 @@
-"""rnd-export with a bound: the search is shown step by step, its file written, and what was found recorded."""
+"""rnd-export with a bound: run the search, print its steps, write the file and a row of what was found."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -10,104 +11,111 @@ from time import perf_counter
 import numpy as np
 import onnx
 from numba import get_num_threads
-from rich.console import Console
 
-from rnd_export.cli import BOUNDS, Options
 from rnd_export.export import export
-from rnd_export.reduce.shots import shots_of
+from rnd_export.reduce.views import views_of
 from rnd_runtime.capture.capture import load_capture
-from rnd_runtime.core.console import print_plain
-from rnd_runtime.core.errors import InputError, flag
 from rnd_runtime.core.files import atomic_path, earlier_rows, write_json
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.doctor import machine
-from rnd_runtime.shading.light import Light, light_notes, load_light
+from rnd_runtime.shading.light import Light, Up, light_notes, load_light
 from rnd_trainer.model.checkpoint import Checkpoint
-from rnd_trainer.training.notes import say_notes
 
 from .budget import Bound, Found, given_up, search
-from .candidates import Scene, Workbench
+from .candidates import SearchScene, Workbench
+
+
+@dataclass(frozen=True)
+class BoundedSearch:
+    """A bound, and in what it is searched: views of ``capture`` or around ``motion``, ``size`` pixels wide.
+
+    ``hdr`` is by default the learned light; the search's row is added to the file ``json``.
+    """
+
+    bound: Bound
+    motion: Motion
+    size: int
+    hdr: Path | None = None
+    hdr_up: Up = "y"
+    capture: Path | None = None
+    json: Path | None = None
 
 
 def export_bounded(
-    options: Options, checkpoint: Checkpoint, out: Path, motion: Motion, given: dict[str, float]
+    checkpoint: Checkpoint,
+    out: Path,
+    what: BoundedSearch,
+    *,
+    show: Callable[[str], None],
+    warn: Callable[[Iterable[str]], None],
 ) -> None:
-    """Write the cheapest file that keeps the bound ``given`` {kind: value}, and say what it gave up.
+    """Write the cheapest file of ``checkpoint`` that keeps the bound, and ``show`` its steps and what it gave up.
 
-    It is looked for in the views of ``options.capture``, or where there is none in shots of ``motion``.
-
-    Raises ``InputError`` for several bounds, one that is not positive, or one that no file keeps.
+    Raises:
+        InputError: no file keeps the bound, or the whole avatar's file differs from torch.
     """
-    if len(given) > 1:
-        raise InputError("bounds", expected=f"one of {', '.join(map(flag, BOUNDS.values()))}", got=f"{len(given)}")
-    ((kind, value),) = given.items()
-    if not value > 0:
-        raise InputError(flag(BOUNDS[kind]), expected="more than 0", got=value)
-    rows = (
-        [] if options.json is None else earlier_rows(options.json, what="rows of an earlier search", names=("bound",))
-    )
+    rows = [] if what.json is None else earlier_rows(what.json, what="rows of an earlier search", names=("bound",))
     started = perf_counter()
-    light = Light(checkpoint.probe.numpy()) if options.hdr is None else load_light(options.hdr, up=options.hdr_up)
-    if options.hdr is not None:
-        say_notes("rnd-export", light_notes(light))
-    if options.capture is None:
-        scene = Scene(motion, light, options.size)
-    else:
-        capture = load_capture(options.capture)
-        moves = capture.motion_for(checkpoint.skeleton)
-        say_notes("rnd-export", moves.notes)
-        scene = Scene(moves, light, options.size, shots=shots_of(capture, options.size))
-    # all that follows is held against the whole avatar: it has to be torch's
-    with TemporaryDirectory() as folder:
-        export(checkpoint, Path(folder) / "avatar.onnx", motion, cull=-1)
-    bench = Workbench(checkpoint, scene)
-    console, steps = Console(), []
+    scene = _scene(checkpoint, what, warn)
+    with TemporaryDirectory() as folder:  # the reference of the search has to agree with torch
+        export(checkpoint, Path(folder) / "avatar.onnx", what.motion, cull=-1)
+    bench, steps = Workbench(checkpoint, scene), []
 
-    def show(found: Found) -> None:
+    def on_step(found: Found) -> None:
         steps.append(found)
-        what = found.measured
-        line = f"{what.ms:7.2f} ms {what.mb:6.2f} MB {what.psnr:6.1f} dB  {', '.join(given_up(bench, found.plan))}"
-        console.print(line, highlight=False, soft_wrap=True)
+        got = found.measured
+        show(f"{got.ms:7.2f} ms {got.mb:6.2f} MB {got.psnr:6.1f} dB  {', '.join(given_up(bench, found.plan))}")
 
-    found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
+    found = search(bench, what.bound, on_step)
     while bench.recalibrated():
-        if kind == "ms":
-            console.print("the machine was busy when the search began, and is calmer now: it begins again")
+        if what.bound.kind == "ms":
+            show("the machine was busy when the search began: it begins again")
             steps.clear()
-            found = search(bench, Bound(kind, value), show)  # type: ignore[arg-type]
-        else:  # what was chosen is the same; what is told of it is not
+            found = search(bench, what.bound, on_step)
+        else:  # times did not decide; only those reported are measured again
             found = replace(found, held_out=bench.measure(found.model, bench.held_out))
             steps[0] = replace(steps[0], measured=bench.measure(steps[0].model, bench.seen))
     with atomic_path(out) as temporary:
         onnx.save_model(found.model, str(temporary))
     assert found.held_out is not None
-    held, lost = found.held_out, "; ".join(given_up(bench, found.plan))
+    held_out, lost = found.held_out, "; ".join(given_up(bench, found.plan))
     usual = bench.usual_times(found.model)
     median, p95 = float(np.median(usual)), float(np.percentile(usual, 95))
-    print_plain(
-        console,
-        f"{out}: {held.mb:.2f} MB, {held.ms:.2f} ms and {held.psnr:.1f} dB in shots that the search has not seen "
-        f"(in this machine's calm moments; just now {median:.1f} ms, 95 frames of a hundred within {p95:.1f}). "
-        f"Given up: {lost}",
+    show(
+        f"{out}: {held_out.mb:.2f} MB, {held_out.ms:.2f} ms and {held_out.psnr:.1f} dB in held-out views "
+        f"(on the idle machine; now {median:.1f} ms, p95 {p95:.1f} ms). Given up: {lost}"
     )
-    if options.json is not None:
-        row = {
-            "bound": f"{flag(BOUNDS[kind])} {value:g}",
-            "given_up": lost,
-            "ms": held.ms,
-            "ms_median": median,
-            "ms_p95": p95,
-            "mb": held.mb,
-            "psnr_db": held.psnr,
-            "whole_ms": steps[0].measured.ms,
-            "whole_mb": steps[0].measured.mb,
-            "steps": len(steps) - 1,
-            "minutes": (perf_counter() - started) / 60,
-            "gaussians": bench.config.gaussians,
-            "size": options.size,
-            "shade": scene.shade,
-            "shots": "around" if options.capture is None else "capture",
-            "threads": get_num_threads(),
-            "machine": machine(),
-        }
-        write_json(options.json, [*(old for old in rows if old["bound"] != row["bound"]), row])
+    if what.json is None:
+        return
+    row = {
+        "bound": str(what.bound),
+        "given_up": lost,
+        "ms": held_out.ms,
+        "ms_median": median,
+        "ms_p95": p95,
+        "mb": held_out.mb,
+        "psnr_db": held_out.psnr,
+        "whole_ms": steps[0].measured.ms,
+        "whole_mb": steps[0].measured.mb,
+        "steps": len(steps) - 1,
+        "minutes": (perf_counter() - started) / 60,
+        "gaussians": bench.config.gaussians,
+        "size": what.size,
+        "shade": scene.shade,
+        "shots": "around" if what.capture is None else "capture",
+        "threads": get_num_threads(),
+        "machine": machine(),
+    }
+    write_json(what.json, [*(old for old in rows if old["bound"] != row["bound"]), row])
+
+
+def _scene(checkpoint: Checkpoint, what: BoundedSearch, warn: Callable[[Iterable[str]], None]) -> SearchScene:
+    light = Light(checkpoint.probe.numpy()) if what.hdr is None else load_light(what.hdr, up=what.hdr_up)
+    if what.hdr is not None:
+        warn(light_notes(light))
+    if what.capture is None:
+        return SearchScene(what.motion, light, what.size)
+    capture = load_capture(what.capture)
+    motion = capture.motion_for(checkpoint.skeleton)
+    warn(motion.notes)
+    return SearchScene(motion, light, what.size, views=views_of(capture, what.size))

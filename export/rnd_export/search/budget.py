@@ -1,9 +1,8 @@
-"""No more than a scene needs: the cheapest file of an avatar that keeps a bound, found on this machine.
+"""Greedy search for the cheapest file of an avatar that keeps a bound, on this machine.
 
-The search starts from the whole avatar and takes, one after another, the step that saves most for what it costs in the
-picture. Steps that a bound of time or size turns out not to need are then taken back, the dearest in the picture first.
-Pictures are compared with those of the whole avatar under the same player, light and poses, the worst one counts. What
-is found must keep the bound in shots that the search has not seen; a file that does not is given up for the one before.
+It starts from the whole avatar and takes, one after another, the step that saves most for its loss of PSNR. Under a
+bound of time or size, steps that turn out not to be needed are taken back. PSNR is the worst view's, against the whole
+avatar under the same player, light and poses. The result must keep the bound in held-out views.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 import onnx
 
 from rnd_export.reduce.variant import OWN_NODES, Variant
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, flag
 from rnd_trainer.config import ModelConfig
 
 from .candidates import Measured, Recipe, Workbench
@@ -34,12 +33,14 @@ LADDERS: dict[str, tuple[float, ...]] = {
     "visibility_degree": (2, 1, 0),
     "window": (0.5, 0.3, 0.2),
 }
-"""steps of each choice away from the whole; nodes, Gaussians and window poses as shares of the checkpoint's, nodes of
-one network as shares of the file's"""
+"""steps of each choice; nodes, Gaussians and window poses as shares of the checkpoint's, nodes of one network as shares
+of the file's"""
 MARGIN_DB = 0.3
-"""that the search keeps from a least PSNR: shots it has not seen are a little worse"""
-LEAST_GAIN = 0.01
-"""of the cost: a step goes down a ladder to the first rung that saves more, and others are taken when none is left"""
+"""above a required PSNR: held-out views are a little worse"""
+MIN_GAIN = 0.01
+"""share of the cost that a step must save; smaller steps are taken when none is left"""
+OPTIONS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
+"""options of the command, by kind of bound"""
 
 
 @dataclass(frozen=True)
@@ -49,15 +50,18 @@ class Bound:
     kind: Literal["ms", "psnr", "mb"]
     value: float
 
-    def held(self, found: Measured) -> bool:
-        """Does a file of which ``found`` was measured keep it?"""
+    def __str__(self) -> str:
+        return f"{flag(OPTIONS[self.kind])} {self.value:g}"
+
+    def kept_by(self, found: Measured) -> bool:
+        """Whether a file with these measurements keeps the bound."""
         value: float = getattr(found, self.kind)
         return value >= self.value if self.kind == "psnr" else value <= self.value
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How many rungs down each of ``LADDERS`` a file is."""
+    """A file, as the number of steps down each of ``LADDERS``."""
 
     precision: int = 0
     cull: int = 0
@@ -71,7 +75,7 @@ class Plan:
     window: int = 0
 
     def recipe(self, config: ModelConfig) -> Recipe:
-        """For a checkpoint of ``config``."""
+        """The recipe for a checkpoint of ``config``."""
 
         def rung(name: str) -> float | None:
             at = getattr(self, name)
@@ -79,8 +83,8 @@ class Plan:
 
         nodes, gaussians, window, degree = (rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree"))
         static = rung("dynamic_mm") == np.inf
-        most = _nodes(nodes, config.nodes) or config.nodes
-        own = {name: _nodes(rung(name), most) for name in OWN_NODES}
+        node_count = _nodes(nodes, config.nodes) or config.nodes
+        own = {name: _nodes(rung(name), node_count) for name in OWN_NODES}
         if static:
             own["skinning_nodes"] = None
         variant = Variant(
@@ -91,18 +95,18 @@ class Plan:
             window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
             visibility_degree=3 if degree is None else int(degree),
         )
-        count = max(int(gaussians * config.gaussians), most) if gaussians else None  # nodes stay
+        count = max(int(gaussians * config.gaussians), node_count) if gaussians else None
         return Recipe(variant, count, rung("dynamic_mm") or 0.0, rung("cull"))
 
 
-def _nodes(share: float | None, most: int) -> int | None:
-    """That share of ``most`` nodes."""
-    return None if share is None else min(max(16, int(share * most)), most)
+def _nodes(share: float | None, count: int) -> int | None:
+    """That share of ``count`` nodes."""
+    return None if share is None else min(max(16, int(share * count)), count)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A plan, its file, and what was measured on the shots of the search and, at the end, on the others."""
+    """A plan, its file, and measurements in the views of the search and, at the end, in held-out ones."""
 
     plan: Plan
     model: onnx.ModelProto
@@ -111,20 +115,21 @@ class Found:
 
 
 def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> Found:
-    """The cheapest file that keeps ``bound``, on held-out shots too; ``on_step`` sees every step taken.
+    """The cheapest file that keeps ``bound``, in held-out views too; ``on_step`` gets every step taken.
 
-    Raises ``InputError`` where no file of the ladders does.
+    Raises:
+        InputError: no file of the ladders keeps it.
     """
-    path, worths = [_made(bench, Plan())], dict.fromkeys(LADDERS, np.inf)
+    path, worths = [_make(bench, Plan())], dict.fromkeys(LADDERS, np.inf)
     on_step(path[-1])
     while True:
         now = path[-1]
-        if bound.kind != "psnr" and bound.held(now.measured):
+        if bound.kind != "psnr" and bound.kept_by(now.measured):
             now = path[-1] = _tested(bench, now)
-            if _kept(bound, now):
+            if _holds(bound, now):
                 return _relaxed(bench, bound, now, on_step)
         step = _best_step(bench, bound, now, worths)
-        if step is None and bound.kind != "psnr":  # each for itself saves little, all of them may be enough
+        if step is None and bound.kind != "psnr":  # small steps may add up
             step, worths = _mildest_step(bench, bound, now), dict.fromkeys(LADDERS, np.inf)
         if step is None:
             break
@@ -132,7 +137,7 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
         on_step(step)
     for found in reversed(path):
         tested = _tested(bench, found)
-        if _kept(bound, tested):
+        if _holds(bound, tested):
             return tested
     raise InputError(
         f"no file keeps the bound of {bound.kind}",
@@ -142,17 +147,14 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
 
 
 def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Found], None]) -> Found:
-    """``found`` with steps taken back for as long as ``bound`` holds: of each round's, what the picture gains most by.
-
-    What saved most for its cost at first may be dear beside what was found later, and the last step may save too much.
-    """
+    """``found`` with steps taken back while ``bound`` holds; in each round the one that gains most PSNR."""
     while True:
         plans = [_next(bench, found.plan, name, -1) for name in LADDERS]
-        made = [_made(bench, plan) for plan in plans if plan is not None]
-        gains = (f for f in made if bound.held(f.measured) and f.measured.psnr > found.measured.psnr)
-        for candidate in sorted(gains, key=_square):
+        made = [_make(bench, plan) for plan in plans if plan is not None]
+        gains = (f for f in made if bound.kept_by(f.measured) and f.measured.psnr > found.measured.psnr)
+        for candidate in sorted(gains, key=_squared_error):
             tested = _tested(bench, candidate)
-            if _kept(bound, tested):
+            if _holds(bound, tested):
                 found = tested
                 on_step(found)
                 break
@@ -161,19 +163,19 @@ def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Fo
 
 
 def _tested(bench: Workbench, found: Found) -> Found:
-    """``found``, measured on the shots that the search does not see too: once, as no time is measured twice alike."""
+    """``found``, measured in held-out views too; once, since a repeated time differs."""
     return found if found.held_out else replace(found, held_out=bench.measure(found.model, bench.held_out))
 
 
-def _kept(bound: Bound, found: Found) -> bool:
-    return found.held_out is not None and bound.held(found.held_out)
+def _holds(bound: Bound, found: Found) -> bool:
+    return found.held_out is not None and bound.kept_by(found.held_out)
 
 
 def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, float]) -> Found | None:
-    """Of the steps further down, the one that saves most for what it costs in the picture.
+    """The step down that saves most cost per loss of PSNR.
 
-    ``worths`` of each ladder are remembered from earlier rounds, and looked at again only where they promise most:
-    what saves little once seldom saves more later.
+    Args:
+        worths: of each ladder in earlier rounds, an upper bound in practice; only the most promising are measured.
     """
     made: dict[str, Found] = {}
     while True:
@@ -182,29 +184,29 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
             return None
         if name in made:
             return made[name]
-        found = _further(bench, bound, now, name, LEAST_GAIN)
+        found = _further(bench, bound, now, name, MIN_GAIN)
         if found is None or (bound.kind == "psnr" and found.measured.psnr < bound.value + MARGIN_DB):
             worths[name] = 0
             continue
-        worths[name] = _saved(bound, now, found) / max(_square(found) - _square(now), 1e-9)
+        worths[name] = _saved(bound, now, found) / max(_squared_error(found) - _squared_error(now), 1e-9)
         made[name] = found
 
 
 def _mildest_step(bench: Workbench, bound: Bound, now: Found) -> Found | None:
-    """Of the steps further down, the one that costs least in the picture; of size, that makes the file any smaller."""
-    least = 0.0 if bound.kind == "mb" else -np.inf  # of time, that may be noise
+    """The step down that loses least PSNR; under a bound of size, one that makes the file smaller."""
+    least = 0.0 if bound.kind == "mb" else -np.inf  # a saved time may be noise
     steps = [_further(bench, bound, now, name, least) for name in LADDERS]
-    return min((step for step in steps if step is not None), key=_square, default=None)
+    return min((step for step in steps if step is not None), key=_squared_error, default=None)
 
 
 def _further(bench: Workbench, bound: Bound, now: Found, name: str, least: float) -> Found | None:
-    """The first rung of ``name`` down the ladder that saves more than ``least`` of the cost; None where none does.
+    """The first rung further down ladder ``name`` that saves more than ``least`` of the cost, or None.
 
-    The first rungs of a ladder may save nothing, as those of dynamic skinning do of the size until it is static.
+    Early rungs may save nothing: dynamic skinning saves size only once all of it is static.
     """
     plan = _next(bench, now.plan, name, 1)
     while plan is not None:
-        found = _made(bench, plan)
+        found = _make(bench, plan)
         if _saved(bound, now, found) > least:
             return found
         plan = _next(bench, plan, name, 1)
@@ -212,16 +214,15 @@ def _further(bench: Workbench, bound: Bound, now: Found, name: str, least: float
 
 
 def _saved(bound: Bound, now: Found, found: Found) -> float:
-    """Share of the cost, the size for a bound of it and the time for others, that ``found`` saves over ``now``."""
+    """Share of the cost (size for a bound of size, else time) that ``found`` saves over ``now``."""
     cost = "mb" if bound.kind == "mb" else "ms"
     return float(1 - getattr(found.measured, cost) / getattr(now.measured, cost))
 
 
-def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan | None:
-    """The next rung of ``name`` down the ladder, or up for −1, that makes another file that is allowed; None at its
-    end."""
-    last = len(LADDERS[name]) if way > 0 else 0
-    for rung in range(getattr(plan, name) + way, last + way, way):
+def _next(bench: Workbench, plan: Plan, name: str, direction: Literal[1, -1]) -> Plan | None:
+    """The next rung of ladder ``name``, down (1) or up (−1), that makes a different, allowed file; None at its end."""
+    last = len(LADDERS[name]) if direction > 0 else 0
+    for rung in range(getattr(plan, name) + direction, last + direction, direction):
         other = replace(plan, **{name: rung})
         recipe = other.recipe(bench.config)
         if recipe != plan.recipe(bench.config) and bench.allows(recipe.variant.precision):
@@ -229,17 +230,17 @@ def _next(bench: Workbench, plan: Plan, name: str, way: Literal[1, -1]) -> Plan 
     return None
 
 
-def _made(bench: Workbench, plan: Plan) -> Found:
+def _make(bench: Workbench, plan: Plan) -> Found:
     model = bench.model(plan.recipe(bench.config))
     return Found(plan, model, bench.measure(model, bench.seen))
 
 
-def _square(found: Found) -> float:
+def _squared_error(found: Found) -> float:
     return float(10 ** (-found.measured.psnr / 10))
 
 
 def given_up(bench: Workbench, plan: Plan) -> list[str]:
-    """What a file of ``plan`` leaves out, a line each."""
+    """What a file of ``plan`` leaves out, a phrase each."""
     recipe, config = plan.recipe(bench.config), bench.config
     lines = []
     if recipe.cull is not None:

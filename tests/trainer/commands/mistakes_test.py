@@ -66,10 +66,6 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         (f"rnd-train {CAPTURE} --out OUT --device mps", "--device: expected cpu, cuda or cuda:NUMBER, got mps"),
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --cull -2", "--cull: expected a cosine, from -1 to 1, got -2"),
-        (
-            "rnd-export OUT/avatar.ckpt --target visionary --motion walk.npz --cull -0.5",
-            "--cull: expected the default, got -0.5 (is for avatars",
-        ),
         ("rnd-export OUT/avatar.ckpt --frames 1", "--frames: expected 2 to 1000, got 1"),
         (f"rnd-export {BODY} --out {BODY}", "output: expected another file than what is read, got"),
         (f"rnd-export {BODY} --out a.json", "--out: expected a name in .onnx, got a.json"),

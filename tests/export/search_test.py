@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -15,15 +14,14 @@ from scipy.spatial import cKDTree
 
 from rnd_export.bake import BakedAvatar, bake
 from rnd_export.cli import main
-from rnd_export.export import random_motion
-from rnd_export.order import gaussians_by_place, moving_sites
+from rnd_export.order import moving_sites, order_gaussians
+from rnd_export.parity import random_motion
 from rnd_export.reduce.merge import fitted_albedo, merged
-from rnd_export.reduce.shots import COUNT, FITTED, resized, shots_around, shots_of
 from rnd_export.reduce.variant import OWN_NODES, Variant, reduced, static_where
-from rnd_export.search import candidates
+from rnd_export.reduce.views import COUNT, FIT_COUNT, resized, views_around, views_of
 from rnd_export.search.budget import LADDERS, Bound, Found, Plan, given_up, search
-from rnd_export.search.candidates import Measured, Recipe, Scene, Workbench
-from rnd_export.search.stopwatch import Stopwatch
+from rnd_export.search.candidates import Measured, Recipe, SearchScene, Workbench
+from rnd_export.search.timing import PairedTimer
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.file import read_metadata
 from rnd_runtime.avatar.onnx_parts import OnnxFile
@@ -50,7 +48,7 @@ def _clock(avatar: Avatar) -> float:
 def bench(tiny_checkpoint) -> Workbench:
     moves = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=60, seed=5)
     light = Light(np.ones((32, 64, 3), np.float32))
-    return Workbench(load_checkpoint(tiny_checkpoint), Scene(moves, light, size=96, shade="table"), _clock)
+    return Workbench(load_checkpoint(tiny_checkpoint), SearchScene(moves, light, size=96, shade="table"), _clock)
 
 
 def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
@@ -60,7 +58,7 @@ def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
     assert again.psnr == found.held_out.psnr >= 32.0
     whole = steps[0].measured
     assert found.measured.ms < 0.9 * whole.ms and whole.psnr > 100
-    seen, held_out = ({shot.time for shot in shots} for shots in (bench.seen, bench.held_out))
+    seen, held_out = ({view.time for view in views} for views in (bench.seen, bench.held_out))
     assert not seen & held_out
 
 
@@ -114,20 +112,6 @@ def test_options_that_would_do_nothing_are_refused(
     assert end.value.code == 2 and refused in capsys.readouterr().err and not out.exists()
 
 
-def test_a_bound_is_searched_only_where_the_whole_avatar_is_torchs(
-    tiny_checkpoint, tmp_path, monkeypatch, capsys
-) -> None:
-    def drifts(*_: object, **__: object) -> None:
-        raise InputError("export refused: places of onnxruntime and torch differ")
-
-    out = tmp_path / "small.onnx"
-    monkeypatch.setattr("rnd_export.search.bounded.export", drifts)
-    monkeypatch.setattr("sys.argv", ["rnd-export", str(tiny_checkpoint), "--min-psnr", "45", "--out", str(out)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2 and "export refused: places" in capsys.readouterr().err and not out.exists()
-
-
 class _Formula:
     """A workbench whose files are their recipes and whose measures follow from them."""
 
@@ -139,13 +123,13 @@ class _Formula:
     def model(self, recipe: Recipe) -> Recipe:
         return recipe
 
-    def measure(self, recipe: Recipe, shots: str) -> Measured:
+    def measure(self, recipe: Recipe, views: str) -> Measured:
         variant = recipe.variant
         n, m = recipe.gaussians or self.config.gaussians, variant.nodes or self.config.nodes
         dynamic = 1 / (1 + recipe.dynamic_mm)
         bits = {"f32": 1.0, "f16": 0.6, "int8": 0.4}[variant.precision]
         square = 1e-9 + 1e-5 * (1 - bits) + 1e-4 * (1 - n / 30_000) + 2e-5 * (1 - dynamic) + 1e-5 * (1 - m / 7_500)
-        square *= 1 + self._harder * (shots == "held out")
+        square *= 1 + self._harder * (views == "held out")
         mb = bits * (1 + n / 10_000)
         return Measured(float(-10 * np.log10(square)), 4 + n / 5_000 + m / 1_500 * dynamic, mb)
 
@@ -170,19 +154,6 @@ def test_cost_bounds_hold_and_no_more_is_given_up_than_needed(kind, value) -> No
     assert given_up(bench, found.plan) != ["nothing"] == given_up(bench, Plan())
 
 
-class _Busy(_Formula):
-    """The same on a machine that is three times as slow while the first steps are looked at."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._calls = 0
-
-    def measure(self, recipe: Recipe, shots: str) -> Measured:
-        self._calls += 1
-        what = super().measure(recipe, shots)
-        return what._replace(ms=what.ms * (3 if 2 <= self._calls <= 8 else 1))
-
-
 class _Machine:
     """A clock, and players whose frames take so many ms of it, three times as many from a moment on, or until one."""
 
@@ -200,30 +171,30 @@ class _Machine:
 @pytest.mark.parametrize("busy_from", [0.4, 0.5, 0.7, 9.0])
 def test_a_busy_machine_does_not_make_a_file_slower(busy_from) -> None:
     machine = _Machine(busy_from)
-    stopwatch = Stopwatch(machine.player(20.0), lambda: machine.seconds)
-    assert stopwatch.ms(machine.player(20.0)) == pytest.approx(20.0)
-    assert stopwatch.ms(machine.player(15.0)) == pytest.approx(15.0)
+    timer = PairedTimer(machine.player(20.0), lambda: machine.seconds)
+    assert timer.ms(machine.player(20.0)) == pytest.approx(20.0)
+    assert timer.ms(machine.player(15.0)) == pytest.approx(15.0)
 
 
 def test_times_of_a_busy_and_of_a_calm_machine_can_be_compared() -> None:
     """Busy from the start and calm later: the same file, timed in either, takes as long."""
     machine = _Machine(9.0)
     machine.busy_until = 3.0
-    stopwatch = Stopwatch(machine.player(20.0), lambda: machine.seconds)
-    busy = stopwatch.ms(machine.player(10.0))
+    timer = PairedTimer(machine.player(20.0), lambda: machine.seconds)
+    busy = timer.ms(machine.player(10.0))
     machine.seconds = 3.0
-    assert stopwatch.ms(machine.player(10.0)) == pytest.approx(busy)
+    assert timer.ms(machine.player(10.0)) == pytest.approx(busy)
 
 
 def test_a_machine_that_becomes_calm_is_noticed_once() -> None:
     machine = _Machine(99.0)
     machine.busy_until = 9.0
-    stopwatch = Stopwatch(machine.player(20.0), lambda: machine.seconds)
-    assert stopwatch.ms(machine.player(10.0)) == pytest.approx(30.0) and not stopwatch.recalibrated()
+    timer = PairedTimer(machine.player(20.0), lambda: machine.seconds)
+    assert timer.ms(machine.player(10.0)) == pytest.approx(30.0) and not timer.recalibrated()
     machine.seconds = 9.0
-    stopwatch.ms(machine.player(10.0))
-    assert stopwatch.recalibrated() and not stopwatch.recalibrated()
-    assert stopwatch.ms(machine.player(10.0)) == pytest.approx(10.0)
+    timer.ms(machine.player(10.0))
+    assert timer.recalibrated() and not timer.recalibrated()
+    assert timer.ms(machine.player(10.0)) == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("bound", ["--target-ms", "--max-mb"])
@@ -242,31 +213,6 @@ def test_a_search_on_a_busy_machine_begins_again_where_time_counts(
     assert ("begins again" in said) == (bound == "--target-ms")
 
 
-def test_what_was_measured_unseen_is_measured_once() -> None:
-    """A time that just held may not hold again: what ended the search is what is told."""
-    bench = _Formula()
-    measured = []
-    original = bench.measure
-    bench.measure = lambda recipe, shots: measured.append((recipe, shots)) or original(recipe, shots)
-    found = search(bench, Bound("ms", 9.0), lambda found: None)
-    unseen = [recipe for recipe, shots in measured if shots == "held out"]
-    assert unseen.count(found.model) == 1 and found.held_out.ms <= 9.0
-
-
-def test_a_busy_moment_does_not_end_the_search() -> None:
-    found = search(_Busy(), Bound("ms", 9.0), lambda found: None)
-    assert found.held_out.ms <= 9.0
-    assert _Formula().measure(found.model, "seen").psnr > 40  # and little more is given up for it
-
-
-def test_what_no_step_reaches_is_refused_at_the_last() -> None:
-    steps = []
-    with pytest.raises(InputError, match="no file keeps the bound of ms"):
-        search(_Formula(), Bound("ms", 1.0), steps.append)
-    deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
-    assert steps[-1].plan.recipe(CONFIG) == deepest.recipe(CONFIG)
-
-
 def test_what_cannot_be_kept_is_refused() -> None:
     with pytest.raises(InputError, match=r"no file keeps the bound of mb: expected 0\.01"):
         search(_Formula(), Bound("mb", 0.01), lambda found: None)
@@ -276,8 +222,8 @@ class _StaticAtLast(_Formula):
     """The size of a dynamic file: skinning at fewer nodes stores a little more, none at all a third less, and a lower
     degree of visibility, whichever, half a hundredth less."""
 
-    def measure(self, recipe: Recipe, shots: str) -> Measured:
-        what, degree = super().measure(recipe, shots), recipe.variant.visibility_degree
+    def measure(self, recipe: Recipe, views: str) -> Measured:
+        what, degree = super().measure(recipe, views), recipe.variant.visibility_degree
         skinning = 0.0 if recipe.dynamic_mm == np.inf else 1.01 if recipe.dynamic_mm else 1.0
         return what._replace(mb=what.mb * (0.67 + 0.33 * skinning) * (1 - 0.005 * (3 - degree)))
 
@@ -320,20 +266,6 @@ def test_a_precision_that_moves_places_too_far_is_not_taken() -> None:
     assert search(_Formula(), Bound("mb", 0.99 * smallest), lambda _: None).plan.precision == 2
 
 
-def test_what_precision_is_allowed_is_what_moves_places_little(bench, monkeypatch) -> None:
-    monkeypatch.setattr(bench, "_allowed", {})
-    assert bench.allows("f32") and bench.allows("f16")
-    monkeypatch.setitem(candidates.MAX_P99_M, "int8", 0.0)
-    assert not bench.allows("int8")
-
-
-def test_a_size_that_no_file_has_is_refused_with_the_smallest() -> None:
-    bench = _StaticAtLast()
-    smallest = _smallest(bench)
-    with pytest.raises(InputError, match=f"got {smallest:.3g} at the end of all steps"):
-        search(bench, Bound("mb", 0.99 * smallest), lambda found: None)
-
-
 def test_a_file_that_fails_unseen_is_given_up_for_the_one_before() -> None:
     easy, hard = (search(_Formula(harder), Bound("psnr", 45.0), lambda found: None) for harder in (0.0, 0.5))
     assert easy.held_out.psnr >= 45 and hard.held_out.psnr >= 45
@@ -360,36 +292,6 @@ def _sites(model: onnx.ModelProto) -> dict[str, int]:
     return {tensor.name.partition("/")[0]: tensor.dims[0] for tensor in stored}
 
 
-def _saved(model: onnx.ModelProto, folder) -> Path:
-    onnx.save_model(model, str(folder / "avatar.onnx"))
-    return folder / "avatar.onnx"
-
-
-def test_dynamic_skinning_at_fewer_nodes_stays_where_it_moves_something(bench, tmp_path) -> None:
-    """Both at once: of the nodes in farthest-point order the first hundred, and of these those whose readers move."""
-    moves = bench._site_moves(bench._baked)
-    limit, variant = float(np.quantile(moves, 0.7)), Variant(skinning_nodes=100)
-    some = Recipe(variant, dynamic_mm=limit)
-    model, share = bench.model(some), bench.still_share(some)
-    moving = round(100 * (1 - share))
-    alone = int((moves[:100] >= limit).sum())
-    assert alone < moving < 100 and _sites(model) == {"skinning": moving}  # a site has readers among other nodes
-    assert Avatar.load(_saved(model, tmp_path)).metadata.variant.dynamic_nodes == moving
-    both, fewer, static = (
-        bench.measure(bench.model(recipe), bench.seen) for recipe in (some, Recipe(variant), Recipe(Variant("static")))
-    )
-    assert static.psnr < both.psnr < fewer.psnr
-
-
-def test_fewer_nodes_are_read_from_farther_away_and_called_still_by_that(bench) -> None:
-    coarse = reduced(bench._baked, bench.config, Variant("coarse", nodes=50))
-    moves = bench._site_moves(coarse)
-    for node in range(50):
-        readers = (coarse.neighbours == node).any(1)
-        assert moves[node] == pytest.approx(max(bench._moves[readers], default=0.0))
-    assert (moves > bench._site_moves(bench._baked)[:50]).any()  # among all nodes these have fewer readers
-
-
 def test_where_no_node_of_its_own_moves_the_file_is_static(tiny_checkpoint) -> None:
     config = ModelConfig(gaussians=800, nodes=200)
     baked = reduced(bake(load_checkpoint(tiny_checkpoint).model), config, Variant(skinning_nodes=50))
@@ -404,8 +306,8 @@ def test_where_no_node_of_its_own_moves_the_file_is_static(tiny_checkpoint) -> N
 class _OwnRates(_Formula):
     """Offsets may be coarse for nothing and visibility for very little; skinning may not."""
 
-    def measure(self, recipe: Recipe, shots: str) -> Measured:
-        what, variant = super().measure(recipe, shots), recipe.variant
+    def measure(self, recipe: Recipe, views: str) -> Measured:
+        what, variant = super().measure(recipe, views), recipe.variant
         most = variant.nodes or self.config.nodes
         skinning, offsets, visibility = (
             1 - (count or most) / most
@@ -437,26 +339,13 @@ def test_what_a_bound_does_not_need_is_taken_back(formula, most_ms) -> None:
             assert measured.ms > most_ms or measured.psnr <= found.measured.psnr, name
 
 
-class _NodesFirst(_OwnRates):
-    """Fewer nodes for all networks cost nothing down to half of them, and very much below."""
-
-    def measure(self, recipe: Recipe, shots: str) -> Measured:
-        what, nodes = super().measure(recipe, shots), recipe.variant.nodes or self.config.nodes
-        below = max(0.5 - nodes / self.config.nodes, 0)
-        return what._replace(psnr=float(-10 * np.log10(10 ** (-what.psnr / 10) + below)))
-
-
-def test_nodes_of_its_own_are_looked_for_below_those_of_all() -> None:
-    found = search(_NodesFirst(), Bound("psnr", 45.0), lambda found: None)
-    variant = found.plan.recipe(CONFIG).variant
-    assert variant.nodes == 3750 and variant.offset_nodes < 3750 > variant.visibility_nodes
-
-
 def test_a_step_that_makes_the_same_file_is_none() -> None:
-    """Not taken for one that costs nothing: no window where nothing is dynamic, nor nodes of skinning's own."""
+    """The search goes down to the deepest recipe, and no step repeats the one before."""
     steps: list[Found] = []
     with pytest.raises(InputError, match="no file keeps the bound of ms"):
         search(_Formula(), Bound("ms", 1.0), steps.append)
+    deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
+    assert steps[-1].plan.recipe(CONFIG) == deepest.recipe(CONFIG)
     recipes = [step.plan.recipe(CONFIG) for step in steps]
     assert all(before != after for before, after in itertools.pairwise(recipes))
 
@@ -490,7 +379,7 @@ def test_merging_keeps_mass_and_valid_gaussians(tiny_checkpoint) -> None:
 
 
 def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> None:
-    baked = gaussians_by_place(bake(load_checkpoint(tiny_checkpoint).model))
+    baked = order_gaussians(bake(load_checkpoint(tiny_checkpoint).model))
     seen = np.random.default_rng(3).uniform(0.1, 1, len(baked.points))
     seen[np.isin(baked.rows, baked.rows[baked.node_rows], invert=True) & (baked.rows % 5 == 0)] = 0
     count = (len(seen) + len(baked.node_rows)) // 2
@@ -506,11 +395,11 @@ def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> Non
 
 def test_sides_that_are_fitted_are_of_the_searchs_moments(bench) -> None:
     motion = random_motion(bench._whole.skeleton, frames=30, seed=2)
-    seen, fitted, held_out = shots_around(motion, 32, lambda time: bench._whole.pose(motion, time))
-    assert (len(seen), len(fitted), len(held_out)) == (COUNT, FITTED, COUNT)
-    assert {shot.time for shot in fitted} == {shot.time for shot in seen}
-    assert not {shot.time for shot in fitted} & {shot.time for shot in held_out}
-    assert len({shot.camera.position.tobytes() for shot in fitted}) == FITTED
+    seen, fitted, held_out = views_around(motion, 32, lambda time: bench._whole.pose(motion, time))
+    assert (len(seen), len(fitted), len(held_out)) == (COUNT, FIT_COUNT, COUNT)
+    assert {view.time for view in fitted} == {view.time for view in seen}
+    assert not {view.time for view in fitted} & {view.time for view in held_out}
+    assert len({view.camera.position.tobytes() for view in fitted}) == FIT_COUNT
 
 
 def test_merging_keeps_the_moments(tiny_checkpoint) -> None:
@@ -564,24 +453,24 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
 
 def test_a_search_looks_at_the_captures_views(tiny_checkpoint, tmp_path, monkeypatch) -> None:
     capture = load_capture(ASSETS / "capture")
-    seen, fitted, held_out = shots_of(capture, 40)
+    seen, fitted, held_out = views_of(capture, 40)
 
-    def views(split) -> set[tuple[float, bytes]]:
+    def of_split(split) -> set[tuple[float, bytes]]:
         cameras = capture.cameras
         return {(f.frame / capture.fps, cameras[f.camera].position.tobytes()) for f in capture.split(split)}
 
-    for shots, split, count in ((seen, "train", COUNT), (fitted, "train", FITTED), (held_out, "novel_pose", COUNT)):
-        assert len(shots) == min(count, len(capture.split(split))) and {
-            (s.time, s.camera.position.tobytes()) for s in shots
-        } <= views(split)
-        assert len({shot.time for shot in shots}) >= COUNT / 2  # spread over the split
-        assert {max(shot.camera.width, shot.camera.height) for shot in shots} == {40}
+    for views, split, count in ((seen, "train", COUNT), (fitted, "train", FIT_COUNT), (held_out, "novel_pose", COUNT)):
+        assert len(views) == min(count, len(capture.split(split))) and {
+            (s.time, s.camera.position.tobytes()) for s in views
+        } <= of_split(split)
+        assert len({view.time for view in views}) >= COUNT / 2  # spread over the split
+        assert {max(view.camera.width, view.camera.height) for view in views} == {40}
     train = tuple(capture.split("train"))
-    seen, fitted, held_out = shots_of(replace(capture, frames=train[:5]), 40)
+    seen, fitted, held_out = views_of(replace(capture, frames=train[:5]), 40)
     assert len(seen) == len(fitted) == 3 and len(held_out) == 2
-    assert not {shot.time for shot in (*seen, *fitted)} & {shot.time for shot in held_out}
+    assert not {view.time for view in (*seen, *fitted)} & {view.time for view in held_out}
     with pytest.raises(InputError, match="training views of the capture: expected at least 2, got 1"):
-        shots_of(replace(capture, frames=train[:1]), 40)
+        views_of(replace(capture, frames=train[:1]), 40)
 
     rows = tmp_path / "bounds.json"
     words = ["rnd-export", str(tiny_checkpoint), "--max-mb", "100", "--size", "48", "--json", str(rows)]
@@ -602,7 +491,7 @@ def test_a_wide_view_stays_wide() -> None:
 def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint) -> None:
     still = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=2, seed=5).at(0.0)
     light = Light(np.ones((32, 64, 3), np.float32))
-    bench = Workbench(load_checkpoint(tiny_checkpoint), Scene(still, light, size=48, shade="table"), _clock)
+    bench = Workbench(load_checkpoint(tiny_checkpoint), SearchScene(still, light, size=48, shade="table"), _clock)
     assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100
 
 
