@@ -60,7 +60,7 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
     found = find_cull(avatar, motion)
     assert found in COSINES[1:-1]
     light = Light(avatar.trained_light)
-    around = views_around(motion, SIZE, lambda time: avatar.pose(motion, time))
+    around = views_around(motion, (SIZE, SIZE), lambda time: avatar.pose(motion, time))
 
     def coded(cull: float) -> np.ndarray:
         """8-bit pictures as they are looked at."""
@@ -93,12 +93,10 @@ def test_the_command_says_what_it_writes_and_that_kernels_are_compiled(
 ) -> None:
     out = tmp_path / "a.onnx"
     monkeypatch.setattr("rnd_runtime.core.kernels.kernels_are_cold", lambda: True)
-    words = ["rnd-export", str(tiny_checkpoint), "--out", str(out), "--frames", "2", "--cull", "-0.3"]
-    monkeypatch.setattr("sys.argv", words)
-    with pytest.raises(SystemExit) as end:
-        main()
+    words = [str(tiny_checkpoint), "--out", str(out), "--frames", "2", "--cull", "-0.3"]
+    assert main(words) == 0
     said = capsys.readouterr()
-    assert not end.value.code and Avatar.load(out).advice.cull == -0.3
+    assert Avatar.load(out).advice.cull == -0.3
     assert "players leave out what faces away (n·v < -0.3)" in said.out
     assert said.err.splitlines() == [f"rnd-export: {COMPILING}"]
 

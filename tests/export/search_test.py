@@ -48,7 +48,7 @@ def _clock(avatar: Avatar) -> float:
 def bench(tiny_checkpoint) -> Workbench:
     moves = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=60, seed=5)
     light = Light(np.ones((32, 64, 3), np.float32))
-    return Workbench(load_checkpoint(tiny_checkpoint), SearchScene(moves, light, size=96, shade="table"), _clock)
+    return Workbench(load_checkpoint(tiny_checkpoint), SearchScene(moves, light, size=(96, 96), shade="table"), _clock)
 
 
 def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
@@ -67,10 +67,7 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
 ) -> None:
     def run(*options: str) -> int:
         given = [str(tiny_checkpoint), "--size", "48", "--frames", "30", *options]
-        monkeypatch.setattr("sys.argv", ["rnd-export", *given, "--out", str(tmp_path / "small.onnx")])
-        with pytest.raises(SystemExit) as end:
-            main()
-        return int(end.value.code)
+        return main([*given, "--out", str(tmp_path / "small.onnx")])
 
     rows = tmp_path / "bounds.json"
     most = 0.7 * tiny_avatar.stat().st_size / 1e6
@@ -93,7 +90,7 @@ def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
     ("options", "refused"),
     [
         (["--json", "bounds.json"], "--json: expected the default, got bounds.json (needs --target-ms"),
-        (["--max-mb", "4", "--size", "0"], "--size: expected 16 to 4096, got 0"),
+        (["--max-mb", "4", "--size", "8"], "--size: expected 16 to 16384, got 8"),
         (["--max-mb", "4", "--hdr-up", "z"], "--hdr-up: expected the default, got z (needs --hdr)"),
         (["--size", "64"], "--size: expected the default, got 64 (needs --target-ms"),
         (["--max-mb", "4", "--precision", "int8"], "--precision: expected the default, got int8 (a bound finds"),
@@ -106,10 +103,11 @@ def test_options_that_would_do_nothing_are_refused(
     options, refused, tiny_checkpoint, tmp_path, monkeypatch, capsys
 ) -> None:
     out = tmp_path / "small.onnx"
-    monkeypatch.setattr("sys.argv", ["rnd-export", str(tiny_checkpoint), *options, "--out", str(out)])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2 and refused in capsys.readouterr().err and not out.exists()
+    assert (
+        main([str(tiny_checkpoint), *options, "--out", str(out)]) == 2
+        and refused in capsys.readouterr().err
+        and not out.exists()
+    )
 
 
 class _Formula:
@@ -204,12 +202,9 @@ def test_a_search_on_a_busy_machine_begins_again_where_time_counts(
     busy = iter([True, False])
     monkeypatch.setattr(Workbench, "recalibrated", lambda self: next(busy))
     out = tmp_path / "small.onnx"
-    words = ["rnd-export", str(tiny_checkpoint), "--size", "48", "--frames", "30", bound, "1000"]
-    monkeypatch.setattr("sys.argv", [*words, "--out", str(out)])
-    with pytest.raises(SystemExit) as end:
-        main()
+    status = main([str(tiny_checkpoint), "--size", "48", "--frames", "30", bound, "1000", "--out", str(out)])
     said = capsys.readouterr().out
-    assert not end.value.code and out.exists() and next(busy, None) is None
+    assert status == 0 and out.exists() and next(busy, None) is None
     assert ("begins again" in said) == (bound == "--target-ms")
 
 
@@ -395,7 +390,7 @@ def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> Non
 
 def test_sides_that_are_fitted_are_of_the_searchs_moments(bench) -> None:
     motion = random_motion(bench._whole.skeleton, frames=30, seed=2)
-    seen, fitted, held_out = views_around(motion, 32, lambda time: bench._whole.pose(motion, time))
+    seen, fitted, held_out = views_around(motion, (32, 32), lambda time: bench._whole.pose(motion, time))
     assert (len(seen), len(fitted), len(held_out)) == (COUNT, FIT_COUNT, COUNT)
     assert {view.time for view in fitted} == {view.time for view in seen}
     assert not {view.time for view in fitted} & {view.time for view in held_out}
@@ -473,12 +468,9 @@ def test_a_search_looks_at_the_captures_views(tiny_checkpoint, tmp_path, monkeyp
         views_of(replace(capture, frames=train[:1]), 40)
 
     rows = tmp_path / "bounds.json"
-    words = ["rnd-export", str(tiny_checkpoint), "--max-mb", "100", "--size", "48", "--json", str(rows)]
+    words = [str(tiny_checkpoint), "--max-mb", "100", "--size", "48", "--json", str(rows)]
     words += ["--capture", str(ASSETS / "capture"), "--out", str(tmp_path / "small.onnx")]
-    monkeypatch.setattr("sys.argv", words)
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 0 and json.loads(rows.read_text())[0]["shots"] == "capture"
+    assert main(words) == 0 and json.loads(rows.read_text())[0]["shots"] == "capture"
 
 
 def test_a_wide_view_stays_wide() -> None:
@@ -491,7 +483,7 @@ def test_a_wide_view_stays_wide() -> None:
 def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint) -> None:
     still = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=2, seed=5).at(0.0)
     light = Light(np.ones((32, 64, 3), np.float32))
-    bench = Workbench(load_checkpoint(tiny_checkpoint), SearchScene(still, light, size=48, shade="table"), _clock)
+    bench = Workbench(load_checkpoint(tiny_checkpoint), SearchScene(still, light, size=(48, 48), shade="table"), _clock)
     assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100
 
 

@@ -39,8 +39,8 @@ class SearchViews(NamedTuple):
     held_out: list[SearchView]
 
 
-def views_around(motion: Motion, size: int, pose: Callable[[float], Gaussians]) -> SearchViews:
-    """Views all along ``motion``, alternating between seen and held out, each framing the posed avatar."""
+def views_around(motion: Motion, size: tuple[int, int], pose: Callable[[float], Gaussians]) -> SearchViews:
+    """Views along ``motion``, alternating between seen and held out, each framing the avatar in (width, height)."""
     times = (np.arange(2 * COUNT) + 0.5) / (2 * COUNT) * motion.duration
     posed = [(float(t), pose(float(t))) for t in times]
 
@@ -80,10 +80,10 @@ def resized(camera: Camera, side: int) -> Camera:
     return camera.resized(*(max(1, round(share * pixels)) for pixels in (camera.width, camera.height)))
 
 
-def _around(gaussians: Gaussians, size: int, number: int) -> Camera:
+def _around(gaussians: Gaussians, size: tuple[int, int], number: int) -> Camera:
     low, high = gaussians.means.min(0), gaussians.means.max(0)
     centre = (low + high) / 2
     distance = 0.6 * float(np.linalg.norm(high - low)) / np.tan(FIELD_OF_VIEW / 2)
     angle = GOLDEN_ANGLE * number
     eye = centre + distance * np.array([np.sin(angle), 0.1, np.cos(angle)])
-    return Camera.look_at(eye, centre, width=size, height=size, fov_y=FIELD_OF_VIEW)
+    return Camera.look_at(eye, centre, width=size[0], height=size[1], fov_y=FIELD_OF_VIEW)

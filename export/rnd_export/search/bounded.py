@@ -27,14 +27,15 @@ from .candidates import SearchScene, Workbench
 
 @dataclass(frozen=True)
 class BoundedSearch:
-    """A bound, and in what it is searched: views of ``capture`` or around ``motion``, ``size`` pixels wide.
+    """A bound, the ``option`` that gave it, and in what it is searched: views of ``capture`` or around ``motion``.
 
-    ``hdr`` is by default the learned light; the search's row is added to the file ``json``.
+    ``size`` is (width, height or None); ``hdr`` by default the learned light; a row is added to the file ``json``.
     """
 
     bound: Bound
+    option: str
     motion: Motion
-    size: int
+    size: tuple[int, int | None]
     hdr: Path | None = None
     hdr_up: Up = "y"
     capture: Path | None = None
@@ -48,8 +49,8 @@ def export_bounded(
     *,
     show: Callable[[str], None],
     warn: Callable[[Iterable[str]], None],
-) -> None:
-    """Write the cheapest file of ``checkpoint`` that keeps the bound, and ``show`` its steps and what it gave up.
+) -> str:
+    """Write the cheapest file of ``checkpoint`` that keeps the bound; ``show`` the steps and return a summary.
 
     Raises:
         InputError: no file keeps the bound, or the whole avatar's file differs from torch.
@@ -81,14 +82,14 @@ def export_bounded(
     held_out, lost = found.held_out, "; ".join(given_up(bench, found.plan))
     usual = bench.usual_times(found.model)
     median, p95 = float(np.median(usual)), float(np.percentile(usual, 95))
-    show(
-        f"{out}: {held_out.mb:.2f} MB, {held_out.ms:.2f} ms and {held_out.psnr:.1f} dB in held-out views "
+    summary = (
+        f"{held_out.mb:.2f} MB, {held_out.ms:.2f} ms and {held_out.psnr:.1f} dB in held-out views "
         f"(on the idle machine; now {median:.1f} ms, p95 {p95:.1f} ms). Given up: {lost}"
     )
     if what.json is None:
-        return
+        return summary
     row = {
-        "bound": str(what.bound),
+        "bound": f"{what.option} {what.bound.value:g}",
         "given_up": lost,
         "ms": held_out.ms,
         "ms_median": median,
@@ -100,22 +101,24 @@ def export_bounded(
         "steps": len(steps) - 1,
         "minutes": (perf_counter() - started) / 60,
         "gaussians": bench.config.gaussians,
-        "size": what.size,
+        "size": what.size[0] if what.size[1] is None else list(what.size),
         "shade": scene.shade,
         "shots": "around" if what.capture is None else "capture",
         "threads": get_num_threads(),
         "machine": machine(),
     }
     write_json(what.json, [*(old for old in rows if old["bound"] != row["bound"]), row])
+    return summary
 
 
 def _scene(checkpoint: Checkpoint, what: BoundedSearch, warn: Callable[[Iterable[str]], None]) -> SearchScene:
     light = Light(checkpoint.probe.numpy()) if what.hdr is None else load_light(what.hdr, up=what.hdr_up)
+    size = what.size[0], what.size[1] or what.size[0]
     if what.hdr is not None:
         warn(light_notes(light))
     if what.capture is None:
-        return SearchScene(what.motion, light, what.size)
+        return SearchScene(what.motion, light, size)
     capture = load_capture(what.capture)
     motion = capture.motion_for(checkpoint.skeleton)
     warn(motion.notes)
-    return SearchScene(motion, light, what.size, views=views_of(capture, what.size))
+    return SearchScene(motion, light, size, views=views_of(capture, max(size)))

@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 
 from rnd_export.reduce.variant import OWN_NODES, Variant
-from rnd_runtime.core.errors import InputError, flag
+from rnd_runtime.core.errors import InputError
 from rnd_trainer.config import ModelConfig
 
 from .candidates import Measured, Recipe, Workbench
@@ -39,8 +39,6 @@ MARGIN_DB = 0.3
 """above a required PSNR: held-out views are a little worse"""
 MIN_GAIN = 0.01
 """share of the cost that a step must save; smaller steps are taken when none is left"""
-OPTIONS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
-"""options of the command, by kind of bound"""
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,6 @@ class Bound:
 
     kind: Literal["ms", "psnr", "mb"]
     value: float
-
-    def __str__(self) -> str:
-        return f"{flag(OPTIONS[self.kind])} {self.value:g}"
 
     def kept_by(self, found: Measured) -> bool:
         """Whether a file with these measurements keeps the bound."""

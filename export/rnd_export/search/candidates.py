@@ -48,7 +48,7 @@ class SearchScene:
 
     motion: Motion
     light: Light
-    size: int = 512
+    size: tuple[int, int] = (512, 512)
     shade: str = "table+sun"
     views: SearchViews | None = None
 

@@ -1,11 +1,9 @@
-"""Avatars to measure: a trained one, or untrained ones of any size that cost as much and look like something.
+"""Avatars to measure: a trained one, or untrained ones of any size at the same cost.
 
-**The seeded avatar** stands on the embedded body. Its networks are drawn at random, their highest frequencies damped
-as in trained ones, and scaled so that they say what trained ones say: weights that move a few per cent, offsets of
-millimetres, visibility around 1. Its albedo follows from the place by a formula (stripes and patches), opacities are
-those of a training's start. It is no likeness of anybody. Its frames cost what a trained avatar's cost, and
-err alike by shading and rasteriser; by encoder they err less (the static one by 1 mm where the trained dancer's errs by
-17), as its networks say less.
+**The seeded avatar** stands on a given body. Its networks are random, their highest frequencies damped and their
+outputs scaled as in trained ones: weights that move a few per cent, offsets of millimetres, visibility around 1. Its
+albedo is a formula of position. Frames cost what a trained avatar's cost, and err alike by shading and rasteriser; by
+encoder they err less (the static one by 1 mm, the trained dancer's by 17 mm).
 """
 
 from __future__ import annotations
@@ -27,19 +25,16 @@ from rnd_runtime.core.errors import InputError
 from rnd_trainer.config import TrainConfig, resized
 
 SEED = 7
-# out layers of the networks, as multiples of their usual start: set by eye on trained ones
+# output layers of the networks, as multiples of their initialisation
 LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
-OPACITY = 2.5  # raw: 0.99 after the sigmoid of model.py, as trained avatars come out
-KEPT = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", "sun_*.exr")
-"""what rnd-bench keeps between runs; the key of its inputs (``content_key``) is in every name"""
+OPACITY = 2.5  # raw: 0.99 after the sigmoid, as of trained avatars
+STORED = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", "sun_*.exr")
+"""what rnd-bench stores between runs; the key of its inputs (``content_key``) is in every name"""
 
 
 @dataclass(frozen=True)
 class Encoders:
-    """What of an avatar's encoders a file holds; options of ``rnd-export``.
-
-    ``encoder`` may also be ``rates``: everything, but skinning at a quarter of the nodes, offsets at an eighth.
-    """
+    """Options of ``rnd-export``; ``encoder`` may also be "rates": skinning at ¼ of the nodes, offsets at ⅛."""
 
     encoder: str = "full"
     precision: str = "f32"
@@ -65,20 +60,20 @@ def content_key(*parts: Path | str) -> str:
 
 
 def forget(folder: Path) -> None:
-    """Delete what rnd-bench keeps in ``folder``, and nothing else: it may hold files of the user's."""
-    for pattern in KEPT:
-        for kept in folder.glob(pattern):
-            kept.unlink()
+    """Delete what rnd-bench stores in ``folder``, and nothing of the user's."""
+    for pattern in STORED:
+        for file in folder.glob(pattern):
+            file.unlink()
 
 
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
-    """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless this exporter has made it."""
+    """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless it is there."""
     key = content_key(checkpoint, *sources("rnd_export"))
     words = encoders.words(checkpoint)
     name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
     out = folder / f"{name}.onnx"
     if not out.exists():
-        code = "from rnd_export.cli import main; main()"
+        code = "from rnd_export.cli import main; raise SystemExit(main())"
         line = [sys.executable, "-c", code, str(checkpoint), "--out", str(out), "--frames", "2", "--cull", "-1", *words]
         done = subprocess.run(line, capture_output=True, text=True, check=False)
         if done.returncode:
@@ -117,7 +112,7 @@ def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
     torch.manual_seed(SEED)
     model = AvatarModel(config.model, sample_template(body, count, config.model.nodes, seed=SEED))
     with torch.no_grad():
-        _speak(model)
+        _activate(model)
         appearance = model.appearance_residual
         appearance[:, 3:6] = torch.from_numpy(_albedo(model.points.numpy()))
         model.geometry_residual[:, 0] = OPACITY
@@ -127,8 +122,8 @@ def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
     return out
 
 
-def _speak(model: object) -> None:
-    """Let networks that are silent at the start of a training say something."""
+def _activate(model: object) -> None:
+    """Give outputs to networks whose output is zero at the start of a training."""
     import torch
 
     frequencies = model.config.frequencies  # type: ignore[attr-defined]
