@@ -32,7 +32,7 @@ pytestmark = [
 
 _READER = """
 import { readFileSync } from "node:fs";
-const { readLight, lightNotes } = await import(process.argv[1] + "/light.js");
+const { readLight, lightNotes } = await import(process.argv[1] + "/shading/light.js");
 let answer;
 try {
     const light = readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]);
@@ -42,8 +42,8 @@ console.log(JSON.stringify(answer));
 """
 _SUNS = """
 import { readFileSync } from "node:fs";
-const { readLight } = await import(process.argv[1] + "/light.js");
-const { extractSuns } = await import(process.argv[1] + "/sun.js");
+const { readLight } = await import(process.argv[1] + "/shading/light.js");
+const { extractSuns } = await import(process.argv[1] + "/shading/sun.js");
 const { suns, sky } = extractSuns(readLight(new Uint8Array(readFileSync(process.argv[2])), process.argv[2]));
 console.log(JSON.stringify({ suns, sky: [...sky.radiance] }));
 """

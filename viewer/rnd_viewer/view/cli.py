@@ -11,11 +11,11 @@ from threading import Thread
 import tyro
 from rich.console import Console
 
+from rnd_runtime.core.command import parse_options, run_command
 from rnd_runtime.core.console import print_plain
-from rnd_runtime.core.errors import parse_options, run_command
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
-from rnd_runtime.playback.start import quick_start, settle
+from rnd_runtime.playback.start import load_ahead
 
 from .options import ViewOptions
 
@@ -31,32 +31,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def view(options: ViewOptions) -> int:
-    """Serve the scene that ``options`` describe until the process is interrupted.
+    """Serve the avatar or the training that ``options`` name until the process is interrupted.
 
     Raises:
         InputError: for whatever cannot be used.
     """
-    with quick_start(options.avatar, options.threads) as ahead:
-        from .scene import Scene  # here, so that --help works where a library does not load
-        from .server import load_websockets, serve
+    watching = options.avatar.is_dir()
+    ahead = load_ahead(None if watching else options.avatar, options.threads)
+    from .scene import Scene  # here, so that --help works where a library does not load
+    from .server import load_websockets, serve
+    from .training import Training
 
-        load_websockets()
-        set_threads(options.threads)
-        console = Console(highlight=False)
+    load_websockets()
+    set_threads(options.threads)
+    console = Console(highlight=False)
+    shown: Scene | Training
+    if watching:
+        shown = Training(options)
+    else:
         cold = kernels_are_cold()
         with console.status("loading"):
-            scene = Scene(options, ahead)
+            shown = Scene(options, ahead)
             if cold:
                 print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
-            scene.warm_up()
-            settle()
-        try:
-            token = None if options.local else secrets.token_urlsafe(16)
-            with serve(scene, options.host, options.port, token) as (server, url):
-                print_plain(console, f"rnd-view: {url}")
-                if options.browser and options.local:
-                    Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
-                server.serve_forever()
-        finally:
-            scene.close()
+            shown.warm_up()
+    try:
+        token = None if options.local else secrets.token_urlsafe(16)
+        with serve(shown, options.host, options.port, token, options.fps_floor) as (server, url):
+            print_plain(console, f"rnd-view: {url}")
+            if options.browser and options.local:
+                Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
+            server.serve_forever()
+    finally:
+        shown.close()
     return 0

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, refuse_outside
 from rnd_viewer.inputs.options import LitOptions, option
 
 SIZES = 64, 2048  # px: the least and the largest side of a picture
@@ -17,13 +17,13 @@ SIZES = 64, 2048  # px: the least and the largest side of a picture
 
 @dataclass(frozen=True)
 class ViewOptions(LitOptions):
-    """Look at an avatar in the browser: turn it, play it, move the light. No GPU needed.
+    """Look at an avatar in the browser: rotate it, play it, relight it; or watch a training. No GPU needed.
 
     rnd-view avatar.onnx --motion walk.npz --hdr sky.exr
     """
 
-    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx")]
-    """The avatar, a file that rnd-export wrote."""
+    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx|RUN")]
+    """An avatar of rnd-export, or a folder of rnd-train: its losses and previews while it trains, then its avatar."""
     motion: Annotated[Path | None, option("FILE")] = None
     """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the pose at rest."""
     hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = field(default_factory=tuple)
@@ -41,6 +41,9 @@ class ViewOptions(LitOptions):
     """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
     threads: Annotated[int | None, option("INT")] = None
     """CPU threads. Default: all."""
+    fps_floor: Annotated[float | None, option("FLOAT")] = None
+    """Frames per second to hold while the avatar plays, at a lower resolution where needed. Screenshots and clips
+    keep the full one."""
     browser: bool = True
     """Open the page in this machine's browser."""
 
@@ -50,6 +53,7 @@ class ViewOptions(LitOptions):
             captured = self.capture is not None
             ours = "the capture's own is read by its rules" if captured else "the pose at rest does not move"
             self.refuse_unread(f"needs --motion: {ours}", edited=captured)
+        refuse_outside(self, {"fps_floor": (1e-3, 1000)})
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         low, high = SIZES

@@ -41,8 +41,8 @@ SHADERS_KEPT = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
 LARGEST_SKY = 1024  # rows of a map that is shown behind the avatar and kept: 25 MB
 
 
-class Picture:
-    """One rendered view.
+class View:
+    """One rendered image.
 
     Attributes:
         srgb: [H, W, 3] uint8.
@@ -110,7 +110,7 @@ class Scene:
         about = self.description()
         self.render(ViewState(time=0.0, width=self.size, height=self.size, light=about["light"], **about["view"]))
 
-    def render(self, state: ViewState) -> Picture:
+    def render(self, state: ViewState) -> View:
         """The picture of ``state`` with the time that each stage took."""
         seconds: dict[str, float] = {}
         if state.truth is not None:
@@ -132,7 +132,7 @@ class Scene:
             shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
             srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))
         seconds |= {**frame.stage_seconds, "tone map": perf_counter() - started}
-        return Picture(srgb, self._joints(motion, time_s, camera), seconds)
+        return View(srgb, self._joints(motion, time_s, camera), seconds)
 
     def notes_of_light(self, state: ViewState) -> list[str]:
         """What the user should know of the light of a ``state`` that was drawn."""

@@ -35,21 +35,26 @@ from rnd_runtime.core.errors import InputError, withheld
 from rnd_runtime.core.threads import set_threads
 from rnd_viewer.play.video import clip_writer
 
-from .scene import Bytes, Picture, Scene
-from .state import MOST_CLIP_FRAMES, ClipRequest, RenderRequest, Request, TruthRequest, parse_request
+from .governor import Governor
+from .options import SIZES
+from .scene import Bytes, Scene
+from .state import MAX_CLIP_FRAMES, ClipRequest, RenderRequest, Request, parse_request
+from .training import Training
 
 INSTALL = "pip install 'rnd-avatar[view]'"
 COOKIE = "rnd_view_token"
 JPEG_QUALITY = 90
 HTTP_PORT = 80  # which browsers leave out of the host's name
-_ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one, for examples, that lies elsewhere
-MOST_BYTES_IN = 1 << 16  # a request is a few hundred
+_ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one of another network
+MAX_BYTES_IN = 1 << 16  # a request is a few hundred
 GOODBYE_S = 1.0  # in which a page that still reads hears that the viewer ends
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
     ".css": "text/css; charset=utf-8",
     ".svg": "image/svg+xml",
+    ".png": "image/png",
+    ".json": "application/json",
 }
 # Nothing from elsewhere runs in the page, and nobody frames it.
 HEADERS = {
@@ -115,14 +120,19 @@ def load_websockets() -> ModuleType:
 
 
 @contextmanager
-def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tuple[Any, str]]:
+def serve(
+    shown: Scene | Training, host: str, port: int, token: str | None, fps_floor: float | None = None
+) -> Iterator[tuple[Any, str]]:
     """Yield a listening server, to be run by its ``serve_forever``, and the URL to open.
+
+    A ``Training`` has its own page at the address; the avatar's is ``index.html`` then.
 
     Raises:
         InputError: websockets is missing, or nothing can listen there.
     """
     server_module = load_websockets()
-    visitor = _Visitor(scene)
+    visitor = _Visitor(shown, fps_floor)
+    training = shown if isinstance(shown, Training) else None
     access: list[Access] = []  # known once the port is
     connections: WeakSet[Any] = WeakSet()  # also those that have asked for nothing yet
 
@@ -136,7 +146,7 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
         if refusal is not None:
             return connection.respond(*refusal)
         path = urlsplit(request.path).path
-        return None if path == "/socket" else _static(connection, path, access[0])
+        return None if path == "/socket" else _answer_http(connection, path, access[0], training)
 
     try:
         server = server_module.serve(
@@ -145,7 +155,7 @@ def serve(scene: Scene, host: str, port: int, token: str | None) -> Iterator[tup
             port,
             process_request=answer,
             compression=None,
-            max_size=MOST_BYTES_IN,
+            max_size=MAX_BYTES_IN,
             max_queue=None,  # behind a full queue pings wait too, and the page is taken for gone
             create_connection=connect,
             server_header=None,
@@ -193,18 +203,24 @@ def _name_from_elsewhere(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _static(connection: Any, path: str, access: Access) -> Any:
-    """A file of the page."""
+def _answer_http(connection: Any, path: str, access: Access, training: Training | None) -> Any:
+    """A file of the page, or what a training has to show."""
     folder = resources.files(__package__) / "page"
-    name = path.removeprefix("/") or "index.html"
-    known = {file.name for file in folder.iterdir()}
+    name = path.removeprefix("/") or ("training.html" if training else "index.html")
+    content: bytes | None = None
+    if training and name == "training.json":
+        content = json.dumps(training.state()).encode()
+    elif training and name.startswith("previews/"):
+        content = training.preview(name.removeprefix("previews/"))
+    elif name in {file.name for file in folder.iterdir()}:
+        content = (folder / name).read_bytes()
     suffix = Path(name).suffix
-    if name not in known or suffix not in CONTENT_TYPES:
+    if content is None or suffix not in CONTENT_TYPES:
         return connection.respond(HTTPStatus.NOT_FOUND, "no such file\n")
     response = connection.respond(HTTPStatus.OK, "")
-    response.body = (folder / name).read_bytes()
+    response.body = content
     del response.headers["Content-Length"], response.headers["Content-Type"]
-    response.headers["Content-Length"] = str(len(response.body))
+    response.headers["Content-Length"] = str(len(content))
     response.headers["Content-Type"] = CONTENT_TYPES[suffix]
     for header, value in HEADERS.items():
         response.headers[header] = value
@@ -222,22 +238,28 @@ def _quiet_logger() -> logging.Logger:
 
 
 class _Visitor:
-    """Answers pages; several may look at one scene, which draws for one at a time."""
+    """Answers pages; several may look at one scene, which renders for one at a time."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._drawing = threading.Lock()
+    def __init__(self, shown: Scene | Training, fps_floor: float | None) -> None:
+        self._shown, self._fps_floor = shown, fps_floor
+        self._rendering = threading.Lock()
 
     def talk(self, socket: Any) -> None:
         """Serve one websocket until it closes. A request that cannot be met is answered with the reason."""
         from websockets.exceptions import ConnectionClosed
 
-        set_threads(self._scene.threads)  # each visitor has a thread, and each thread a number of its own
-        with suppress(ConnectionClosed):  # while a picture was on its way
-            self._send(socket, {"kind": "scene", "scene": self._scene.description()})
+        with suppress(ConnectionClosed):  # while a frame was on its way
+            try:
+                scene = self._shown.scene() if isinstance(self._shown, Training) else self._shown
+            except InputError as error:
+                self._send(socket, {"kind": "error", "message": str(error)})
+                return
+            set_threads(scene.threads)  # per thread, and each visitor has one
+            governor = None if self._fps_floor is None else Governor(self._fps_floor)
+            self._send(socket, {"kind": "scene", "scene": scene.description()})
             for message in socket:
                 try:
-                    self._answer(socket, parse_request(message))
+                    self._answer(socket, scene, governor, parse_request(message))
                 except InputError as error:
                     self._send(socket, {"kind": "error", "message": str(error)})
                 except OSError as error:
@@ -245,51 +267,54 @@ class _Visitor:
                         raise
                     self._send(socket, {"kind": "error", "message": reason})
 
-    def _answer(self, socket: Any, request: Request) -> None:
+    def _answer(self, socket: Any, scene: Scene, governor: Governor | None, request: Request) -> None:
         if isinstance(request, RenderRequest):
-            self._render(socket, request)
+            self._render(socket, scene, governor if request.live else None, request)
         elif isinstance(request, ClipRequest):
-            self._clip(socket, request)
+            self._clip(socket, scene, request)
         else:
-            self._truth(socket, request)
+            data = scene.truth_file(request.index).read_bytes()
+            self._send(socket, {"kind": "truth", "index": request.index}, data)
 
-    def _render(self, socket: Any, request: RenderRequest) -> None:
-        with self._drawing:
-            picture = self._scene.render(request.state)
-            notes = self._scene.notes_of_light(request.state)
-        pixels, encoding_ms = encode(picture, request.state.encoding)
+    def _render(self, socket: Any, scene: Scene, governor: Governor | None, request: RenderRequest) -> None:
+        state, started = request.state, perf_counter()
+        if governor:
+            width, height = (max(round(governor.scale * side), SIZES[0]) for side in (state.width, state.height))
+            state = replace(state, width=width, height=height)
+        with self._rendering:
+            view = scene.render(state)
+            notes = scene.notes_of_light(state)
+        pixels, encoding_ms = encode(view.srgb, state.encoding)
         header = {
             "kind": "picture",
             "number": request.number,
-            "width": picture.srgb.shape[1],
-            "height": picture.srgb.shape[0],
-            "encoding": request.state.encoding,
-            "joints": picture.joints.astype(np.float64).round(2).tolist(),
+            "width": view.srgb.shape[1],
+            "height": view.srgb.shape[0],
+            "encoding": state.encoding,
+            "joints": view.joints.astype(np.float64).round(2).tolist(),
             "notes": notes,
-            "times": {name: 1e3 * seconds for name, seconds in picture.seconds.items()} | {"encoding": encoding_ms},
+            "times": {name: 1e3 * seconds for name, seconds in view.seconds.items()} | {"encoding": encoding_ms},
         }
         self._send(socket, header, pixels)
+        if governor:
+            governor.observe(perf_counter() - started)
 
-    def _clip(self, socket: Any, request: ClipRequest) -> None:
-        motion, state = self._scene.motion, replace(request.state, truth=None)
+    def _clip(self, socket: Any, scene: Scene, request: ClipRequest) -> None:
+        motion, state = scene.motion, replace(request.state, truth=None)
         frames = motion.frames_at(request.fps)
-        if frames > MOST_CLIP_FRAMES:
-            raise InputError("clip", expected=f"at most {MOST_CLIP_FRAMES} frames", got=frames)
+        if frames > MAX_CLIP_FRAMES:
+            raise InputError("clip", expected=f"at most {MAX_CLIP_FRAMES} frames", got=frames)
         with TemporaryDirectory() as folder:
             file = Path(folder) / "clip.mp4"
             with clip_writer(file, fps=request.fps) as append:
                 for number in range(frames):
                     azimuth = state.azimuth + request.turn * number / frames
                     now = replace(state, time=number / request.fps, azimuth=azimuth)
-                    with self._drawing:
-                        append(np.ascontiguousarray(self._scene.render(now).srgb))
+                    with self._rendering:
+                        append(np.ascontiguousarray(scene.render(now).srgb))
                     self._send(socket, {"kind": "progress", "done": number + 1, "of": frames})
             notes = motion.loop_notes(request.fps)
             self._send(socket, {"kind": "clip", "notes": notes}, file.read_bytes())
-
-    def _truth(self, socket: Any, request: TruthRequest) -> None:
-        data = self._scene.truth_file(request.index).read_bytes()
-        self._send(socket, {"kind": "truth", "index": request.index}, data)
 
     @staticmethod
     def _send(socket: Any, header: dict[str, Any], body: bytes | Bytes | None = None) -> None:
@@ -299,15 +324,15 @@ class _Visitor:
             socket.send(body if isinstance(body, bytes) else body.data.cast("B"))
 
 
-def encode(picture: Picture, encoding: str) -> tuple[bytes | Bytes, float]:
-    """The pixels as ``raw`` RGBA [H, W, 4] or as ``jpeg``, and the milliseconds that took."""
+def encode(srgb: Bytes, encoding: str) -> tuple[bytes | Bytes, float]:
+    """The pixels [H, W, 3] as ``raw`` RGBA [H, W, 4] or as ``jpeg``, and the milliseconds that took."""
     started = perf_counter()
     data: bytes | Bytes
     if encoding == "jpeg":
-        data = _jpeg(picture.srgb)
+        data = _jpeg(srgb)
     else:
-        data = np.full((*picture.srgb.shape[:2], 4), 255, np.uint8)
-        data[..., :3] = picture.srgb
+        data = np.full((*srgb.shape[:2], 4), 255, np.uint8)
+        data[..., :3] = srgb
     return data, 1e3 * (perf_counter() - started)
 
 

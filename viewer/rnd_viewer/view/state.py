@@ -14,7 +14,7 @@ from rnd_runtime.core.errors import InputError
 from .options import SIZES
 
 Output = Literal["lit", "light", "albedo", "normal", "roughness", "visibility"]
-MOST_CLIP_FRAMES = 3600
+MAX_CLIP_FRAMES = 3600
 
 _Side = Annotated[int, Meta(ge=SIZES[0], le=SIZES[1])]
 _Angle = Annotated[float, Meta(ge=-1e4, le=1e4)]
@@ -66,10 +66,11 @@ class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="render", tag_field="ask"):
-    """One picture. ``number`` comes back with it."""
+    """One frame. ``number`` comes back with it; a ``live`` one may be smaller, to hold ``--fps-floor``."""
 
     number: int
     state: ViewState
+    live: bool = False
 
 
 class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="clip", tag_field="ask"):

@@ -1,4 +1,4 @@
-"""A folder that ``rnd-train`` writes, read while it grows: progress, losses, previews, and the avatar once it is exported."""
+"""A folder of ``rnd-train``, read while it grows: progress, losses, previews, and the avatar once exported."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
 from .options import ViewOptions
@@ -37,11 +36,11 @@ class Training:
         self._rows: list[dict[str, Any]] = []
         self._file, self._offset = 0, 0
         self._scenes: dict[int, Scene] = {}  # by the avatar file's time of change
-        self._lock = threading.Lock()
+        self._reading, self._loading = threading.Lock(), threading.Lock()
 
     def state(self) -> dict[str, Any]:
         """What the page shows: the status that rnd-train writes, one curve ``[[step, mean], …]`` a loss, file names."""
-        with self._lock:
+        with self._reading:
             rows = self._read_metrics()
         status = _json(self.folder / STATUS)
         last = rows[-1] if rows else {}
@@ -73,8 +72,8 @@ class Training:
         Raises:
             InputError: it is not exported yet, or something else cannot be used.
         """
-        file = existing_file(self._options.avatar, what="avatar of the run", hint="rnd-export makes it")
-        with self._lock:
+        file = existing_file(self._options.avatar, what="avatar of the run")
+        with self._loading:
             stamp = file.stat().st_mtime_ns
             if stamp not in self._scenes:
                 self._scenes[stamp] = Scene(self._options)

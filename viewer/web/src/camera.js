@@ -1,10 +1,10 @@
 // Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/core/camera.py, rnd_viewer/inputs/cameras.py).
 
+import { ELEVATION, FIELD_OF_VIEW, PADDING } from "./constants.js";
 import { jointsAt } from "./posing/avatar.js";
 import { multiply, rotate, transposed } from "./rotations.js";
 
-const PADDING = 0.14;  // of the skeleton's height: what the body reaches beyond its joints
-const ELEVATION = 5 * Math.PI / 180, FIELD_OF_VIEW = 35 * Math.PI / 180;  // as rnd_viewer/inputs/options.py has them
+const RADIANS = Math.PI / 180;
 
 /** The camera of a state: {width, height, focal, rotation [9], translation [3], position [3]}. */
 export function cameraOf({ azimuth, elevation, distance, target, fov, width, height }) {
@@ -33,7 +33,7 @@ export function inFrame(camera, frame) {
   return { ...camera, rotation, translation, position };
 }
 
-/** rnd-play's front view of `motion` in a square picture. */
+/** rnd-play's front view of `motion` in a square frame. */
 export function homeView(skeleton, motion) {
   const frames = Array.from({ length: motion.frames }, (_, f) => jointsAt(skeleton, motion, f / motion.fps));
   const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x), tall = [[...low], [...high]];
@@ -47,7 +47,7 @@ export function homeView(skeleton, motion) {
   const target = low.map((x, k) => (x + high[k]) / 2);
   const fx = motion.rotations[2], fz = motion.rotations[8];  // a body at rest faces +Z
   const azimuth = Math.hypot(fx, fz) > 1e-3 ? Math.atan2(fx, fz) : 0;
-  const view = { azimuth, elevation: ELEVATION, distance: 1, target, fov: FIELD_OF_VIEW };
+  const view = { azimuth, elevation: ELEVATION * RADIANS, distance: 1, target, fov: FIELD_OF_VIEW * RADIANS };
   const { rotation } = cameraOf({ ...view, width: 1, height: 1 });
   let distance = 0;
   for (const joints of frames)

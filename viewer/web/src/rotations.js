@@ -47,6 +47,14 @@ export function transposedTimes(a, atA, b, atB, out, at) {
       out[at + 3 * i + j] = a[atA + i] * b[atB + j] + a[atA + 3 + i] * b[atB + 3 + j] + a[atA + 6 + i] * b[atB + 6 + j];
 }
 
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+export function unit(v) {
+  const length = Math.hypot(...v);
+  return v.map((value) => value / length);
+}
+
 /** aᵀ of a 3×3. */
 export const transposed = (a) => [a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8]];
 

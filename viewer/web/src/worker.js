@@ -1,5 +1,6 @@
-// Everything but the page: reads the files, makes pictures of states; the same states and answers as rnd-view's.
+// Everything but the page: reads the files, renders states; the same states and answers as rnd-view's.
 
+import { CLAY, COSINE_LOBE, LARGEST_SKY, PROBE_SHAPE } from "./constants.js";
 import { Avatar } from "./posing/avatar.js";
 import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
@@ -12,10 +13,7 @@ import { shBasis } from "./shading/sh.js";
 import { makeShader } from "./shading/shader.js";
 import { Splatter } from "./raster/splat.js";
 
-const CLAY = 0.8;  // albedo of a body that shows the light alone
-const LARGEST_SKY = 1024;  // rows behind the avatar
 const SIZE = 512, SIZES = [64, 1024];  // px: to begin with, the least and the largest
-const COSINE_LOBE = Float64Array.from({ length: 16 }, (_, j) => (j < 1 ? 1 : j < 4 ? 2 / 3 : j < 9 ? 1 / 4 : 0));
 
 let splatter = new Splatter();
 // What is shown: the motion as its file has it (null: at rest) and for the avatar, and
@@ -52,7 +50,7 @@ async function take({ name, bytes }, next, opened) {
   if (kind === "onnx") {
     next.avatar = await Avatar.load(bytes, name);
     opened.push(next.avatar);
-    const own = { height: 32, width: 64, radiance: next.avatar.trainedLight }, others = next.lights.filter((light) => !light.own);
+    const own = { height: PROBE_SHAPE[0], width: PROBE_SHAPE[1], radiance: next.avatar.trainedLight }, others = next.lights.filter((light) => !light.own);
     next.lights = [{ own: true, ...lightEntry("the avatar's own", own) }, ...others];
   } else if (kind === "npz") next.record = readMotionFile(bytes, name);
   else if (kind === "hdr" || kind === "exr") {
@@ -93,7 +91,7 @@ async function render({ number, state }) {
     shownSky = null;
   }
   splatter.draw(records, state.width, state.height, look(state, camera));
-  if (splatter.isLost()) throw new Error("the browser took WebGL2 away while it drew; it is asked for again with the next picture");
+  if (splatter.isLost()) throw new Error("the browser took WebGL2 away while it drew; it is asked for again with the next frame");
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
@@ -146,29 +144,29 @@ function material(output, { albedo, normals, roughness, visibility }, count, { r
   return features;
 }
 
-/** What the last pass is told: see picture.frag. */
+/** Uniforms of blend.frag. */
 function look(state, { rotation: r, focal, width, height }) {
   const show = { normal: 1, roughness: 2, visibility: 2 }[state.output] ?? 0, gain = 2 ** state.exposure;
   if (state.background !== "hdr") {
     const hex = /^#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})$/i.exec(state.background);
-    return { show, behind: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
+    return { show, background: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
   }
   if (shownSky !== scene.lights[state.light]) {
     shownSky = scene.lights[state.light];
     const { light } = shownSky;
     splatter.setSky(light.height > LARGEST_SKY ? downsize(light, LARGEST_SKY, 2 * LARGEST_SKY) : light);
   }
-  const turn = lightToWorld(state.yaw), pixelToLight = [];
+  const rotation = lightToWorld(state.yaw), pixelToLight = [];
   for (let row = 0; row < 3; row++) {  // lightToWorldᵀ · rotationᵀ · K⁻¹
-    const [x, y, z] = [0, 1, 2].map((axis) => turn[row] * r[3 * axis] + turn[3 + row] * r[3 * axis + 1] + turn[6 + row] * r[3 * axis + 2]);
+    const [x, y, z] = [0, 1, 2].map((axis) => rotation[row] * r[3 * axis] + rotation[3 + row] * r[3 * axis + 1] + rotation[6 + row] * r[3 * axis + 2]);
     pixelToLight.push(x / focal, y / focal, z - (x * width + y * height) / 2 / focal);
   }
-  return { show, behind: 1, gain, pixel_to_light: pixelToLight };
+  return { show, background: 1, gain, pixel_to_light: pixelToLight };
 }
 
 const linear = (srgb) => (srgb <= 0.04045 ? srgb / 12.92 : ((srgb + 0.055) / 1.055) ** 2.4);
 
-/** Turns the light about +Y, from +X towards +Z. */
+/** Rotates the light about +Y, from +X towards +Z. */
 function lightToWorld(yaw) {
   const c = Math.cos(yaw), s = Math.sin(yaw);
   return [c, 0, -s, 0, 1, 0, s, 0, c];

@@ -32,7 +32,7 @@ export async function connect(on) {
     else queueMicrotask(() => on.error(UNREACHABLE));
   };
   return {
-    render: (number, state, exact) => send({ ask: "render", number, state: { ...state, encoding: exact ? "raw" : encoding } }),
+    render: (number, state, exact) => send({ ask: "render", number, live: !exact, state: { ...state, encoding: exact ? "raw" : encoding } }),
     clip: (state, fps, turn) => send({ ask: "clip", state, fps, turn }),
     truth: (index) => send({ ask: "truth", index }),
   };

@@ -1,15 +1,13 @@
 // The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion/readers/arrays.py).
 
+import {
+  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT,
+} from "../constants.js";
 import { refusal, short, sizes } from "../errors.js";
-import { NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT } from "./motion_names.js";
 import { Npz } from "./npz.js";
 import { axisAngleToMatrix, multiply, rotate } from "../rotations.js";
 
-// What AMASS' SMPL-X files hold beside the split poses, and nobody else's
-const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length"];
-const MAX_ANGLE = 100, MANY_BEYOND_A_TURN = 0.2;  // rad; share of the rotations
-const MAX_DISTANCE = 1000;  // m
-const DEFAULT_FPS = 60, MIN_FPS = 0.001, MAX_FPS = 10_000;
+const [MIN_FPS, MAX_FPS] = FPS_LIMITS;
 const FINGERS = 30;
 
 /** {name, rotations [F·J·9] local, translations [F·3] m, added to the root's rest position, restRoot [3] m that they were made

@@ -1,32 +1,32 @@
-// Poses between the frames of a recording: cubic Hermite paths (rnd_runtime/motion/interpolation.py says which and why).
+// Poses between the frames of a motion: cubic Hermite paths (rnd_runtime/motion/interpolation.py).
 
-import { axisAngleToMatrix, matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
+import { LARGEST_MOVE, LARGEST_STEP } from "../constants.js";
+import { axisAngleToMatrix, cross, dot, matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
 
-const LARGEST_STEP = 1, LARGEST_MOVE = 1;  // rad, m
-const turn = new Float64Array(9);
+const rotation = new Float64Array(9);
 
-/** Rotations [J·9] at `place`, in frames from 0 to frames − 1. */
-export function rotationsAt({ rotations, frames, joints }, place) {
-  const before = Math.min(Math.floor(place), frames - 1), t = place - before, at = (frame) => 9 * frame * joints;
+/** Rotations [J·9] at `position`, in frames from 0 to frames − 1. */
+export function rotationsAt({ rotations, frames, joints }, position) {
+  const before = Math.min(Math.floor(position), frames - 1), t = position - before, at = (frame) => 9 * frame * joints;
   if (t === 0) return rotations.slice(at(before), at(before + 1));
   const result = new Float64Array(9 * joints), innerStart = before > 0, innerEnd = before + 2 < frames;
   for (let joint = 0; joint < joints; joint++) {
     const stepFrom = (frame) => {  // log(R_frameᵀ R_{frame + 1})
-      transposedTimes(rotations, at(frame) + 9 * joint, rotations, at(frame + 1) + 9 * joint, turn, 0);
-      return matrixToAxisAngle(turn, 0);
+      transposedTimes(rotations, at(frame) + 9 * joint, rotations, at(frame + 1) + 9 * joint, rotation, 0);
+      return matrixToAxisAngle(rotation, 0);
     };
     const step = stepFrom(before);
     const previous = innerStart ? stepFrom(before - 1) : step, following = innerEnd ? stepFrom(before + 1) : step;
     const [x, y, z] = hermite(previous, step, following, innerStart, innerEnd, t);
-    axisAngleToMatrix(x, y, z, turn, 0);
-    multiply(rotations, at(before) + 9 * joint, turn, 0, result, 9 * joint);
+    axisAngleToMatrix(x, y, z, rotation, 0);
+    multiply(rotations, at(before) + 9 * joint, rotation, 0, result, 9 * joint);
   }
   return result;
 }
 
-/** The point [3] at `place` of `points` [frames·3]. */
-export function pointAt(points, frames, place) {
-  const before = Math.min(Math.floor(place), frames - 1), t = place - before;
+/** The point [3] at `position` of `points` [frames·3]. */
+export function pointAt(points, frames, position) {
+  const before = Math.min(Math.floor(position), frames - 1), t = position - before;
   if (t === 0) return [...points.slice(3 * before, 3 * before + 3)];
   const innerStart = before > 0, innerEnd = before + 2 < frames;
   const stepFrom = (frame) => [0, 1, 2].map((axis) => points[3 * frame + 3 + axis] - points[3 * frame + axis]);
@@ -64,5 +64,3 @@ function hermite(previous, step, following, innerStart, innerEnd, t) {
   });
 }
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const cross = ([ax, ay, az], [bx, by, bz]) => [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx];

@@ -1,14 +1,9 @@
 // Motions: a file's poses on an avatar's skeleton (rnd_runtime/motion/motion.py), and the window its skinning looks at (window.py).
 
+import { SMPL_REST_ROOT, STAND_INS, TURNS, Z_UP_TO_Y_UP } from "../constants.js";
 import { refusal } from "../errors.js";
 import { pointAt, rotationsAt } from "./interpolation.js";
-import { SMPL_REST_ROOT } from "../files/motion_names.js";
 import { matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
-
-// SMPL's hands are one joint each; files with fingers drive them by the index finger's base.
-const STAND_INS = { left_hand: "left_index1", right_hand: "right_index1" };
-const TURNS = 1e-6;  // of a matrix' elements, less than which a joint stands still
-const Z_UP_TO_Y_UP = new Float64Array([1, 0, 0, 0, 0, 1, 0, -1, 0]);
 
 /** A record of motion_files.js for `skeleton` ({names, rest}), Y up: {rotations [F·J·9], translations [F·3] m, frames, joints,
  *  fps, duration in s, name, notes}. The record stays as it is. */
@@ -36,7 +31,7 @@ function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, s
     const placed = zUp ? [p[0], p[2], -p[1]] : p;
     for (let k = 0; k < 3; k++) translations[3 * f + k] = placed[k] - skeleton.rest[k];
     if (!zUp) continue;
-    multiply(Z_UP_TO_Y_UP, 0, rotations, 9 * f * joints, turned, 0);
+    multiply(Z_UP_TO_Y_UP.flat(), 0, rotations, 9 * f * joints, turned, 0);
     rotations.set(turned, 9 * f * joints);
   }
 }

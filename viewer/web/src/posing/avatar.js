@@ -1,21 +1,15 @@
 // avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar/file.py, avatar.py, skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
-import { LARGEST_ALBEDO } from "../shading/brdf.js";
+import {
+  ADVICE_KEY, CONSTANT_OUTPUTS, LARGEST_ALBEDO, METADATA_KEY, NODE_LOGITS, NODE_OUTPUTS, POSED_OUTPUTS, REST_OUTPUTS, SCHEMA,
+} from "../constants.js";
 import { refusal } from "../errors.js";
 import { shareTwists } from "./forearm.js";
 import { motionWindow, poseAt } from "../motion/motion.js";
 import { OnnxFile } from "../files/onnx.js";
 import { RestPose } from "./posing.js";
 import { multiply, rotate } from "../rotations.js";
-
-const SCHEMA = "rnd-avatar/1";
-const POSED = ["means", "covariances", "normals", "visibility"], CONSTANT = ["opacities", "albedo", "roughness"];
-// Outputs of a file that lets us pose without the graph; node_logits is missing where skinning is the template's.
-const NODES = ["node_offsets", "node_visibility"], LOGITS = "node_logits";
-const REST = [
-  "neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs", "posing_limits",
-];
 
 // What the metadata may say (AvatarMetadata of rnd_runtime/avatar/file.py): true for a value, an object for one inside.
 const FIELDS = {
@@ -31,7 +25,7 @@ const EVERYTHING = -2;  // n·v that nothing is below
 export class Avatar {
   /** Read the file; throws with a reason when it is no avatar of ours. */
   static async load(bytes, name) {
-    const file = new OnnxFile(bytes), text = file.metadata.get("rnd_avatar");
+    const file = new OnnxFile(bytes), text = file.metadata.get(METADATA_KEY);
     if (!text) throw new Error(`${name} is not an RnD avatar`);
     const about = JSON.parse(text);
     if (about.schema !== SCHEMA) throw new Error(`${name}: schema ${about.schema}, expected ${SCHEMA}`);
@@ -48,11 +42,11 @@ export class Avatar {
     const { names, parents, rest_joints: rest } = about.skeleton;
     avatar.skeleton = { names, parents, rest: Float64Array.from(rest.flat()) };
     avatar.trainedLight = new Float32Array(Uint8Array.from(atob(about.trained_light), (c) => c.charCodeAt(0)).buffer);
-    [avatar.opacities, avatar.albedo, avatar.roughness] = await constants(file, CONSTANT);
+    [avatar.opacities, avatar.albedo, avatar.roughness] = await constants(file, CONSTANT_OUTPUTS);
     avatar.albedo.forEach((value, k) => { avatar.albedo[k] = Math.min(value, LARGEST_ALBEDO); });
-    const posesItself = [...NODES, ...REST].every((name) => file.outputs.has(name));
-    avatar.outputs = posesItself ? [...NODES, LOGITS].filter((name) => file.outputs.has(name)) : POSED;
-    if (posesItself) avatar.rest = new RestPose(about.gaussians, await constants(file, REST));
+    const posesItself = [...NODE_OUTPUTS, ...REST_OUTPUTS].every((name) => file.outputs.has(name));
+    avatar.outputs = posesItself ? [...NODE_OUTPUTS, NODE_LOGITS].filter((name) => file.outputs.has(name)) : POSED_OUTPUTS;
+    if (posesItself) avatar.rest = new RestPose(about.gaussians, await constants(file, REST_OUTPUTS));
     [avatar.session, avatar.inputs] = await sessionOf(file, avatar.outputs);
     return avatar;
   }
@@ -85,13 +79,13 @@ export class Avatar {
    *  translation [3]} → world; and joints [J·3] m in the world. */
   posed({ values, bones, root, joints }) {
     const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
-    return { count, ...Object.fromEntries(POSED.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, joints };
+    return { count, ...Object.fromEntries(POSED_OUTPUTS.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, joints };
   }
 }
 
 /** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar/file.py). */
 function advisedCull(file) {
-  const advice = JSON.parse(file.metadata.get("rnd_player") ?? "{}"), cull = advice?.cull ?? -1;
+  const advice = JSON.parse(file.metadata.get(ADVICE_KEY) ?? "{}"), cull = advice?.cull ?? -1;
   if (advice?.constructor !== Object || !(typeof cull === "number" && cull >= -1 && cull <= 1))
     throw refusal("metadata 'rnd_player'", { expected: "an object whose cull is -1 to 1", got: JSON.stringify(advice) });
   return cull > -1 ? cull : EVERYTHING;

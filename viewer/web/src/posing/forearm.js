@@ -1,8 +1,8 @@
 // Forearms that share a twist between elbow and wrist (rnd_runtime/posing/forearm.py, which has the formulas).
 
-import { axisAngleToMatrix, multiply, transposed } from "../rotations.js";
+import { FREE, MOST } from "../constants.js";
+import { axisAngleToMatrix, multiply, transposed, unit } from "../rotations.js";
 
-const FREE = Math.PI / 3, MOST = Math.PI / 3;  // radians
 const SIDES = ["left", "right"];
 
 /** Turn the forearms of local rotations [J·9] about themselves, and their hands back, in place. */
@@ -10,9 +10,9 @@ export function shareTwists({ names, parents, rest }, rotations) {
   for (const side of SIDES) {
     const elbow = names.indexOf(`${side}_elbow`), wrist = names.indexOf(`${side}_wrist`);
     if (elbow < 0 || wrist < 0 || parents[wrist] !== elbow) continue;
-    const bone = [0, 1, 2].map((k) => rest[3 * wrist + k] - rest[3 * elbow + k]), length = Math.hypot(...bone);
-    if (!(length > 0)) continue;
-    const axis = bone.map((value) => value / length);
+    const bone = [0, 1, 2].map((k) => rest[3 * wrist + k] - rest[3 * elbow + k]);
+    if (!(Math.hypot(...bone) > 0)) continue;
+    const axis = unit(bone);
     const angle = handedOn(rotations, 9 * elbow, axis) - handedOn(rotations, 9 * wrist, axis);
     if (angle === 0) continue;
     const turn = new Float64Array(9), turned = new Float64Array(9);

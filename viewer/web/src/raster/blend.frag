@@ -1,6 +1,6 @@
 // The Gaussians of a pixel's tile, blended front to back by the rule of rnd_runtime/raster/oracle.py: a pixel stops before
 // the one that would leave less than 1e-4 of its light, which no blending unit can do. Then the background, and sRGB; or
-// what a material map shows (rnd_viewer/play/aov.py).
+// what a material map shows (rnd_runtime/playback/aov.py).
 
 uniform sampler2D records;   // TEXELS for each Gaussian; see project.js
 uniform usampler2D pairs;    // Gaussians, tile by tile, front to back
@@ -8,16 +8,12 @@ uniform usampler2D tiles;    // first and last + 1 of a tile's pairs
 uniform sampler2D sky;       // lat-long radiance
 uniform ivec2 size;          // px
 uniform int show;            // 0 radiance, 1 normals, 2 a number
-uniform int behind;          // 0 one colour, 1 the sky
+uniform int background;          // 0 one colour, 1 the sky
 uniform vec3 colour;         // linear
 uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's frame
 uniform float gain;
-out vec4 picture;
+out vec4 image;
 
-const float LOG2_ALPHA_MIN = -7.9943534368588578;  // log2(1/255)
-const float ALPHA_MAX = 0.99;
-const float TRANSMITTANCE_MIN = 0.9999e-4;
-const float MIN_COVERAGE = 0.05;
 const float PI = 3.14159265358979;
 
 /** Premultiplied attributes and alpha. */
@@ -28,8 +24,8 @@ vec4 blend(ivec2 pixel) {
     for (uint pair = range.x; pair < range.y; pair++) {
         int gaussian = int(texelFetch(pairs, ivec2(pair % ROW_PAIRS, pair / ROW_PAIRS), 0).x);
         ivec2 texel = ivec2(gaussian % ROW_GAUSSIANS * TEXELS, gaussian / ROW_GAUSSIANS);
-        vec4 place = texelFetch(records, texel, 0), shape = texelFetch(records, texel + ivec2(1, 0), 0);
-        vec2 d = vec2(pixel) - place.xy - place.zw;
+        vec4 centre = texelFetch(records, texel, 0), shape = texelFetch(records, texel + ivec2(1, 0), 0);
+        vec2 d = vec2(pixel) - centre.xy - centre.zw;
         float across = d.x - shape.x * d.y;
         float exponent = shape.w - shape.y * d.y * d.y - shape.z * across * across;
         if (!(exponent >= LOG2_ALPHA_MIN)) continue;
@@ -67,7 +63,7 @@ void main() {
     value *= value.a * (3.0 - 2.0 * value.a);  // outlines as sharp as a body's: rnd_runtime/raster/outline.py
     vec3 result;
     if (show == 0) {
-        vec3 far = behind == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
+        vec3 far = background == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
         result = srgb(value.rgb + (1.0 - value.a) * far);
     } else if (value.a < MIN_COVERAGE) {
         result = vec3(0.0);
@@ -75,5 +71,5 @@ void main() {
         vec3 mean = value.rgb / value.a;
         result = show == 1 ? (mean / max(length(mean), 1e-6) + 1.0) / 2.0 : mean.rrr;
     }
-    picture = vec4(result, 1.0);
+    image = vec4(result, 1.0);
 }

@@ -1,11 +1,12 @@
-// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/raster/project.py, _raster_tiles.py).
+// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/raster/project.py, tiles.py).
+
+import { ALPHA_MIN, DILATION, FIELD_OF_VIEW_MARGIN, HALF_LOG2_E, LOG2_ALPHA_MIN, NEAR, RADIX_BITS } from "../constants.js";
 
 export const ROW_GAUSSIANS = 512, ROW_PAIRS = 2048, TILE = 4;
 export const TEXELS = 3;  // whole and broken part of the centre less ½; shear, fall_y, fall_x, peak; three attributes
 
-const NEAR = 0.1, DILATION = 0.05, MARGIN = 0.3, HALF_LOG2_E = 0.5 * Math.LOG2E, LOG2_255 = Math.log2(255);
-const HALF = 0.5 * (TILE - 1), LEAST = -LOG2_255 - 1e-3;  // no tile is lost to rounding
-const RADIX = 11, DIGITS = 1 << RADIX;
+const HALF = 0.5 * (TILE - 1), LEAST = LOG2_ALPHA_MIN - 1e-3;  // no tile is lost to rounding
+const DIGITS = 1 << RADIX_BITS;
 
 /**
  * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
@@ -15,7 +16,7 @@ const RADIX = 11, DIGITS = 1 << RADIX;
  */
 export function project({ means, covariances, opacities, normals }, count, features, camera, grown, cull) {
   const { rotation: r, translation: t, position: eye, focal, width, height } = camera;
-  const limitX = (0.5 + MARGIN * 0.5) * width / focal, limitY = (0.5 + MARGIN * 0.5) * height / focal;
+  const limitX = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * width / focal, limitY = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * height / focal;
   const records = new Float32Array(wholeRows(count, ROW_GAUSSIANS) * TEXELS * 4);
   const boxes = new Int32Array(4 * count), depths = new Float64Array(count), drawn = new Int32Array(count);
   let visible = 0;
@@ -24,7 +25,7 @@ export function project({ means, covariances, opacities, normals }, count, featu
     const x = r[0] * mx + r[1] * my + r[2] * mz + t[0], y = r[3] * mx + r[4] * my + r[5] * mz + t[1];
     const z = r[6] * mx + r[7] * my + r[8] * mz + t[2];
     const trace = covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5];
-    if (!(z >= NEAR && z < Infinity && opacity >= 1 / 255 && opacity < Infinity && trace > 0 && trace < Infinity)) continue;
+    if (!(z >= NEAR && z < Infinity && opacity >= ALPHA_MIN && opacity < Infinity && trace > 0 && trace < Infinity)) continue;
     const awayX = eye[0] - mx, awayY = eye[1] - my, awayZ = eye[2] - mz;
     const along = awayX * normals[3 * i] + awayY * normals[3 * i + 1] + awayZ * normals[3 * i + 2];
     if (along < cull * Math.sqrt(awayX * awayX + awayY * awayY + awayZ * awayZ)) continue;
@@ -40,7 +41,7 @@ export function project({ means, covariances, opacities, normals }, count, featu
     const pyy = b0 * sb0 + b1 * sb1 + b2 * sb2 + DILATION, shear = pxy / pyy, conditional = pxx - pxy * shear;
     if (!(pyy > 0 && conditional > 0 && pxx < Infinity && pyy < Infinity)) continue;
     const centerX = focal * x / z + width / 2, centerY = focal * y / z + height / 2, peak = Math.log2(opacity);
-    const reach = Math.max(peak + LOG2_255, 0) / HALF_LOG2_E;  // 2·ln(255·opacity)
+    const reach = Math.max(peak - LOG2_ALPHA_MIN, 0) / HALF_LOG2_E;  // 2·ln(255·opacity)
     const reachX = Math.sqrt(reach * pxx) - 0.499, reachY = Math.sqrt(reach * pyy) - 0.499;  // to the last pixel centre
     const left = Math.max(centerX - reachX, 0), right = Math.min(centerX + reachX, width - 1);
     const top = Math.max(centerY - reachY, 0), bottom = Math.min(centerY + reachY, height - 1);
@@ -115,7 +116,7 @@ function frontToBack(depths, drawn) {
   let order = drawn, other = new Int32Array(drawn.length);
   let keys = new Uint32Array(drawn.length), otherKeys = new Uint32Array(drawn.length);
   for (let k = 0; k < drawn.length; k++) keys[k] = (depths[drawn[k]] - near) * scale;
-  for (let shift = 0; shift < 32; shift += RADIX) {
+  for (let shift = 0; shift < 32; shift += RADIX_BITS) {
     const starts = new Int32Array(DIGITS + 1);
     for (const key of keys) starts[((key >>> shift) & (DIGITS - 1)) + 1]++;
     for (let digit = 0; digit < DIGITS; digit++) starts[digit + 1] += starts[digit];

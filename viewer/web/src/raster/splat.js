@@ -1,11 +1,14 @@
-// WebGL2: each pixel of the picture goes through the Gaussians of its tile.
+// WebGL2: each pixel goes through the Gaussians of its tile.
 
-import pictureFragment from "./blend.frag";
+import { ALPHA_MAX, LOG2_ALPHA_MIN, MIN_COVERAGE, TRANSMITTANCE_MIN } from "../constants.js";
+import blendFragment from "./blend.frag";
 import { ROW_GAUSSIANS, ROW_PAIRS, TEXELS, TILE } from "./project.js";
 
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler2D;\n";
-const MACROS = `#define TEXELS ${TEXELS}\n#define ROW_GAUSSIANS ${ROW_GAUSSIANS}\n#define ROW_PAIRS ${ROW_PAIRS}u\n#define TILE ${TILE}\n`;
-const WHOLE = "void main() { gl_Position = vec4(vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 1.0, 0.0, 1.0); }";
+const MACROS = Object.entries({
+  TEXELS, ROW_GAUSSIANS, ROW_PAIRS: `${ROW_PAIRS}u`, TILE, ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, MIN_COVERAGE,
+}).map(([name, value]) => `#define ${name} ${value}\n`).join("");
+const FULLSCREEN = "void main() { gl_Position = vec4(vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 1.0, 0.0, 1.0); }";
 const TEXTURES = ["records", "pairs", "tiles", "sky"];  // by unit
 
 export class Splatter {
@@ -14,7 +17,7 @@ export class Splatter {
     const gl = this.gl = this.canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
     if (!gl) throw new Error("this browser has no WebGL2");
     this.name = "WebGL2";
-    this.program = new Program(gl, HEAD + WHOLE, HEAD + MACROS + pictureFragment);
+    this.program = new Program(gl, HEAD + FULLSCREEN, HEAD + MACROS + blendFragment);
     this.largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.formats = {
       records: [gl.RGBA32F, gl.RGBA, gl.FLOAT], sky: [gl.RGBA32F, gl.RGBA, gl.FLOAT],
@@ -32,14 +35,14 @@ export class Splatter {
   /** Whether the browser has taken the context away, as after a driver's reset: nothing is drawn any more. */
   isLost() { return this.gl.isContextLost(); }
 
-  /** The map that may stand behind. */
+  /** The map of the background. */
   setSky({ width, height, radiance }) {
     const texels = new Float32Array(4 * width * height);
     for (let k = 0; k < width * height; k++) texels.set(radiance.subarray(3 * k, 3 * k + 3), 4 * k);
     this.upload("sky", width, texels);
   }
 
-  /** Draw what `project` made and show it as `look` says; the picture is then on `canvas`. */
+  /** Draw what `project` made and show it as `look` says; the image is then on `canvas`. */
   draw({ records, pairs, tiles, columns }, width, height, look) {
     const { gl, canvas } = this;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -55,7 +58,7 @@ export class Splatter {
   upload(name, width, values) {
     const { gl } = this, [internal, format, type] = this.formats[name];
     const height = values.length / width / { [gl.RGBA]: 4, [gl.RG_INTEGER]: 2, [gl.RED_INTEGER]: 1 }[format];
-    if (height > this.largest) throw new Error("more Gaussians in the picture than this browser's textures hold");
+    if (height > this.largest) throw new Error("more Gaussians in the frame than this browser's textures hold");
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf(name));
     gl.texImage2D(gl.TEXTURE_2D, 0, internal, width, height, 0, format, type, values);
   }

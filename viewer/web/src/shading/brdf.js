@@ -1,10 +1,8 @@
 // GGX with Smith's separable masking and Schlick, metallic 0 (rnd_runtime/shading/brdf.py).
 
-export const ROUGHNESS_LOW = 0.09, ROUGHNESS_HIGH = 0.99;
-const F0 = 0.04, COSINE_FLOOR = 1e-4;
-export const LARGEST_ALBEDO = 1 - F0 - (1 - F0) / 21;
+import { COSINE_FLOOR, F0, ROUGHNESS_RANGE } from "../constants.js";
 
-export const clampRoughness = (roughness) => Math.min(Math.max(roughness, ROUGHNESS_LOW), ROUGHNESS_HIGH);
+export const clampRoughness = (roughness) => Math.min(Math.max(roughness, ROUGHNESS_RANGE[0]), ROUGHNESS_RANGE[1]);
 
 /** D·F·G / (4 n·l n·v) from α², cosines, sin²θ_h and |l + v|². */
 export function ggx(alphaSquared, nDotL, nDotV, sineSquared, halfSquared) {

@@ -1,17 +1,14 @@
 // Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/shading/light.py).
 
+import { DIM, MOST_EXPOSED, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
 import { refusal, short } from "../errors.js";
 import { readExr } from "../files/exr.js";
 
 const LARGEST_FLOAT = 3.4028234663852886e38;
-const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];  // x and y of red, green, blue and white
-const SAME_COLOUR = 2e-3;  // by which x and y may miss them: D65 has more digits
-const DIM = 1e-3;  // largest radiance below which every 8-bit pixel of a body would be black or next to it
 const RGBE = "FORMAT=32-bit_rle_rgbe";
-const MOST_EXPOSED = 1e30;
 
-/** Rec.709. */
-export const luminance = (r, g, b) => 0.2126 * r + 0.7152 * g + 0.0722 * b;
+const [LUMA_R, LUMA_G, LUMA_B] = REC709_LUMINANCE;
+export const luminance = (r, g, b) => LUMA_R * r + LUMA_G * g + LUMA_B * b;
 
 /** {height, width, radiance: Float32Array [H·W·3], repaired, chromaticities} of an .exr or .hdr file. */
 export function readLight(bytes, name) {

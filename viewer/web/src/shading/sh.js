@@ -1,9 +1,7 @@
 // Real spherical harmonics of degree 3, in the order and with the signs of rnd_runtime/core/sh.py.
 
-const C0 = Math.sqrt(1 / (4 * Math.PI)), C1 = Math.sqrt(3 / (4 * Math.PI));
-const C2 = Math.sqrt(15 / (4 * Math.PI)), C20 = Math.sqrt(5 / (16 * Math.PI));
-const C33 = Math.sqrt(35 / (32 * Math.PI)), C32 = Math.sqrt(105 / (4 * Math.PI));
-const C31 = Math.sqrt(21 / (32 * Math.PI)), C30 = Math.sqrt(7 / (16 * Math.PI));
+import { C0, C1, C2_SIDE as C2, C2_ZONAL as C20, C3_0 as C30, C3_1 as C31, C3_2 as C32, C3_3 as C33, SH_DEGREES } from "../constants.js";
+
 // Gauss–Legendre, four nodes: with eight steps of azimuth exact up to degree 7
 const NODES = [[-0.8611363115940526, 0.34785484513745385], [-0.3399810435848563, 0.6521451548625461],
   [0.3399810435848563, 0.6521451548625461], [0.8611363115940526, 0.34785484513745385]];
@@ -30,19 +28,19 @@ export function shBasis(x, y, z, out) {
   return out;
 }
 
-/** M [16·16] that turns coefficients as the 3×3 `r` turns directions: Y(R d) · M c = Y(d) · c. */
+/** M [16·16] that rotates coefficients as the 3×3 `r` rotates directions: Y(R d) · M c = Y(d) · c. */
 export function shRotation(r) {
-  const matrix = new Float64Array(256), here = new Float64Array(16), turned = new Float64Array(16);
+  const matrix = new Float64Array(256), here = new Float64Array(16), rotated = new Float64Array(16);
   for (const [z, weight] of NODES)
     for (let k = 0; k < 8; k++) {
       const azimuth = (k + 0.5) * Math.PI / 4, ring = Math.sqrt(1 - z * z);
       const x = ring * Math.cos(azimuth), y = ring * Math.sin(azimuth);
       shBasis(x, y, z, here);
-      shBasis(r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z, turned);
+      shBasis(r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z, rotated);
       for (let i = 0; i < 16; i++)
         for (let j = 0; j < 16; j++)
-          if (Math.floor(Math.sqrt(i)) === Math.floor(Math.sqrt(j)))
-            matrix[16 * i + j] += weight * Math.PI / 4 * here[i] * turned[j];
+          if (SH_DEGREES[i] === SH_DEGREES[j])
+            matrix[16 * i + j] += weight * Math.PI / 4 * here[i] * rotated[j];
     }
   return matrix;
 }

@@ -1,11 +1,11 @@
 // Suns: a hard shadow from a depth map splatted from the Gaussians (rnd_runtime/shading/shadow.py), and their own shading.
 
+import {
+  AT_SILHOUETTE, CASTING_OPACITY, CLEARANCE, CLEARANCE_TEXELS, DISC_SIGMAS, DROP, EDGE_ON, RIM_TEXELS, SHADOW_RESOLUTION, SLOPE_FLOOR,
+  SOFTNESS, TURNED_AWAY,
+} from "../constants.js";
+import { cross, unit } from "../rotations.js";
 import { clampRoughness, ggx } from "./brdf.js";
-
-const RESOLUTION = 384, DISC_SIGMAS = 1.4, CASTING_OPACITY = 0.5;
-const TURNED_AWAY = -0.2, AT_SILHOUETTE = 0;  // n·v over which suns fade out on what faces away (sunlight.py)
-const CLEARANCE_TEXELS = 0.35, COSINE_FLOOR = 0.1;  // and of a disc's radius, once
-const DROP = 2, RIM_TEXELS = 0.5, EDGE_ON = 0.02, SOFTNESS = 0.25;
 
 /** Add to `radiance` [count·3] what `suns` ({direction in the root's frame, irradiance, spread}) lay on the Gaussians. */
 export function addSuns(suns, gaussians, count, eye, grown, radiance) {
@@ -45,7 +45,7 @@ function sunVisibility(direction, { means, normals }, count, radii) {
     high = Math.max(high, up);
   }
   const spans = [right - left, high - low].map((span) => Math.max(span, 0)), extent = Math.max(...spans);
-  const texel = (extent > 0 ? extent : 1) / (RESOLUTION - 3);  // centres at integers, empty rows around, one for rounding
+  const texel = (extent > 0 ? extent : 1) / (SHADOW_RESOLUTION - 3);  // centres at integers, empty rows around, one for rounding
   const [width, height] = spans.map((span) => Math.floor(span / texel) + 4);
   const map = { depth: new Float32Array(width * height).fill(-Infinity), width, height, texel };
   for (let i = 0; i < count; i++) {
@@ -66,24 +66,15 @@ function frameOf(direction) {
   return [x, cross(z, x), z];
 }
 
-function unit(v) {
-  const length = Math.hypot(...v);
-  return v.map((value) => value / length);
-}
-
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-}
-
 /** Rise of a point's tangent plane towards the light, in metres a texel, along x and y. */
 function slopes(normal, k, texel) {
-  const scale = -texel / Math.max(normal[k + 2], COSINE_FLOOR);
+  const scale = -texel / Math.max(normal[k + 2], SLOPE_FLOOR);
   return [normal[k] * scale, normal[k + 1] * scale];
 }
 
 function drawDisc({ depth, width, height, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2] - DROP * Math.max(1 - normal[k + 2] / EDGE_ON, 0);
-  const cosine = Math.max(normal[k + 2], COSINE_FLOOR), box = radius / texel + RIM_TEXELS;
+  const cosine = Math.max(normal[k + 2], SLOPE_FLOOR), box = radius / texel + RIM_TEXELS;
   const area = texel * texel, square = radius * radius;
   const fall = DROP / (box * box * area - square), [slopeX, slopeY] = slopes(normal, k, texel);
   const left = Math.max(Math.ceil(x - box), 0), right = Math.min(Math.floor(x + box) + 1, width);
@@ -101,7 +92,7 @@ function drawDisc({ depth, width, height, texel }, position, normal, k, radius) 
 /** Bilinear share of the four texels around a point that lies open: what rises above its plane hides it. */
 function lookUp({ depth, width, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
-  const clearance = Math.max(radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], COSINE_FLOOR);
+  const clearance = Math.max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], SLOPE_FLOOR);
   const top = z + (1 + SOFTNESS) * clearance, span = 1 / (2 * SOFTNESS * clearance);
   const column = Math.floor(x), row = Math.floor(y);
   let lit = 0;
@@ -132,7 +123,7 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
     const cx = ny * hz - nz * hy, cy = nz * hx - nx * hz, cz = nx * hy - ny * hx;
     const sineSquared = (cx * cx + cy * cy + cz * cz) / halfSquared;
     const alpha = clampRoughness(roughness[i]) ** 2;
-    const shine = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * arriving * (albedo[3 * i + c] / Math.PI + shine) * sun.irradiance[c];
+    const specular = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * arriving * (albedo[3 * i + c] / Math.PI + specular) * sun.irradiance[c];
   }
 }

@@ -1,15 +1,14 @@
 // The sum over distant lights, each with the whole BRDF and its own visibility (rnd_runtime/shading/sum.py).
 
+import { CUT_TEXELS, HALF_FLOOR, PROBE_SHAPE } from "../constants.js";
 import { clampRoughness, ggx } from "./brdf.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 import { rotate } from "../rotations.js";
 import { shBasis } from "./sh.js";
 
-const TEXELS = [32, 64], CUT_TEXELS = [128, 256], HALF_FLOOR = 1e-8;
-
 /** Every texel of a light: {directions [K·3], flux [K·3]}. */
 export function allTexels(light) {
-  const { directions, flux } = gridOf(light, TEXELS);
+  const { directions, flux } = gridOf(light, PROBE_SHAPE);
   return { directions, flux };
 }
 
@@ -75,7 +74,7 @@ function halves({ top, bottom, left, right }, total, height, width) {
   });
 }
 
-/** Radiance [count·3] towards `eye` under the lights, turned by the 3×3 `lightToRoot`. */
+/** Radiance [count·3] towards `eye` under the lights, rotated by the 3×3 `lightToRoot`. */
 export function shadeLights(lights, { means, normals, albedo, roughness, visibility }, count, eye, lightToRoot, radiance) {
   const K = lights.flux.length / 3, { flux } = lights, toward = new Float64Array(3 * K), basis = new Float64Array(16 * K);
   for (let k = 0; k < K; k++) {
@@ -91,7 +90,7 @@ export function shadeLights(lights, { means, normals, albedo, roughness, visibil
     vy /= distance;
     vz /= distance;
     const nDotV = nx * vx + ny * vy + nz * vz, alphaSquared = clampRoughness(roughness[i]) ** 4;
-    const diffuse = [0, 0, 0], shine = [0, 0, 0];
+    const diffuse = [0, 0, 0], specular = [0, 0, 0];
     for (let k = 0; k < K; k++) {
       const lx = toward[3 * k], ly = toward[3 * k + 1], lz = toward[3 * k + 2], nDotL = nx * lx + ny * ly + nz * lz;
       if (!(nDotL > 0)) continue;
@@ -103,9 +102,9 @@ export function shadeLights(lights, { means, normals, albedo, roughness, visibil
       const reflected = arriving * ggx(alphaSquared, nDotL, nDotV, (cx * cx + cy * cy + cz * cz) / halfSquared, halfSquared);
       for (let c = 0; c < 3; c++) {
         diffuse[c] += arriving * flux[3 * k + c];
-        shine[c] += reflected * flux[3 * k + c];
+        specular[c] += reflected * flux[3 * k + c];
       }
     }
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * diffuse[c] + shine[c], 0);
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] = Math.max(albedo[3 * i + c] / Math.PI * diffuse[c] + specular[c], 0);
   }
 }

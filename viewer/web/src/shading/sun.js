@@ -1,13 +1,13 @@
 // Taking the sun out of a light probe (rnd_runtime/shading/sun.py): sky + suns = map.
 
+import { CAP, LAMP, LARGEST, LEAST_SHARE, MOST_PEAKS, RING, RING_AREA } from "../constants.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 
-const CAP = 6 * Math.PI / 180, RING = 10 * Math.PI / 180, LEAST_SHARE = 0.05, LARGEST = 512, LIMIT = 2, MOST_PEAKS = 16, LAMP = 2 * Math.PI / 180;
-const RING_AREA = 2 * Math.PI * (1 - Math.cos(RING));
+const LIMIT = 2;  // suns
 
 /** {sky: light, suns: [{direction, irradiance, spread}]}, strongest first. */
 export function extractSuns(light) {
-  const map = light.height > LARGEST ? downsize(light, LARGEST, 2 * LARGEST) : light;
+  const map = light.height > LARGEST[0] ? downsize(light, ...LARGEST) : light;
   const { height, width } = map, radiance = Float64Array.from(map.radiance);
   const angles = texelSolidAngles(height, width), directions = texelDirections(height, width);
   const bright = new Float64Array(height * width);  // luminance, -Infinity where a peak was passed over

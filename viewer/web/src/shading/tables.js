@@ -1,15 +1,14 @@
 // Shading by tables over the normal that depend on the light alone (rnd_runtime/shading/tables.py).
 
+import { DIFFUSE_SIZE as DIFFUSE, LOBE_WIDTHS, PROBE_SHAPE, SH_DEGREES, SPECULAR_SIZE as SPECULAR } from "../constants.js";
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
-import { WIDTHS, lobeAt, lobeTable } from "./lobe.js";
+import { lobeAt } from "./lobe.js";
 import { transposed } from "../rotations.js";
 import { shBasis, shRotation } from "./sh.js";
 
-const TEXELS = [32, 64], DIFFUSE = 33, SPECULAR = 49;
-
 /** {diffuse [33²·3·16], specular [7·49²·3]} of a light. */
 export function buildSky(light) {
-  const [height, width] = TEXELS, count = height * width;
+  const [height, width] = PROBE_SHAPE, count = height * width;
   const { radiance } = downsize(light, height, width);
   const directions = texelDirections(height, width), angles = texelSolidAngles(height, width);
   const weighted = new Float64Array(count * 48), basis = new Float64Array(16), flux = new Float64Array(count * 4);
@@ -40,11 +39,11 @@ function diffuseTable(directions, weighted) {
 
 function specularTable(directions, flux) {
   const nodes = octahedralNodes(SPECULAR), count = SPECULAR * SPECULAR;
-  const table = new Float32Array(WIDTHS.length * count * 3), cosines = new Float64Array(directions.length / 3);
+  const table = new Float32Array(LOBE_WIDTHS.length * count * 3), cosines = new Float64Array(directions.length / 3);
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < cosines.length; k++)
       cosines[k] = nodes[3 * i] * directions[3 * k] + nodes[3 * i + 1] * directions[3 * k + 1] + nodes[3 * i + 2] * directions[3 * k + 2];
-    WIDTHS.forEach((width, level) => {
+    LOBE_WIDTHS.forEach((width, level) => {
       let total = 0, red = 0, green = 0, blue = 0;
       for (let k = 0; k < cosines.length; k++) {
         const away = 1 + width - cosines[k], weight = 1 / (away * away);
@@ -72,7 +71,7 @@ function octahedralNodes(size) {
   return nodes;
 }
 
-/** Cell of the octahedral grid for the direction in `d` and the place within it, into `out`: node, s, t. */
+/** Cell of the octahedral grid for the direction in `d` and the position within it, into `out`: node, s, t. */
 function octahedralCell(x, y, z, size, out) {
   const scale = 1 / Math.max(Math.abs(x) + Math.abs(y) + Math.abs(z), 1e-12);
   let a = x * scale, b = y * scale;
@@ -85,12 +84,12 @@ function octahedralCell(x, y, z, size, out) {
   out[2] = b - row;
 }
 
-/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, turned by the 3×3 `lightToRoot`. */
+/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, rotated by the 3×3 `lightToRoot`. */
 export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
-  const { means, normals, albedo, roughness, visibility } = gaussians, lobes = lobeTable(), r = lightToRoot;
-  const diffuse = turned(sky.diffuse, shRotation(transposed(r))), { specular } = sky;
+  const { means, normals, albedo, roughness, visibility } = gaussians, r = lightToRoot;
+  const diffuse = rotated(sky.diffuse, shRotation(transposed(r))), { specular } = sky;
   const n = [0, 0, 0], v = [0, 0, 0], lobe = new Float64Array(8), basis = new Float64Array(16);
-  const cell = new Float64Array(3), node = new Float64Array(3), level = 3 * SPECULAR * SPECULAR;
+  const cell = new Float64Array(3), node = new Float64Array(3), mapSize = 3 * SPECULAR * SPECULAR;
   for (let i = 0; i < count; i++) {
     const dx = eye[0] - means[3 * i], dy = eye[1] - means[3 * i + 1], dz = eye[2] - means[3 * i + 2];
     const distance = Math.max(Math.sqrt(dx * dx + dy * dy + dz * dz), 1e-12);
@@ -98,24 +97,24 @@ export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
       n[k] = r[k] * normals[3 * i] + r[3 + k] * normals[3 * i + 1] + r[6 + k] * normals[3 * i + 2];
       v[k] = (r[k] * dx + r[3 + k] * dy + r[6 + k] * dz) / distance;
     }
-    lobeAt(lobes, roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
-    const mx = lobe[1], my = lobe[2], mz = lobe[3], place = lobe[4];
+    lobeAt(roughness[i], n[0] * v[0] + n[1] * v[1] + n[2] * v[2], n, v, lobe);
+    const mx = lobe[1], my = lobe[2], mz = lobe[3], level = lobe[4];
     shBasis(r[0] * mx + r[1] * my + r[2] * mz, r[3] * mx + r[4] * my + r[5] * mz, r[6] * mx + r[7] * my + r[8] * mz, basis);
     let seen = visibility[16 * i] * basis[0];  // averaged over the lobe
-    for (let j = 1; j < 16; j++) seen += lobe[j < 4 ? 5 : j < 9 ? 6 : 7] * visibility[16 * i + j] * basis[j];
-    const low = Math.min(Math.floor(place), WIDTHS.length - 2), up = place - low;
+    for (let j = 1; j < 16; j++) seen += lobe[4 + SH_DEGREES[j]] * visibility[16 * i + j] * basis[j];
+    const low = Math.min(Math.floor(level), LOBE_WIDTHS.length - 2), up = level - low;
     octahedralCell(mx, my, mz, SPECULAR, cell);
     octahedralCell(n[0], n[1], n[2], DIFFUSE, node);
     const s = node[1], t = node[2], w00 = (1 - s) * (1 - t), w01 = s * (1 - t), w10 = (1 - s) * t, w11 = s * t;
     let a = node[0] * 48, b = a + 48, c = a + DIFFUSE * 48, d = c + 48;  // the cell's corners
     for (let channel = 0; channel < 3; channel++) {
-      const corner = 3 * cell[0] + channel + low * level;
-      const lower = bilinear(specular, corner, cell[1], cell[2]), upper = bilinear(specular, corner + level, cell[1], cell[2]);
-      const shine = lobe[0] * Math.max(seen, 0) * (lower + up * (upper - lower));
+      const corner = 3 * cell[0] + channel + low * mapSize;
+      const lower = bilinear(specular, corner, cell[1], cell[2]), upper = bilinear(specular, corner + mapSize, cell[1], cell[2]);
+      const specularRadiance = lobe[0] * Math.max(seen, 0) * (lower + up * (upper - lower));
       let irradiance = 0;
       for (let j = 16 * i; j < 16 * i + 16; j++)
         irradiance += visibility[j] * (w00 * diffuse[a++] + w01 * diffuse[b++] + w10 * diffuse[c++] + w11 * diffuse[d++]);
-      radiance[3 * i + channel] = Math.max(albedo[3 * i + channel] / Math.PI * irradiance + shine, 0);
+      radiance[3 * i + channel] = Math.max(albedo[3 * i + channel] / Math.PI * irradiance + specularRadiance, 0);
     }
   }
 }
@@ -125,15 +124,15 @@ function bilinear(table, corner, s, t) {
   return top + t * (table[next] + s * (table[next + 3] - table[next]) - top);
 }
 
-/** The diffuse tables for coefficients of the root's frame: each of their rows times `turn` [16·16], degree by degree. */
-function turned(diffuse, turn) {
+/** The diffuse tables for coefficients of the root's frame: each of their rows times `rotation` [16·16], degree by degree. */
+function rotated(diffuse, rotation) {
   const result = new Float32Array(diffuse.length);
   for (let degree = 0; degree < 4; degree++) {
     const first = degree * degree, last = first + 2 * degree + 1;
     for (let row = 0; row < diffuse.length; row += 16)
       for (let target = first; target < last; target++) {
         let sum = 0;
-        for (let source = first; source < last; source++) sum += diffuse[row + source] * turn[16 * source + target];
+        for (let source = first; source < last; source++) sum += diffuse[row + source] * rotation[16 * source + target];
         result[row + target] = sum;
       }
   }

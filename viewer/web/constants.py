@@ -1,0 +1,71 @@
+"""Writes ``src/constants.js``, what the web player shares with Python: ``python viewer/web/constants.py``.
+
+Run it after a change of any constant below; a test holds the file against Python's.
+"""
+
+from __future__ import annotations
+
+import json
+from base64 import b64encode
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rnd_runtime.shading.specular_lobe import lobe_table
+
+FILE = Path(__file__).parent / "src/constants.js"
+# Names by module; private ones lose their underscore in JavaScript.
+SHARED = {
+    "rnd_runtime.avatar.file": (
+        "SCHEMA METADATA_KEY ADVICE_KEY PROBE_SHAPE POSED_OUTPUTS CONSTANT_OUTPUTS NODE_OUTPUTS NODE_LOGITS REST_OUTPUTS"
+    ),
+    "rnd_runtime.motion.readers.smpl_names": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
+    "rnd_runtime.motion.readers.arrays": (
+        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _DEFAULT_FPS FPS_LIMITS"
+    ),
+    "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS _TURNS",
+    "rnd_runtime.motion.interpolation": "LARGEST_STEP LARGEST_MOVE",
+    "rnd_runtime.posing.forearm": "FREE MOST",
+    "rnd_runtime.posing.posing": "_SHORTEST TWIST_STEPS SMALLEST_SQUARE _DEEPEST",
+    "rnd_runtime.core.sh": "SH_COUNT SH_DEGREES COSINE_LOBE _C0 _C1 _C2_SIDE _C2_ZONAL _C3_3 _C3_2 _C3_1 _C3_0",
+    "rnd_runtime.shading.light": "REC709 REC709_LUMINANCE _SAME_COLOUR _MOST_EXPOSED _DIM",
+    "rnd_runtime.shading.brdf": "F0 ROUGHNESS_RANGE COSINE_FLOOR LARGEST_ALBEDO",
+    "rnd_runtime.shading.specular_lobe": "LOBE_WIDTHS ROUGHNESS_COUNT COSINE_COUNT",
+    "rnd_runtime.shading.lookup": "DIFFUSE_SIZE SPECULAR_SIZE",
+    "rnd_runtime.shading.sum": "_HALF_FLOOR _CUT_TEXELS",
+    "rnd_runtime.shading.sun": "_CAP _RING _RING_AREA _LARGEST _LEAST_SHARE _MOST_PEAKS _LAMP",
+    "rnd_runtime.shading.shader": "SHADOW_RESOLUTION DISC_SIGMAS CASTING_OPACITY",
+    "rnd_runtime.shading.shadow": "CLEARANCE CLEARANCE_TEXELS DROP RIM_TEXELS EDGE_ON SOFTNESS SLOPE_FLOOR",
+    "rnd_runtime.shading.sunlight": "TURNED_AWAY AT_SILHOUETTE",
+    "rnd_runtime.raster.oracle": "NEAR DILATION ALPHA_MIN ALPHA_MAX TRANSMITTANCE_MIN FIELD_OF_VIEW_MARGIN",
+    "rnd_runtime.raster.project": "HALF_LOG2_E LOG2_ALPHA_MIN",
+    "rnd_runtime.raster.tiles": "RADIX_BITS",
+    "rnd_runtime.playback.aov": "MIN_COVERAGE",
+    "rnd_viewer.inputs.cameras": "PADDING",
+    "rnd_viewer.inputs.options": "ELEVATION FIELD_OF_VIEW",
+    "rnd_viewer.view.scene": "CLAY LARGEST_SKY",
+}
+
+
+def source() -> str:
+    """The text of ``src/constants.js``."""
+    lines = ["// Written by viewer/web/constants.py from Python's constants; not to be edited.", ""]
+    for module, names in SHARED.items():
+        lines.append(f"// {module}")
+        lines += [f"export const {name.lstrip('_')} = {_value(module, name)};" for name in names.split()]
+    table = b64encode(np.ascontiguousarray(lobe_table(), "<f4").tobytes()).decode()
+    lines += ["// float32 [ROUGHNESS_COUNT·COSINE_COUNT·7] of rnd_runtime.shading.specular_lobe.make_table"]
+    return "\n".join([*lines, f'export const LOBE_TABLE = "{table}";', ""])
+
+
+def _value(module: str, name: str) -> str:
+    value: Any = getattr(import_module(module), name)
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    return json.dumps(value)
+
+
+if __name__ == "__main__":
+    FILE.write_text(source(), encoding="utf-8")
