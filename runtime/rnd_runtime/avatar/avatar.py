@@ -66,7 +66,7 @@ class Avatar:
 
         Args:
             ahead: its networks, where they are being loaded already, with threads of their own: see
-                ``playback.start.quick_start``.
+                ``playback.start.load_ahead``.
 
         Raises:
             InputError: for anything that is not a whole avatar of the schema we know.

@@ -1,25 +1,34 @@
-"""How many threads the compiled kernels may take."""
+"""How many threads a process takes: by default one for each core that it may use."""
 
 from __future__ import annotations
 
-import numba
+import os
 
-from .errors import check_option
+from .errors import InputError
 
 
-def most_threads() -> int:
-    """One per core, or as many as NUMBA_NUM_THREADS says."""
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def max_threads() -> int:
+    """Threads that compiled kernels may take: one per core, or NUMBA_NUM_THREADS."""
+    import numba
+
     return int(numba.config.NUMBA_NUM_THREADS)
 
 
 def check_threads(threads: int) -> None:
-    """Raise ``core.errors.InputError`` unless the compiled kernels can run on so many."""
-    most = most_threads()
-    check_option(1 <= threads <= most, "--threads", f"1 to {most}", threads)
+    """Raise ``InputError`` unless the compiled kernels can run on so many."""
+    if not 1 <= threads <= (most := max_threads()):
+        raise InputError("--threads", expected=f"1 to {most}", got=threads)
 
 
 def set_threads(threads: int | None) -> None:
-    """Run the compiled kernels on ``threads``; None leaves all. Raises as ``check_threads``."""
+    """Run this thread's kernels on ``threads``; None leaves all. Raises as ``check_threads``."""
     if threads is not None:
+        import numba
+
         check_threads(threads)
         numba.set_num_threads(threads)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from rnd_runtime.core.threads import cores
 from rnd_runtime.gl.context import INSTALL
 
 PROBE_SECONDS = 60.0  # a driver that hangs must not hang us
@@ -75,7 +75,7 @@ def machine() -> str:
 
     A cloud's model names tell little: what calls itself AMD EPYC has AVX-512 or has not.
     """
-    return f"{_cpu_model()} ({_microarchitecture()}), {_cores()} cores"
+    return f"{_cpu_model()} ({_microarchitecture()}), {cores()} cores"
 
 
 def _start(code: str) -> subprocess.Popen[str]:
@@ -134,8 +134,3 @@ def _microarchitecture() -> str:
     except (ImportError, OSError):  # numba's, of which the doctor says that it is missing
         return platform.machine()
     return str(get_host_cpu_name())
-
-
-def _cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

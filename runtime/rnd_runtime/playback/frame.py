@@ -29,7 +29,6 @@ from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 
-from . import frame_cpu
 from .aov import aov_layers, splat_features
 from .rasterizer import ChosenRasterizer, Kind, make_rasterizer
 
@@ -160,7 +159,7 @@ class FrameRenderer:
         rendered = camera
         if scale != 1 and not aovs:
             rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
-        raster = self._raster(body, rendered, aovs, lit, srgb and rendered is camera)
+        raster = self._raster(body, rendered, aovs, lit)
         seconds = dict(raster.seconds)
         layers = aov_layers(aovs, raster, 3 if lit else 0)
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
@@ -187,10 +186,8 @@ class FrameRenderer:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _raster(
-        self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool, srgb: bool
-    ) -> Raster:
-        """On OpenGL's device or in one call of the CPU's where that can be, else stage by stage."""
+    def _raster(self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool) -> Raster:
+        """On OpenGL's device where that can be, else stage by stage."""
         shader, camera = in_root_frame(body.root, self.shader, camera)
         cull = None if self.cull is None or self.cull <= -1 else self.cull
         if isinstance(body, PosedAvatar):
@@ -199,8 +196,6 @@ class FrameRenderer:
             unposed, device = self.avatar.unposed(body), self.rasterizer.renderer
             if unposed is not None and device is not None:
                 return device.draw(unposed, shader, camera, cull=cull)
-            if unposed is not None and frame_cpu.draws(shader):
-                return frame_cpu.draw(unposed, shader, camera, cull=cull, coded=srgb)
         started = perf_counter()
         gaussians = self.avatar.posed(body)
         posing = perf_counter() - started

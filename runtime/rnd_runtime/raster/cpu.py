@@ -20,10 +20,9 @@ from rnd_runtime.core.arrays import check_shape, checked, floats, mask
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Floats32, Raster
 
-from .blend import blend_backward
-from .passes import splat
-from .project import Pinhole, pinhole, project_backward
-from .tiles import Splats
+from .blend import blend, blend_backward
+from .project import Pinhole, pinhole, project, project_backward
+from .tiles import Splats, sort_into_tiles
 
 _EVERYTHING = np.empty(0, np.bool_)
 
@@ -53,7 +52,7 @@ def rasterize(
     outlines: bool = False,
     seen: ArrayLike | None = None,
 ) -> Raster:
-    """Splat N Gaussians: projection, culling, sorting and blending in one compiled pass.
+    """Splat N Gaussians: projection, culling, sorting into tiles and blending.
 
     Args:
         means: [N, 3] m, world.
@@ -102,13 +101,16 @@ def _splat(
 ) -> tuple[Raster, Splats, Floats32]:
     """The pictures, what ``backward`` needs of their making, and features and depth in one picture [H, W, K]."""
     started = perf_counter()
-    splats, image, coverage, (projection, sort) = splat(
-        arrays, seen, view, get_num_threads(), depth, differentiable, outlines
-    )
-    blending = perf_counter() - started - projection - sort
-    channels = arrays[3].shape[1]
+    threads, channels = get_num_threads(), arrays[3].shape[1]
+    centers, shapes, boxes, attributes, depths, slot_starts = project(*arrays, seen, view, depth)
+    projected = perf_counter()
+    size = view.width, view.height
+    tile_starts, *pairs = sort_into_tiles(boxes, depths, slot_starts, size, threads, differentiable)
+    sorted_ = perf_counter()
+    splats = Splats(centers, shapes, attributes, slot_starts, tile_starts, *pairs)
+    image, coverage = blend(splats, view.width, view.height, threads, outlines)
     far = image[..., channels] if depth else np.zeros_like(coverage)
-    seconds = {"projection": projection, "sort": sort, "raster": blending}
+    seconds = {"projection": projected - started, "sort": sorted_ - projected, "raster": perf_counter() - sorted_}
     return Raster(image[..., :channels], coverage, far, seconds), splats, image
 
 

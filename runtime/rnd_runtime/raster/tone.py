@@ -94,15 +94,6 @@ def _code(x, steps, first):  # type: ignore[no-untyped-def]
 _START = int(_LOWEST.view(np.int32)) >> _SHIFT
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def tone_map_on_black(radiance, alpha, tables):  # type: ignore[no-untyped-def]
-    """``tone_map`` over black, with ``tone_tables``."""
-    image = np.empty(radiance.shape, np.uint8)
-    steps, first = tables
-    _tone_map(radiance, alpha, np.zeros((1, 3), np.float32), steps, first, image)
-    return image
-
-
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape

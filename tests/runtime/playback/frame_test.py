@@ -11,7 +11,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, load_motion
-from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians, in_root_frame
+from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, draw_gaussians, in_root_frame
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.in_view import in_view
@@ -76,18 +76,14 @@ def test_a_frame_is_its_parts(avatar, motion, sky):
 
 @pytest.mark.parametrize("mode", ["table", "table+sun", "ao", "lights:8"])
 @pytest.mark.parametrize("cull", [None, LEAST])
-def test_one_call_draws_what_its_stages_draw(avatar, motion, sky, mode, cull):
-    """Tables are looked up within one compiled call; the other modes go stage by stage and draw alike."""
+def test_encoded_and_posed_bodies_give_one_frame(avatar, motion, sky, mode, cull):
     camera = Camera.look_at([0.2, 1.5, 1.4], [0, 1.3, 0], width=70, height=50, fov_y=0.6)
     renderer = FrameRenderer(avatar, sky, camera, shade=mode, cull=-1 if cull is None else cull)
     renderer.turn(0.7)
     frame, encoded = renderer.render(motion, 0.3), avatar.encode(motion, 0.3)
-    shader, beside = in_root_frame(encoded.root, Shader(sky, mode).turned(0.7), camera)
-    with make_rasterizer("cpu") as cpu:
-        parts = draw_gaussians(avatar.posed(encoded), shader, beside, cpu, cull=cull)
-    np.testing.assert_array_equal(frame.radiance, parts.image)
-    np.testing.assert_array_equal(frame.alpha, parts.alpha)
-    np.testing.assert_array_equal(frame.srgb, tone_map(parts.image, parts.alpha))
+    parts = renderer.draw(PosedAvatar(avatar.posed(encoded), encoded.root))
+    np.testing.assert_array_equal(frame.radiance, parts.radiance)
+    np.testing.assert_array_equal(frame.srgb, tone_map(parts.radiance, parts.alpha))
     stages = ["motion", "encoders", "posing", "shading", "projection", "sort", "raster", "tone map"]
     assert list(frame.stage_seconds) == stages
 

@@ -1,7 +1,7 @@
 """One point of the speed–accuracy chart: frames of an avatar, timed in a process of their own.
 
-The process that draws imports no torch and computes no reference, so that its memory and its time are a player's.
-Motion and light both change from frame to frame.
+That process imports no torch and computes no reference, so that its memory and its time are a player's. Motion and
+light both change from frame to frame.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ Floats32 = NDArray[np.float32]
 
 WARMUP = 5
 STEP_S = 1 / 30  # of the motion, from frame to frame
-TURN = 0.02  # radians that the light turns from frame to frame
-COMPARED = (8, 19, 30, 41, 52, 63, 74, 85)  # frames whose pixels and places are compared with the reference
+STEP_YAW = 0.02  # radians of the light, from frame to frame
+COMPARED = (8, 19, 30, 41, 52, 63, 74, 85)  # frames whose pixels and positions are compared with the reference
 DEADLINE_S = 300.0
 
 
 @dataclass(frozen=True)
 class Point:
-    """What is drawn and how; ``seconds`` bounds the time spent on ``frames`` frames.
+    """What is rendered and how; ``seconds`` bounds the time spent on ``frames`` frames.
 
-    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``, ``view`` as of ``bench_scenes.bench_camera``.
+    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``, ``view`` as of ``scenes.bench_camera``.
     """
 
     avatar: str
@@ -53,12 +53,12 @@ class Point:
     view: str = USUAL
 
 
-class Drawn(NamedTuple):
-    """Times of a point, and what it drew at the frames ``COMPARED``.
+class Measured(NamedTuple):
+    """Times of a point, and what it rendered at the frames ``COMPARED``.
 
     ``row``: ms_median, ms_p95, stages (median ms), stages_p95, cold_start_ms (from the start of the process to its
-    first frame), peak_mb, file_mb, frames, renderer (what drew). ``radiance`` [K, H, W, 3] linear, premultiplied;
-    ``means`` [K, N, 3] m.
+    first frame), peak_mb, file_mb, frames, renderer. ``radiance`` [K, H, W, 3] linear, premultiplied; ``means``
+    [K, N, 3] m.
     """
 
     row: dict[str, Any]
@@ -66,19 +66,15 @@ class Drawn(NamedTuple):
     means: Floats32
 
 
-def measure(point: Point) -> Drawn:
-    """Run ``point`` in a process of its own. Raises ``InputError`` where it cannot be drawn here."""
-    environment = os.environ | {
-        "NUMBA_NUM_THREADS": str(point.threads),
-        "OMP_NUM_THREADS": str(point.threads),
-        "OMP_WAIT_POLICY": "PASSIVE",
-    }
-    # of a player that was used before not only the kernels are compiled: some machines forbid it, for tidiness
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)
+def measure(point: Point) -> Measured:
+    """Run ``point`` in a process of its own. Raises ``InputError`` where it cannot be rendered here."""
+    threads = str(point.threads)
+    environment = os.environ | {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, "OMP_WAIT_POLICY": "PASSIVE"}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # a player that was used before has its modules compiled
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
-        code = "import sys; from rnd_bench.speed.frame import draw; draw(sys.argv[1], float(sys.argv[2]))"
+        code = "import sys; from rnd_bench.speed.frame import render; render(sys.argv[1], float(sys.argv[2]))"
         line = [sys.executable, "-c", code, folder, repr(time.monotonic())]
         what = f"{point.raster}, {point.shade}"
         try:
@@ -92,28 +88,26 @@ def measure(point: Point) -> Drawn:
             why = why.removeprefix(f"{InputError.__module__}.{InputError.__qualname__}: ")
             raise InputError(what, got=why[:200])
         row = json.loads((out / "row.json").read_text("utf-8"))
-        with np.load(out / "drawn.npz") as drawn:
-            return Drawn(row, drawn["radiance"], drawn["means"])
+        with np.load(out / "frames.npz") as frames:
+            return Measured(row, frames["radiance"], frames["means"])
 
 
-def draw(folder: str, spawned: float) -> None:
-    """What the process does: reads point.json, leaves row.json and drawn.npz.
+def render(folder: str, spawned: float) -> None:
+    """What the process does: reads point.json, leaves row.json and frames.npz.
 
     ``spawned`` is the parent's monotonic clock, which processes share, when it started this one.
     """
-    from rnd_runtime.playback.start import quick_start
+    from rnd_runtime.playback.start import load_ahead
 
     out = Path(folder)
     point = Point(**json.loads((out / "point.json").read_text("utf-8")))
-    with quick_start(point.avatar, point.threads) as ahead:  # as rnd-play does
-        _draw(point, out, spawned, ahead)
+    _render(point, out, spawned, load_ahead(point.avatar, point.threads))  # as rnd-play does
 
 
-def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
+def _render(point: Point, out: Path, spawned: float, ahead: Any) -> None:
     from rnd_runtime.avatar.avatar import Avatar
     from rnd_runtime.motion.motion import load_motion
     from rnd_runtime.playback.frame import FrameRenderer
-    from rnd_runtime.playback.start import settle
     from rnd_runtime.shading.light import load_light
 
     avatar = Avatar.load(point.avatar, threads=point.threads, ahead=ahead)
@@ -124,12 +118,11 @@ def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
     renderer = FrameRenderer(avatar, light, camera, shade=point.shade, raster=raster, cull=point.cull)
 
     def frame(number: int) -> Any:
-        renderer.turn(TURN * number)
+        renderer.turn(STEP_YAW * number)
         return renderer.render(motion, STEP_S * number)
 
     frame(0)
     cold_ms = 1e3 * (time.monotonic() - spawned)
-    settle()
     for number in range(1, WARMUP):
         frame(number)
     taken: list[float] = []
@@ -137,9 +130,9 @@ def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
     until = time.perf_counter() + point.seconds
     while len(taken) < point.frames and (len(taken) < 5 or time.perf_counter() < until):
         before = time.perf_counter()
-        drawn = frame(WARMUP + len(taken))
+        done = frame(WARMUP + len(taken))
         taken.append(1e3 * (time.perf_counter() - before))
-        for name, seconds in drawn.stage_seconds.items():
+        for name, seconds in done.stage_seconds.items():
             stages.setdefault(name, []).append(1e3 * seconds)
     peak_mb = _peak_mb()
     compared = [frame(number).radiance for number in COMPARED]
@@ -156,7 +149,7 @@ def _draw(point: Point, out: Path, spawned: float, ahead: Any) -> None:
         "renderer": renderer.draws_with,
     }
     (out / "row.json").write_text(json.dumps(row), encoding="utf-8")
-    np.savez(out / "drawn.npz", radiance=np.array(compared), means=np.array(means))
+    np.savez(out / "frames.npz", radiance=np.array(compared), means=np.array(means))
     renderer.close()
 
 

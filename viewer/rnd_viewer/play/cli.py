@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import tyro
 
-from rnd_runtime.core.errors import parse_options, run_command
-from rnd_runtime.playback.start import quick_start
+from rnd_runtime.core.command import parse_options, run_command
+from rnd_runtime.playback.start import load_ahead
 from rnd_viewer.inputs.options import PlayOptions
 
 
@@ -21,10 +21,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
         if options.doctor:
             return _doctor()
-        with quick_start(options.avatar, options.threads) as ahead:
-            from .play import play  # here, so that --help and --doctor work where a library does not load
+        ahead = load_ahead(options.avatar, options.threads)
+        from .play import play  # here, so that --help and --doctor work where a library does not load
 
-            return play(options, ahead)
+        return play(options, ahead)
 
     return run_command("rnd-play", command)
 

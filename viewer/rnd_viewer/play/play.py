@@ -23,7 +23,6 @@ from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
-from rnd_runtime.playback.start import settle
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.cameras import (
@@ -167,7 +166,6 @@ class _Run:
             started = before = perf_counter()
 
             def put(number: int, drawn: tuple[RenderedFrame, Camera]) -> None:
-                settle()
                 write(number, drawn[0], _reach(self.framing, drawn[1]))
 
             for _ in with_progress(self.frames, run(self.frames, self._encode, self._draw, put, overlap=overlap)):
