@@ -47,7 +47,7 @@ def cameras() -> dict[str, Camera]:
     return result
 
 
-def shots() -> list[tuple[Split, str, int, str]]:
+def views() -> list[tuple[Split, str, int, str]]:
     """Every picture as (split, camera, frame, light)."""
     train = range(0, round(TRAIN_SECONDS * FPS), 2)
     return [
@@ -76,7 +76,7 @@ def make_capture(folder: Path, body: Body) -> None:
         lights[name] = CaptureLight(f"lights/{name}.exr", (scale, scale, scale))
         print(f"{name}: scale {scale:.4f}")
     frames = []
-    for split, camera, index, light in shots():
+    for split, camera, index, light in views():
         frames.append(filming.shoot(folder, split, camera, index, light, lights[light].scale[0]))
         print(f"{split} {camera} {index} {light}", flush=True)
     save_capture(

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from rnd_runtime.capture.body import Body
 from rnd_runtime.core.rotations import matrix_to_axis_angle
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, bone_transforms
+from rnd_runtime.motion.skeleton import bone_transforms
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_stage.people.dressing import transferred_weights
 from rnd_stage.people.person import person
 from rnd_stage.people.remesh import Floats, Ints, vertex_normals

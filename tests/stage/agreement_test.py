@@ -22,8 +22,8 @@ from rnd_runtime.shading.shadow import directional_visibility  # noqa: E402
 
 mi.set_variant("scalar_rgb")
 
+from rnd_bench.studies.agreement import AgreementOptions, ball, compare, fitted_visibility, true_gaussians  # noqa: E402
 from rnd_stage import cli  # noqa: E402
-from rnd_stage.agreement import AgreementOptions, ball, compare, fitted_visibility, true_gaussians  # noqa: E402
 from rnd_stage.film.cameras import ring_cameras  # noqa: E402
 from rnd_stage.people import dressing  # noqa: E402
 

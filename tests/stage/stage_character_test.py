@@ -19,7 +19,7 @@ from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import linear_to_srgb, write_image
 from rnd_runtime.core.npz import save_npz
-from rnd_runtime.motion.skeleton import SMPL_NAMES, SMPL_PARENTS
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 from rnd_stage.people import characters
 
 MIXAMO = dict(

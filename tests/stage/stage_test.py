@@ -33,7 +33,7 @@ from rnd_runtime.shading.reference import shade_reference  # noqa: E402
 
 mi.set_variant("scalar_rgb")
 
-from rnd_bench.stability.commands import environment  # noqa: E402
+from rnd_bench.stability.processes import environment  # noqa: E402
 from rnd_stage import cli, variants  # noqa: E402
 from rnd_stage.film import estimates, film, lights, manifest, plan  # noqa: E402
 from rnd_stage.film.cameras import ring_cameras  # noqa: E402
@@ -41,7 +41,7 @@ from rnd_stage.film.dances import dance  # noqa: E402
 from rnd_stage.people import subjects  # noqa: E402
 from rnd_stage.people.cloth import SKIN_GAP, Cloth, Drape  # noqa: E402
 from rnd_stage.people.dressing import Wearer  # noqa: E402
-from rnd_stage.render import Set, Surface  # noqa: E402
+from rnd_stage.render import RenderSet, Surface  # noqa: E402
 
 ENERGY = 0.01  # relative; what is left is Fresnel's exact term against Schlick's, 7 % of the gloss under a white sky
 SAME_SURFACE = 1e-6  # m: SuperLU gives the skinning weights of two processes apart by 2e-9
@@ -63,7 +63,7 @@ def production(tmp_path_factory) -> film.Production:
 @pytest.fixture(scope="module")
 def filmed(production, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
-    film.film(production, folder, on_picture=lambda name: None)
+    film.film(production, folder, on_image=lambda name: None)
     assert manifest.finish(production, folder, "scalar_rgb", None)
     return folder
 
@@ -84,7 +84,7 @@ def test_a_convex_body_has_the_energy_of_our_own_sum(name: str) -> None:
     light = next(light for light in lights.stage_lights() if light.name == name)
     eye = [0.0, 0, 40.0]  # far away: a pixel's rays are parallel, so its point follows from its place
     camera = Camera.look_at(eye, [0.0, 0, 0], width=64, height=64, fov_y=2 * np.arctan(1.0 / 40))
-    theirs = Set(ball()).radiance(camera, light.radiance, samples=36, seed=1)
+    theirs = RenderSet(ball()).radiance(camera, light.radiance, samples=36, seed=1)
     line = (np.arange(64) + 0.5) / 32 - 1
     x, y = np.meshgrid(line, -line)
     inside = x**2 + y**2 < 0.9
@@ -112,7 +112,7 @@ def test_cloth_is_seen_from_its_inside() -> None:
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     faces, matt = np.array([[0, 1, 2], [0, 2, 3]]), np.full(4, 0.9)
     sheet = Surface(corners, np.tile([0.0, 0, 1], (4, 1)), faces, np.full((4, 3), 0.5), matt)
-    stage, sky = Set(sheet), np.ones((16, 32, 3))
+    stage, sky = RenderSet(sheet), np.ones((16, 32, 3))
     pixels = []
     for z in (4.0, -4.0):
         camera = Camera.look_at([0.0, 0.5, z], [0.0, 0, 0], width=16, height=16, fov_y=0.4)
@@ -232,16 +232,16 @@ def test_two_processes_make_the_whole(filmed: Path, production, tmp_path: Path) 
 
 
 def test_what_is_there_is_not_filmed_again(filmed: Path, production) -> None:
-    lost = filmed / production.shots[0].image("white")
+    lost = filmed / production.views[0].image("white")
     before = lost.read_bytes()
     times = {path: path.stat().st_mtime_ns for path in filmed.rglob("*.png")}
     lost.unlink()
     named: list[str] = []
-    film.film(production, filmed, on_picture=named.append)
+    film.film(production, filmed, on_image=named.append)
     assert lost.read_bytes() == before
-    assert len(named) == plan.picture_count(production.shots)
+    assert len(named) == plan.image_count(production.views)
     kept = [path for path, time in times.items() if path.stat().st_mtime_ns == time]
-    assert len(times) - len(kept) == len(production.shots[0].truth_files(False))  # the one shot's PNGs and its picture
+    assert len(times) - len(kept) == len(production.views[0].truth_files(False))  # the one view's PNGs and its picture
 
 
 def test_who_filmed_a_capture_stays_where_nothing_was_filmed_since(filmed, production, tmp_path, monkeypatch) -> None:
@@ -542,7 +542,7 @@ def test_the_first_working_llvm_is_chosen(monkeypatch) -> None:
 def test_a_turned_light_turns_the_picture() -> None:
     """The footlight shines from below: the ball's lower half is brighter; the red light from the person's left (+X)."""
     camera = Camera.look_at([0.0, 0, 6], [0.0, 0, 0], width=16, height=16, fov_y=0.35)
-    stage = Set(ball(16))
+    stage = RenderSet(ball(16))
     by_name = {light.name: light for light in lights.stage_lights()}
     foot = stage.radiance(camera, by_name["footlight"].radiance, samples=16, seed=0)[..., 0]
     assert foot[9:].mean() > 2 * foot[:7].mean()
@@ -566,6 +566,6 @@ def test_the_benchmark_trains_scores_and_does_nothing_twice(filmed: Path, tmp_pa
     assert {row["split"] for row in result["rows"]} >= {"novel_view", "novel_pose", "relight"}
     assert all(row["subject"] == 0 and row["method"] == "ours" for row in result["rows"])
     assert result["cost"]["seconds_per_picture"] == pytest.approx(2.0)
-    assert result["cost"]["cpu_seconds_per_picture"] == pytest.approx(3.0)
+    assert result["cost"]["cpu_seconds_per_image"] == pytest.approx(3.0)
     again = benchmark.run_benchmark(options, tmp_path, perceptual=None, on_run=lambda *told: None)
     assert again["rows"] == result["rows"]

@@ -1,6 +1,6 @@
 """Path tracing a posed surface with Mitsuba 3, in this project's conventions.
 
-The material is the project's own model written down independently: Lambert plus a rough dielectric's first reflection,
+The material is the project's model, formulated independently: Lambert plus a rough dielectric's first reflection,
 GGX with F0 = 0.04 and no transmission. ``rnd_runtime.shading.brdf`` has Schlick's Fresnel term where Mitsuba has the
 exact Fresnel equations. Mitsuba has no sum of two materials, only their blend, so both parts are scaled up by the
 share they get.
@@ -20,8 +20,8 @@ from rnd_runtime.core.camera import Camera
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-GLOSS_SHARE = 0.3  # of the blend, and of the sampled directions; any share gives the same mean
-MOST_SAMPLES = 2**24  # paths traced at once: LLVM keeps them all in memory, about 200 B each
+SPECULAR_SHARE = 0.3  # of the blend, and of the sampled directions; any share gives the same mean
+MAX_SAMPLES = 2**24  # paths traced at once: LLVM keeps them all in memory, about 200 B each
 NEAR = 0.1  # m
 MASK_FLOOR = 0.05  # of coverage, below which truths are left at zero
 GRAZING = 0.05  # cosine below which a light counts as not visible: the surface turns away from it
@@ -62,11 +62,11 @@ class Truth:
     depth: Floats
 
 
-class Set:
-    """A surface on the stage, to be filmed by any camera under any light.
+class RenderSet:
+    """A surface on the stage, to be rendered by any camera under any light.
 
     Args:
-        surface: what is filmed; meshed once for all pictures.
+        surface: meshed once for all images.
         max_depth: of the paths; 2 is direct light alone.
     """
 
@@ -95,12 +95,12 @@ class Set:
         roughness, coverage = extra[..., 0], extra[..., 1]
         share = np.maximum(coverage, 1e-6)
         covered = coverage >= MASK_FLOOR
-        places = seen[..., 6:9] / share[..., None]
-        away = np.sum(seen[..., 9:12] * (places - camera.position), axis=-1) > 0  # cloth seen from its inside
-        turned = np.where(away, -1, 1)[..., None] * seen[..., 3:6] @ camera.world_to_camera[:3, :3].T
-        turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-9)
-        depth = places @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-        return Truth(coverage, seen[..., :3], turned * covered[..., None], roughness / share * covered, depth * covered)
+        positions = seen[..., 6:9] / share[..., None]
+        away = np.sum(seen[..., 9:12] * (positions - camera.position), axis=-1) > 0  # cloth seen from its inside
+        facing = np.where(away, -1, 1)[..., None] * seen[..., 3:6] @ camera.world_to_camera[:3, :3].T
+        facing /= np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-9)
+        depth = positions @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        return Truth(coverage, seen[..., :3], facing * covered[..., None], roughness / share * covered, depth * covered)
 
     def visibility(self, camera: Camera, directions: Floats, normals: Floats, *, samples: int, seed: int) -> Floats:
         """Share [L, H, W] of each pixel's surface that distant lights at ``directions`` [L, 3] (towards them) reach.
@@ -127,7 +127,7 @@ class Set:
         return result
 
     def _attribute_scenes(self) -> list[Any]:
-        """Two scenes without light: albedo, normals and places; roughness and coverage."""
+        """Two scenes without light: albedo, normals and positions; roughness and coverage."""
         surface = self.surface
         one = np.ones_like(surface.roughness)
         plain = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
@@ -163,7 +163,7 @@ def layered() -> dict[str, Any]:
     }
     blend = {
         "type": "blendbsdf",
-        "weight": GLOSS_SHARE,
+        "weight": SPECULAR_SHARE,
         "first": {"type": "diffuse", "reflectance": attribute("color")},
         "second": gloss,
     }
@@ -173,9 +173,9 @@ def layered() -> dict[str, Any]:
 def _layers(surface: Surface) -> dict[str, Floats]:
     count = len(surface.vertices)
     return {
-        "vertex_color": surface.colour / (1 - GLOSS_SHARE),
+        "vertex_color": surface.colour / (1 - SPECULAR_SHARE),
         "vertex_alpha": surface.roughness[:, None] ** 2,
-        "vertex_gain": np.full((count, 1), 1 / GLOSS_SHARE),
+        "vertex_gain": np.full((count, 1), 1 / SPECULAR_SHARE),
     }
 
 
@@ -229,8 +229,8 @@ def sensor(camera: Camera, samples: int, film: str = "rgba") -> dict[str, Any]:
 
 
 def render(scene: Any, camera: Camera, samples: int, seed: int, film: str = "rgba") -> Floats:
-    """All channels [H, W, C] of ``scene`` seen by ``camera``; the same seed gives the same picture."""
-    passes = -(-samples * camera.width * camera.height // MOST_SAMPLES) if mi.variant() != "scalar_rgb" else 1
+    """All channels [H, W, C] of ``scene`` seen by ``camera``; the same seed gives the same image."""
+    passes = -(-samples * camera.width * camera.height // MAX_SAMPLES) if mi.variant() != "scalar_rgb" else 1
     each = -(-samples // passes)
     view = mi.load_dict(sensor(camera, each, film))
     pixels = [
@@ -245,7 +245,7 @@ def probe() -> None:
     facing = np.tile([0.0, 0, 1], (3, 1))
     surface = Surface(corners, facing, np.array([[0, 1, 2]]), np.full((3, 3), 0.5), np.full(3, 0.5))
     camera = Camera.look_at([0.0, 0, 3], [0.0, 0, 0], width=8, height=8, fov_y=0.5)
-    stage = Set(surface)
+    stage = RenderSet(surface)
     pixels = stage.radiance(camera, np.ones((8, 16, 3)), samples=4, seed=0)
     assert 0.3 < pixels[4, 4, 0] < 0.8, pixels[4, 4]
     stage.truth(camera, samples=4, seed=0)

@@ -1,4 +1,4 @@
-"""Which of Mitsuba's back ends works here: a wrong LLVM aborts the whole process, so a child process tries it first."""
+"""Which of Mitsuba's back ends works: a wrong LLVM aborts the process, so a child process tries it first."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ probe()
 
 
 def need_extra() -> None:
-    """Refuse to go on, naming the extra to install, where Mitsuba or what meshes the subjects is missing."""
+    """Raise ``InputError`` where a package of the extra is missing."""
     from importlib.util import find_spec
 
     for module, package in (("mitsuba", "mitsuba"), ("skimage", "scikit-image"), ("scipy", "scipy"), ("cv2", "opencv")):
@@ -60,17 +60,17 @@ def use_variant(wanted: Variant = "auto") -> str:
     import mitsuba as mi
 
     mi.set_variant(name)
-    mi.set_log_level(mi.LogLevel.Error)  # samplers tell that they round sample counts up
+    mi.set_log_level(mi.LogLevel.Error)  # samplers log that they round sample counts up
     return name
 
 
 def working_llvm() -> str | None:
-    """The first LLVM library with which a child process renders a picture; None where there is none."""
+    """The first LLVM library with which a child process renders an image; None where there is none."""
     return next((library for library in _candidates() if _renders(library)), None)
 
 
 def _candidates() -> Iterator[str]:
-    """What the user named, and nothing else; otherwise the system's libraries, the newest first."""
+    """What the user named, and nothing else; by default the system's libraries, the newest first."""
     named = os.environ.get(LIBRARY_VARIABLE)
     if named:
         yield named

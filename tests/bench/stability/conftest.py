@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rnd_bench.scenes.figures import amount
+from rnd_bench.stability.figures import amount
 from support.stash import MEASURED
 
 STEPS, GAUSSIANS, SIZE, FRAMES = 160, 1500, 64, 8
@@ -17,7 +17,7 @@ def subject(tmp_path_factory):
 
     from rnd_bench.scenes.studio import write_studio
     from rnd_bench.scenes.subject import Subject
-    from rnd_bench.stability.trainings import train_small
+    from rnd_bench.stability.small import train_small
     from rnd_export.export import export
     from rnd_trainer.model.checkpoint import load_checkpoint
     from support.tiny import body

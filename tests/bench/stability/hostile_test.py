@@ -1,4 +1,4 @@
-"""Broken files, kills and threads: short runs of what ``rnd-bench --stability`` does for hours."""
+"""Broken files, kills and threads: short runs of what ``rnd-bench stability`` does for hours."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ import time
 import numpy as np
 import pytest
 
-from rnd_bench.stability.processes import environment
+from rnd_bench.stability import fuzz as module
 from rnd_bench.stability.determinism import backends_agree, frames_agree
-from rnd_bench.stability.fuzz import READERS, fuzz, prepare
-from rnd_bench.stability.kill import half_files
+from rnd_bench.stability.fuzz import fuzz
+from rnd_bench.stability.hostile import READERS, prepare
+from rnd_bench.stability.kill import incomplete_files
+from rnd_bench.stability.processes import environment
 
+pytestmark = pytest.mark.slow
 INPUTS = 40
 
 
@@ -34,8 +37,6 @@ def test_broken_files_are_refused_or_read(reader, honest):
 
 
 def test_batches_that_were_fed_are_not_fed_again(honest, monkeypatch):
-    from rnd_bench.stability import fuzz as module
-
     monkeypatch.setattr(module, "BATCH", 6)
     fed, batch = [], module._batch
     monkeypatch.setattr(module, "_batch", lambda *words: fed.append(words) or batch(*words))
@@ -70,7 +71,7 @@ def test_a_killed_writer_leaves_whole_files_under_final_names(tmp_path):
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
             time.sleep(float(rng.uniform(0.05, 0.3)))
             process.send_signal(signal.SIGKILL)
-        assert half_files(tmp_path) == []
+        assert incomplete_files(tmp_path) == []
         if (tmp_path / "numbers.npz").exists():
             values = np.load(tmp_path / "numbers.npz")["values"]
             assert len(values) == 50_000 and np.all(np.diff(values) == 1)
@@ -80,8 +81,8 @@ def test_a_killed_writer_leaves_whole_files_under_final_names(tmp_path):
 def test_half_a_file_is_told_from_a_whole_one(tmp_path):
     (tmp_path / "half.json").write_text('{"a": ')
     (tmp_path / "whole.json").write_text("{}")
-    assert half_files(tmp_path) == ["half.json: JSONDecodeError"]
+    assert incomplete_files(tmp_path) == ["half.json: JSONDecodeError"]
 
 
-def test_both_openglbackends_agree_draw_the_same_bits(subject):
+def test_both_backends_of_opengl_render_the_same_bits(subject):
     assert backends_agree(subject).passes and frames_agree(subject).passes

@@ -1,4 +1,4 @@
-"""Every row of FAILURES.md on a small avatar, with the number it measured."""
+"""Every row of the stability list on a small avatar, with the number it measured."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import pytest
 from rnd_bench.stability.rows import ROWS
 from support.stash import MEASURED
 
-# What the design cannot pass yet: the figures, by how they begin, and why.
+pytestmark = pytest.mark.slow
+
+# What the design does not pass: the figures, by how they begin, and why.
 KNOWN: dict[str, tuple[tuple[str, ...], str]] = {
     "L8": (("albedo 0:",), "what GGX scatters twice is lost, as in the paper")
 }

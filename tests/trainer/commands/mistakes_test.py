@@ -49,20 +49,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ),
         (f"rnd-train {CAPTURE} --out OUT --steps 0", "--steps: expected at least 1, got 0"),
         (f"rnd-train {CAPTURE} --out OUT --image-scale 0", "--image-scale: expected more than 0, at most 1, got 0"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 0", "--seeds: expected at least 1, got 0"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --image-scale 2", "--image-scale: expected more than 0, at most 1"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8", "--gaussians: expected 64 to 1000000, got 8"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --chart x.txt", "--chart: expected .svg or .png, got x.txt"),
-        (
-            f"rnd-eval OUT {CAPTURE} --ablate --chart x.svg",
-            "--chart: expected --study lengths beside it, got ablations",
-        ),
-        (f"rnd-eval OUT {CAPTURE} --ablate --method me", "--method: expected the default, got me"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --seeds 101", "--seeds: expected at most 100, got 101"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --shade lights:K", "shading mode: expected one of ao, table, table+sun"),
-        (f"rnd-eval OUT {CAPTURE} --seeds 2", "--seeds: expected the default, got 2"),
         (f"rnd-eval OUT {CAPTURE} --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --study causes", "variant 'true normals': expected normal_gt"),
         (f"rnd-train {CAPTURE} --out OUT --device mps", "--device: expected cpu, cuda or cuda:NUMBER, got mps"),
         ("rnd-export OUT/avatar.ckpt --motion walk.npz --frames 9", "--frames: expected the default, got 9"),
         ("rnd-export OUT/avatar.ckpt --cull -2", "--cull: expected a cosine, from -1 to 1, got -2"),
@@ -72,9 +59,14 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ("rnd-export .", "avatar.ckpt: checkpoint not found"),
         (f"rnd-export {AVATAR}", "not a checkpoint: expected an avatar.ckpt of rnd-train, got .onnx"),
         ("rnd-bench raster --threads 999", "--threads: expected 1 to "),
-        ("rnd-bench frame --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
-        ("rnd-bench peers --threads 999", "--threads: expected 1 to "),
-        ("rnd-bench --quick --json OUT/grid.json --chart chart.pdf", "--chart: expected .svg or .png, got chart.pdf"),
+        (f"rnd-bench frame {ASSETS} --cull 2", "--cull: expected a cosine, from -1 to 1, got 2"),
+        (f"rnd-bench grid {ASSETS} --chart chart.pdf", "--chart: expected .svg or .png, got chart.pdf"),
+        (f"rnd-bench stability {CAPTURE} --rows P1,Q9", "--rows: expected some of P1,P2"),
+        (f"rnd-bench stability {CAPTURE} --size 0", "--size: expected 16 to 4096, got 0"),
+        (f"rnd-bench study causes OUT {CAPTURE} --seeds 101", "--seeds: expected 1 to 100, got 101"),
+        (f"rnd-bench study causes OUT {CAPTURE} --shade lights:K", "shading mode: expected one of ao, table"),
+        (f"rnd-bench study causes OUT {CAPTURE}", "variant 'true normals': expected normal_gt"),
+        (f"rnd-bench study causes OUT {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
         (f"{IMPORT} --every 0", "--every: expected at least 1, got 0"),
         (f"{IMPORT} --held-out-every 0", "--held-out-every: expected at least 1, got 0"),
         (f"{IMPORT} --count 0", "--count: expected at least 1, got 0"),
@@ -87,18 +79,16 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         (f"{MOTION} --speed 1e-7", "--speed: expected 0.01 to 100, got 1e-07"),
         (f"{MOTION} --smooth 1e4", "--smooth: expected 0.01 to 1000, got 10000"),
         (f"rnd-eval OUT {CAPTURE} --json {ASSETS}", "assets: cannot be written: it is a folder"),
-        (f"rnd-eval OUT {CAPTURE} --ablate --json {BODY}/a.json", "body.npz: output folder cannot be made"),
         (f"rnd-export {BODY} --out {BODY}/a.onnx", "body.npz: output folder cannot be made"),
         (f"rnd-eval OUT {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
         (f"rnd-eval OUT/avatar.ckpt {CAPTURE} --json OUT/avatar.ckpt", IS_READ),
         (f"rnd-eval OUT {CAPTURE} --perceptual-weights {BODY} --json {BODY}", IS_READ),
-        (f"rnd-eval OUT {CAPTURE} --ablate --gaussians 8 --json {CAPTURE}/capture.json", IS_READ),
         (f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json OUT.onnx", IS_READ),
         (f"rnd-export {BODY} --max-mb 5 --capture {CAPTURE} --json {CAPTURE}/capture.json", IS_READ),
         (f"rnd-export {BODY} --out OUT.onnx --max-mb 5 --json {ASSETS}", "assets: cannot be written: it is a folder"),
-        ("rnd-stage agreement OUT/a.json --step nan", "--step: expected 0.001 to 0.03 m, got nan"),
-        ("rnd-stage agreement OUT/a.json --step 0", "--step: expected 0.001 to 0.03 m, got 0"),
-        (f"rnd-stage agreement {ASSETS}", "assets: cannot be written: it is a folder"),
+        ("rnd-bench study agreement OUT/a.json --step nan", "--step: expected 0.001 to 0.03 m, got nan"),
+        ("rnd-bench study agreement OUT/a.json --step 0", "--step: expected 0.001 to 0.03 m, got 0"),
+        (f"rnd-bench study agreement {ASSETS}", "assets: cannot be written: it is a folder"),
         (
             "rnd-stage OUT --character X.npz --subject 2",
             "--subject: expected the default, got 2 (--character has its own)",
@@ -110,20 +100,25 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 def test_numbers_that_no_command_can_use(line, message, tmp_path, monkeypatch, capsys) -> None:
     command, *words = line.replace("OUT", str(tmp_path / "out")).split()
     monkeypatch.setattr("sys.argv", [command, *words])
-    with pytest.raises(SystemExit) as ended:
-        COMMANDS[command]()
+    code = _code(COMMANDS[command])
     error = capsys.readouterr().err.lstrip()  # where a progress bar had begun, it has ended its line
-    assert ended.value.code == 2 and error.startswith(command) and message in error, error
+    assert code == 2 and error.startswith(command) and message in error, error
     assert error.count("\n") == 1 and not any(tmp_path.rglob("*.*"))
+
+
+def _code(main) -> object:
+    """Exit code of a command, returned or raised."""
+    try:
+        return main()
+    except SystemExit as ended:
+        return ended.code
 
 
 def test_rows_of_another_bench_are_not_added_to(tmp_path, monkeypatch, capsys) -> None:
     rows = tmp_path / "raster.json"
     rows.write_text(json.dumps([{"n": 3, "machine": "this one"}]))
-    monkeypatch.setattr("sys.argv", ["rnd-bench", "--quick", "--json", str(rows)])
-    with pytest.raises(SystemExit) as ended:
-        rnd_bench.cli.main()
-    assert ended.value.code == 2 and "expected rows of rnd-bench, got another file" in capsys.readouterr().err
+    assert rnd_bench.cli.main(["grid", str(ASSETS), "--quick", "--json", str(rows)]) == 2
+    assert "expected rows of rnd-bench, got another file" in capsys.readouterr().err
 
 
 def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch) -> None:

@@ -10,47 +10,30 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
-import numba
 import numpy as np
 import pytest
 import torch
 from msgspec import structs
 
-import rnd_bench.studies.ablate
 import rnd_trainer.commands.eval
 import rnd_trainer.evaluation.evaluate
 import rnd_trainer.evaluation.held_out
-from rnd_bench.charts import draw_lengths
-from rnd_bench.studies.ablate import (
-    CAUSES,
-    LENGTHS,
-    VARIANTS,
-    StudyRow,
-    ablate,
-    check_needs,
-    chosen,
-    encoder_cost,
-    summarise,
-    time_encoders,
-)
 from rnd_runtime.capture.capture import Capture, load_capture
-from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import sha256_of, write_json
+from rnd_runtime.core.files import sha256_of
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.commands.eval import EvalOptions, _is_of, evaluate_run
-from rnd_trainer.config import ModelConfig, to_dict
+from rnd_trainer.config import ModelConfig
 from rnd_trainer.evaluation.evaluate import Judge, albedo_scale, evaluate, flicker
 from rnd_trainer.evaluation.evaluator import Rendered, render_runtime
 from rnd_trainer.evaluation.held_out import picture_names, playback, score
 from rnd_trainer.evaluation.scores import frame_scores, normal_picture, outline_length, silhouette, to_srgb8
 from rnd_trainer.losses.metrics import psnr, ssim_map
-from rnd_trainer.model.checkpoint import load_checkpoint, write_tensors
+from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.training.data import pose_input
-from rnd_trainer.training.state import STATE_FILE, STATE_SCHEMA
 from rnd_trainer.training.training import Training
 from support.tiny import ASSETS
 
@@ -160,7 +143,7 @@ def test_a_model_that_learned_without_shadows_is_judged_without(tiny_capture, mo
     overhead = np.zeros((32, 64, 3), np.float32)
     overhead[1] = 1e3  # the head's shadow falls on the shoulders
     shader = Shader(Light(overhead), "table+sun")
-    assert shader.suns
+    assert shader.directional
 
     def picture() -> torch.Tensor:
         pose = pose_input(tiny_capture.motion, body.skeleton, 0.0, config)
@@ -394,205 +377,6 @@ def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, t
     (tmp_path / "avatar.onnx").write_bytes(bytes(3_000_000))
     judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
     assert playback(tmp_path / "avatar.onnx", judge) == {"file_mb": 3.0, "fps": pytest.approx(100)}
-
-
-@pytest.mark.parametrize(
-    ("differences", "shows"),
-    [((2.0, 2.2), True), ((-2.0, -2.2), True), ((-0.1, 0.3), False), ((0.1, -0.3), False), ((2.0,), None)],
-)
-def test_a_loss_shows_as_a_gain_does(differences, shows) -> None:
-    variants = (StudyRow("ours", "", None), StudyRow("less", "", "ours"))
-    common = {"split": "novel_view", "encoder_gflop": 1.0, "encoder_ms": 1.0}
-    rows = [
-        common | {"method": name, "seed": seed, "psnr": 30 + (difference if name == "less" else 0)}
-        for seed, difference in enumerate(differences)
-        for name in ("ours", "less")
-    ]
-    assert summarise(rows, variants)[1]["novel_view"]["shows"] is shows
-
-
-def test_windows_of_the_study_are_as_dense_as_ours() -> None:
-    ours = ModelConfig()
-    step = ours.window_seconds / (ours.window_poses - 1)
-    windows = [row.model for row in VARIANTS if row.name.startswith("d = ")]
-    assert [model["window_poses"] for model in windows] == [2, 5, 20, 30]
-    for model in windows:
-        assert model["window_seconds"] == pytest.approx((model["window_poses"] - 1) * step)
-
-
-def test_ablations_are_trained_once_and_compared_seed_by_seed(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
-    calls: list[tuple[str, int, float, int]] = []
-    config = dataclasses.replace(tiny_config, steps=4)
-    read = Capture.load_frame
-
-    def with_albedo(capture, frame):
-        images = read(capture, frame)
-        return dataclasses.replace(images, albedo_srgb=images.image_srgb)
-
-    monkeypatch.setattr(Capture, "load_frame", with_albedo)
-
-    def go():
-        return ablate(
-            tiny_capture,
-            config,
-            tmp_path,
-            VARIANTS[:3],
-            seeds=(0, 1),
-            perceptual=None,
-            on_run=lambda *call: calls.append(call),
-        )
-
-    rows = go()
-    told = [done for _, _, done, _ in calls]
-    assert len({call[:2] for call in calls}) == 6 and {row["seed"] for row in rows} == {0, 1}
-    assert told == sorted(told) and {0, 0.25, 0.5, 0.75, 1, 5.5, 6} <= set(told)  # four steps each
-    written = (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns
-    assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
-    config = dataclasses.replace(config, steps=5)
-    with pytest.raises(InputError, match="steps of a run done before: expected 5, got 4"):
-        go()
-    config = dataclasses.replace(config, steps=4)
-    poses = tiny_capture.motion
-    tiny_capture = dataclasses.replace(tiny_capture, motion=dataclasses.replace(poses, source="other.npz"))
-    with pytest.raises(InputError, match=r"motion of a run done before: expected other\.npz, got motion\.npz"):
-        go()
-    timed = time_encoders(rows, tmp_path, VARIANTS[:3], 0)
-    assert [row["encoder_gflop"] for row in timed] == [row["encoder_gflop"] for row in rows]
-    table = summarise(timed, VARIANTS[:3])
-    assert [line["method"] for line in table] == ["ours", "LBS, plain colour", "static skinning"]
-    cell = table[2]["novel_view"]
-    both = [
-        next(r["psnr"] for r in rows if r["method"] == name and r["seed"] == seed)
-        for seed in (0, 1)
-        for name in ("static skinning", "ours")
-    ]
-    assert cell["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
-    assert table[2]["encoder_gflop"] == 0 < table[0]["encoder_gflop"]
-    ssim = [r["ssim"] for r in rows if (r["method"], r["split"]) == ("static skinning", "novel_view")]
-    assert cell["ssim"] == pytest.approx(sum(ssim) / 2) and "lpips" not in cell
-    assert table[2]["minutes"] > 0 and "pose_error_after_deg" not in table[2]
-    # plain colours have no albedo that could be compared
-    assert {row["method"] for row in rows if "psnr_albedo" in row} == {"ours", "static skinning"}
-    assert {row["train_threads"] for row in rows} == {numba.get_num_threads()}
-
-
-def test_runs_done_before_are_looked_at_before_any_is_trained(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
-    def train(*_: object) -> None:
-        raise AssertionError("trained")
-
-    def go() -> object:
-        return ablate(
-            tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None, on_run=lambda *call: None
-        )
-
-    monkeypatch.setattr(rnd_bench.studies.ablate, "_train", train)
-    row = {"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": 12}
-    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
-    file = tmp_path / "lbs__plain_colour-0" / "rows.json"
-    with pytest.raises(AssertionError, match="trained"):
-        go()
-    write_json(file, [row | {"steps": 4}])  # the second variant's
-    with pytest.raises(InputError, match=r"rows\.json: steps of a run done before: expected 12, got 4"):
-        go()
-    for broken in ('[{"method": "LBS', "{}", '[{"psnr": 20}]'):
-        file.write_text(broken)
-        with pytest.raises(InputError, match=r"rows\.json: a run done before: expected rows of a study, got an"):
-            go()
-    write_json(file, [row | {"capture_sha256": "of another capture.json"}])
-    with pytest.raises(InputError, match="capture_sha256 of a run done before"):
-        go()
-    for usable in ([row], [row | {"motion": "motion.npz"}], []):  # older rows do not name their motion
-        write_json(file, usable)
-        with pytest.raises(AssertionError, match="trained"):
-            go()
-
-
-def test_runs_begun_before_are_looked_at_before_any_is_trained(
-    tiny_capture, tiny_config, tmp_path, monkeypatch
-) -> None:
-    def train(*_: object) -> None:
-        raise AssertionError("trained")
-
-    def begin(steps: int, rate_residuals: float = tiny_config.rate_residuals, **more: str) -> None:
-        """A state of the second variant, LBS with plain colours, that was to have ``steps``."""
-        model = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
-        others = {"light": "none", "weight_consistency": 0.0, "unseen_fraction": 0.0, "steps": steps}
-        others["rate_residuals"] = rate_residuals
-        config = to_dict(dataclasses.replace(tiny_config, model=model, **others))
-        header = {"schema": STATE_SCHEMA, "config": config, "perceptual_sha256": None, **more}
-        folder = tmp_path / "lbs__plain_colour-0"
-        folder.mkdir(exist_ok=True)
-        write_tensors(folder / STATE_FILE, {"generator": torch.zeros(1)}, header)
-
-    def go() -> object:
-        return ablate(
-            tiny_capture, tiny_config, tmp_path, VARIANTS[:2], seeds=(0,), perceptual=None, on_run=lambda *call: None
-        )
-
-    monkeypatch.setattr(rnd_bench.studies.ablate, "_train", train)
-    begin(tiny_config.steps + 1)
-    with pytest.raises(InputError, match=r"training\.state: a run begun before: expected .* other \['steps'\]"):
-        go()
-    begin(tiny_config.steps, capture_sha256="another's")
-    with pytest.raises(InputError, match=r"training\.state: capture_sha256 of a run begun before: expected"):
-        go()
-    begin(tiny_config.steps)
-    with pytest.raises(AssertionError, match="trained"):
-        go()
-    row = {"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": tiny_config.steps}
-    row |= {"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"}
-    write_json(tmp_path / "lbs__plain_colour-0" / "rows.json", [row])
-    begin(tiny_config.steps, rate_residuals=tiny_config.rate_residuals / 2)  # done, but at another rate
-    with pytest.raises(InputError, match=r"a run begun before: expected .* other \['rate_residuals'\]"):
-        go()
-
-
-def test_what_a_study_needs_is_looked_for_before_it_begins(tiny_capture) -> None:
-    noisy, true_light = (next(v for v in CAUSES if v.name == name) for name in ("noisy poses", "true light"))
-    with pytest.raises(InputError, match="motion_noisy"):
-        check_needs([noisy], tiny_capture)
-    with pytest.raises(InputError, match="light: expected"):
-        check_needs([true_light], dataclasses.replace(tiny_capture, lights={}))
-    first, *others = tiny_capture.frames
-    two = dataclasses.replace(tiny_capture, frames=(structs.replace(first, light="sky"), *others))
-    with pytest.raises(InputError, match="variant 'true light': expected one light in the train split, got sk"):
-        check_needs([true_light], two)
-
-
-def test_lengths_are_shares_of_the_presets_steps_and_are_drawn(tiny_capture, tiny_config, tmp_path) -> None:
-    config = dataclasses.replace(tiny_config, steps=8)
-    shorter = [variant for variant in LENGTHS if variant.name in ("ours", "1/4", "1/2")]
-    rows = ablate(tiny_capture, config, tmp_path, shorter, seeds=(0,), perceptual=None, on_run=lambda *call: None)
-    assert {(row["method"], row["steps"]) for row in rows} == {("ours", 8), ("1/4", 2), ("1/2", 4)}
-    draw_lengths(rows, [tmp_path / "lengths.svg"])
-    drawn = (tmp_path / "lengths.svg").read_text(encoding="utf-8")
-    for said in ("minutes of training", *{row["split"] for row in rows}, *{row["train_machine"] for row in rows}):
-        assert said in drawn
-    draw_lengths(rows, [tmp_path / "again.svg"])
-    assert (tmp_path / "again.svg").read_text(encoding="utf-8") == drawn
-
-
-def test_rows_of_a_study_are_chosen_by_name() -> None:
-    assert chosen(VARIANTS, ()) == VARIANTS
-    assert [one.name for one in chosen(VARIANTS, ("static skinning", "ours"))] == ["ours", "static skinning"]
-    with pytest.raises(InputError, match="--variants"):
-        chosen(VARIANTS, ("ours", "theirs"))
-
-
-def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_capture, tiny_config) -> None:
-    from rnd_trainer.training.training import Training
-
-    costs = {}
-    exact = tuple(structs.replace(frame, normal_gt=frame.normal) for frame in tiny_capture.frames)
-    tiny_capture = dataclasses.replace(tiny_capture, frames=exact)
-    for variant in (*VARIANTS, *CAUSES[:5]):
-        model = dataclasses.replace(tiny_config.model, **variant.model)
-        config = dataclasses.replace(tiny_config, model=model, steps=2, **variant.train)
-        training = Training(tiny_capture, config)
-        assert not any(training.step().skipped for _ in range(2)), variant.name
-        costs[variant.name] = encoder_cost(training.model)["encoder_gflop"]
-    assert costs["d = 2"] < costs["d = 5"] < costs["d = 20"] < costs["d = 30"]
-    assert costs["spatial only"] < costs["ours"]
 
 
 def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from rnd_bench.scenes.subject import EXTREMES
+from rnd_bench.scenes.poses import EXTREMES
 from rnd_runtime.capture.body import skin
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion

@@ -12,8 +12,6 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from rnd_bench import cli as bench_cli
-from rnd_bench.options import Step
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import read_image
 from rnd_trainer.losses.perceptual import Perceptual, load_perceptual
@@ -310,11 +308,6 @@ def test_whole_networks_are_lpips_and_parts_are_not(distances, folder, nets, tmp
     assert len(bare.features(_image(31, 31).float())) == 5
     with pytest.raises(InputError, match=r"bare\.safetensors: .*expected LPIPS heads.*alexnet without heads"):
         bare(_image(31, 31).float(), _image(31, 31).float())
-
-
-def test_the_bench_of_a_step_takes_what_training_takes(small) -> None:
-    with pytest.raises(InputError, match="--perceptual-weights: expected a whole network with LPIPS heads"):
-        bench_cli._step(Step(small.parent, perceptual_weights=small))
 
 
 @pytest.mark.parametrize("zipped", [True, False])

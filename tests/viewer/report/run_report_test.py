@@ -434,7 +434,7 @@ def test_a_curve_goes_through_the_points():
         ("eval.json", '[{"split": "a", "psnr": "?"}]', 'eval.json: psnr: expected a number, got "?"'),
         ("eval.json", '{"summary": [], "rows": []}', "eval.json: expected rows of rnd-eval"),  # of an ablation
         ("bench/stability.json", "{", "stability.json: not JSON"),
-        ("bench/stability.json", '[{"id": "P1"}]', "stability.json: expected rows of rnd-bench --stability"),
+        ("bench/stability.json", '[{"id": "P1"}]', "stability.json: expected rows of rnd-bench stability"),
         ("bench/grid.json", "3", "grid.json: expected rows of rnd-bench"),
         ("avatar.onnx", "onnx", "avatar.onnx: not a readable ONNX model"),
     ],

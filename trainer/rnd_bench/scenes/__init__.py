@@ -1,1 +1,1 @@
-"""Subjects, lights and avatars that benchmarks and the stability suite share."""
+"""Subjects, poses, lights and avatars that benchmarks and the stability suite share."""

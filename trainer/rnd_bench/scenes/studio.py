@@ -1,4 +1,4 @@
-"""A capture made by our own runtime on a template body: true in every number, made in seconds, lit from one side."""
+"""A synthetic capture of a template body by our own runtime: exact, made in seconds, lit from one side."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ from rnd_runtime.shading.shader import Shader
 from rnd_trainer.model.template import sample_template
 
 from .lights import sun_and_sky
-from .subject import ARMS_DOWN, CROSSED, EXTREMES, FPS, Angles
+from .poses import ARMS_DOWN, CROSSED, EXTREMES, FPS, Angles
 
 POINTS = 6000
 HELD_OUT = (*EXTREMES.values(), CROSSED)
 """poses of the split novel_pose"""
 STRIPES = 25.0
-"""rad/m of the painted stripes. They are light and dark: were they equally light, an albedo that is off by a twentieth
-where light falls would be all the error there is (L12)"""
+"""rad/m of the painted stripes, light and dark: with equal ones, albedo error is only where light falls (L12)"""
 
 
 def write_studio(folder: Path, body: Body, *, size: int, frames: int) -> Capture:
-    """Film ``body``: an A-pose spin in sunlight to train on, the extreme poses, a side view and another light."""
+    """Render ``body``: an A-pose spin in sunlight to train on, the extreme poses, a side view and another light."""
     lights = {"sun": sun_and_sky(64), "evening": sun_and_sky(64, sun=(-0.9, 0.3, 0.2), radiance=500.0)}
     for name, light in lights.items():
         write_image(folder / "lights" / f"{name}.exr", light.radiance)
@@ -40,9 +39,8 @@ def write_studio(folder: Path, body: Body, *, size: int, frames: int) -> Capture
     motion = _motion(body, [*spin, *HELD_OUT])
     front = Camera.look_at([0, 1.0, 3.3], [0, 0.95, 0], width=size, height=size, fov_y=0.7)
     side = Camera.look_at([3.2, 1.2, 0.4], [0, 0.95, 0], width=size, height=size, fov_y=0.7)
-    film = _Film(
-        folder, body, motion, {"front": front, "side": side}, {n: Shader(v, "table+sun") for n, v in lights.items()}
-    )
+    shaders = {name: Shader(light, "table+sun") for name, light in lights.items()}
+    film = _Film(folder, body, motion, {"front": front, "side": side}, shaders)
     records = [film.shoot(k, "front", "sun", "train") for k in range(frames)]
     records += [film.shoot(k, "side", "sun", "novel_view") for k in range(0, frames, max(1, frames // 2))]
     records += [film.shoot(frames + k, "front", "sun", "novel_pose") for k in range(len(HELD_OUT))]
@@ -61,7 +59,7 @@ def _motion(body: Body, poses: list[Angles]) -> Motion:
 
 
 class _Film:
-    """The painted body and what it is seen by."""
+    """The painted body, its cameras and lights."""
 
     def __init__(
         self, folder: Path, body: Body, motion: Motion, cameras: dict[str, Camera], shaders: dict[str, Shader]
@@ -86,7 +84,7 @@ class _Film:
         )
 
     def shoot(self, frame: int, camera_name: str, light: str, split: str) -> Frame:
-        """Write the pictures of one frame."""
+        """Write the images of one frame."""
         camera = self.cameras[camera_name]
         bones = bone_transforms(self.body.skeleton, self.motion.rotations[frame], np.zeros(3)).astype(np.float64)
         blend = np.einsum("nj,jrc->nrc", self.weights, bones)
@@ -104,14 +102,14 @@ class _Film:
         features = np.concatenate([radiance, self.albedo, seen], axis=1).astype(np.float32)
         raster = rasterize(posed.means, posed.covariances, posed.opacities, features, camera)
         name = f"{light}_{camera_name}_{frame:03d}.png"
-        unit = seen_normals(raster.image[..., 6:], raster.alpha)
-        pictures = {
+        unit = _seen_normals(raster.image[..., 6:], raster.alpha)
+        images = {
             "images": to_bytes(linear_to_srgb(raster.image[..., :3])),
             "masks": to_bytes(raster.alpha),
             "normals": to_bytes(unit),
             "albedo": to_bytes(linear_to_srgb(raster.image[..., 3:6])),
         }
-        for kind, pixels in pictures.items():
+        for kind, pixels in images.items():
             write_image(self.folder / kind / name, pixels)
         return Frame(
             image=f"images/{name}",
@@ -125,7 +123,7 @@ class _Film:
         )
 
 
-def seen_normals(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+def _seen_normals(blended: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Blended normals [H, W, 3] as (n + 1)/2, black where nothing is seen."""
     length = np.linalg.norm(blended, axis=-1, keepdims=True)
     unit = blended / np.maximum(length, 1e-6)

@@ -1,4 +1,4 @@
-"""The avatar under test, its body and capture, and how rows pose and picture it."""
+"""The avatar under test, its body and capture, and how the stability rows pose and render it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rnd_runtime.avatar.avatar import Avatar
@@ -15,7 +15,6 @@ from rnd_runtime.capture.body import Body
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.images import to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, save_motion
 from rnd_runtime.motion.skeleton import bone_transforms
@@ -26,38 +25,11 @@ from rnd_runtime.raster.oracle import symmetric
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 
-from .figures import Bytes, Floats, coded
 from .lights import sun_and_sky
+from .poses import APART, ARMS_DOWN, FPS, Angles
+from .psnr import Floats, srgb
 
 Floats32 = NDArray[np.float32]
-Angles = dict[str, tuple[float, float, float]]
-
-FPS = 30.0
-APART: Angles = {"left_hip": (0, 0, 0.35), "right_hip": (0, 0, -0.35)}
-"""the rest pose with the legs apart: neighbours in it are neighbours on the skin"""
-ARMS_DOWN: Angles = {"left_shoulder": (0, 0, -1.0), "right_shoulder": (0, 0, 1.0)}
-EXTREMES: dict[str, Angles] = {
-    "T-pose": {},
-    "squat": {
-        "left_hip": (-1.9, 0, 0.2),
-        "right_hip": (-1.9, 0, -0.2),
-        "left_knee": (2.2, 0, 0),
-        "right_knee": (2.2, 0, 0),
-        "spine1": (0.5, 0, 0),
-        **ARMS_DOWN,
-    },
-    "arms up": {"left_shoulder": (0, 0, 1.2), "right_shoulder": (0, 0, -1.2)},
-    "splits": {"left_hip": (0, 0, 1.2), "right_hip": (0, 0, -1.2)},
-}
-"""poses that an A-pose spin does not show (axis-angle, radians)"""
-
-
-CROSSED: Angles = {
-    "left_shoulder": (0.0, -0.9, -0.8),
-    "right_shoulder": (0.0, 0.9, 0.8),
-    "left_elbow": (0.0, -1.7, 0.0),
-    "right_elbow": (0.0, 1.7, 0.0),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +38,9 @@ class Subject:
 
     Attributes:
         avatar_file: avatar.onnx. avatar: the same, read. checkpoint: the avatar.ckpt it was exported from.
-        capture: pictures of the same person.
+        capture: images of the same person.
         work: a folder for files; small: seconds matter, so fewer poses and frames are tried.
-        size: side of the pictures, pixels.
+        size: side of the images, pixels.
     """
 
     avatar_file: Path
@@ -88,7 +60,7 @@ class Subject:
 
     @cached_property
     def light(self) -> Light:
-        """A sky and a sun from one side, made here: the same for everybody."""
+        """A sky and a sun from one side."""
         return sun_and_sky()
 
     @cached_property
@@ -99,8 +71,6 @@ class Subject:
         """A number of tries: the first for a test of seconds, the second for the table."""
         return small if self.small else full
 
-    # -- poses ---------------------------------------------------------------------------------------------
-
     def motion(self, *frames: Angles, fps: float = FPS) -> Motion:
         """One frame for each set of joint angles, the root at the origin."""
         names = self.avatar.skeleton.names
@@ -108,11 +78,10 @@ class Subject:
         for frame, pose in enumerate(frames):
             for name, vector in pose.items():
                 angles[frame, names.index(name)] = vector
-        return self.moving(angles, fps)
+        return self.motion_of(axis_angle_to_matrix(angles), fps)
 
-    def moving(self, angles: ArrayLike, fps: float = FPS) -> Motion:
-        """Joint angles [F, J, 3] as a motion on the spot."""
-        rotations = axis_angle_to_matrix(angles)
+    def motion_of(self, rotations: Floats, fps: float = FPS) -> Motion:
+        """Joint rotations [F, J, 3, 3] as a motion on the spot."""
         return Motion(rotations, np.zeros((len(rotations), 3)), fps, self.avatar.skeleton.names)
 
     def walk(self, seconds: float, fps: float = FPS) -> Motion:
@@ -124,23 +93,18 @@ class Subject:
         time = np.arange(int(np.floor(seconds * fps + 1e-9)) + 1)[:, None, None] / fps
         angles = amplitude * np.sin(2 * np.pi * rate * time + phase)
         angles[:, 0] = 0
-        return self.moving(angles, fps)
+        return self.motion_of(axis_angle_to_matrix(angles), fps)
 
-    def save_motion(self, path: Path) -> None:
+    @cached_property
+    def still_file(self) -> Path:
         """A motion of two frames with the arms down, as a file."""
-        save_motion(path, self.motion(ARMS_DOWN, ARMS_DOWN))
+        save_motion(self.work / "still.npz", self.motion(ARMS_DOWN, ARMS_DOWN))
+        return self.work / "still.npz"
 
     @cached_property
     def rest(self) -> Gaussians:
         """The avatar in its rest pose."""
         return self.avatar.pose(self.motion({}), 0.0)
-
-    @cached_property
-    def template_weights(self) -> Floats32:
-        """The template's skinning weights [N, J]: plain blend skinning uses them in every pose."""
-        logs = self._of_graph("log_template", self.motion({}), 0.0)
-        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-        return weights / weights.sum(axis=1, keepdims=True)
 
     def weights(self, motion: Motion, time: float) -> Floats32:
         """Skinning weights [N, J] at a moment."""
@@ -151,9 +115,16 @@ class Subject:
         return self.avatar.run((*window, self.bones(motion, time)), (output,))[0]
 
     def bones(self, motion: Motion, time: float) -> Floats32:
-        """What the avatar is skinned by at a moment [J, 3, 4]."""
+        """The transforms [J, 3, 4] that skin the avatar at a moment."""
         now = motion.at([time])
         return skinning_bones(self.avatar.skeleton, now.rotations[0], now.translations[0])
+
+    @cached_property
+    def template_weights(self) -> Floats32:
+        """The template's skinning weights [N, J], which plain blend skinning uses in every pose."""
+        logs = self._of_graph("log_template", self.motion({}), 0.0)
+        weights = np.exp(logs - logs.max(axis=1, keepdims=True))
+        return weights / weights.sum(axis=1, keepdims=True)
 
     def by_template(self, motion: Motion, time: float) -> Gaussians:
         """The baseline: the rest pose's Gaussians moved by the template's weights, normals by A_R n."""
@@ -162,23 +133,22 @@ class Subject:
         blend = np.einsum("nj,jrc->nrc", self.template_weights, bones.astype(np.float64))
         linear = blend[:, :, :3]
         means = np.einsum("nrc,nc->nr", linear, rest.means) + blend[:, :, 3]
-        full = symmetric(rest.covariances)
-        moved = (linear @ full @ linear.transpose(0, 2, 1)).reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+        moved = linear @ symmetric(rest.covariances) @ linear.transpose(0, 2, 1)
         normals = np.einsum("nrc,nc->nr", linear, rest.normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-        arrays = (np.asarray(a, np.float32) for a in (means, moved, normals, bones[0, :, :3]))
-        means32, covariances, normals32, root32 = arrays
         return replace(
-            rest, means=means32, covariances=covariances, normals=normals32, root_rotation=np.ascontiguousarray(root32)
+            rest,
+            means=means.astype(np.float32),
+            covariances=moved.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].astype(np.float32),
+            normals=normals.astype(np.float32),
+            root_rotation=np.ascontiguousarray(bones[0, :, :3], np.float32),
         )
 
     @cached_property
     def neighbours(self) -> NDArray[np.int64]:
         """[N, 6] nearest Gaussians on the skin, found with the legs apart."""
-        means = self.avatar.pose(self.motion({**APART}), 0.0).means
+        means = self.avatar.pose(self.motion(APART), 0.0).means
         return np.asarray(cKDTree(means).query(means, k=7)[1][:, 1:], np.int64)
-
-    # -- pictures ------------------------------------------------------------------------------------------
 
     def camera(self, azimuth: float = 0.0, elevation: float = 0.1, size: int | None = None) -> Camera:
         """A view of the whole body from ``azimuth`` (radians from the front, towards +X) and ``elevation``."""
@@ -188,22 +158,17 @@ class Subject:
         side = size or self.size
         return Camera.look_at(middle + 2.2 * height * way, middle, width=side, height=side, fov_y=0.6)
 
-    def picture(self, gaussians: Gaussians, camera: Camera | None = None, shader: Shader | None = None) -> Floats:
-        """What the player shows on black, as sRGB in 0…1 before rounding: [H, W, 3]."""
-        return coded(self.linear(gaussians, camera, shader)[..., :3])
-
-    def linear(self, gaussians: Gaussians, camera: Camera | None = None, shader: Shader | None = None) -> Floats32:
+    def radiance(self, gaussians: Gaussians, camera: Camera | None = None, shader: Shader | None = None) -> Floats32:
         """Premultiplied linear radiance and alpha [H, W, 4]."""
         camera = camera or self.camera()
         radiance = (shader or self.shader).shade(gaussians, camera.position)
         raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, radiance, camera, depth=False)
         return np.dstack([raster.image, raster.alpha])
 
-    def shown(self, motion: Motion, time: float, camera: Camera | None = None) -> Floats:
-        """``picture`` of the avatar at a moment."""
-        return self.picture(self.avatar.pose(motion, time), camera)
+    def image(self, gaussians: Gaussians, camera: Camera | None = None, shader: Shader | None = None) -> Floats:
+        """What the player shows on black, as sRGB in 0…1 before rounding: [H, W, 3]."""
+        return srgb(self.radiance(gaussians, camera, shader)[..., :3])
 
-
-def bytes_of(picture: ArrayLike) -> Bytes:
-    """An sRGB picture in 0…1 as 8 bits."""
-    return to_bytes(picture)
+    def image_at(self, motion: Motion, time: float, camera: Camera | None = None) -> Floats:
+        """``image`` of the avatar at a moment."""
+        return self.image(self.avatar.pose(motion, time), camera)

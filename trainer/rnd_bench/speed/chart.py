@@ -1,26 +1,27 @@
-"""The speed–accuracy chart: every point, the front that nothing beats, one panel for each stage.
+"""The speed–accuracy chart: every point, the Pareto front, one panel for each stage.
 
-Errors are those to the same avatar in full, so fronts are drawn for each number of Gaussians by itself.
+Errors are those to the same avatar in full, so each number of Gaussians has a front of its own.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rnd_bench.charts import chart
 from rnd_bench.scenes.scenes import USUAL as USUAL_SCENE
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path
 
 from .grid import pareto
-from .point import Row
+from .point import Row, Setting
 
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
-USUAL = {"encoder": "full", "precision": "f32", "window": None, "raster": "cpu", "threads": 2}
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
 SEEDED = "seeded"
-"""``avatar`` of a row whose networks nobody trained"""
+"""``avatar`` of a row with untrained networks"""
 HARD = "X"
 """marks a frame of one of the hardest scenes"""
 EDGES = {"ao": "#aaaaaa", "table": "#000000", "table+sun": "#f4d03f", "lights": "#ff4fa3", "brute": "#00c8ff"}
@@ -29,93 +30,107 @@ MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
 EDGE = 0.9
 """points wide"""
 CEILING_DB = 60.0
-"""points above it are drawn on it: a picture that is the reference's has a hundred"""
-LEAST_SPAN = 5.0
-"""a panel's greatest milliseconds over its least, at least: equal times should look equal, and two of the ticks
-1, 2, 5, 10 … have room"""
+"""points above it are plotted on it"""
+MIN_SPAN = 5.0
+"""a panel's greatest milliseconds over its least, at least: room for two of the ticks 1, 2, 5, 10 …"""
 CROWDED = 500.0
-"""that ratio in a panel, from which on only 0.1, 1, 10 … have room"""
+"""that ratio from which on only 0.1, 1, 10 … have room"""
 COLUMNS, WIDE = 5, 3
 """panels side by side, and how many of them the overview is as wide as"""
 
 
-def draw_chart(rows: list[Row], files: list[Path]) -> None:
-    """Write the chart of ``rows`` to every file, SVG or PNG by its suffix.
+def check_chart(*files: Path) -> None:
+    """Raise ``InputError`` unless all ``files`` are charts by their suffix and matplotlib is installed."""
+    for file in files:
+        if file.suffix not in (".svg", ".png"):
+            raise InputError("--chart", expected=".svg or .png", got=file.name)
+    if files and importlib.util.find_spec("matplotlib") is None:
+        hint = 'needs the extra: pip install "rnd-avatar[bench]", in a clone ".[bench]"'
+        raise InputError("matplotlib is not installed", hint=hint)
+
+
+def draw_chart(rows: list[Row], files: Sequence[Path]) -> None:
+    """Write the chart of ``rows`` to every file, SVG or PNG by its suffix: the same bytes for the same rows.
 
     Raises ``InputError`` where nothing was measured.
     """
     rows = [row for row in rows if "psnr_db" in row]
     if not rows:
         raise InputError("chart", expected="at least one measured point", got="none")
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
     stages = list(dict.fromkeys(name for row in rows for name in row["stages"]))
     below = -(-len(stages) // COLUMNS)
-    with chart(files, (13, 5.4 + 2.5 * below)) as figure:
+    with matplotlib.rc_context({"svg.hashsalt": "rnd-bench", "font.size": 9, "svg.fonttype": "none"}):
+        figure = plt.figure(figsize=(13, 5.4 + 2.5 * below), layout="constrained")
         grid = figure.add_gridspec(1 + below, COLUMNS, height_ratios=[2.2, *[1] * below])
-        whole, words = figure.add_subplot(grid[0, :WIDE]), figure.add_subplot(grid[0, WIDE:])
-        _overview(whole, words, rows)
+        overview = figure.add_subplot(grid[0, :WIDE])
+        _overview(overview, figure.add_subplot(grid[0, WIDE:]), rows)
         for k, stage in enumerate(stages):
-            axes = figure.add_subplot(grid[1 + k // COLUMNS, k % COLUMNS], sharey=whole)
+            axes = figure.add_subplot(grid[1 + k // COLUMNS, k % COLUMNS], sharey=overview)
             _stage(axes, rows, stage)
             if k % COLUMNS == 0:
                 axes.set_ylabel("dB")
             else:
                 axes.tick_params(labelleft=False)
+        for file in files:
+            with atomic_path(file) as temporary:
+                metadata: Row = {"Date": None} if file.suffix == ".svg" else {}
+                figure.savefig(temporary, dpi=110, metadata=metadata)
+        plt.close(figure)
 
 
 def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
-    """All points, and what the usual front is in ``words`` beside them.
+    """All points, and the usual front in ``words`` beside them.
 
-    Fronts are drawn for pictures of one size, since smaller ones are always faster, and of the usual scene.
+    Fronts are of images of one size, since smaller ones are always faster, and of the usual scene.
     """
     usual, size = rows[0]["n"], rows[0]["size"]
     easy = [row for row in rows if row["size"] == size and not _hard(row)]
     fronts = {n: list(pareto([row for row in easy if row["n"] == n])) for n in COLOURS}
     for n, along in fronts.items():
-        axes.plot(
-            [r["ms_median"] for r in along], [_shown_db(r) for r in along], color=COLOURS[n], lw=1, alpha=0.7, zorder=1
-        )
-    front = fronts.get(usual, [])
+        points = [r["ms_median"] for r in along], [_shown_db(r) for r in along]
+        axes.plot(*points, color=COLOURS[n], lw=1, alpha=0.7, zorder=1)
     axes.axvline(BUDGET_MS, color="#999", lw=0.8, ls="--")
     axes.axhline(BUDGET_DB, color="#999", lw=0.8, ls="--")
     _points(axes, rows, "ms_median")
     named = [f"front of {usual:,} at {size}²:".replace(",", " ")]
-    for number, row in enumerate(front, 1):
-        axes.annotate(
-            str(number),
-            (row["ms_median"], _shown_db(row)),
-            xytext=(0, 6),
-            textcoords="offset points",
-            fontsize=8,
-            ha="center",
-            weight="bold",
-        )
+    style = {"xytext": (0, 6), "textcoords": "offset points", "fontsize": 8, "ha": "center", "weight": "bold"}
+    for number, row in enumerate(fronts.get(usual, []), 1):
+        axes.annotate(str(number), (row["ms_median"], _shown_db(row)), **style)
         named.append(f"{number:2}  {_label(row)}: {row['ms_median']:.1f} ms, {row['psnr_db']:.1f} dB")
     words.axis("off")
     words.text(0, 1, "\n".join(named), transform=words.transAxes, fontsize=8, va="top", linespacing=1.5)
     axes.set_xlabel("ms per frame, pose to pixels (median); dashed: 60 frames a second")
     axes.set_ylabel(f"PSNR to the full reference, dB; dashed: 45; cut at {CEILING_DB:g}")
     axes.set_title(f"Speed against accuracy: {len(rows)} points on {rows[0]['machine']}", loc="left")
-    handles = [
-        axes.scatter([], [], color=colour, label=f"{n:,} Gaussians".replace(",", " "))
-        for n, colour in COLOURS.items()
-        if any(row["n"] == n for row in rows)
-    ]
-    handles += [axes.scatter([], [], color="#555", marker=m, label=f"encoder {name}") for name, m in MARKERS.items()]
-    handles += [
-        axes.scatter([], [], facecolor="#ddd", edgecolor=edge, lw=EDGE, label=f"shade {mode}")
-        for mode, edge in EDGES.items()
-        if any(_mode(row) == mode for row in rows)
-    ]
-    handles += [
-        axes.scatter([], [], s=_area(side), color="#555", label=f"{side}²")
-        for side in sorted({row["size"] for row in rows})
-    ]
-    if any(_hard(row) for row in rows):
-        hard = ", ".join(row["scene"] for row in rows if _hard(row))
-        handles.append(axes.scatter([], [], color="#555", marker=HARD, label=hard))
-    if any(row["avatar"] == SEEDED for row in rows):
-        handles.append(axes.scatter([], [], facecolor="none", edgecolor="#555", label="hollow: an untrained avatar"))
+    handles = _legend(axes, rows)
     words.legend(handles=handles, loc="lower left", fontsize=8, frameon=False, borderaxespad=0, ncols=2)
+
+
+def _legend(axes: Any, rows: list[Row]) -> list[Any]:
+    """A handle for everything that ``rows`` show."""
+
+    def mark(label: str, **style: Any) -> Any:
+        return axes.scatter([], [], label=label, **({"color": "#555"} if "edgecolor" not in style else {}) | style)
+
+    numbers, modes = {row["n"] for row in rows}, {_mode(row) for row in rows}
+    handles = [mark(f"{n:,} Gaussians".replace(",", " "), color=c) for n, c in COLOURS.items() if n in numbers]
+    handles += [mark(f"encoder {name}", marker=marker) for name, marker in MARKERS.items()]
+    handles += [
+        mark(f"shade {mode}", facecolor="#ddd", edgecolor=edge, lw=EDGE)
+        for mode, edge in EDGES.items()
+        if mode in modes
+    ]
+    handles += [mark(f"{side}²", s=_area(side)) for side in sorted({row["size"] for row in rows})]
+    if any(_hard(row) for row in rows):
+        handles.append(mark(", ".join(row["scene"] for row in rows if _hard(row)), marker=HARD))
+    if any(row["avatar"] == SEEDED for row in rows):
+        handles.append(mark("hollow: an untrained avatar", facecolor="none", edgecolor="#555"))
+    return handles
 
 
 def _stage(axes: Any, rows: list[Row], stage: str) -> None:
@@ -125,24 +140,24 @@ def _stage(axes: Any, rows: list[Row], stage: str) -> None:
     _points(axes, had, "stage_ms")
     axes.set_title(stage, loc="left", fontsize=9)
     axes.set_xlabel("ms")
-    least, most = axes.get_xlim()
-    short = max(0.5 * (math.log(LEAST_SPAN) - math.log(most / least)), 0)
-    axes.set_xlim(least * math.exp(-short), most * math.exp(short))
-    if most > CROWDED * least:
+    low, high = axes.get_xlim()
+    short = max(0.5 * (math.log(MIN_SPAN) - math.log(high / low)), 0)
+    axes.set_xlim(low * math.exp(-short), high * math.exp(short))
+    if high > CROWDED * low:
         axes.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1,)))
 
 
 def _hard(row: Row) -> bool:
-    return str(row.get("scene", USUAL_SCENE)) != USUAL_SCENE
+    return str(row["scene"]) != USUAL_SCENE
 
 
 def _mode(row: Row) -> str:
-    """Its shading, without how many lights."""
+    """Its shading, without the number of lights."""
     return str(row["shade"]).partition(":")[0]
 
 
 def _area(side: int) -> float:
-    """Of the mark of a picture of so many pixels' side."""
+    """Of the mark of an image of ``side`` pixels."""
     return 14 + 26 * (side / 512)
 
 
@@ -176,16 +191,15 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
 
 def _label(row: Row) -> str:
     """What distinguishes a point, in few words."""
+    usual = Setting()
     words = [row["shade"]]
-    words += [
-        str(row[name]) for name, usual in USUAL.items() if row[name] != usual and name not in ("window", "threads")
-    ]
+    words += [str(row[name]) for name in ("encoder", "precision", "raster") if row[name] != getattr(usual, name)]
     if row["window"] is not None:
         words.append(f"d={row['window']}")
     if _hard(row):
         words.append(row["scene"])
     if row["cull"] is not None:
         words.append(f"n·v ≥ {row['cull']:g}")
-    if row["threads"] != USUAL["threads"]:
+    if row["threads"] != usual.threads:
         words.append(f"{row['threads']} thread")
     return " · ".join(words)

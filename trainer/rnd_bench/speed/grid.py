@@ -1,19 +1,17 @@
-"""The grid of the speed–accuracy chart: one factor at a time around the usual case and a crossed core, or factors that
-are crossed with one another, all combinations of them or some drawn at random.
+"""The grid of the speed–accuracy chart: one factor at a time around the usual case and a crossed core, or all
+combinations of given factors.
 
-Every point is one row of JSON. Rows that are there already, measured on this machine, of the same files and by the same
-code, are not measured again: an interrupted run goes on where it stopped.
+Every point is one row of JSON. Rows of this machine, of the same files and the same code are not measured again, so
+that an interrupted run resumes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
-from itertools import islice, product
+from itertools import product
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from rnd_bench.scenes.avatars import forget
 from rnd_bench.scenes.scenes import HARDEST
@@ -25,8 +23,6 @@ from .point import FULL_N, Inputs, Row, Setting, measured
 
 CULLS = (-0.2, -0.5)
 """cosines below which n·v is left out"""
-
-
 FACTORS: dict[str, tuple[Any, ...]] = {
     "n": (4_000, 8_000, 15_000, FULL_N, 60_000),
     "size": (256, 512, 1024),
@@ -38,38 +34,31 @@ FACTORS: dict[str, tuple[Any, ...]] = {
     "threads": (2, 1),
     "cull": (None, *CULLS),
 }
-"""what each field of a ``Setting`` is varied over"""
+"""values of each field of a ``Setting``"""
 
 
-def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None = None) -> list[Setting]:
+QUICK: dict[str, tuple[Any, ...]] = {
+    "n": (4_000,),
+    "shade": ("ao", "table"),
+    "encoder": ("coarse", "static"),
+    "threads": (1,),
+    "raster": ("gl-egl",),
+}
+
+
+def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
     """The points, the usual case first, none twice; with ``cross`` all combinations of those factors and no others.
 
-    ``sample`` takes so many of these combinations, or of all factors', at random: see ``drawn``.
-
-    Raises ``InputError`` for a factor that does not exist, and more points than there are combinations.
+    Raises ``InputError`` for an unknown or a repeated factor.
     """
     usual = Setting(n=8_000, size=256) if quick else Setting()
-    factors = FACTORS
     for name in cross:
         check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
     check_option(len(set(cross)) == len(cross), "--cross", "each factor once", ",".join(cross))
-    if cross or sample is not None:
-        names = tuple(cross or FACTORS)
-        combinations = product(*(FACTORS[name] for name in names))
-        points = [usual, *(_of(usual, names, values) for values in combinations)]
-        distinct = list(dict.fromkeys(points))
-        if sample is None:
-            return distinct
-        check_option(0 < sample < len(distinct), "--sample", f"1 to {len(distinct) - 1} points", sample)
-        return [usual, *islice(drawn(names, usual), sample)]
-    if quick:
-        factors = {
-            "n": (4_000,),
-            "shade": ("ao", "table"),
-            "encoder": ("coarse", "static"),
-            "threads": (1,),
-            "raster": ("gl-egl",),
-        }
+    if cross:
+        combinations = product(*(FACTORS[name] for name in cross))
+        return list(dict.fromkeys([usual, *(_of(usual, cross, values) for values in combinations)]))
+    factors = QUICK if quick else FACTORS
     points = [usual, *(replace(usual, **{name: value}) for name, values in factors.items() for value in values)]
     if not quick:
         core = product((8_000, 15_000, FULL_N), FACTORS["encoder"], ("table", "table+sun"))
@@ -79,28 +68,9 @@ def settings(quick: bool = False, cross: Sequence[str] = (), sample: int | None 
     return list(dict.fromkeys(points))
 
 
-def drawn(names: Sequence[str], usual: Setting, seed: int = 0) -> Iterator[Setting]:
-    """Combinations of those factors' values at random, none twice and never the ``usual`` one.
-
-    Each factor goes through its values again and again, in another order each time, so that every stretch of points has
-    about as many of each; a longer sample begins with a shorter one.
-    """
-    rng = np.random.default_rng(seed)
-    waiting: dict[str, list[Any]] = {name: [] for name in names}
-    seen = {usual}
-    while True:
-        for name in names:
-            if not waiting[name]:
-                waiting[name] = [FACTORS[name][k] for k in rng.permutation(len(FACTORS[name]))]
-        point = _of(usual, names, [waiting[name].pop() for name in names])
-        if point not in seen:
-            seen.add(point)
-            yield point
-
-
 def _of(usual: Setting, names: Sequence[str], values: Sequence[Any]) -> Setting:
     point = replace(usual, **dict(zip(names, values)))
-    return replace(point, window=None) if point.encoder == "static" else point  # which looks at no window
+    return replace(point, window=None) if point.encoder == "static" else point  # which has no window
 
 
 def grid(
@@ -109,7 +79,6 @@ def grid(
     *,
     quick: bool = False,
     cross: Sequence[str] = (),
-    sample: int | None = None,
     fresh: bool = False,
     on_row: Callable[[Row, bool, int], None],
 ) -> list[Row]:
@@ -121,7 +90,7 @@ def grid(
     if fresh:
         forget(inputs.work)
     rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *FACTORS))
-    wanted, key = settings(quick, cross, sample), inputs.key()
+    wanted, key = settings(quick, cross), inputs.key()
     here = {
         _key(row): row
         for row in rows
@@ -135,7 +104,7 @@ def grid(
         if row is None:
             try:
                 row = measured(setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick, full_n=wanted[0].n)
-            except InputError as error:  # no such rasteriser here: say so and go on
+            except InputError as error:  # such as a rasteriser that is missing
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
             row["inputs"], left = key, left - 1
         done.append(row)
@@ -154,4 +123,4 @@ def pareto(rows: list[Row], cost: str = "ms_median", worth: str = "psnr_db") -> 
 
 
 def _key(row: Row) -> tuple[Any, ...]:
-    return tuple(row.get(name, usual) for name, usual in asdict(Setting()).items())  # older rows have no scene
+    return tuple(row.get(name) for name in asdict(Setting()))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rnd_bench.scenes.avatars import Encoders, checkpoint_model, content_key, exported, seeded_checkpoint, sources
-from rnd_bench.scenes.scenes import USUAL, Scene, scene
+from rnd_bench.scenes.scenes import USUAL, BenchScene, bench_scene
 from rnd_runtime import __version__
 from rnd_runtime.avatar.file import advice_of, metadata_of
 from rnd_runtime.core.errors import InputError, check_option
@@ -61,14 +61,14 @@ class Inputs:
         return self
 
     def key(self) -> str:
-        """What tells rows of these files, by this code, from rows of others."""
+        """Digest of these files and of the code that plays them."""
         code = (*sources("rnd_runtime"), *sources("rnd_export"))
         return content_key(self.body, self.motion, self.hdr, *(self.checkpoints or ("none",)), *code)
 
-    def scene(self, name: str) -> Scene:
-        """The scene ``name`` of ``bench_scenes``."""
+    def scene(self, name: str) -> BenchScene:
+        """The scene ``name`` of ``scenes.scenes``."""
         key = content_key(self.body, self.motion, *sources("rnd_trainer"))
-        return scene(name, self.body, self.motion, self.hdr, self.work, key)
+        return bench_scene(name, self.body, self.motion, self.hdr, self.work, key)
 
     def source(self, n: int) -> tuple[Path, str]:
         """The checkpoint of ``n`` Gaussians, and which it is: trained or seeded."""
@@ -78,7 +78,7 @@ class Inputs:
         return seeded_checkpoint(n, self.body, self.work), "seeded"
 
     def own(self, file: Path, setting: Setting) -> tuple[Setting, Path]:
-        """``setting`` with what the avatar.onnx ``file`` says of itself, and the whole avatar of its checkpoint.
+        """``setting`` with the metadata of the avatar.onnx ``file``, and the full avatar of its checkpoint.
 
         Raises ``InputError`` where no checkpoint here is the file's.
         """
@@ -114,53 +114,51 @@ def measured(
     full_n: int | None = None,
     file: Path | None = None,
 ) -> Row:
-    """One row: the setting, times and sizes, and the errors against the whole avatar's reference.
+    """One row: the setting, times and sizes, and the errors against the full avatar's reference.
 
-    ``psnr_full_db`` compares the pictures with those of the same kind of avatar with ``full_n`` Gaussians: seeded
-    ones follow one formula, and trained ones one capture, so that is what fewer Gaussians cost. Of ``table+sun``,
-    ``psnr_suns_db`` and ``psnr_suns_db_worst`` compare with the reference whose suns cast the same shadows; that
-    reference takes twice as long as the other and is left out without ``with_suns``. A ``file`` that was exported
-    from one of the checkpoints is measured as it is, beside that checkpoint's whole avatar.
+    ``psnr_full_db`` compares with frames of the same kind of avatar with ``full_n`` Gaussians: the cost of fewer
+    Gaussians. ``with_suns`` adds ``psnr_suns_db`` to ``table+sun``, against the reference whose suns cast the same
+    shadows, which takes twice as long. A ``file`` that was exported from one of the checkpoints is measured as it is.
     """
     if file is None:
         file, which = inputs.avatar(setting.n, Encoders(setting.encoder, setting.precision, setting.window))
-        whole = None
+        full = None
     else:
-        setting, whole, which = *inputs.own(file, setting), "exported"
-    filmed = inputs.scene(setting.scene)
+        setting, full, which = *inputs.own(file, setting), "exported"
+    scene = inputs.scene(setting.scene)
     point = Point(
         str(file),
-        str(filmed.motion),
-        str(filmed.hdr),
+        str(scene.motion),
+        str(scene.hdr),
         setting.size,
         setting.shade,
         setting.raster,
         setting.threads,
         seconds=seconds,
         cull=setting.cull,
-        view=filmed.view,
+        view=scene.view,
     )
     truths: dict[str, Reference] = {}
     with ThreadPoolExecutor(1) as other:
-        # a cold start is one of a machine whose numba cache has the kernels: what it lacks is compiled meanwhile
+        # a cold start is one with the kernels in numba's cache: what it lacks is compiled meanwhile
         compiled = other.submit(measure, replace(point, frames=1))
         if compare:
-            whole = whole or inputs.avatar(setting.n, Encoders())[0]
-            truths[""] = reference(whole, filmed, setting.size, inputs.work)
+            full = full or inputs.avatar(setting.n, Encoders())[0]
+            truths[""] = reference(full, scene, setting.size, inputs.work)
             if setting.shade == "table+sun" and with_suns:
-                truths["suns"] = reference(whole, filmed, setting.size, inputs.work, with_suns=True)
+                truths["suns"] = reference(full, scene, setting.size, inputs.work, with_suns=True)
             if which != "exported":
                 largest, kind = inputs.avatar(full_n or setting.n, Encoders())
                 if kind == which:
-                    truths["full"] = reference(largest, filmed, setting.size, inputs.work)
+                    truths["full"] = reference(largest, scene, setting.size, inputs.work)
         compiled.result()
-    drawn = measure(point)
-    row: Row = {**asdict(setting), "avatar": which, **drawn.row, "machine": machine(), "version": __version__}
+    result = measure(point)
+    row: Row = {**asdict(setting), "avatar": which, **result.row, "machine": machine(), "version": __version__}
     if compare:
-        row |= errors(drawn, truths[""])
+        row |= errors(result, truths[""])
     if "suns" in truths:
-        off = errors(drawn, truths["suns"])
+        off = errors(result, truths["suns"])
         row |= {f"psnr_suns_db{part}": off[f"psnr_db{part}"] for part in ("", "_worst")}
     if "full" in truths:
-        row["psnr_full_db"], row["full_n"] = errors(drawn, truths["full"])["psnr_db"], full_n or setting.n
+        row["psnr_full_db"], row["full_n"] = errors(result, truths["full"])["psnr_db"], full_n or setting.n
     return row

@@ -26,9 +26,9 @@ KINDS = {
     "perceptual network": "convolution|max_pool|grid_sampler",
     "matrix products": r"aten::(mm|addmm|bmm|baddbmm|matmul)$",
 }
-"""patterns of an operation's name, its gradient's included; what none of them finds is the rest of torch"""
+"""patterns of an operation's name, its gradient's included"""
 OPTIMISER, OPTIMISING = "optimiser", "Optimizer.step#"
-"""what torch does within an optimiser's step, whose name begins so, is the optimiser's"""
+"""the beginning of the name of an optimiser's step: operations within it are the optimiser's"""
 REST, OUTSIDE = "element by element", "outside operations"
 WARMUP = 4
 
@@ -39,24 +39,24 @@ def bench_step(
     perceptual: Perceptual | None,
     *,
     repeats: int = 24,
-    on_step: Callable[[int, int], None] = lambda done, total: None,
+    on_step: Callable[[int], None] = lambda done: None,
 ) -> list[dict[str, Any]]:
-    """Milliseconds of a step of the second stage, by kind; the whole first.
+    """Milliseconds of a step of the second stage, the total first, then by kind.
 
-    Instead of ``config.steps`` so few are planned that the second stage is soon reached: its steps cost what they cost
-    in a whole training. The profiler itself adds a few per cent.
+    Fewer steps than ``config.steps`` are planned, so that the second stage is soon reached. The profiler adds a few
+    per cent.
     """
     within = 1 - config.stage1_fraction - config.full_light_fraction
     steps = math.ceil((repeats + WARMUP + 1) / within)
     training = Training(capture, resized(config, None, steps), perceptual)
     first = training.schedule.first_stage + WARMUP
     for done in range(first):
-        on_step(done, first + repeats)
+        on_step(done)
         training.step()
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
         started = time.perf_counter()
         for done in range(repeats):
-            on_step(first + done, first + repeats)
+            on_step(first + done)
             training.step()
         whole = 1e3 * (time.perf_counter() - started) / repeats
     spent = {kind: ms / repeats for kind, ms in spent_by_kind(profiled).items()}

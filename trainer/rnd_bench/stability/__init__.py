@@ -1,5 +1,4 @@
-"""Where methods of this kind fail: one function for each row of the stability suite.
+"""The cases in which methods of this kind break.
 
-``tests/stability`` runs them on a small avatar, ``rnd-bench --stability`` at full size; both call the same functions
-(``rows.ROWS``), which return what they measured and never raise for a failed line.
+``rnd-bench stability`` runs them at full size, ``tests/bench/stability`` on a small avatar: the same functions.
 """

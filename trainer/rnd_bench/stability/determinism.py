@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from rnd_bench.scenes.figures import Figure, Result, at_most, holds
-from rnd_bench.scenes.subject import FPS, Subject
+from rnd_bench.scenes.poses import FPS
+from rnd_bench.scenes.subject import Subject
 from rnd_runtime.gl.context import create_context
 from rnd_runtime.gl.raster import GlRasterizer
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.rasterizer import Kind
 
-from .commands import EXPORT, PLAY, run_commands
+from .figures import Figure, Result, at_most, holds
+from .processes import export, play, run_commands
 
 THREADS = (1, 2)
 FRAMES = 8
@@ -27,16 +28,16 @@ def same_bytes(subject: Subject) -> Result:
     """Files of export and play, each made at one thread and at two; frames of both OpenGL backends."""
     motion = subject.work / "moving.npz"
     save_motion(motion, subject.walk(FRAMES / FPS))
+    options = ("--size", 96, "--format", "png,exr,mp4", "--aov", "normal,depth")
     made: list[dict[str, str]] = []
     for threads in THREADS:
         folder = subject.work / f"same_{threads}"
-        play = [str(subject.avatar_file), "--motion", str(motion), "--out", str(folder / "play"), "--size", "96"]
+        folder.mkdir(parents=True, exist_ok=True)
         runs = [
-            (EXPORT, [str(subject.checkpoint), "--out", str(folder / "avatar.onnx")]),
-            (PLAY, [*play, "--threads", str(threads), "--format", "png,exr,mp4", "--aov", "normal,depth"]),
+            export(subject.checkpoint, folder / "avatar.onnx"),
+            play(subject.avatar_file, motion, folder / "play", "--threads", threads, *options),
         ]
         variables = {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
-        folder.mkdir(parents=True, exist_ok=True)
         for done in run_commands(folder, runs, **variables):
             if done.code != 0:
                 return Result((holds("commands that failed", [done.errors[-200:]]),))
@@ -49,13 +50,13 @@ def same_bytes(subject: Subject) -> Result:
 
 def frames_agree(subject: Subject) -> Figure:
     """Everything after the encoders by OpenGL, on EGL and on OSMesa, of a body in motion."""
-    motion, drawn = subject.walk(FRAMES / FPS), []
+    motion, rendered = subject.walk(FRAMES / FPS), []
     backends: tuple[Kind, ...] = ("gl-egl", "gl-osmesa")
     for backend in backends:
         renderer = FrameRenderer(subject.avatar, subject.light, subject.camera(), raster=backend)
-        drawn.append([renderer.render(motion, k / FPS).radiance for k in range(FRAMES)])
+        rendered.append([renderer.render(motion, k / FPS).radiance for k in range(FRAMES)])
         renderer.close()
-    apart = max(float(np.abs(a - b).max()) for a, b in zip(*drawn))
+    apart = max(float(np.abs(a - b).max()) for a, b in zip(*rendered))
     return at_most(f"{FRAMES} frames on EGL against OSMesa, largest difference", apart, 0)
 
 

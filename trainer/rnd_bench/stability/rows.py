@@ -1,16 +1,45 @@
-"""Every row of the list, in its order."""
+"""Every row of the stability list, in its order."""
 
 from __future__ import annotations
 
-from rnd_bench.scenes.figures import Row
+from collections.abc import Callable
+from typing import NamedTuple
 
-from . import captures, drift, files, materials, motions, playback, poses, relighting, splats, stress, trainings
+from rnd_bench.scenes.subject import Subject
 
+from .figures import Result
+from .measures import (
+    captures,
+    files,
+    materials,
+    motions,
+    parity,
+    playback,
+    poses,
+    relighting,
+    splats,
+    stress,
+    trainings,
+    twists,
+)
+
+AVATAR = "the avatar"
 SHORT = "a training of at most 4 000 Gaussians, 96²"
 MADE = "Gaussians or a light made for it"
+
+
+class Row(NamedTuple):
+    """One failure mode: its id in the list, its name, what measures it, and ``on`` what."""
+
+    id: str
+    failure: str
+    measure: Callable[[Subject], Result]
+    on: str = AVATAR
+
+
 ROWS: tuple[Row, ...] = (
     Row("P1", "out-of-distribution pose", poses.out_of_distribution),
-    Row("P2", "candy wrapper", poses.candy_wrapper),
+    Row("P2", "candy wrapper", twists.candy_wrapper),
     Row("P3", "axis-angle wrap", poses.axis_angle_wrap),
     Row("P4", "global rotation", poses.global_rotation),
     Row("P7", "self-contact", playback.self_contact),
@@ -44,9 +73,9 @@ ROWS: tuple[Row, ...] = (
     Row("L12", "light baked into albedo", materials.baked_light),
     Row("L13", "visibility blind to pose", materials.crossed_arms),
     Row("L15", "monochrome probe", relighting.monochrome_probe),
-    Row("R1", "torch and onnxruntime drift", drift.torch_against_onnx),
-    Row("R2", "f16 and int8", drift.stored_precisions),
-    Row("R3", "threads, no AVX-512", drift.threads),
+    Row("R1", "torch against onnxruntime", parity.torch_against_onnx),
+    Row("R2", "f16 and int8", parity.stored_precisions),
+    Row("R3", "threads, no AVX-512", parity.threads),
     Row("R4", "broken checkpoint or avatar", files.broken_files),
     Row("R5", "broken capture", captures.broken_captures),
     Row("R6", "empty or full masks", captures.bad_masks),

@@ -1,1 +1,1 @@
-"""Studies of many trainings."""
+"""Studies of many trainings, and of the light stage."""

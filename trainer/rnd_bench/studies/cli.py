@@ -1,81 +1,75 @@
-"""rnd-eval --ablate: a study's trainings, their table on the terminal, their rows and their chart."""
+"""``rnd-bench study``: trainings of many variants, and what stands on the light stage."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rnd_runtime.core.errors import check_option
-from rnd_runtime.core.files import write_json
-from rnd_trainer.commands.eval import EvalOptions, check_outputs, need_extra, wide_console
+import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-if TYPE_CHECKING:
-    from rnd_trainer.config import TrainConfig
+from rnd_runtime.capture.capture import capture_file, load_capture
+from rnd_runtime.core.command import log, warn
+from rnd_runtime.core.errors import InputError, check_option
+from rnd_runtime.core.files import output_file, output_folder, refuse_input, write_json
+from rnd_runtime.core.images import to_bytes, write_image
+from rnd_runtime.core.progress import Progress
+from rnd_runtime.playback.doctor import machine
+from rnd_runtime.shading.shader import check_mode
+from rnd_stage.film.plan import check_step
+from rnd_stage.variants import need_extra, use_variant
+from rnd_trainer.config import TrainConfig, check_sizes, preset, resized
+from rnd_trainer.evaluation.evaluate import HELD_OUT
+from rnd_trainer.losses.perceptual import load_features, load_lpips
+from rnd_trainer.training.notes import capture_notes
 
-    from .ablate import StudyRow
+from .options import Ablations, Agreement, Causes, Lengths, People, Trainings
+from .summary import summarise
+from .trainings import ablate, check_needs, time_encoders
+from .variants import CAUSES, LENGTHS, VARIANTS, StudyRow, chosen
 
-MOST_SEEDS = 100
+STUDIES: dict[type[Trainings], tuple[StudyRow, ...]] = {Ablations: VARIANTS, Causes: CAUSES, Lengths: LENGTHS}
+MAX_SEEDS = 100
+WIDTH = 140
+"""characters of the widest table"""
 
 
-def run_study(options: EvalOptions) -> None:
-    """Train a study's rows into the folder ``options.run``; print their table, write rows and summary as JSON."""
-    need_extra()
-    from rnd_bench.charts import check_chart, draw_lengths
-    from rnd_runtime.shading.shader import check_mode
-
-    from .ablate import STUDIES, chosen, summarise, time_encoders
-
-    variants = chosen(STUDIES[options.study], options.variants)
-    if options.chart is not None:
-        check_chart(options.chart)
-        check_option(options.study == "lengths", "--chart", "--study lengths beside it", options.study)
-    check_option(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
-    check_option(options.seeds <= MOST_SEEDS, "--seeds", f"at most {MOST_SEEDS}", options.seeds)
+def run_trainings(options: Trainings) -> None:
+    """Train a study's rows into the folder ``options.run``; print their table, write summary and rows."""
+    variants = chosen(STUDIES[type(options)], options.variants)
+    check_option(1 <= options.seeds <= MAX_SEEDS, "--seeds", f"1 to {MAX_SEEDS}", options.seeds)
     check_mode(options.shade)
-    check_outputs(options)
-    rows = time_encoders(_trained(options, _config(options), variants), options.run, variants, seed=0)
-    summary = summarise(rows, variants)
     if options.json is not None:
-        write_json(options.json, {"summary": summary, "rows": rows})
-    if options.chart is not None:
-        draw_lengths(rows, [options.chart])
-    _show(summary, options.study)
-
-
-def _config(options: EvalOptions) -> TrainConfig:
-    from rnd_trainer.config import check_sizes, preset, resized
-
+        refuse_input(
+            options.json, capture_file(options.capture), options.perceptual_weights, options.consistency_weights
+        )
+        output_file(options.json)
     config = resized(preset(options.preset), options.gaussians, options.steps)
     config = dataclasses.replace(config, image_scale=options.image_scale)
     check_sizes(config)
-    return config
+    rows = time_encoders(_trained(options, config, variants), options.run, variants, seed=0)
+    summary = summarise(rows, variants)
+    if options.json is not None:
+        write_json(options.json, {"summary": summary, "rows": rows})
+    _show(summary, type(options).__name__.lower())
 
 
-def _trained(options: EvalOptions, config: TrainConfig, variants: Sequence[StudyRow]) -> list[dict[str, Any]]:
+def _trained(options: Trainings, config: TrainConfig, variants: Sequence[StudyRow]) -> list[dict[str, Any]]:
     """Scores of every row and seed, trained with a progress bar where they were not before."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from rnd_runtime.capture.capture import load_capture
-    from rnd_trainer.evaluation.evaluate import HELD_OUT
-    from rnd_trainer.losses.perceptual import load_features, load_lpips
-    from rnd_trainer.training.notes import capture_notes, say_notes
-
-    from .ablate import ablate, check_needs
-
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)
-    say_notes("rnd-eval", capture_notes(capture, HELD_OUT))
+    for note in capture_notes(capture, HELD_OUT):
+        log(note)
     perceptual = load_lpips(options.perceptual_weights)
-    console = Console(stderr=True)
     if perceptual is None:
-        console.print("rnd-eval: no --perceptual-weights: no LPIPS, and without --consistency-weights no L_gc")
-    with Progress(console=console, speed_estimate_period=600) as progress:
-        task = progress.add_task("", total=None)
+        warn("no --perceptual-weights: no LPIPS, and without --consistency-weights no L_gc")
+    with Progress() as progress:
+        progress.phase("trainings", len(variants) * options.seeds)
 
         def on_run(name: str, seed: int, done: float, total: int) -> None:
-            progress.update(task, description=f"{name}, seed {seed}", completed=done, total=total)
+            progress.update(done, step=f"{name}, seed {seed}, {done:.2f}/{total}")
 
         return ablate(
             capture,
@@ -91,15 +85,13 @@ def _trained(options: EvalOptions, config: TrainConfig, variants: Sequence[Study
 
 
 def _show(summary: Sequence[dict[str, Any]], study: str) -> None:
-    from rich.table import Table
-
     splits = [key for key, cell in summary[0].items() if isinstance(cell, dict)]
     table = Table("method", *splits, "read beside", "GFLOP", "ms", title=f"{study}, PSNR")
     for line in summary:
         cells = [_with_gain(line[split]) if split in line else "" for split in splits]
         cost = (f"{line['encoder_gflop']:.3f}", f"{line['encoder_ms']:.1f}")
         table.add_row(line["method"], *cells, line["beside"] or "", *cost)
-    wide_console().print(table)
+    _wide_console().print(table)
 
 
 def _with_gain(cell: dict[str, Any]) -> str:
@@ -109,3 +101,88 @@ def _with_gain(cell: dict[str, Any]) -> str:
         return text
     gain = f"{cell['gain']:+.2f}"
     return f"{text}  {f'({gain})' if cell['shows'] is False else gain}"
+
+
+def _wide_console() -> Console:
+    """Wraps lines on a narrow terminal instead of cutting figures."""
+    return Console(width=max(Console().width, WIDTH), soft_wrap=True)
+
+
+def run_people(options: People) -> None:
+    """Render every subject, train, score; print the means, write all."""
+    need_extra()
+    options.sizes.check()
+    variant = use_variant(options.variant)
+    from .people import FIGURES, film_subjects, run_study
+
+    perceptual = load_lpips(options.perceptual_weights)
+    output_folder(options.out)
+    if options.json is not None:
+        output_file(options.json)
+    with Progress() as progress:
+        progress.phase("rendering")
+        film_subjects(
+            options.sizes, options.out, variant, lambda done, total: progress.update(done, step=f"{done}/{total}")
+        )
+        if options.film_only:
+            return
+        progress.phase("trainings")
+
+        def on_run(what: str, done: float, total: int) -> None:
+            progress.update(done, step=f"{what}, {done:.2f}/{total}")
+
+        result = run_study(options.sizes, options.out, perceptual=perceptual, on_run=on_run)
+    if options.json is not None:
+        write_json(options.json, result)
+    table = Table("method", "split", *FIGURES, title=f"means of {options.sizes.subjects} subjects")
+    for line in result["means"]:
+        cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)
+        table.add_row(line["method"], line["split"], *cells)
+    _wide_console().print(table)
+
+
+def run_agreement(options: Agreement) -> None:
+    """Compare with Mitsuba under every light; print the table, write rows and sheet."""
+    need_extra()
+    check_option(options.size >= 16, "--size", "at least 16", options.size)
+    check_option(options.samples >= 2, "--samples", "at least 2", options.samples)
+    check_step(options.step)
+    if options.sheet is not None:
+        check_option(options.sheet.suffix.lower() == ".png", "--sheet", "a .png", options.sheet.name)
+    for file in filter(None, (options.json, options.sheet)):
+        output_file(file)
+    variant = use_variant(options.variant)
+    from rnd_stage.film.cameras import ring_cameras
+    from rnd_stage.film.dances import dance
+    from rnd_stage.people.dressing import Wearer, dress
+    from rnd_stage.people.subjects import subject
+
+    from .agreement import MODES, ball, compare
+
+    camera = ring_cameras(1, options.size)["cam00"]
+    table = Table("body", "light", *MODES, "noise", "interreflection", "its energy", title="PSNR inside, dB")
+    rows: list[dict[str, Any]] = []
+    strips: list[Any] = []
+    with Progress() as progress:
+        progress.phase("dressing")
+        dressed = dress(subject(options.subject), options.step)
+        motion = dance(dressed.body.skeleton)
+        if not 0 <= options.frame < motion.frame_count:
+            raise InputError("--frame", expected=f"below {motion.frame_count}", got=options.frame)
+        person = Wearer(dressed, motion, [options.frame]).surface(options.frame)
+        for name, surface in (("ball", ball()), ("person", person)):
+            progress.phase(f"{name}: fitting visibility, rendering")
+            for result in compare(name, surface, camera, options.samples, options.lights):
+                row = {**result.row, "variant": variant, "machine": machine()}
+                ours = [f"{row[mode]['psnr_inside']:.1f} ({row[mode]['energy'] - 1:+.1%})" for mode in MODES]
+                more = (f"{row['noise_psnr']:.1f}", f"{row['interreflection_psnr']:.1f}")
+                table.add_row(name, row["light"], *ours, *more, f"{row['interreflection_energy']:+.1%}")
+                rows.append(row)
+                strips.append(result.strip())
+                progress.update(len(rows), step=row["light"])
+    write_json(options.json, rows)
+    if options.sheet is not None:
+        half = len(strips) // 2
+        sheet = np.concatenate([np.concatenate(part) for part in (strips[:half], strips[half:])], axis=1)
+        write_image(options.sheet, to_bytes(sheet))
+    Console().print(table)

@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_stage.people.remesh import Floats
 
 FPS = 30.0

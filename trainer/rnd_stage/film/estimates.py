@@ -1,4 +1,4 @@
-"""What a user would have instead of the truth: estimated poses, normals and masks, from a seed and a strength."""
+"""Estimated poses, normals and masks, from the truth, a seed and a strength."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ POSE_JITTER = np.radians(1.0)  # per axis and joint, independent from frame to f
 POSE_DRIFT = np.radians(2.5)  # the same, wandering over
 DRIFT_SECONDS = 1.5
 ROOT_JITTER, ROOT_DRIFT = 0.004, 0.015  # m
-NORMAL_BLUR = 1.5  # pixels of a picture of 512
+NORMAL_BLUR = 1.5  # pixels of an image of 512
 NORMAL_TILT = 0.16  # of the smooth tilt's vector: about 8° on average
-NORMAL_TURN = np.radians(3.0)  # the whole picture's, another one in every frame
-MASK_WANDER = 2.5  # pixels of a picture of 512 by which the edge wanders in and out
-MASK_GRAIN = 9.0  # pixels of a picture of 512 along the edge over which it does
+NORMAL_TURN = np.radians(3.0)  # of the whole image, another one in every frame
+MASK_WANDER = 2.5  # pixels of an image of 512 by which the edge wanders in and out
+MASK_GRAIN = 9.0  # pixels of an image of 512 along the edge over which it does
 
 
 def estimated_motion(motion: Motion, seed: int, strength: float = 1.0) -> Motion:
-    """``motion`` with jitter and drift in every joint and in the root's place; strength 0 leaves it as it is."""
+    """``motion`` with jitter and drift in every joint and in the root's position; strength 0 leaves it as it is."""
     rng = np.random.default_rng((seed, 1))
     shape = (motion.frame_count, len(motion.joint_names), 3)
     sigma = DRIFT_SECONDS * motion.fps
-    turns = POSE_JITTER * rng.normal(size=shape) + POSE_DRIFT * _wandering(rng, shape, sigma)
+    angles = POSE_JITTER * rng.normal(size=shape) + POSE_DRIFT * _wandering(rng, shape, sigma)
     shifts = ROOT_JITTER * rng.normal(size=(shape[0], 3)) + ROOT_DRIFT * _wandering(rng, (shape[0], 3), sigma)
     return replace(
         motion,
-        rotations=motion.rotations @ axis_angle_to_matrix(strength * turns),
+        rotations=motion.rotations @ axis_angle_to_matrix(strength * angles),
         translations=motion.translations + strength * shifts,
     )
 
 
 def estimated_normals(normals: Floats, coverage: Floats, seed: int, strength: float = 1.0) -> Floats:
-    """``normals`` [H, W, 3] (camera axes) as a network would give them: blurred, smoothly tilted, turned a little.
+    """``normals`` [H, W, 3] (camera axes) as a network would give them: blurred, smoothly tilted, rotated a little.
 
     Unit where ``coverage`` [H, W] is at least 5 %, zero elsewhere, never facing away.
     """

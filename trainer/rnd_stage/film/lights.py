@@ -15,11 +15,11 @@ from rnd_runtime.shading.light import Light, downsize, load_light, texel_directi
 Floats = NDArray[np.float64]
 
 SHARPNESS = 14.0  # λ of exp(λ(μ·d − 1)): half as bright 18° off its axis, so that neighbours blend
-AMBIENT = 0.02  # radiance everywhere, the room's, in units of a module's peak
+AMBIENT = 0.02  # ambient radiance, in units of a module's peak
 MAP_HEIGHT = 64  # rows of the written maps: a Gaussian of 18° is smooth on texels of 3°
 EXPOSURE = 0.75  # the strongest channel's mean radiance: an albedo of 0.3 then shows as about 0.2
 WHITE = "white"
-_MOST_ROWS = 256  # of a given HDR, before it is traced and written
+_MAX_ROWS = 256  # of a given HDR, before it is traced and written
 
 # elevation in degrees and number of modules evenly around, the first at azimuth 90° (+Z, before the person)
 RINGS = ((90.0, 1), (45.0, 6), (5.0, 8), (-35.0, 4))
@@ -78,7 +78,7 @@ def coloured() -> dict[str, Floats]:
 
 
 def spherical_gaussians(amplitudes: Floats, height: int = MAP_HEIGHT) -> NDArray[np.float32]:
-    """The lat-long map [height, 2·height, 3] of the modules' Gaussians, ``amplitudes`` [19, 3], plus the room's."""
+    """The lat-long map [height, 2·height, 3] of the modules' Gaussians, ``amplitudes`` [19, 3], plus ambient light."""
     directions = texel_directions(height, 2 * height)
     lobes = np.exp(SHARPNESS * (directions @ module_directions().T - 1))
     return (lobes @ amplitudes + AMBIENT).astype(np.float32)
@@ -87,8 +87,7 @@ def spherical_gaussians(amplitudes: Floats, height: int = MAP_HEIGHT) -> NDArray
 def stage_lights(hdr_files: tuple[Path, ...] = ()) -> list[StageLight]:
     """White, the eight coloured ones, and each of ``hdr_files`` by its stem.
 
-    All are exposed alike without a picture being taken: the strongest channel's mean radiance is ``EXPOSURE``,
-    so that every machine that renders a part of a capture uses the same number.
+    All are exposed alike, without a test image: the strongest channel's mean radiance is ``EXPOSURE``.
 
     Raises:
         InputError: an HDR that cannot be read, gives no light, or shares a name.
@@ -101,7 +100,7 @@ def stage_lights(hdr_files: tuple[Path, ...] = ()) -> list[StageLight]:
         light = load_light(path)
         if light.maximum <= 0:
             raise InputError("light", expected="some radiance", got="black", file=path)
-        rows = min(_MOST_ROWS, light.radiance.shape[0])
+        rows = min(_MAX_ROWS, light.radiance.shape[0])
         lights.append(_exposed(path.stem, downsize(light.radiance, rows, 2 * rows)))
     return lights
 

@@ -1,4 +1,4 @@
-"""What makes a capture of pictures: capture.json, the README with its provenance, the contact sheet."""
+"""The manifest of a capture: capture.json, the README with its provenance, the contact sheet."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ from rnd_runtime.playback.doctor import machine
 
 from .estimates import estimated_motion
 from .film import Production
-from .plan import missing, picture_count
+from .plan import image_count, missing
 
 ESTIMATED = "capture_estimated.json"
-_TILE, _COLUMNS = 128, 10  # pixels, pictures in a row
+_TILE, _COLUMNS = 128, 10  # pixels, images in a row
 
 
-def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_picture: float | None) -> bool:
-    """Write the manifest when every picture of every shard is there; False when some are still missing.
+def write_manifest(production: Production, folder: Path, variant: str, cpu_seconds_per_image: float | None) -> bool:
+    """Write the manifest when every image of every shard is there; False when some are missing.
 
-    Where nothing was filmed, ``cpu_seconds_per_picture`` is None: a capture.json and a README that are there stay as
-    they are, as they say who filmed, and at what cost.
+    Where nothing was rendered, ``cpu_seconds_per_image`` is None: an existing capture.json and README, which have
+    machine and cost, stay.
     """
-    if any(missing(folder, shot, production.recipe.visibility) for shot in production.shots):
+    if any(missing(folder, view, production.recipe.visibility) for view in production.views):
         return False
-    frames = tuple(row for shot in production.shots for row in shot.records(estimated=False))
+    frames = tuple(row for view in production.views for row in view.records(estimated=False))
     lights = {light.name: CaptureLight(f"lights/{light.name}.exr", (light.scale,) * 3) for light in production.lights}
     dressed, recipe = production.dressed, production.recipe
 
-    def told(*names: str) -> bool:
-        return cpu_seconds_per_picture is None and all((folder / name).exists() for name in names)
+    def stays(*names: str) -> bool:
+        return cpu_seconds_per_image is None and all((folder / name).exists() for name in names)
 
-    if not told("capture.json", "body.npz", "motion.npz"):
+    if not stays("capture.json", "body.npz", "motion.npz"):
         capture = Capture(folder, production.cameras, lights, dressed.body, production.motion, frames)
         save_capture(capture, subject=production.title, recipe=asdict(recipe), engine=_engine(variant))
     noisy = estimated_motion(production.motion, recipe.estimate_seed, recipe.estimate_strength)
@@ -59,9 +59,9 @@ def finish(production: Production, folder: Path, variant: str, cpu_seconds_per_p
             "roughness": dressed.roughness.astype(np.float32),
         },
     )
-    if not told("README.md"):
+    if not stays("README.md"):
         with atomic_path(folder / "README.md") as temporary:
-            temporary.write_text(_readme(production, variant, cpu_seconds_per_picture), encoding="utf-8")
+            temporary.write_text(_readme(production, variant, cpu_seconds_per_image), encoding="utf-8")
     contact_sheet(folder)
     return True
 
@@ -71,10 +71,10 @@ def contact_sheet(folder: Path) -> None:
     capture = load_capture(folder)
     rows = []
     for split in ("train", "novel_view", "novel_pose", "relight"):
-        frames = _spread(capture.split(split))
+        frames = _evenly(capture.split(split))
         if frames:
             rows.append([_tile(capture.load_frame(frame).image_srgb) for frame in frames])
-    train = _spread(capture.split("train"))
+    train = _evenly(capture.split("train"))
     shown = [capture.load_frame(frame) for frame in train]
     for kind in ("normal_gt", "normal"):
         rows.append([_tile(0.5 * (getattr(s, kind) + 1) * (s.mask[..., None] > 0.05)) for s in shown])
@@ -85,21 +85,21 @@ def contact_sheet(folder: Path) -> None:
     write_image(folder / "contact.png", to_bytes(np.concatenate(sheet)))
 
 
-def _spread(frames: list[Frame]) -> list[Frame]:
+def _evenly(frames: list[Frame]) -> list[Frame]:
     return [frames[k] for k in sorted({round(x) for x in np.linspace(0, len(frames) - 1, _COLUMNS)})] if frames else []
 
 
-def _tile(picture: NDArray[np.floating] | None) -> NDArray[np.floating]:
-    assert picture is not None
-    return cv2.resize(np.asarray(picture, np.float32), (_TILE, _TILE), interpolation=cv2.INTER_AREA)
+def _tile(image: NDArray[np.floating] | None) -> NDArray[np.floating]:
+    assert image is not None
+    return cv2.resize(np.asarray(image, np.float32), (_TILE, _TILE), interpolation=cv2.INTER_AREA)
 
 
 def _estimated_record(production: Production, folder: Path) -> None:
-    """The same capture as a user would have it: noisy poses, ragged masks."""
+    """The same capture with estimated poses and masks."""
     record = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
-    rows = [row for shot in production.shots for row in shot.records(estimated=True)]
-    for kept, row in zip(record["frames"], rows):
-        kept["mask"] = row.mask
+    rows = [row for view in production.views for row in view.records(estimated=True)]
+    for frame, row in zip(record["frames"], rows):
+        frame["mask"] = row.mask
     record["motion"] = "motion_noisy.npz"
     write_json(folder / ESTIMATED, record)
 
@@ -116,17 +116,17 @@ def _readme(production: Production, variant: str, seconds: float | None) -> str:
         if value not in (None, ()) and not isinstance(value, bool)
     )
     options += "" if recipe.visibility else " --no-visibility"
-    cost = "" if seconds is None else f" {seconds:.2f} s of processor time a picture with its truth, cloth included."
-    counts = {s: sum(use[0] == s for shot in production.shots for use in shot.uses) for s in _SPLITS}
+    cost = "" if seconds is None else f" {seconds:.2f} s of processor time an image with its truth, cloth included."
+    counts = {s: sum(use[0] == s for view in production.views for use in view.uses) for s in _SPLITS}
     splits = ", ".join(f"{name} {count}" for name, count in counts.items())
     return f"""# {production.title}
 
-Made by `rnd-stage` (RnD-Avatar); nothing in it was filmed. Made again by
+Made by `rnd-stage` (RnD-Avatar): all images are rendered. To reproduce:
 
     rnd-stage OUT {options}
 
 Mitsuba {version("mitsuba")}, `{variant}`, {recipe.samples} paths a pixel, at most {recipe.max_depth} deep (with
-self-shadowing and interreflection), distant light only, no ground. {picture_count(production.shots)} pictures:
+self-shadowing and interreflection), distant light only, no ground. {image_count(production.views)} images:
 {splits}.{cost}
 Machine: {machine()}.
 
@@ -136,11 +136,11 @@ are the novel views, the last fifth from all cameras the novel poses, those unde
 | path | what |
 |---|---|
 | `capture.json` | exact poses and masks, `normals/` as an estimator would give them for the train split |
-| `{ESTIMATED}` | the same with `motion_noisy.npz` and `masks_estimated/`: what a user would have |
+| `{ESTIMATED}` | the same with `motion_noisy.npz` and `masks_estimated/`, as estimators would give them |
 | `images/LIGHT/` | sRGB of linear radiance, on black, premultiplied, clipped at 1 |
 | `masks/`, `normals_gt/`, `albedo/`, `roughness/` | exact; roughness is 8 bit linear |
 | `depth/*.exr` | metres along the camera's z, 0 outside |
-| `visibility/*.npz` | `visibility` [19, H, W], 255 where the module is seen; from the top down |
+| `visibility/*.npz` | `visibility` [19, H, W], 255 where the module is visible; from the top down |
 | `surface/rest.npz`, `surface/FRAME.npz` | the dressed surface at rest and its vertices [V, 3] in every frame, metres |
 | `lights/*.exr` | linear lat-long radiance, image light = file × `scale` |
 

@@ -1,35 +1,30 @@
 """Rigged, textured characters of other makers, brought to the stage: SMPL's joints, a T-pose, the stage's cloth.
 
-Read are the project's own .npz layout (``vertices``, ``faces``, ``uv``, ``face_uv``, ``material``, ``material_names``,
-``textures``, ``weights``, ``joint_names``, ``parents``, ``joints``) and skinned glTF (``.gltf``). Joints are known
-by their usual names (Mixamo's, CMU's, SMPL's); others pass their weights to the nearest ancestor that is known.
+Files are .npz (``.character``) or skinned glTF (``.gltf``). Joints are known by their usual names (Mixamo's, CMU's,
+SMPL's); others pass their weights to the nearest known ancestor.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import read_image, srgb_to_linear
-from rnd_runtime.core.npz import Npz
-from rnd_runtime.motion.skeleton import SMPL_NAMES, bone_transforms, smpl_skeleton
+from rnd_runtime.motion.skeleton import bone_transforms, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_runtime.shading.light import REC709_LUMINANCE
 
+from .character import Character, Floats, Ints, read_npz
 from .cloth import Capsules, Drape
 from .dressing import Dressed
 from .garments import ramp
+from .gltf import read_gltf
 from .remesh import vertex_normals
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 CLOTH = re.compile(r"suit|shirt|trouser|pant|dress|skirt|jean|cloth|coat|jacket|sweater|hood|top|bottom|robe", re.I)
 UNWORN = re.compile(r"eye|brow|lash|hair|braid|short0|long0|bob0|pony|afro|teeth|tongue|high-poly|low-poly", re.I)
@@ -37,15 +32,14 @@ SKIN = re.compile(r"skin|body", re.I)
 SHOES = re.compile(r"shoe|boot", re.I)
 HAIR = re.compile(r"hair|braid|short0|long0|bob0|pony|afro", re.I)
 ROUGHNESS = ((SKIN, 0.45), (SHOES, 0.40), (re.compile(r"eye", re.I), 0.35), (UNWORN, 0.52), (CLOTH, 0.80))
-OVER, UNDER = 0.03, 0.01  # m that a cover may lie above, or below where it comes through
+OVER, UNDER = 0.03, 0.01  # m that a cover may be above, or below where it comes through
 ASIDE = 0.012  # m from a point's normal to the covering vertex: the usual distance of these
 SUNK = 0.012  # m that what is covered is sunk: cloth may move 7 mm inwards
 RIM = (0.012, 0.03)  # m from what is bare over which it sinks
 CLEAR = 0.5  # opacity below which a triangle of a hair card is left out
 RADIUS, SLACK, GAP = 0.015, 0.035, 0.010  # of the cloth: m, share, m
-MOST_VERTICES = 60_000  # before triangles are halved for the sake of their textures
 WELD = 1e-5  # m
-HEIGHTS = (0.4, 2.6)  # m that a person may be tall: others are in centimetres, or lie
+HEIGHTS = (0.4, 2.6)  # m: others are in centimetres, or on the ground
 
 # what a joint of SMPL is called elsewhere, left side; lower case, without "mixamorig:" and punctuation
 _ALIASES = {
@@ -76,29 +70,6 @@ _SPARE = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Character:
-    """What a file holds, one texture coordinate to a vertex.
-
-    Attributes:
-        vertices: [V, 3] m; faces: [F, 3]; weights: [V, J].
-        albedo: [V, 3] linear; opacity: [V].
-        material: [F] into ``materials``.
-        joint_names, parents, joints: J of them, at rest, m.
-    """
-
-    vertices: Floats
-    faces: Ints
-    weights: Floats
-    albedo: Floats
-    opacity: Floats
-    material: Ints
-    materials: tuple[str, ...]
-    joint_names: tuple[str, ...]
-    parents: Ints
-    joints: Floats
-
-
 def load_character(path: Path) -> Dressed:
     """Read a character and make it ready for the stage.
 
@@ -109,10 +80,8 @@ def load_character(path: Path) -> Dressed:
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        character = _read_npz(path)
+        character = read_npz(path)
     elif suffix in (".glb", ".gltf"):
-        from .gltf import read_gltf
-
         character = read_gltf(path)
     else:
         raise InputError("--character", expected=".npz, .glb or .gltf", got=path.suffix or "no suffix", file=path)
@@ -202,69 +171,6 @@ def _tucked_in(vertices: Floats, faces: Ints, weights: Floats, of_vertex: Ints, 
     return sunk
 
 
-def _read_npz(path: Path) -> Character:
-    with Npz(path, what="character") as archive:
-        names = archive.strings("joint_names")
-        vertices = archive.numbers("vertices", (None, 3))
-        faces = archive.numbers("faces", (None, 3)).astype(np.int64)
-        uv = archive.numbers("uv", (None, 2))
-        face_uv = archive.numbers("face_uv", (len(faces), 3)).astype(np.int64)
-        material = archive.numbers("material", (len(faces),)).astype(np.int64)
-        materials, textures = archive.strings("material_names"), archive.strings("textures")
-        weights = archive.numbers("weights", (len(vertices), len(names)))
-        parents = archive.numbers("parents", (len(names),)).astype(np.int64)
-        joints = archive.numbers("joints", (len(names), 3))
-    for what, index, limit in (
-        ("faces", faces, len(vertices)),
-        ("face_uv", face_uv, len(uv)),
-        ("material", material, min(len(materials), len(textures))),
-    ):
-        if len(index) and not 0 <= index.min() <= index.max() < limit:
-            raise InputError(what, expected=f"indices below {limit}", got=int(index.max()), file=path)
-    corners = np.stack([faces.ravel(), face_uv.ravel(), np.repeat(material, 3)], axis=1)
-    split, index = np.unique(corners, axis=0, return_inverse=True)
-    arrays = _finer(
-        vertices[split[:, 0]], index.reshape(-1, 3), {"uv": uv[split[:, 1]], "weights": weights[split[:, 0]]}, material
-    )
-    points, triangles, values, material = arrays
-    albedo, opacity = np.full((len(points), 3), 0.5), np.ones(len(points))
-    for number, texture in enumerate(textures):
-        here = np.unique(triangles[material == number])
-        if len(here):
-            albedo[here], opacity[here] = sample_texture(read_image(path.parent / texture), values["uv"][here])
-    return Character(points, triangles, values["weights"], albedo, opacity, material, materials, names, parents, joints)
-
-
-def _finer(
-    vertices: Floats, faces: Ints, values: dict[str, Floats], material: Ints
-) -> tuple[Floats, Ints, dict[str, Floats], Ints]:
-    """Triangles cut in four until there are vertices enough to hold the textures."""
-    while len(vertices) < MOST_VERTICES / 2:
-        vertices, faces, values = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=values)
-        material = np.repeat(material, 4)  # the four parts of a triangle follow each other
-    return vertices, faces, values, material
-
-
-def sample_texture(pixels: NDArray[np.generic], uv: Floats) -> tuple[Floats, Floats]:
-    """Linear albedo [N, 3] and opacity [N] of an 8- or 16-bit picture at ``uv`` [N, 2] (v upwards, wrapping)."""
-    full = 255.0 if pixels.dtype == np.uint8 else 65535.0
-    values = pixels.astype(np.float64) / full
-    if values.shape[2] < 3:
-        values = np.concatenate([np.repeat(values[..., :1], 3, axis=2), values[..., 1:]], axis=2)
-    height, width = values.shape[:2]
-    column, row = np.mod(uv[:, 0], 1) * width - 0.5, np.mod(1 - uv[:, 1], 1) * height - 0.5
-    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
-    s, t = (column - left)[:, None], (row - top)[:, None]
-
-    def at(rows: Ints, columns: Ints) -> Floats:
-        return values[np.mod(rows, height), np.mod(columns, width)]
-
-    mixed = (1 - t) * ((1 - s) * at(top, left) + s * at(top, left + 1))
-    mixed += t * ((1 - s) * at(top + 1, left) + s * at(top + 1, left + 1))
-    opacity = mixed[:, 3] if mixed.shape[1] > 3 else np.ones(len(mixed))
-    return np.asarray(srgb_to_linear(mixed[:, :3]), np.float64), opacity
-
-
 def _smpl_joints(character: Character, path: Path) -> tuple[Floats, Floats]:
     """[J, 24] ones where a joint of the file belongs to one of SMPL's, and SMPL's joints at rest [24, 3] m."""
     plain = [re.sub(r"mixamorig|[^a-z0-9]", "", name.lower()) for name in character.joint_names]
@@ -309,7 +215,7 @@ def _known_names(plain: list[str]) -> dict[str, str]:
 def _t_pose(vertices: Floats, weights: Floats, joints: Floats) -> tuple[Floats, Floats]:
     """The character with straight, level arms and upright legs, which is what SMPL's poses start from."""
     skeleton = smpl_skeleton(joints)
-    turns = np.tile(np.eye(3), (len(SMPL_NAMES), 1, 1))
+    rotations = np.tile(np.eye(3), (len(SMPL_NAMES), 1, 1))
     limbs = [("shoulder", "elbow", "arm"), ("elbow", "wrist", "arm"), ("hip", "knee", "leg"), ("knee", "ankle", "leg")]
     for side, sign in (("left_", 1.0), ("right_", -1.0)):
         carried = np.eye(3)
@@ -319,19 +225,19 @@ def _t_pose(vertices: Floats, weights: Floats, joints: Floats) -> tuple[Floats, 
             j, c = SMPL_NAMES.index(side + joint), SMPL_NAMES.index(side + child)
             wanted = np.array([sign, 0, 0]) if limb == "arm" else np.array([0.03 * sign, -1.0, 0])
             bone = carried @ (joints[c] - joints[j])
-            turn = _between(bone, wanted)
-            turns[j] = carried.T @ turn @ carried
-            carried = turn @ carried
-    bones = bone_transforms(skeleton, turns, np.zeros(3)).astype(np.float64)
+            rotation = _between(bone, wanted)
+            rotations[j] = carried.T @ rotation @ carried
+            carried = rotation @ carried
+    bones = bone_transforms(skeleton, rotations, np.zeros(3)).astype(np.float64)
     blend = np.tensordot(weights, bones, axes=1)
     posed = np.einsum("vij,vj->vi", blend[:, :, :3], vertices) + blend[:, :, 3]
-    moved = skeleton.joint_transforms(turns, np.zeros(3))[:, :3, 3]
+    moved = skeleton.joint_transforms(rotations, np.zeros(3))[:, :3, 3]
     floor = np.array([0.0, posed[:, 1].min(), 0.0])
     return posed - floor, moved - floor
 
 
 def _between(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation [3, 3] that turns direction ``a`` into ``b``."""
+    """The smallest rotation [3, 3] that takes direction ``a`` to ``b``."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     cross, cosine = np.cross(a, b), float(a @ b)
     x, y, z = cross

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from rnd_runtime.capture.body import Body
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, bone_transforms, smpl_skeleton
+from rnd_runtime.motion.skeleton import bone_transforms, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_stage.render import Surface
 
 from .cloth import Capsules, Cloth, Drape
@@ -18,7 +19,7 @@ from .garments import BOTTOM, HAIR, TOP, Garments, layers, ramp
 from .paint import paint
 from .remesh import adjacency, vertex_normals
 from .solids import project, surface
-from .subjects import Subject
+from .subjects import PersonDesign
 from .template import template_body
 
 Floats = NDArray[np.float64]
@@ -73,7 +74,7 @@ class Wearer:
         return Surface(vertices, vertex_normals(vertices, d.faces), d.faces, d.colour, d.roughness)
 
 
-def dress(subject: Subject, step: float = 0.005, template: Body | None = None) -> Dressed:
+def dress(subject: PersonDesign, step: float = 0.005, template: Body | None = None) -> Dressed:
     """Mesh, skin and paint ``subject``; ``step`` is the distance of its vertices in metres.
 
     The clothes are cut on the template; then body, joints and clothes take on the subject's shape together.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .person import person
-from .solids import Figure, smooth_min
+from .solids import SolidModel, smooth_min
 
 Floats = NDArray[np.float64]
 
@@ -184,7 +184,7 @@ def hair(points: Floats, cut: Garments) -> Floats:
 def _mane(points: Floats, end: float) -> Floats:
     """Hair that falls behind the ears and over the nape down to ``end``."""
     x, y, z = points.T
-    mass = Figure()
+    mass = SolidModel()
     mass.loft(
         "hair",
         "y",

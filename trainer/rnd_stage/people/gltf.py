@@ -18,9 +18,7 @@ from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_image
 from rnd_runtime.core.rotations import quaternion_to_matrix
 
-from .characters import Character, sample_texture
-
-Floats = NDArray[np.float64]
+from .character import Character, Floats, sample_texture
 
 _TYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -48,15 +46,15 @@ def _open(path: Path) -> tuple[dict[str, Any], bytes]:
     magic, version, _ = struct.unpack_from("<III", content)
     if magic != _GLB or version != 2:
         raise ValueError("no GLB of version 2")
-    document, binary, place = {}, b"", 12
-    while place < len(content):
-        length, kind = struct.unpack_from("<II", content, place)
-        chunk = content[place + 8 : place + 8 + length]
+    document, binary, offset = {}, b"", 12
+    while offset < len(content):
+        length, kind = struct.unpack_from("<II", content, offset)
+        chunk = content[offset + 8 : offset + 8 + length]
         if kind == _JSON:
             document = json.loads(chunk)
         elif kind == _BIN:
             binary = chunk
-        place += 8 + length
+        offset += 8 + length
     return document, binary
 
 
@@ -79,7 +77,7 @@ class _Gltf:
         # A skinned point p is where jointWorld · inverseBind · p puts it: the same for all joints in the bound pose.
         # What the nodes above the skeleton do (metres, Y up) is in there, what a mesh's own node does is not.
         world = self._world(joints[top], above) @ bind[top]
-        places = _moved(np.asarray(np.linalg.inv(bind)[:, :3, 3], np.float64), world)
+        positions = _moved(np.asarray(np.linalg.inv(bind)[:, :3, 3], np.float64), world)
         parts = [
             self._primitive(primitive, len(joints))
             for node in nodes
@@ -102,7 +100,7 @@ class _Gltf:
             materials=tuple(materials) or ("body",),
             joint_names=names,
             parents=parents,
-            joints=places,
+            joints=positions,
             **joined,
         )
 
@@ -192,12 +190,12 @@ class _Gltf:
 
 
 def _local(node: dict[str, Any]) -> Floats:
-    """[4, 4] of a node in the one above it: its matrix, column by column, or a scale, then a turn, then a shift."""
+    """[4, 4] of a node in the one above it: its matrix, column by column, or scale, rotation and translation."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    turn = quaternion_to_matrix(np.roll(node.get("rotation", (0.0, 0, 0, 1)), 1))
+    rotation = quaternion_to_matrix(np.roll(node.get("rotation", (0.0, 0, 0, 1)), 1))
     local = np.eye(4)
-    local[:3, :3] = turn * np.array(node.get("scale", (1.0, 1, 1)))
+    local[:3, :3] = rotation * np.array(node.get("scale", (1.0, 1, 1)))
     local[:3, 3] = node.get("translation", (0.0, 0, 0))
     return local
 

@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from .solids import Figure
+from .solids import SolidModel
 
 HEIGHT = 1.75
 JOINTS = {  # rest positions in metres; right_* are mirrored
@@ -33,9 +33,9 @@ JOINTS = {  # rest positions in metres; right_* are mirrored
 
 
 @cache
-def person() -> Figure:
+def person() -> SolidModel:
     """All solids of the body; the same object every time, not to be changed."""
-    figure = Figure()
+    figure = SolidModel()
     _torso(figure)
     _leg(figure)
     _foot(figure)
@@ -45,7 +45,7 @@ def person() -> Figure:
     return figure
 
 
-def _torso(f: Figure) -> None:
+def _torso(f: SolidModel) -> None:
     # s = y: centre x, half-width, back z, front z, exponent
     f.loft(
         "torso",
@@ -79,7 +79,7 @@ def _torso(f: Figure) -> None:
     f.cone("torso", (0, 1.37, 0.108), 0.010, (0, 1.20, 0.118), 0.010, 0.03, cut=True)  # between the breast muscles
 
 
-def _leg(f: Figure) -> None:
+def _leg(f: SolidModel) -> None:
     f.loft(
         "leg",
         "y",
@@ -111,7 +111,7 @@ def _leg(f: Figure) -> None:
     f.ellipsoid("leg", (0.163, 0.076, -0.024), (0.013, 0.016, 0.014), 0.015)  # outer ankle
 
 
-def _foot(f: Figure) -> None:
+def _foot(f: SolidModel) -> None:
     # s = z: centre x, half-width, sole y, top y, exponent
     f.loft(
         "foot",
@@ -138,7 +138,7 @@ def _foot(f: Figure) -> None:
         f.cone("foot", (x - 0.002, r + 0.004, z - 0.03), r, (x, r, z + length - 0.012), r * 0.95, 0.009)
 
 
-def _arm(f: Figure) -> None:
+def _arm(f: SolidModel) -> None:
     # s = x: centre z, half-depth, low y, high y, exponent
     f.loft(
         "arm",
@@ -168,7 +168,7 @@ def _arm(f: Figure) -> None:
     f.ellipsoid("arm", (0.462, 1.416, -0.058), (0.020, 0.016, 0.013), 0.02)  # point of the elbow
 
 
-def _hand(f: Figure) -> None:
+def _hand(f: SolidModel) -> None:
     f.loft(
         "hand",
         "x",
@@ -200,7 +200,7 @@ def _hand(f: Figure) -> None:
     f.cone("hand", (0.766, 1.400, 0.042), 0.0115, (0.800, 1.394, 0.054), 0.0092, 0.006)
 
 
-def _head(f: Figure) -> None:
+def _head(f: SolidModel) -> None:
     f.cone("neck", (0, 1.435, -0.034), 0.062, (0, 1.585, -0.006), 0.053, 0.035)
     f.cone("neck", (0.018, 1.452, 0.022), 0.010, (0.058, 1.585, -0.020), 0.014, 0.03)  # sternomastoid
     f.ellipsoid("head", (0, 1.654, -0.010), (0.0755, 0.0922, 0.0985), 0.03)  # skull

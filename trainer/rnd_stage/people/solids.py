@@ -24,7 +24,7 @@ LOFT_SAMPLES = 128
 
 
 @dataclass
-class Figure:
+class SolidModel:
     """An ordered list of solids, each with a part name and the radius over which it blends with those before."""
 
     rows: list[list[float]] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""People made by code: four that are looked after, and as many more as there are seeds."""
+"""People made by code: four composed by hand, and random ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .shapes import Shape
 
 
 @dataclass(frozen=True)
-class Subject:
+class PersonDesign:
     """A person: body, cut of the clothes, what everything is made of."""
 
     title: str
@@ -24,8 +24,8 @@ class Subject:
     palette: Palette
 
 
-def subject(seed: int) -> Subject:
-    """Seeds 0 to 3 are composed by hand; every other is drawn from the same vocabulary.
+def subject(seed: int) -> PersonDesign:
+    """Seeds 0 to 3 are composed by hand; every other is sampled from the same vocabulary.
 
     Raises:
         InputError: a negative seed.
@@ -33,11 +33,11 @@ def subject(seed: int) -> Subject:
     if seed < 0:
         raise InputError("--subject", expected="0 or more", got=seed)
     chosen = (_lumberjack, _flowers, _knitwear, _summer)
-    return chosen[seed]() if seed < len(chosen) else _drawn(seed)
+    return chosen[seed]() if seed < len(chosen) else _sampled(seed)
 
 
-def _lumberjack() -> Subject:
-    return Subject(
+def _lumberjack() -> PersonDesign:
+    return PersonDesign(
         "a broad man in a plaid shirt, jeans and trainers",
         Shape(height=1.02, shoulders=1.06, waist=1.08, hips=1.02, limbs=1.08, belly=0.022),
         Garments(loose=0.013, hang=0.016, hem=0.885, collar="shirt", leg=(0.010, 0.014, 0.026)),
@@ -53,8 +53,8 @@ def _lumberjack() -> Subject:
     )
 
 
-def _flowers() -> Subject:
-    return Subject(
+def _flowers() -> PersonDesign:
+    return PersonDesign(
         "a woman in a printed dress with long hair and ankle boots",
         Shape(height=0.95, shoulders=0.89, waist=0.88, hips=1.05, limbs=0.88, bust=0.026),
         Garments(
@@ -84,8 +84,8 @@ def _flowers() -> Subject:
     )
 
 
-def _knitwear() -> Subject:
-    return Subject(
+def _knitwear() -> PersonDesign:
+    return PersonDesign(
         "a slim man in a cable-knit sweater, wide cords, boots and a woollen cap",
         Shape(height=1.04, shoulders=0.96, waist=0.92, hips=0.95, limbs=0.92),
         Garments(
@@ -112,8 +112,8 @@ def _knitwear() -> Subject:
     )
 
 
-def _summer() -> Subject:
-    return Subject(
+def _summer() -> PersonDesign:
+    return PersonDesign(
         "a woman in a striped hooded top, a pleated skirt and canvas shoes, her hair in a bun",
         Shape(height=0.98, shoulders=0.94, waist=1.0, hips=1.10, limbs=1.0, bust=0.030, belly=0.008),
         Garments(
@@ -157,8 +157,8 @@ _SKINS = ((0.62, 0.40, 0.30), (0.50, 0.295, 0.205), (0.40, 0.22, 0.14), (0.23, 0
 _HAIRS = ((0.035, 0.031, 0.030), (0.060, 0.038, 0.025), (0.23, 0.105, 0.045), (0.45, 0.30, 0.13), (0.30, 0.29, 0.28))
 
 
-def _drawn(seed: int) -> Subject:
-    """A person drawn at random; like seeds, like people."""
+def _sampled(seed: int) -> PersonDesign:
+    """A random person; the same for the same seed."""
     rng = np.random.default_rng(seed)
 
     def pick(options):
@@ -210,4 +210,4 @@ def _drawn(seed: int) -> Subject:
         buttons=garments.collar == "shirt",
         seed=int(seed),
     )
-    return Subject(f"person {seed}, drawn at random", shape, garments, palette)
+    return PersonDesign(f"random person {seed}", shape, garments, palette)

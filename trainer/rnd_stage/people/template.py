@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rnd_runtime.capture.body import Body
-from rnd_runtime.motion.skeleton import SMPL_NAMES, smpl_skeleton
+from rnd_runtime.motion.skeleton import smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 
 from .person import JOINTS, person
 from .remesh import Floats, Ints, mirror, remesh

@@ -6,11 +6,12 @@ import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rnd_runtime.core.errors import InputError, check_cull, parse_options, refuse_changed, run_command
+from rnd_runtime.core.command import parse_options, run_command
+from rnd_runtime.core.errors import InputError, check_cull
 from rnd_runtime.core.files import is_folder, output_file, output_folder, refuse_input, write_json
 
 if TYPE_CHECKING:
@@ -32,18 +33,6 @@ COLUMNS = {
     "outline_px": ("outline px", "{:.2f}"),
 }
 """what the terminal's table shows of a row: heading and format"""
-OF_ONE_RUN = ("pictures", "method", "cull")
-OF_STUDIES = (
-    "study",
-    "variants",
-    "preset",
-    "steps",
-    "gaussians",
-    "image_scale",
-    "chart",
-    "seeds",
-    "consistency_weights",
-)
 WIDTH = 140
 """characters of the widest table"""
 
@@ -62,50 +51,23 @@ class EvalOptions:
     """folder for strips: truth, render, normals, albedo, error"""
     perceptual_weights: Path | None = None
     """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds the LPIPS column"""
-    consistency_weights: Path | None = None
-    """of the studies' trainings, as of rnd-train"""
     shade: str = "table+sun"
     """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
     cull: float | None = None
     """as of rnd-play: leave out what faces away, Gaussians whose n·v is below this cosine (−1 to 1), such as -0.5"""
     motion: str | None = None
     """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones. Default: the
-    poses that the training corrected (--refine-poses), else the capture's own. A study trains with it too"""
+    poses that the training corrected (--refine-poses), else the capture's own."""
     method: str | None = None
     """name of the rows in the JSON; the run folder's unless given"""
-    ablate: bool = False
-    """train and score a study's variants in the folder RUN instead; done runs are not done again"""
-    study: Literal["ablations", "causes", "lengths"] = "ablations"
-    """the paper's ablations; what holds the figures back (light, normals, poses, number of Gaussians); or an eighth
-    to five times the steps"""
-    variants: tuple[str, ...] = ()
-    """names of the study's rows to train, such as "static skinning"; none named: all"""
-    preset: Literal["quick", "standard", "full"] = "quick"
-    """of the ablations' trainings"""
-    steps: int | None = None
-    """of the ablations' trainings, instead of the preset's"""
-    gaussians: int | None = None
-    """of the ablations' trainings, instead of the preset's"""
-    image_scale: float = 1.0
-    """of the ablations' training pictures"""
-    chart: Path | None = None
-    """draw the PSNR against the minutes of a study's trainings here (.svg or .png)"""
-    seeds: int = 3
-    """of the ablations' trainings: 0 to SEEDS − 1"""
 
 
 def main() -> None:
     """Entry point of ``rnd-eval``."""
 
     def command() -> None:
-        from rnd_bench.studies.cli import run_study
-
         options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
-        if options.ablate:
-            refuse_changed(options, OF_ONE_RUN, "a study scores and names its rows itself")
-        else:
-            refuse_changed(options, OF_STUDIES, "needs --ablate")
-        (run_study if options.ablate else evaluate_run)(options)
+        evaluate_run(options)
 
     sys.exit(run_command("rnd-eval", command))
 
@@ -176,8 +138,8 @@ def check_outputs(options: EvalOptions) -> None:
 
     checkpoint = _checkpoint_file(options)
     read = (checkpoint, checkpoint.with_suffix(".onnx"), capture_file(options.capture))
-    for file in filter(None, (options.json, options.chart)):
-        refuse_input(file, *read, options.perceptual_weights, options.consistency_weights)
+    for file in filter(None, (options.json,)):
+        refuse_input(file, *read, options.perceptual_weights)
         output_file(file)
     if options.pictures is not None:
         output_folder(options.pictures)

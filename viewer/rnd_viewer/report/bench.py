@@ -54,7 +54,7 @@ def _chart(file: Path, run: Path) -> str:
 
 
 def _stability(file: Path, run: Path) -> str:
-    rows = read_rows(file, "rows of rnd-bench --stability", "id", "what")
+    rows = read_rows(file, "rows of rnd-bench stability", "id", "what")
     caption = (
         f"From {file}. {measured_on(rows, run)} ✓ keeps its limit, ✗ does not; what has no limit is only reported."
     )

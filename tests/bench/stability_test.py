@@ -1,0 +1,192 @@
+"""rnd-bench stability: its table, that a row replaces itself, and what a capture lacks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from rnd_bench.scenes.psnr import IDENTICAL_DB, decibels
+from rnd_bench.scenes.subject import Subject
+from rnd_bench.stability import soak
+from rnd_bench.stability.cli import measured_on
+from rnd_bench.stability.figures import Figure, above, below, holds, not_measured, reported
+from rnd_bench.stability.measures import captures, materials, poses, stress
+from rnd_bench.stability.rows import AVATAR, ROWS
+from rnd_bench.stability.table import line_of, rows_of, store
+from rnd_runtime.capture.capture import Capture, load_capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.images import write_image
+
+pytestmark = pytest.mark.slow
+
+
+def test_every_row_of_the_list_is_there_once():
+    ids = [row.id for row in ROWS]
+    expected = {
+        "P": (1, 2, 3, 4, 7, 8, 9, 10, 11, 13, 14, 15, 16, 17),
+        "G": (1, 2, 3, 5, 6, 7, 9, 10),
+        "L": (1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 15),
+        "R": (1, 2, 3, 4, 5, 6, 9, 10, 11, 12),
+    }
+    assert ids == [f"{letter}{number}" for letter, numbers in expected.items() for number in numbers]
+
+
+def _about(name: str, failure: str) -> dict:
+    return {"id": name, "failure": failure, "on": AVATAR, "machine": "this one"}
+
+
+def test_the_table_holds_other_rows_and_replaces_its_own(tmp_path):
+    file = tmp_path / "table.json"
+    image = np.full((4, 6, 3), 9, np.uint8)
+    store(file, _about("L1", "suns"), (below("energy", 0.2, 1, "%", baseline=("bilinear", 39.0)),))
+    for measured in (1.0, 5.0):
+        store(
+            file,
+            _about("P1", "poses"),
+            (above("edges", measured, 3, "×"), reported("length", 2.0, "m")),
+            (image, image),
+        )
+    rows = rows_of(file)
+    verdicts = [("P1", 5.0, "pass"), ("P1", 2.0, "reported"), ("L1", 0.2, "pass")]
+    assert [(row["id"], row["measured"], row["verdict"]) for row in rows] == verdicts
+    assert rows[2]["baseline"] == 39.0 and rows[2]["line"] == "< 1" and rows[2]["machine"] == "this one"
+    assert "| L1 | suns | energy | 0.2 % | < 1 | ✓ | bilinear: 39 % |" in (tmp_path / "table.md").read_text()
+    assert (tmp_path / "table" / "P1.png").exists()
+    file.write_text('[{"fps": 60}]')
+    with pytest.raises(InputError, match="expected rows of rnd-bench stability, got another file"):
+        rows_of(file)
+
+
+def test_a_row_that_is_not_of_the_avatar_does_not_borrow_its_size(bare):
+    assert {"gaussians", "size", "checkpoint_sha256"} <= set(measured_on(AVATAR, bare))
+    assert set(measured_on("a ball", bare)) == {"on", "threads", "machine"}
+
+
+def test_the_worst_cases_are_timed_and_compared(bare):
+    measured = {figure.what: figure.measured for figure in stress.worst_cases(bare).figures}
+    for scene in ("an ordinary frame", "camera inside the body", "squat", "light of 1e6"):
+        assert 0 < measured[f"{scene}: frame time, median"] <= measured[f"{scene}: frame time, p95"]
+        assert 20 < measured[f"{scene}: PSNR to the full reference"] < 120
+
+
+def test_missing_figures_and_nan_never_pass(tmp_path):
+    file, nan = tmp_path / "table.json", float("nan")
+    figures = (not_measured("scale"), below("pace", nan, 1, "×", baseline=("plain", nan)), reported("lost", nan, "dB"))
+    assert not any(figure.passes for figure in figures) and not holds("x", ["one"]).passes and holds("x", []).passes
+    store(file, _about("L11", "scale"), figures)
+    store(file, _about("P1", "poses"), (reported("length", 2.0, "m"),))
+    verdicts = [(2.0, "reported"), (None, "not measured"), (None, "fail"), (None, "fail")]
+    assert [(row["measured"], row["verdict"]) for row in json.loads(file.read_text())] == verdicts
+    table = (tmp_path / "table.md").read_text()
+    assert "| L11 | scale | scale (not in this capture) | not measured |  |  |  |" in table
+    assert "| L11 | scale | pace | nan × | < 1 | **✗** | plain: nan × |" in table
+    assert line_of("L11", figures[1]) == "✗ L11  pace: nan × < 1  (plain: nan)"
+
+
+def test_a_short_soak_has_no_slope_of_memory():
+    segment = {"frames": 300, "memory": [1, 2], "seconds": [1.0] * 300, "loads": [], "wrong": 0}
+    figures = soak._figures("playback", [segment], True, ())
+    assert figures[0].what == "playback, 300: memory a frame (too few in one go)" and not figures[0].line
+    assert figures[0].measured is None and len(figures) == 2 and figures[1].passes
+
+
+def test_memory_that_a_kind_of_step_asks_for_once_is_no_leak_and_one_that_grows_is():
+    """Readings every twenty steps from the 200th on; the second kind begins with step 800."""
+    once, leak = [0] * 30 + [10**6] * 60, [2_000 * 20 * k for k in range(90)]
+    for memory, passes in ((once, True), (leak, False)):
+        segment = {"frames": 2000, "memory": memory, "seconds": [], "loads": [], "wrong": 0}
+        figures = soak._figures("training", [segment], False, (800, 2000))
+        assert [figure.what.partition(": ")[2] for figure in figures] == [
+            "memory a frame",
+            "memory a frame, within each kind of step",
+        ]
+        assert figures[1].passes is passes
+
+
+@pytest.fixture(scope="module")
+def bare(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory) -> Subject:
+    """A capture of five images to train on: no other lights or poses, no albedo, no normals."""
+    frames = tuple(msgspec.structs.replace(frame, normal=None) for frame in tiny_capture.frames if frame.frame < 5)
+    return _with(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory.mktemp("bare"), frames)
+
+
+def _with(avatar, checkpoint, capture: Capture, work, frames) -> Subject:
+    return Subject(avatar, checkpoint, dataclasses.replace(capture, frames=frames), work, small=True, size=24)
+
+
+def _linked(capture: Capture, folder: Path) -> Path:
+    """All of ``capture`` but its normals and capture.json."""
+    folder.mkdir()
+    for part in ("images", "masks", "lights", "body.npz", "motion.npz"):
+        (folder / part).symlink_to(capture.folder / part)
+    return folder
+
+
+def _missing(figures: tuple[Figure, ...]) -> list[str]:
+    """What was not measured; the others are numbers."""
+    missing = [figure for figure in figures if figure.measured is None]
+    assert not any(np.isnan(figure.measured) for figure in figures if figure not in missing)
+    assert all(not figure.line and not figure.passes and "this capture)" in figure.what for figure in missing)
+    return [figure.what.split(" (")[0] for figure in missing]
+
+
+def test_what_a_capture_lacks_is_not_measured(bare):
+    assert len(_missing(materials.relit_scale(bare).figures)) == 4
+    assert _missing(materials.baked_light(bare).figures) == ["|correlation| of albedo error and irradiance"]
+    assert _missing((materials.lost_to_exact(bare),)) == ["PSNR lost to exact visibility on held-out poses"]
+    assert _missing((poses.held_out_poses(bare)[0],)) == ["PSNR over template LBS on held-out poses, mean"]
+    assert len(_missing(captures.broken_captures(bare).figures)) == 1
+    assert len(_missing(captures.bad_masks(bare).figures)) == 2
+
+
+def test_flipped_normals_are_of_captures_that_have_normals(bare, tiny_capture, tmp_path):
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, tiny_capture.frames)
+    assert captures.flipped_normals(subject).passes
+    record = captures._record(tiny_capture.folder)
+    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"]]
+    folder = _linked(tiny_capture, tmp_path / "plain")
+    captures._save(folder, record)
+    plain = dataclasses.replace(tiny_capture, folder=folder)
+    subject = _with(bare.avatar_file, bare.checkpoint, plain, tmp_path, plain.frames)
+    assert len(_missing((captures.flipped_normals(subject),))) == 1
+
+
+def test_a_copy_is_of_the_file_that_was_read(bare, tiny_capture, tmp_path):
+    record = captures._record(tiny_capture.folder)
+    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"][1:4]]
+    night = _linked(tiny_capture, tmp_path / "plain") / "night.json"
+    night.write_text(json.dumps(record))
+    capture = load_capture(night)
+    assert capture.file == night
+    subject = _with(bare.avatar_file, bare.checkpoint, capture, tmp_path, capture.frames)
+    assert captures._record(captures._copy(subject, "night"))["frames"] == record["frames"]
+
+
+def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture, tmp_path):
+    other = msgspec.structs.replace(tiny_capture.frames[0], split="relight")
+    frames = (*tiny_capture.frames[1:3], other)
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, frames)
+    figures = materials.relit_scale(subject).figures
+    assert [figure.measured is None for figure in figures] == [False, True, False, True]
+
+
+def test_frames_without_light_or_person_are_passed_over(bare, tiny_capture, tmp_path):
+    camera = tiny_capture.cameras["front"]
+    write_image(tmp_path / "empty.png", np.zeros((camera.height, camera.width, 1), np.uint8))
+    train = msgspec.structs.replace(tiny_capture.frames[0], albedo=tiny_capture.frames[0].image, light=None)
+    empty = msgspec.structs.replace(tiny_capture.frames[1], split="novel_pose", mask=str(tmp_path / "empty.png"))
+    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, (train, empty))
+    assert len(_missing(materials.baked_light(subject).figures)) == 1
+    assert len(_missing((materials.lost_to_exact(subject),))) == 1
+    assert len(_missing((poses.held_out_poses(subject)[0],))) == 1
+
+
+def test_an_image_that_is_not_finite_is_not_identical():
+    spoilt = np.full((2, 2), np.nan)
+    assert np.isnan(decibels(spoilt, np.ones((2, 2)))) and decibels(np.ones(3), np.ones(3)) == IDENTICAL_DB
+    assert not above("PSNR", decibels(spoilt, spoilt), 45, "dB").passes

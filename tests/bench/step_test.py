@@ -1,0 +1,44 @@
+"""Where a training step's time goes: operations are told apart, and their times add up."""
+
+import pytest
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from rnd_bench.speed.step import KINDS, OPTIMISER, OUTSIDE, REST, bench_step, kind_of, spent_by_kind
+
+
+@pytest.mark.parametrize(
+    ("operation", "kind"),
+    [
+        ("aten::mm", "matrix products"),
+        ("aten::mul", REST),
+        ("_CpuRasterizerBackward", "our splatting"),
+        ("autograd::engine::evaluate_function: PoseGaussiansBackward", "our posing"),
+        ("aten::convolution_backward", "perceptual network"),
+    ],
+)
+def test_operations_are_told_apart_by_name(operation, kind):
+    assert kind_of(operation) == kind
+
+
+def test_what_an_optimiser_does_is_the_optimisers():
+    weights = torch.ones(200, 200, requires_grad=True)
+    optimizer = torch.optim.Adam([weights], foreach=False)
+    for _ in range(2):
+        weights.grad = torch.ones_like(weights)
+        with profile(activities=[ProfilerActivity.CPU]) as profiled:
+            optimizer.step()
+    spent = spent_by_kind(profiled)
+    assert spent[OPTIMISER] > 0 and spent[OPTIMISER] == sum(spent.values())
+
+
+def test_the_parts_add_up_to_the_step_and_ours_are_among_them(tiny_capture, tiny_config):
+    seen: list[float] = []
+    rows = bench_step(tiny_capture, tiny_config, None, repeats=3, on_step=seen.append)
+    assert rows[0]["what"] == "a step" and seen == list(range(len(seen)))
+    assert {row["what"] for row in rows[1:]} == {*KINDS, OPTIMISER, REST, OUTSIDE}
+    spent = {row["what"]: row["ms"] for row in rows}
+    assert spent[OUTSIDE] >= 0  # the total by the clock, less what the profiler counted: nothing is counted twice
+    assert min(spent[kind] for kind in ("our posing", "our shading", "our splatting", "our SSIM")) > 0
+    assert spent["perceptual network"] == 0  # none was given
+    assert rows[0]["gaussians"] == tiny_config.model.gaussians

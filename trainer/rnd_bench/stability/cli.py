@@ -1,0 +1,164 @@
+"""``rnd-bench stability``: every row of the stability list at full size, and what takes hours."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from rnd_runtime.core.command import Count, File, Flag, OptionalFile, OptionalFolder, option, show
+from rnd_runtime.core.errors import InputError, check_option
+from rnd_runtime.core.files import sha256_of, write_json
+
+if TYPE_CHECKING:
+    from rnd_bench.scenes.subject import Subject
+
+    from .figures import Figure
+
+SMALL_STEPS = 600
+"""of the avatar that is trained where none is given"""
+
+
+@dataclass(frozen=True)
+class Stability:
+    """The cases in which methods of this kind break, beside a plain baseline; --fuzz, --soak and --kill take hours.
+
+    Example: rnd-bench stability assets/capture --rows P1,L8
+    """
+
+    capture: Annotated[Path, tyro.conf.Positional, option("CAPTURE")]
+    """folder with capture.json"""
+    checkpoint: OptionalFile = None
+    """avatar.ckpt trained on CAPTURE; by default an avatar of low quality is trained in some minutes"""
+    json: File = Path("out/bench/stability.json")
+    """the table; a .md and a folder of images are written beside it"""
+    rows: Annotated[str, option("LIST")] = "all"
+    """such as P1,L8; 'none' for only what is asked for below"""
+    size: Count = 512
+    """side of the images in pixels"""
+    fuzz: Count = 0
+    """broken inputs for every reader; resumes in WORK"""
+    soak: Count = 0
+    """frames of playback, and a tenth as many steps of training; resumes in WORK"""
+    kill: Count = 0
+    """times that training, export and play are each killed"""
+    determinism: Flag = False
+    """compare the bytes of export and play at one and at two threads, and EGL with OSMesa"""
+    work: OptionalFolder = None
+    """folder for intermediate files, kept; by default a temporary one"""
+
+
+def run(options: Stability) -> None:
+    """Measure the rows that are asked for; each is written as soon as it is known."""
+    try:
+        from .rows import ROWS, TIMES
+    except ModuleNotFoundError as error:
+        hint = 'needs the extra: pip install "rnd-avatar[dev]", in a clone ".[dev]"'
+        raise InputError(f"{error.name} is not installed", hint=hint) from error
+    from .table import line_of, rows_of, store
+
+    known = [row.id for row in (*ROWS, TIMES)]
+    wanted = known if options.rows == "all" else [] if options.rows == "none" else options.rows.split(",")
+    if unknown := set(wanted) - set(known):
+        raise InputError("--rows", expected=f"some of {','.join(known)}", got=",".join(sorted(unknown)))
+    check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
+    rows_of(options.json)  # before hours go by
+    temporary = tempfile.TemporaryDirectory() if options.work is None else nullcontext(str(options.work))
+    with temporary as folder:
+        work = Path(folder)
+        work.mkdir(parents=True, exist_ok=True)
+        subject = _subject(options, work)
+
+        def keep(name: str, failure: str, on: str, figures: Sequence[Figure], images: Any = None) -> None:
+            store(options.json, {"id": name, "failure": failure} | measured_on(on, subject), figures, images)
+            for figure in figures:
+                show(line_of(name, figure))
+
+        for row in (*ROWS, TIMES):
+            if row.id in wanted:
+                keep(row.id, row.failure, row.on, *row.measure(subject))
+        for name, failure, on, figures in _long_runs(options, subject):
+            keep(name, failure, on, figures)
+
+
+def _subject(options: Stability, work: Path) -> Subject:
+    """The avatar of the checkpoint, exported here, or one trained in minutes on the capture."""
+    from rnd_bench.scenes.subject import Subject
+    from rnd_runtime.capture.capture import load_capture
+
+    from .processes import export, run_commands
+    from .small import train_small
+
+    capture, checkpoint = load_capture(options.capture), options.checkpoint
+    if checkpoint is None:
+        checkpoint = train_small(work / "run", capture, SMALL_STEPS, 30_000)
+    checkpoint, avatar = checkpoint.resolve(), (work / "avatar.onnx").resolve()
+    done = run_commands(work, [export(checkpoint, avatar)])[0]
+    if done.code != 0:
+        raise InputError("the checkpoint cannot be exported", got=done.errors.strip()[-200:], file=checkpoint)
+    return Subject(avatar, checkpoint, capture, work.resolve(), small=False, size=options.size)
+
+
+def measured_on(on: str, subject: Subject) -> dict[str, Any]:
+    """What a row says of where and on what it was measured: the avatar's numbers only where that is the avatar."""
+    from numba import get_num_threads
+
+    from rnd_runtime.playback.doctor import machine
+
+    from .rows import AVATAR
+
+    about: dict[str, Any] = {"on": on, "threads": get_num_threads(), "machine": machine()}
+    if on == AVATAR:
+        about |= {"gaussians": subject.avatar.gaussians, "size": subject.size}
+        about["checkpoint_sha256"] = sha256_of(subject.checkpoint)
+    return about
+
+
+def _long_runs(options: Stability, subject: Subject) -> Iterable[tuple[str, str, str, Sequence[Figure]]]:
+    """What --fuzz, --soak, --kill and --determinism ask for: id, failure, what it is measured on, figures."""
+    from .rows import AVATAR, SHORT
+
+    if options.fuzz:
+        yield "F", "hostile files", "small files", _fuzz(options, subject)
+    if options.soak:
+        from .soak import soak_playback, soak_training
+
+        state = subject.work / "soak.json"
+        yield "S1", "soak, playback", AVATAR, soak_playback(subject, options.soak, state)
+        yield "S2", "soak, training", SHORT, soak_training(subject, options.soak // 10, state)
+    if options.kill:
+        from .kill import kill_all
+
+        yield "K", "kill -9", "the avatar; trainings of 400 Gaussians", kill_all(subject, options.kill)
+    if options.determinism:
+        from .determinism import same_bytes
+
+        yield "D", "determinism", AVATAR, same_bytes(subject).figures
+
+
+def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
+    from rnd_runtime.core.progress import Progress
+
+    from .fuzz import batches, fuzz
+    from .hostile import READERS, prepare
+    from .processes import export, run_commands
+    from .small import studio, train_small
+
+    folder = subject.work / "fuzz"
+    if not (folder / "files/light.hdr").exists():  # which is written last
+        capture = studio(subject)
+        small = train_small(folder / "run", capture, 12, 200)
+        run_commands(folder, [export(small, folder / "small.onnx")])
+        prepare(folder / "files", folder / "small.onnx", small, capture.folder)
+    done = count()
+    with Progress() as progress:
+        progress.phase("broken files", len(READERS) * batches(options.fuzz))
+        figures, record = fuzz(folder / "files", options.fuzz, on_batch=lambda: progress.update(next(done) + 1))
+    write_json(options.json.with_name("stability_fuzz.json"), record)
+    return figures

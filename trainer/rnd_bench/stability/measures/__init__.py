@@ -1,0 +1,1 @@
+"""What the rows measure, a module a subject."""

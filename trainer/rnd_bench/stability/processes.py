@@ -1,0 +1,79 @@
+"""Running our commands as a user does, in a process of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+PLAY, EXPORT, TRAIN = "rnd_viewer.play.cli", "rnd_export.cli", "rnd_trainer.commands.train"
+PATIENCE_S = 600
+
+Command = tuple[str, list[str]]
+"""the module whose ``main`` is run, and its arguments"""
+
+# Several commands in one interpreter, since each start costs seconds: their exit codes and stderr come back as JSON.
+_DRIVER = """
+import contextlib, importlib, io, json, os, sys
+for module, arguments in json.loads(sys.argv[1]):
+    said = io.StringIO()
+    sys.argv = [module, *arguments]
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            code = importlib.import_module(module).main() or 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        except BaseException as error:
+            code = f"{type(error).__name__}: {error}"
+    print(json.dumps([code, said.getvalue()]), flush=True)
+"""
+
+
+class Done(NamedTuple):
+    """How a command ended: its exit code (or the exception that escaped it) and its stderr."""
+
+    code: int | str
+    errors: str
+
+    @property
+    def refused(self) -> bool:
+        """Whether it ended in one line with exit code 2."""
+        return self.code == 2 and len(self.errors.strip().splitlines()) == 1
+
+    def __str__(self) -> str:
+        return f"exit {self.code}, {self.errors.strip()[-80:]!r}"
+
+
+def play(avatar: Path, motion: Path, out: Path, *options: object) -> Command:
+    """``rnd-play`` with these files."""
+    return PLAY, [str(avatar), "--motion", str(motion), "--out", str(out), *map(str, options)]
+
+
+def export(checkpoint: Path, out: Path, *options: str) -> Command:
+    """``rnd-export`` with these files."""
+    return EXPORT, [str(checkpoint), "--out", str(out), *options]
+
+
+def environment(**more: str) -> dict[str, str]:
+    """This process's environment with its import path, so that a child finds the same packages."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path), **more}
+
+
+def run_commands(folder: Path, commands: Sequence[Command], **more: str) -> list[Done]:
+    """Run ``commands`` one after the other in one fresh interpreter, in ``folder``."""
+    result = subprocess.run(
+        [sys.executable, "-c", _DRIVER, json.dumps(list(commands))],
+        cwd=folder,
+        env=environment(**more),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    done = [Done(*json.loads(line)) for line in result.stdout.splitlines()]
+    lost = len(commands) - len(done)
+    return [*done, *[Done(f"died with {result.returncode}", result.stderr[-300:])] * lost]

@@ -1,0 +1,159 @@
+"""People of the light stage: render every subject, train on one camera's white light, score the rest.
+
+Images, trainings and rows are in one folder, and nothing is done twice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from rnd_runtime.capture.capture import load_capture
+from rnd_runtime.core.files import write_json
+from rnd_runtime.playback.doctor import machine
+from rnd_stage.film.film import film, prepare, recipe_for
+from rnd_stage.film.manifest import write_manifest
+from rnd_stage.film.plan import image_count, missing
+from rnd_trainer.config import preset, resized
+from rnd_trainer.losses.perceptual import Perceptual
+
+from .options import PeopleSizes
+from .summary import summarise
+from .trainings import ablate
+from .variants import VARIANTS
+
+METHODS = ("ours", "static skinning", "LBS, plain colour")
+COST_FILE = "cost.json"
+FIGURES = ("psnr", "ssim", "lpips", "psnr_box", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
+"""of rnd-eval, averaged over the subjects"""
+
+
+def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Callable[[int, int], None]) -> None:
+    """Render what is missing of every subject; ``on_image`` is called with the number of images done and of all."""
+    done, total = 0, None
+    for subject in range(sizes.subjects):
+        out = folder / f"subject{subject}"
+        if (out / "capture.json").exists():
+            recipe_for(sizes.recipe(subject), out)
+            continue
+        production = prepare(sizes.recipe(subject), out)
+        fresh = [view for view in production.views if missing(out, view, False)]
+        total = sizes.subjects * image_count(production.views) if total is None else total
+
+        def count(name: str, expected: int = total) -> None:
+            nonlocal done
+            done += 1
+            on_image(done, expected)
+
+        started, started_cpu = time.perf_counter(), time.process_time()
+        try:
+            film(production, out, on_image=count)
+        finally:  # of an interrupted run too
+            images = image_count([view for view in fresh if not missing(out, view, False)])
+            spent = {
+                "images": images,
+                "seconds": time.perf_counter() - started,
+                "cpu_seconds": time.process_time() - started_cpu,
+            }
+            cost = _added(out / COST_FILE, spent) | {"variant": variant, "machine": machine()}
+            write_json(out / COST_FILE, cost)
+        write_manifest(production, out, variant, cost["cpu_seconds"] / max(cost["images"], 1))
+
+
+def _added(file: Path, spent: dict[str, float]) -> dict[str, Any]:
+    """``spent`` with what earlier runs left in ``file``."""
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    return {name: value + before.get(name, 0) for name, value in spent.items()}
+
+
+def run_study(
+    sizes: PeopleSizes, folder: Path, *, perceptual: Perceptual | None, on_run: Callable[[str, float, int], None]
+) -> dict[str, Any]:
+    """Train and score every method on every filmed subject: rows, their summary, and what it all cost.
+
+    ``on_run`` is called with a line on what is being trained, how many trainings are done (that in hand by its share of
+    steps) and how many there are.
+    """
+    started = time.perf_counter()
+    base = resized(preset("quick"), sizes.gaussians, sizes.steps)
+    variants = [variant for variant in VARIANTS if variant.name in METHODS]
+    total = (sizes.subjects - 1 + sizes.seeds) * len(variants)
+    rows: list[dict[str, Any]] = []
+    summaries: dict[str, list[dict[str, Any]]] = {}
+    done = 0
+    for subject in range(sizes.subjects):
+        capture = load_capture(folder / f"subject{subject}")
+        seeds = tuple(range(sizes.seeds if subject == 0 else 1))
+
+        def on_training(
+            name: str, seed: int, of_subject: float, _: int, subject: int = subject, before: int = done
+        ) -> None:
+            on_run(f"subject {subject}, {name}, seed {seed}", before + of_subject, total)
+
+        own = ablate(
+            capture,
+            base,
+            folder / f"runs{subject}-{sizes.steps}-{sizes.gaussians}",
+            variants,
+            seeds=seeds,
+            perceptual=perceptual,
+            on_run=on_training,
+        )
+        done += len(seeds) * len(variants)
+        rows += [{**row, "subject": subject} for row in own]
+        summaries[f"subject{subject}"] = summarise(own, variants)
+    return {
+        "options": dataclasses.asdict(sizes),
+        "means": means(rows),
+        "summary": summaries,
+        "cost": _cost(folder, sizes, rows, time.perf_counter() - started),
+        "rows": rows,
+    }
+
+
+def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for every method and split: FIGURES as means over the subjects, the seeds of one counting as one.
+
+    ``psnr_spread`` is the standard deviation over the first subject's seeds; a figure that no row has is None.
+    """
+    table = []
+    for method, split in dict.fromkeys((row["method"], row["split"]) for row in rows):
+        by_subject: dict[int, list[dict[str, Any]]] = {}
+        for row in rows:
+            if (row["method"], row["split"]) == (method, split):
+                by_subject.setdefault(row["subject"], []).append(row)
+        line: dict[str, Any] = {"method": method, "split": split, "subjects": len(by_subject)}
+        for figure in FIGURES:
+            each = [[row[figure] for row in of if row.get(figure) is not None] for of in by_subject.values()]
+            each = [values for values in each if values]
+            line[figure] = statistics.fmean(map(statistics.fmean, each)) if each else None
+        first = [row["psnr"] for row in by_subject[min(by_subject)]]
+        line["psnr_spread"] = statistics.stdev(first) if len(first) > 1 else None
+        table.append(line)
+    return table
+
+
+def _cost(folder: Path, sizes: PeopleSizes, rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
+    """Seconds an image with its truth, and hours of rendering and training, as measured when it was done.
+
+    Subjects that rnd-stage rendered by itself left no figures; where none did, those of images are None.
+    """
+    files = [folder / f"subject{subject}" / COST_FILE for subject in range(sizes.subjects)]
+    filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
+    images, filming, cpu = (sum(f[key] for f in filmed) for key in ("images", "seconds", "cpu_seconds"))
+    trainings = {(row["subject"], row["method"], row["seed"]): row["minutes"] for row in rows}
+    return {
+        "seconds_per_image": filming / images if images else None,
+        "cpu_seconds_per_image": cpu / images if images else None,
+        "images": images,
+        "hours_filming": filming / 3600,
+        "hours_training": sum(minutes or 0 for minutes in trainings.values()) / 60,
+        "hours_this_call": seconds / 3600,
+        "variant": filmed[0]["variant"] if filmed else None,
+        "machine": machine(),
+    }

@@ -1,0 +1,212 @@
+"""The trainings of a study on one capture: same steps, same seeds; each is run once and scored."""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from rnd_runtime.capture.capture import Capture, load_capture
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import earlier_rows, sha256_of, write_json
+from rnd_trainer.config import TrainConfig
+from rnd_trainer.evaluation.held_out import score
+from rnd_trainer.losses.perceptual import Perceptual, networks_by_role, networks_sha256
+from rnd_trainer.model.checkpoint import load_checkpoint
+from rnd_trainer.model.model import AvatarModel
+from rnd_trainer.training.data import check_true_normals, training_light
+from rnd_trainer.training.pose_refinement import joint_error_degrees
+from rnd_trainer.training.run import run
+from rnd_trainer.training.state import STATE_FILE, read_state
+from rnd_trainer.training.training import Step, Training
+
+from .variants import StudyRow
+
+ROWS = "rows.json"
+"""of one run, in its folder"""
+MOTION = "motion"
+"""of a row: the file of the poses that were scored in, and learned from unless the method says otherwise"""
+CAPTURE = "capture_sha256"
+"""of a row: the digest of capture.json, which names the images of every split"""
+FEATURES = "consistency_sha256"
+"""of a row: the network whose features L_gc compared in training"""
+ELSEWHERE = "another folder for RUN, or delete this one"
+NOISY_MOTION = "motion_noisy.npz"
+"""beside a capture's exact motion"""
+TIMED = 20
+"""evaluations of the motion encoder whose median is reported"""
+
+
+def ablate(
+    capture: Capture,
+    base: TrainConfig,
+    folder: Path,
+    variants: Sequence[StudyRow],
+    *,
+    seeds: Sequence[int],
+    perceptual: Perceptual | None,
+    consistency: Perceptual | None = None,
+    mode: str = "table+sun",
+    on_run: Callable[[str, int, float, int], None],
+) -> list[dict[str, Any]]:
+    """Train and score every variant with every seed; rows as of rnd-eval with the encoder's cost added.
+
+    The third stage is off but in the row that asks for it. Each run leaves ``rows.json`` in ``folder/NAME-SEED`` and is
+    not done again where that exists. ``on_run`` is called with the variant's name, the seed, the number of runs done
+    (that in hand by its share of steps) and of all runs.
+
+    Raises ``InputError``, before anything is trained, where an earlier run in ``folder`` is not of this study.
+    """
+    learned = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256_of(capture.file)}
+    rows: list[dict[str, Any]] = []
+    jobs: list[tuple[StudyRow, int, TrainConfig, list[dict[str, Any]]]] = []
+    for seed in seeds:
+        for variant in variants:
+            config = _config(base, variant, seed)
+            same = {
+                "capture": capture.folder.resolve().name,
+                "steps": config.steps,
+                "gaussians": config.model.gaussians,
+                "image_scale": config.image_scale,
+                "shade": mode,
+                "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+                FEATURES: networks_sha256(consistency or perceptual),
+                **learned,
+            }
+            run_folder = _run_folder(folder, variant, seed)
+            found = _rows(run_folder)
+            if found:
+                _refuse_others(found[0], same, "done", run_folder / ROWS)
+            if (run_folder / STATE_FILE).exists():
+                begun = read_state(run_folder / STATE_FILE)
+                networks = networks_by_role(perceptual, consistency or perceptual)
+                begun.refuse_other(config, networks, what="a run begun before", hint=ELSEWHERE)
+                motion = {MOTION: NOISY_MOTION} if variant.noisy else {}
+                _refuse_others(begun.header, learned | motion, "begun", run_folder / STATE_FILE)
+            jobs.append((variant, seed, config, found))
+    for done, (variant, seed, config, found) in enumerate(jobs):
+
+        def on_share(share: float, name: str = variant.name, seed: int = seed, before: int = done) -> None:
+            on_run(name, seed, before + share, len(jobs))
+
+        on_share(0.0)
+        if not found:
+            run_folder = _run_folder(folder, variant, seed)
+            seen = _noisy(capture) if variant.noisy else capture
+            extra = _train(seen, config, run_folder, perceptual, consistency, capture, on_share)
+            checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
+            scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
+            cost = encoder_cost(checkpoint.model)
+            write_json(run_folder / ROWS, [row | cost | extra for row in scored])
+            found = _rows(run_folder)
+        rows += found
+    return rows
+
+
+def check_needs(variants: Iterable[StudyRow], capture: Capture) -> None:
+    """Raise ``InputError`` where ``capture`` lacks what one of ``variants`` learns from."""
+    for variant in variants:
+        if variant.noisy:
+            _noisy(capture)
+        if variant.train.get("light") == "capture":
+            training_light(capture, f"variant {variant.name!r}")
+        if variant.train.get("normals") == "true":
+            check_true_normals(capture, capture.split("train"), f"variant {variant.name!r}")
+
+
+def _config(base: TrainConfig, variant: StudyRow, seed: int) -> TrainConfig:
+    model = dataclasses.replace(base.model, **variant.model)
+    steps = max(round(base.steps * variant.length), 1)
+    changed = {"steps": steps, "unseen_fraction": 0.0, **variant.train}
+    return dataclasses.replace(base, model=model, seed=seed, **changed)
+
+
+def _noisy(capture: Capture) -> Capture:
+    return load_capture(capture.file, motion_file=NOISY_MOTION)
+
+
+def _refuse_others(before: dict[str, Any], same: dict[str, Any], stage: str, file: Path) -> None:
+    """Raise ``InputError`` where an earlier run does not say ``same``."""
+    for name, value in same.items():
+        got = before.get(name)
+        if got != value:
+            raise InputError(f"{name} of a run {stage} before", expected=value, got=got, file=file, hint=ELSEWHERE)
+
+
+def _rows(run_folder: Path) -> list[dict[str, Any]]:
+    file = run_folder / ROWS
+    try:
+        return earlier_rows(file, what="rows of a study", names=("method", "split", "seed", "psnr"))
+    except InputError as error:
+        what, expected = "a run done before", error.expected
+        raise InputError(what, expected=expected, got=error.got, file=file, hint=ELSEWHERE) from error
+
+
+def time_encoders(
+    rows: list[dict[str, Any]], folder: Path, variants: Sequence[StudyRow], seed: int
+) -> list[dict[str, Any]]:
+    """``rows`` with every variant's ``encoder_cost`` measured now, one after the other, on its avatar of ``seed``."""
+    costs = {
+        variant.name: encoder_cost(load_checkpoint(_run_folder(folder, variant, seed) / "avatar.ckpt").model)
+        for variant in variants
+    }
+    return [row | costs[row["method"]] for row in rows]
+
+
+@torch.no_grad()
+def encoder_cost(model: AvatarModel) -> dict[str, float]:
+    """FLOPs (2 per multiply-add) and median milliseconds in torch of the motion encoder D_W at its nodes."""
+    if not model.config.dynamic_skinning:
+        return {"encoder_gflop": 0.0, "encoder_ms": 0.0}
+    joints = model.log_weights.shape[1] - 1
+    window, velocity = torch.zeros(model.config.window_poses, joints, 6), torch.zeros(joints, 3)
+    encoded = model.encoded_nodes()
+    with FlopCounterMode(display=False) as counter:
+        model.skinning(encoded, window, velocity)
+    times = []
+    for _ in range(TIMED):
+        started = time.perf_counter()
+        model.skinning(encoded, window, velocity)
+        times.append(1e3 * (time.perf_counter() - started))
+    return {"encoder_gflop": counter.get_total_flops() / 1e9, "encoder_ms": statistics.median(times)}
+
+
+def _train(
+    seen: Capture,
+    config: TrainConfig,
+    folder: Path,
+    perceptual: Perceptual | None,
+    consistency: Perceptual | None,
+    truth: Capture,
+    on_share: Callable[[float], None],
+) -> dict[str, float]:
+    """Train on ``seen``; the poses' errors before and after, in degrees, where they were not exact."""
+    folder.mkdir(parents=True, exist_ok=True)
+    training = Training(seen, config, perceptual, consistency=consistency)
+    if (folder / STATE_FILE).exists():
+        training.resume(folder / STATE_FILE)
+    effort = training.schedule.effort
+
+    def on_step(step: Step) -> None:
+        on_share(effort(step.index + 1) / effort(training.schedule.total))
+
+    if run(training, folder, on_step=on_step, on_preview=lambda: None):
+        raise KeyboardInterrupt
+    if seen is truth:
+        return {}
+    frames = [view.frame.frame for view in training.views]
+    return {
+        "pose_error_before_deg": joint_error_degrees(seen.motion, truth.motion, frames),
+        "pose_error_after_deg": joint_error_degrees(training.motion(), truth.motion, frames),
+    }
+
+
+def _run_folder(folder: Path, variant: StudyRow, seed: int) -> Path:
+    slug = "".join(c if c.isalnum() else "_" for c in variant.name).strip("_").lower()
+    return folder / f"{slug}-{seed}"
