@@ -3,12 +3,13 @@
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
 the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, A.json+B.json has those of both,
 and ``FILE.json of A; B`` shows those of the methods A and B alone. ``<!-- chart: FILE.svg -->`` …
-``<!-- end -->`` holds a picture. What was not measured yet leaves its place empty.
+``<!-- end -->`` holds an image. Tables and charts without a file stay empty.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,12 @@ ROOT = Path(__file__).parent.parent
 CHART = re.compile(r"(<!-- chart: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 TABLE = re.compile(r"(<!-- table: (\S+)(?: of (.+?))? \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
-
 PAGES = {
-    ROOT / "README.md": "assets/bench",
-    ROOT / "docs" / "performance.md": "../assets/bench",
-    ROOT / "docs" / "quality.md": "../assets/bench",
-    ROOT / "docs" / "tried.md": "../assets/bench",
-    ROOT / "docs" / "light-stage.md": "../assets/bench",
+    page: os.path.relpath(ROOT / "assets" / "bench", page.parent)
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    if "<!-- table: " in page.read_text(encoding="utf-8")
 }
-"""the pages with tables, and where their pictures lie as seen from them"""
+"""pages with tables, and the folder of their charts as seen from them"""
 
 
 def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
