@@ -1,5 +1,4 @@
-# Sourced by scripts/demo and scripts/test: brings a bare Debian machine to where the project runs.
-# Makes .venv, installs what is missing into it, and system packages where that is allowed.
+# Sourced by the other scripts: makes .venv and installs what is missing, system packages where that is allowed.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -20,7 +19,7 @@ need_system_packages() {
     fi
 }
 
-# numba's cache knows a kernel by its own file: constants and helpers from other files would stay as they were
+# numba keys a kernel by its own file, so the folder is keyed by all sources
 export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/numba-$(find runtime trainer -name "*.py" -print0 | sort -z | xargs -0 cat | sha256sum | cut -c1-12)}
 
 # $1: extras of rnd-avatar to install, such as dev
@@ -36,10 +35,10 @@ need_python_packages() {
     }
     # shellcheck disable=SC1091
     source .venv/bin/activate
-    local stamp whole
+    local stamp full
     stamp=".venv/installed-$1-$(sha256sum pyproject.toml | cut -c1-16)"
-    whole=${stamp/installed-$1-/installed-dev-} # has every other extra too
-    [ -e "$stamp" ] || [ -e "$whole" ] && return
+    full=${stamp/installed-$1-/installed-dev-} # has every other extra too
+    [ -e "$stamp" ] || [ -e "$full" ] && return
     # torch first and by version: the plain name would bring gigabytes of CUDA to a machine without a GPU
     python -c 'import torch' 2>/dev/null || install_cpu_torch
     pip install --quiet --editable ".[$1]"
