@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from rnd_runtime.core.kernels import prepare_process
+
+prepare_process()
+
 
 @pytest.fixture(scope="session")
 def tiny_capture(tmp_path_factory):

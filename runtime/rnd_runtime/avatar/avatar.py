@@ -15,7 +15,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
-from rnd_runtime.posing.posing import RestPose, Unposed
+from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
 

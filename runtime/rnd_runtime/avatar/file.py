@@ -21,7 +21,7 @@ That is the whole avatar for any ONNX runtime. For ours, which poses faster than
 stands between its networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
 is dynamic, ``node_logits`` [M, J], and the constants ``neighbours`` [N, K] (int32), ``neighbour_weights`` [N, K],
 ``log_template`` [N, J], ``rest_points`` [N, 3], ``rest_factors`` [N, 9], ``rest_normals`` [N, 3], ``rest_limbs`` [N, 7]
-and ``posing_limits`` [3]; see ``posing.posing.RestPose``. Without these the graph does all of the posing.
+and ``posing_limits`` [3]; see ``posing.rest.RestPose``. Without these the graph does all of the posing.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, first_line
 
 from .onnx_parts import OnnxFile
 
@@ -232,7 +232,3 @@ def encode_light(radiance: NDArray[np.float32]) -> str:
     """A probe [32, 64, 3] as the metadata stores it."""
     assert radiance.shape == PROBE_SHAPE
     return base64.b64encode(np.ascontiguousarray(radiance, "<f4").tobytes()).decode()
-
-
-def first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:300] if str(error).strip() else type(error).__name__

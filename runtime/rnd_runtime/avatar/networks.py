@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
@@ -10,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
+from rnd_runtime.core.inference import open_session, run_session
+from rnd_runtime.core.kinds import explained
+from rnd_runtime.core.threads import cores
 
 from .file import (
     CONSTANT_OUTPUTS,
@@ -24,7 +25,6 @@ from .file import (
     REST_OUTPUTS,
     check_shapes,
     decode_light,
-    first_line,
     read_advice,
     read_metadata,
 )
@@ -47,8 +47,8 @@ class Networks:
         self.metadata, self.advice = read_metadata(file), read_advice(file)
         check_shapes(file, self.metadata)
         self.trained_light = decode_light(self.metadata)
-        self._file, self._threads, self._path = file, threads or os.cpu_count() or 1, path
-        self._sessions: dict[tuple[str, ...], ort.InferenceSession] = {}
+        self._file, self._threads, self._path = file, threads or cores(), path
+        self._sessions: dict[tuple[str, ...], Any] = {}
         self.posed_outside = not {*NODE_OUTPUTS, *REST_OUTPUTS} - file.outputs.keys()
         self._aside = ThreadPoolExecutor(1, "networks")
         sessions = self._aside.submit(lambda: [self._session(part) for part in self._parts])
@@ -62,11 +62,11 @@ class Networks:
 
         Raises ``InputError`` for anything that is not a whole avatar of the schema we know.
         """
-        path = existing_file(path, what="avatar")
         try:
+            path = existing_file(path, what="avatar")
             return cls(OnnxFile(path.read_bytes()), threads, path)
         except InputError as error:
-            raise error.at(file=path) from error
+            raise explained(error, path, "avatar") from error
 
     @property
     def nodes(self) -> int:
@@ -92,13 +92,8 @@ class Networks:
         except InputError as error:
             raise error.at(file=self._path) from error
 
-    def _evaluated(
-        self, session: ort.InferenceSession, outputs: Sequence[str], values: dict[str, Floats32]
-    ) -> list[Floats32]:
-        try:
-            results: list[Floats32] = session.run(list(outputs), values)
-        except Exception as error:
-            raise InputError("graph cannot be evaluated", got=first_line(error)) from error
+    def _evaluated(self, session: Any, outputs: Sequence[str], values: dict[str, Floats32]) -> list[Floats32]:
+        results: list[Floats32] = run_session(session, outputs, values)
         self._check_promised(outputs, results)
         return results
 
@@ -110,18 +105,18 @@ class Networks:
                 raise InputError(name, expected=f"shape {promised}", got=list(value.shape))
 
     def _constants(self, outputs: Sequence[str]) -> list[Floats32]:
-        session = _session(self._file.cut(outputs), 1)
+        session = open_session(self._file.cut(outputs), 1)
         if session.get_inputs():
             names = ", ".join(outputs)
             raise InputError("graph outputs", expected=f"{names}: constants", got="some that need a pose")
         return self._evaluated(session, outputs, {})
 
-    def _session(self, outputs: tuple[str, ...]) -> ort.InferenceSession:
+    def _session(self, outputs: tuple[str, ...]) -> Any:
         """A session that computes ``outputs`` and no more; kept."""
         if outputs not in self._sessions:
             at_once = len(self._parts) if outputs in self._parts else 1
             threads = -(-self._threads // at_once)
-            self._sessions[outputs] = _session(self._file.cut(outputs), threads)
+            self._sessions[outputs] = open_session(self._file.cut(outputs), threads)
         return self._sessions[outputs]
 
     @cached_property
@@ -134,17 +129,3 @@ class Networks:
         if skinning and self._threads > 1:
             return skinning, NODE_OUTPUTS
         return ((*skinning, *NODE_OUTPUTS),)
-
-
-def _session(model: bytes, threads: int) -> ort.InferenceSession:
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
-    # Of a session that has threads, these may spin as long as an operation's gap, and no longer: else they would take
-    # the cores from the kernels that follow, and from everyone on a busy machine.
-    options.add_session_config_entry("session.intra_op.spin_duration_us", "50")
-    options.log_severity_level = 4  # its complaints about broken files go into our one line instead
-    try:
-        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise InputError("not a readable ONNX model", got=first_line(error)) from error

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.kinds import explained
 from rnd_runtime.core.npz import Npz, save_npz
 from rnd_runtime.motion.skeleton import Skeleton, bone_transforms
 
@@ -73,11 +74,11 @@ class Body:
     @classmethod
     def load(cls, path: str | Path) -> Body:
         """Read ``body.npz`` (arrays: ``save``)."""
-        with Npz(path, what="body") as archive:
-            names = archive.strings("joint_names")
-            joints = len(names)
-            parents = archive.numbers("joint_parents", (joints,))
-            try:
+        try:
+            with Npz(path, what="body") as archive:
+                names = archive.strings("joint_names")
+                joints = len(names)
+                parents = archive.numbers("joint_parents", (joints,))
                 skeleton = Skeleton(names, parents, archive.numbers("rest_joints", (joints, 3)))  # type: ignore[arg-type]
                 return cls(
                     archive.numbers("vertices", (None, 3)),
@@ -86,8 +87,8 @@ class Body:
                     skeleton,
                     next(iter(archive.strings("license")), "unknown") if "license" in archive.names else "unknown",
                 )
-            except InputError as error:
-                raise error.at(file=path) from error
+        except InputError as error:
+            raise explained(error, path, "body") from error
 
     def save(self, path: str | Path) -> None:
         """Write ``body.npz``; vertices are stored as float32 (0.1 µm), everything else as it is."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path, existing_file, is_folder, sha256_of
+from rnd_runtime.core.kinds import explained
 from rnd_runtime.motion.motion import Motion, load_motion, save_motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.shading import light as lights
@@ -157,9 +158,12 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
     Raises:
         InputError: naming file, field or frame, and both values.
     """
-    file = existing_file(capture_file(path), what="capture")
+    try:
+        file = existing_file(capture_file(path), what="capture")
+        record = read_record(file)
+    except InputError as error:
+        raise explained(error, path, "capture") from error
     folder = file.parent
-    record = read_record(file)
     cameras = {}
     for name, camera in record.cameras.items():
         try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .copies import twin
+from .copies import shallow_copy
 from .errors import InputError
 
 Floats = NDArray[np.float64]
@@ -61,7 +61,7 @@ class Camera:
     def in_frame(self, frame_to_world: Floats) -> Camera:
         """The same view for points in another frame, which ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
         # what is rigid stays so and need not be looked at again in every frame
-        return twin(self, world_to_camera=self.world_to_camera @ frame_to_world)
+        return shallow_copy(self, world_to_camera=self.world_to_camera @ frame_to_world)
 
     @classmethod
     def look_at(

@@ -1,4 +1,4 @@
-"""Copies for what changes from frame to frame: ``copy.copy`` goes by way of pickling, at ten times the price."""
+"""Shallow copies of objects that change from frame to frame."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 
-def twin(original: T, **changes: Any) -> T:
-    """A shallow copy of an object, frozen or not, whose attributes ``changes`` are others; nothing is looked at."""
+def shallow_copy(original: T, **changes: Any) -> T:
+    """A copy of an object, frozen or not, with other attributes; no check of its class runs."""
     copied = object.__new__(type(original))
     copied.__dict__.update(original.__dict__, **changes)
     return copied

@@ -129,8 +129,11 @@ class Npz(Members):
             if not isinstance(array, np.ndarray):  # numpy hands over the bytes of what is no array
                 raise ValueError("not an array")
         except _UNREADABLE as error:
-            objects = "allow_pickle" in str(error)
-            got = "Python objects" if objects else "data that is cut short or damaged"
+            got = "data that is cut short or damaged"
+            if isinstance(error, MemoryError):
+                got = "more numbers than memory holds"
+            elif "allow_pickle" in str(error):
+                got = "Python objects"
             raise InputError(name, expected="an array", got=got, file=self.path) from error
         return array
 

@@ -17,7 +17,7 @@ from typing import Any, Literal, Protocol, get_args
 import glcontext
 import moderngl
 
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, first_line
 
 Backend = Literal["auto", "egl", "osmesa", "window"]
 
@@ -69,7 +69,7 @@ def create_context(backend: Backend = "auto") -> moderngl.Context:
                 try:
                     return _context_of(name, open_loader(version), version)
                 except Exception as error:  # glcontext, moderngl and ctypes raise nothing more precise
-                    failure = f"{name}: {error}"
+                    failure = f"{name}: {first_line(error)}"
             failures.append(failure)
     hint = INSTALL.get(backend, f"{INSTALL['egl']}, or {INSTALL['osmesa']}")
     raise InputError("no OpenGL 3.3 context", got="; ".join(failures), hint=hint)
@@ -146,7 +146,7 @@ class OSMesa:
         self._handle = self._library.OSMesaCreateContextAttribs(attributes, None)
         if not self._handle:
             raise OSError("OSMesaCreateContextAttribs failed")
-        self._pixel = (ctypes.c_ubyte * 4)()  # its own 1 × 1 picture, which nobody draws to
+        self._pixel = (ctypes.c_ubyte * 4)()  # its own 1 × 1 image, which nobody draws to
 
     def load_opengl_function(self, name: str) -> int:
         return self._library.OSMesaGetProcAddress(name.encode()) or 0

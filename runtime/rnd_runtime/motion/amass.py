@@ -8,10 +8,10 @@ import numpy as np
 
 from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import matrix_to_axis_angle
-from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, SMPLH_NAMES
 
 from .motion import STAND_INS, Z_UP_TO_Y_UP, Motion
 from .skeleton import Skeleton
+from .smpl import SMPL_REST_ROOT, SMPLH_NAMES
 
 # SMPL's one joint for a hand turns all its fingers, where they do not turn themselves; SMPL-H has their bases instead.
 FINGER_BASES = ("index1", "middle1", "pinky1", "ring1", "thumb1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError, flag, refuse_outside
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
 
-from .motion import Motion
+if TYPE_CHECKING:
+    from .motion import Motion
 
 Floats = NDArray[np.float64]
 

@@ -14,13 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder
+from rnd_runtime.core.kinds import explained
 from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import matrix_to_axis_angle
-from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, check_translations, read_motion_file
+from rnd_runtime.motion.readers.arrays import check_translations, read_motion_file
 
 from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import load_joint_map, match_joints
 from .skeleton import Skeleton
+from .smpl import SMPL_REST_ROOT
 
 Floats = NDArray[np.float64]
 
@@ -157,7 +159,7 @@ def load_motion(
         else:
             motion = _load_arrays(path, skeleton, up, joint_names, joint_map)
     except InputError as error:
-        raise error.at(file=path) from error
+        raise explained(error, path, "motion") from error
     if fps is None:
         return motion
     notes = tuple(note for note in motion.notes if "frame rate" not in note)
@@ -177,7 +179,7 @@ def motion_inputs(path: str | Path) -> list[Path]:
         return easymocap_files(path)
     if path.suffix.lower() != ".amc":
         return [path]
-    from rnd_runtime.motion.readers.mocap import asf_beside
+    from rnd_runtime.motion.readers.asf_amc import asf_beside
 
     return [path, asf_beside(path)]
 
@@ -188,14 +190,16 @@ def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | N
 
 
 def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
-    from rnd_runtime.motion.readers.mocap import (  # not before there is one: readers take part in every start
-        read_acclaim,
-        read_bvh,
-    )
-
     from .retarget import retarget
 
-    tree = read_bvh(path) if Path(path).suffix.lower() == ".bvh" else read_acclaim(path)
+    if Path(path).suffix.lower() == ".bvh":
+        from rnd_runtime.motion.readers.bvh import read_bvh
+
+        tree = read_bvh(path)
+    else:
+        from rnd_runtime.motion.readers.asf_amc import read_amc
+
+        tree = read_amc(path)
     moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
     first = len(tree.rotations) - len(moved.rotations)
     finite = np.isfinite(moved.rotations).all((1, 2, 3)) & np.isfinite(moved.translations).all(1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_runtime.motion.readers.mocap import MocapTree
+from rnd_runtime.motion.readers.tree import MocapTree
 
 from .skeleton import Skeleton
 

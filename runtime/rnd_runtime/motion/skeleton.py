@@ -10,17 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.errors import InputError
 
+from .smpl import SMPL_NAMES, SMPL_PARENTS
+
 Floats = NDArray[np.float64]
-
-SMPL_NAMES: tuple[str, ...] = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
-    *("right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head"),
-    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
-    *("left_hand", "right_hand"),
-)
-"""SMPL's 24 joints in SMPL's order: the default skeleton."""
-
-SMPL_PARENTS: tuple[int, ...] = (*(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8), *(9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21))
 
 
 @dataclass(frozen=True, eq=False)

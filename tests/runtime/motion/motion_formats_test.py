@@ -16,9 +16,9 @@ from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.joint_names import load_joint_map, match_joints
 from rnd_runtime.motion.motion import load_motion, motion_inputs
-from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from rnd_runtime.motion.retarget import Retargeted, retarget
-from rnd_runtime.motion.skeleton import SMPL_NAMES, SMPL_PARENTS, Skeleton
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS, SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from support.paths import ASSETS, SHARED
 
 SKELETON = Body.load(ASSETS / "body.npz").skeleton

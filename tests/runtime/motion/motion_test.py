@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.motion.motion import Motion, load_motion, save_motion
-from rnd_runtime.motion.readers.arrays import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
-from rnd_runtime.motion.skeleton import SMPL_NAMES, SMPL_PARENTS, Skeleton, smpl_skeleton
+from rnd_runtime.motion.skeleton import Skeleton, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS, SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from support.paths import SHARED
 
 SHARED_DATA = SHARED / "data"

@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_runtime.motion.skeleton import SMPL_NAMES, SMPL_PARENTS, Skeleton, bone_transforms, smpl_skeleton
+from rnd_runtime.motion.skeleton import Skeleton, bone_transforms, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 
 REST = np.random.default_rng(5).normal(size=(24, 3))
 

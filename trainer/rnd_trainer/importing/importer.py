@@ -1,4 +1,4 @@
-"""From whatever a user has to a capture: find out what it is, read it, fill in what is missing, write it."""
+"""Import of a source as a capture: detect its layout, read it, add what is missing, write it."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from rnd_trainer.importing.layouts import (
     neuman,
     rana,
     snapshot,
+    video,
     zju,
 )
-from rnd_trainer.importing.surfaces.estimate import attached, with_masks, with_normals
+from rnd_trainer.importing.surfaces.estimate import add_masks, add_normals
+from rnd_trainer.importing.surfaces.files import attach_files
 
-from . import video
 from .body_models import BodyModel, load_body_model
-from .options import ImportOptions
+from .dataset import ImportedDataset, undistort_dataset
+from .options import ImportOptions, OnProgress, no_progress
 from .pose_files import read_poses
-from .recording import Recording, RootConvention, read_as, straightened
-from .write import Scene, chosen_shots, placed, refuse_cameras, write_capture
+from .poses import with_convention
+from .scene import PlacedScene, place_scene
+from .select import refuse_cameras, select_samples
+from .write import write_capture
 
 LAYOUTS: dict[str, Any] = {
     "zju": zju,
@@ -46,11 +50,10 @@ LAYOUTS: dict[str, Any] = {
     "easymocap": easymocap,
     "video": video,
 }
-"""modules with ``detect`` and ``read``, the particular before the general: a folder of pictures may be anything"""
-_CONVENTIONS: dict[str, RootConvention] = {"smpl": "smpl", "easymocap": "easymocap"}
+"""modules with ``detect`` and ``read``, the particular before the general: a folder of images may be anything"""
 _COEFFICIENTS = (0, 4, 5, 8, 12, 14)
 """numbers that OpenCV takes as a lens's distortion"""
-_POSES_FROM_ELSEWHERE = ("video", "nerfstudio", "easymocap")
+_EXTERNAL_POSES = ("video", "nerfstudio", "easymocap")
 
 
 def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
@@ -63,43 +66,21 @@ def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
         raise InputError("source not found", file=source)
     if (source / "capture.json").is_file():
         raise InputError("a capture already", file=source, hint="rnd-train takes it as it is")
-    if name in LAYOUTS:
-        found = _detect(name, source)
-        if found is None and name == "easymocap":  # then it says how the poses' root is meant
-            return find_layout(source)
-        if found is None:
-            raise InputError("layout", expected=f"{name}: {_needs(name)}", got="none of it", file=source)
-        return name, found
-    if name not in (None, "smpl"):
-        raise InputError("--as", expected=" or ".join([*LAYOUTS, "smpl"]), got=name)
-    for layout in LAYOUTS:
-        found = _detect(layout, source)
-        if found is not None:
-            return layout, found
-    raise InputError(
-        "source",
-        expected="a known layout",
-        got="none of " + ", ".join(LAYOUTS),
-        file=source,
-        hint="docs/own-video.md lists what each one needs",
-    )
+    if name is not None and name not in LAYOUTS:
+        raise InputError("--as", expected=" or ".join(LAYOUTS), got=name)
+    for layout in LAYOUTS if name is None else [name]:
+        if source.is_dir() or layout in ("video", "nerfstudio"):
+            found = LAYOUTS[layout].detect(source)
+            if found is not None:
+                return layout, found
+    if name is not None:
+        raise InputError("layout", expected=f"{name}: {_requirements(name)}", got="none of it", file=source)
+    known, hint = "none of " + ", ".join(LAYOUTS), "docs/own-video.md lists what each one needs"
+    raise InputError("source", expected="a known layout", got=known, file=source, hint=hint)
 
 
-def _said(name: str | None) -> tuple[str | None, RootConvention | None]:
-    """(layout, root convention) of ``--as``: one of them, or both with a comma between."""
-    layout, comma, root = (name or "").partition(",")
-    if comma and (layout not in LAYOUTS or root not in _CONVENTIONS):
-        raise InputError("--as", expected="a layout, a comma and smpl or easymocap", got=name)
-    return layout or None, _CONVENTIONS.get(root or layout)
-
-
-def _detect(layout: str, source: Path) -> str | None:
-    found: str | None = LAYOUTS[layout].detect(source) if source.is_dir() or layout in ("video", "nerfstudio") else None
-    return found
-
-
-def _needs(layout: str) -> str:
-    return str(LAYOUTS[layout].detect.__doc__).rstrip(".")
+def _requirements(layout: str) -> str:
+    return str(LAYOUTS[layout].detect.__doc__).strip().rstrip(".")
 
 
 def import_source(
@@ -107,147 +88,125 @@ def import_source(
     out: Path,
     options: ImportOptions,
     *,
-    on_shot: Callable[[int, int], None] = lambda done, total: None,
+    on_progress: OnProgress = no_progress,
     on_found: Callable[[str], None] = lambda sentence: None,
-) -> Scene:
+) -> PlacedScene:
     """Turn ``source`` into a capture in the folder ``out``.
 
     Args:
-        on_shot: called with (pictures written, pictures in all).
-        on_found: called with what the source was found to be, then with what it holds.
+        on_progress: called with (phase, done, total).
+        on_found: called with the layout, then with a summary of the content.
 
     Raises:
         InputError: with the file and, where there is one, the frame.
     """
     _check_numbers(options)
-    name, convention = _said(options.layout)
-    layout, found = find_layout(source, name)
+    layout, found = find_layout(source, options.layout)
     on_found(f"{layout}: {found}")
-    _refuse_full(out, source, options)
-    _refuse_unmakeable(out)
+    _refuse_occupied(out, source, options)
+    _refuse_unwritable(out)
     if options.body is None:
         raise InputError("--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none")
     _refuse_unused(layout, options)
     model = load_body_model(options.body)
     try:
-        recording = _read(layout, source, model, options)
+        dataset = _read(layout, source, model, options, on_progress)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         got = f"{type(error).__name__}: {error}"
-        raise InputError(f"{layout} cannot be read", expected=_needs(layout), got=got, file=source) from error
-    if convention is not None:
-        recording = replace(recording, poses=read_as(recording.poses, convention))
-    on_found(_contents(recording))
-    recording = straightened(attached(recording, options.masks, options.normals))
+        raise InputError(f"{layout} cannot be read", expected=_requirements(layout), got=got, file=source) from error
+    if options.root is not None:
+        dataset = replace(dataset, poses=with_convention(dataset.poses, options.root))
+    on_found(_summary(dataset))
+    dataset = undistort_dataset(attach_files(dataset, options.masks, options.normals))
     if options.fps is not None:
-        recording = replace(recording, fps=options.fps)
-    scene = placed(recording, model, options.up)
-    shots = chosen_shots(recording, options.choice)
-    shots = with_masks(shots, scene, recording, options.mask_net)
-    shots, axes = with_normals(
-        shots, scene, recording, net=options.normal_net, axes=options.normal_axes, found=options.normals is not None
-    )
-    write_capture(out, recording, scene, shots, on_shot, normal_axes=axes)
+        dataset = replace(dataset, fps=options.fps)
+    scene = place_scene(dataset, model, options.up)
+    samples = select_samples(dataset, options.selection)
+    samples = add_masks(samples, scene, dataset, options.mask_net, on_progress)
+    samples, axes = add_normals(samples, scene, dataset, options)
+    write_capture(out, dataset, scene, samples, on_progress, normal_axes=axes)
     return scene
 
 
-def _refuse_full(out: Path, source: Path, options: ImportOptions) -> None:
-    """Refuse a folder ``out`` with files whose place a capture's would take, or among which they would stand."""
+def _read(
+    layout: str, source: Path, model: BodyModel, options: ImportOptions, on_progress: OnProgress
+) -> ImportedDataset:
+    if layout == "video":
+        if options.poses is None:
+            raise InputError("--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none")
+        return video.read(source, model, read_poses(options.poses, person=options.person), options, on_progress)
+    more = {"poses": options.poses, "person": options.person} if layout in _EXTERNAL_POSES else {}
+    dataset: ImportedDataset = LAYOUTS[layout].read(source, **more)
+    return dataset
+
+
+def _summary(dataset: ImportedDataset) -> str:
+    lens = next(iter(dataset.lenses.values()))
+    distorted = any(any(lens.distortion) for lens in dataset.lenses.values())
+    size = f"{lens.camera.width} x {lens.camera.height}" + (", distorted lenses" if distorted else "")
+    root = {"smpl": "SMPL's root", "easymocap": "EasyMocap's root", "position": "pelvis positions"}
+    poses, count = dataset.poses, len(dataset.lenses)
+    return (
+        f"{dataset.kind}: {len(dataset.samples)} images of {count} camera{'s' * (count > 1)}, {size}; "
+        f"{len(poses.frames)} poses ({len(poses.joint_names)} joints, {root[poses.convention]})"
+    )
+
+
+def _refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
+    """Refuse a folder ``out`` with files that a capture would replace or mix with."""
     if out.resolve() == source.resolve():
         raise InputError("OUT", expected="another folder than the source", got=out)
     for name in ("capture.json", "motion.npz", "body.npz"):
         if (out / name).exists():
             what = "holds a capture already" if name == "capture.json" else f"holds a {name}"
             raise InputError(what, file=out, hint="choose another folder")
-    given = {"the source": source, "--masks": options.masks, "--normals": options.normals}
+    inputs = {"the source": source, "--masks": options.masks, "--normals": options.normals}
     for name in ("images", "masks", "normals"):
-        place = out / name
-        for what, folder in given.items():
-            if folder is not None and place.resolve() == folder.resolve():
+        folder = out / name
+        for what, given in inputs.items():
+            if given is not None and folder.resolve() == given.resolve():
                 raise InputError("OUT", expected=f"another folder than that of {what}", got=out)
-        if place.is_file() or (place.is_dir() and any(place.iterdir())):
+        if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
             raise InputError(f"holds {name} already", file=out, hint="choose another folder, or remove them")
 
 
-def _refuse_unmakeable(out: Path) -> None:
-    """Refuse a folder ``out`` that cannot be made or written, before what takes long; made to try, it is removed."""
-    missing = [place for place in (out, *out.parents) if not place.exists()]
+def _refuse_unwritable(out: Path) -> None:
+    """Refuse a folder ``out`` that cannot be made or written, before the long work; a folder made to try is removed."""
+    missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     output_folder(out)
-    for place in missing:
-        with contextlib.suppress(OSError):  # somebody else put a file there
-            place.rmdir()
+    for folder in missing:
+        with contextlib.suppress(OSError):  # another program put a file there
+            folder.rmdir()
 
 
 def _check_numbers(options: ImportOptions) -> None:
-    choice = options.choice
-    check_option(choice.every >= 1, "--every", "at least 1", choice.every)
-    check_option(choice.held_out_every >= 1, "--held-out-every", "at least 1", choice.held_out_every)
-    check_option(options.count >= 1, "--count", "at least 1", options.count)
-    stop = math.inf if choice.stop is None else choice.stop
-    check_option(stop > choice.start, "--stop", f"more than --start {choice.start}", choice.stop)
-    check_option(
-        len(options.distortion) in _COEFFICIENTS and all(map(math.isfinite, options.distortion)),
-        "--distortion",
-        "k1 k2 p1 p2 [k3 …], as OpenCV has them",
-        " ".join(map(str, options.distortion)),
-    )
+    selection = options.selection
+    for name, value in (
+        ("--every", selection.every),
+        ("--held-out-every", selection.held_out_every),
+        ("--count", options.count),
+    ):
+        check_option(value >= 1, name, "at least 1", value)
+    stop = math.inf if selection.stop is None else selection.stop
+    check_option(stop > selection.start, "--stop", f"more than --start {selection.start}", selection.stop)
+    coefficients = options.distortion
+    good = len(coefficients) in _COEFFICIENTS and all(map(math.isfinite, coefficients))
+    check_option(good, "--distortion", "k1 k2 p1 p2 [k3 …], as OpenCV has them", " ".join(map(str, coefficients)))
     refuse_outside(options, {"fps": FPS_LIMITS})
 
 
 def _refuse_unused(layout: str, options: ImportOptions) -> None:
-    """What is given and would change nothing is a misunderstanding."""
-    if options.masks and options.mask_net:
-        raise InputError("--masks and --mask-net", expected="one of them", got="both")
-    if options.normals and options.normal_net:
-        raise InputError("--normals and --normal-net", expected="one of them", got="both")
-    for name, used in (
-        ("poses", layout in _POSES_FROM_ELSEWHERE),
-        ("person", layout in _POSES_FROM_ELSEWHERE),
-        ("intrinsics", layout == "video"),
-        ("distortion", layout == "video"),
-    ):
-        given = getattr(options, name)
-        if not used and given is not None and given != ():
+    """Refuse options that would change nothing."""
+    for one, other in (("masks", "mask_net"), ("normals", "normal_net")):
+        if getattr(options, one) and getattr(options, other):
+            raise InputError(f"{flag(one)} and {flag(other)}", expected="one of them", got="both")
+    unused = [] if layout == "video" else ["intrinsics", "distortion"]
+    unused += [] if layout in _EXTERNAL_POSES else ["poses", "person"]
+    for name in unused:
+        if (given := getattr(options, name)) not in (None, ()):
             raise InputError(flag(name), expected=f"none, as {layout} has its own", got=given)
     if layout == "video":
-        why = "a video has one camera, and its last 1/5 are novel poses"
-        refuse_cameras(options.choice, [video.CAMERA], why)
+        refuse_cameras(options.selection, [video.CAMERA], "a video has one camera, and its last 1/5 are novel poses")
     else:
-        why = f"of a video the sharpest pictures are chosen; of {layout}, --every keeps fewer"
+        why = f"of a video the sharpest images are chosen; of {layout}, --every keeps fewer"
         refuse_changed(options, ["count"], why)
-
-
-def _contents(recording: Recording) -> str:
-    """What a source was found to hold, in a sentence."""
-    lens = next(iter(recording.lenses.values()))
-    bent = any(any(lens.distortion) for lens in recording.lenses.values())
-    size = f"{lens.camera.width} x {lens.camera.height}" + (", lenses bend" if bent else "")
-    convention = {"smpl": "SMPL's root", "easymocap": "EasyMocap's root", "placed": "the pelvis's place"}
-    poses = recording.poses
-    count = len(recording.lenses)
-    return (
-        f"{recording.kind}: {len(recording.shots)} pictures of {count} camera{'s' * (count > 1)}, {size}; "
-        f"{len(poses.frames)} poses ({len(poses.joint_names)} joints, {convention[poses.convention]})"
-    )
-
-
-def _read(layout: str, source: Path, model: BodyModel, options: ImportOptions) -> Recording:
-    if layout == "video":
-        if options.poses is None:
-            raise InputError("--poses", expected="a file from WHAM, GVHMR, 4D-Humans, ROMP or EasyMocap", got="none")
-        poses = read_poses(options.poses, person=options.person)
-        return video.read(
-            source,
-            model,
-            poses,
-            intrinsics=options.intrinsics,
-            distortion=options.distortion,
-            count=options.count,
-            fps=options.fps,
-            choice=options.choice,
-        )
-    if layout == "nerfstudio":
-        return nerfstudio.read(source, poses=options.poses, person=options.person)
-    if layout == "easymocap":
-        return easymocap.read(source, poses=options.poses, person=options.person)
-    recording: Recording = LAYOUTS[layout].read(source)
-    return recording

@@ -1,4 +1,4 @@
-"""Body poses of a video from the programs that estimate them, told apart by their keys and shapes."""
+"""Body poses of a video from the programs that estimate them, recognised by their keys and shapes."""
 
 from __future__ import annotations
 
@@ -28,49 +28,48 @@ from rnd_runtime.motion.readers.video_fits import (
     with_root,
 )
 
-from .images import count_shift, listed, natural, numbers_of
-from .recording import Floats, Lens, Poses, easymocap_poses, moved, smpl_poses, threes
-
-Focal = Callable[[int, int], float]
+from .dataset import Lens
+from .images import count_shift, list_files, natural_key, numbers_of
+from .poses import Floats, Poses, easymocap_poses, rows_of_three, smpl_poses, transformed
 
 _ROMP_HALF_ANGLE = np.radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
-class FoundPoses:
-    """What a file of body poses says.
+class PoseFile:
+    """Content of a file of body poses.
 
     Attributes:
         kind: the program that wrote it.
         poses: in the camera's frame for programs that look at a video; in the world for EasyMocap's.
-        K: [3, 3] intrinsics where the file has them.
-        focal: what the program assumed, as a function of width and height; None where it says nothing.
-        fps: where the file has it.
-        notes: what had to be assumed.
-        numbered: a file a frame, and the frames are the numbers in their names; else they count from 0.
-        in_camera: the poses are in the axes of the camera that saw them, whatever its place in the world.
+        K: [3, 3] intrinsics of the file, or None.
+        focal: the focal length that the program assumed, px, as a function of width and height; or None.
+        fps: frames per second of the file, or None.
+        notes: assumptions, one sentence each.
+        numbered: one file a frame, numbered by its name; otherwise frames count from 0.
+        in_camera: the poses are in the axes of the camera that saw them.
     """
 
     kind: str
     poses: Poses
     K: Floats | None = None
-    focal: Focal | None = None
+    focal: Callable[[int, int], float] | None = None
     fps: float | None = None
     notes: tuple[str, ...] = ()
     numbered: bool = False
     in_camera: bool = False
 
 
-def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
+def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
     """Read the body poses of one person.
 
     ==============================================  =============================  ============================
-    file                                            told by                        in the camera's frame by
+    file                                            recognised by                  in the camera's frame by
     ==============================================  =============================  ============================
     WHAM ``wham_output.pkl`` (joblib)               person → pose, trans,          pose, trans; focal √(w² + h²)
                                                     frame_ids
     GVHMR ``hmr4d_results.pt``                      smpl_params_incam              itself; K_fullimg (SMPL-X)
-    PHALP / 4D-Humans ``*.pkl`` (joblib)            picture → smpl, camera, tid    camera; focal 5000 for
+    PHALP / 4D-Humans ``*.pkl`` (joblib)            image → smpl, camera, tid      camera; focal 5000 for
                                                                                    256 pixels
     ROMP ``*.npz`` of a video, or a folder of them  smpl_thetas, cam_trans         cam_trans; field of view 60°
     EasyMocap folder of JSON, ``motion.npz``        Rh, Th, poses, shapes          (its own world)
@@ -79,57 +78,55 @@ def read_poses(path: Path, *, person: int | None = None) -> FoundPoses:
     ==============================================  =============================  ============================
 
     Args:
-        person: track or person number; the one with most frames when None.
+        person: track or person number. Default: the one with most frames.
 
     Raises:
-        InputError: for any other file, and for a ``person`` where people have no numbers.
+        InputError: any other file, or a ``person`` where people have no numbers.
     """
-    if path.is_dir():
-        files = listed(path, (".json", ".npz"))
-        if files[0].suffix == ".json":
-            numbered = numbers_of(easymocap_files(path)) is not None
-            return replace(_fitted("EasyMocap", read_easymocap_folder(path, person)), numbered=numbered)
-        _refuse_number(person, "ROMP")
-        try:
+    try:
+        if path.is_dir():
+            files = list_files(path, (".json", ".npz"))
+            if files[0].suffix == ".json":
+                numbered = numbers_of(easymocap_files(path)) is not None
+                return replace(_video_fits("EasyMocap", read_easymocap_folder(path, person)), numbered=numbered)
+            _refuse_person(person, "ROMP")
             return _romp(files)
-        except InputError as error:
-            raise error.at(file=path) from error
-    if path.suffix.lower() == ".npz":
-        with Npz(path, what="body poses") as archive:
-            names = archive.names
-        _refuse_number(person, path.name)
-        try:
+        if path.suffix.lower() == ".npz":
+            with Npz(path, what="body poses") as archive:
+                names = archive.names
+            _refuse_person(person, path.name)
             return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
-        except InputError as error:
-            raise error.at(file=path) from error
+        return _from_pickle(path, person)
+    except InputError as error:
+        raise error.at(file=path) from error
+
+
+def _from_pickle(path: Path, person: int | None) -> PoseFile:
     content = read_pickle(path, what="body poses")
-    if isinstance(content, dict):
-        try:
-            if "smpl_params_incam" in content:
-                _refuse_number(person, "GVHMR")
-                return _gvhmr(content)
-            values = [value for value in content.values() if isinstance(value, dict)]
-            if values and all("frame_ids" in value and "pose" in value for value in values):
-                return _wham(content, person, path)
-            if is_phalp(content):
-                found = _fitted("4D-Humans / PHALP", read_phalp(content, path, person))
-                notes = ("frames are those of PHALP's picture list", *found.notes)
-                return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes, in_camera=True)
-        except InputError as error:
-            raise error.at(file=path) from error
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-            raise InputError(
-                "body poses", expected="the layout its keys promise", got=repr(error), file=path
-            ) from error
-    keys = ", ".join(map(str, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
-    raise InputError("body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys, file=path)
+    if not isinstance(content, dict):
+        content = {type(content).__name__: content}
+    try:
+        if "smpl_params_incam" in content:
+            _refuse_person(person, "GVHMR")
+            return _gvhmr(content)
+        values = [value for value in content.values() if isinstance(value, dict)]
+        if values and all("frame_ids" in value and "pose" in value for value in values):
+            return _wham(content, person, path)
+        if is_phalp(content):
+            found = _video_fits("4D-Humans / PHALP", read_phalp(content, path, person))
+            notes = ("frames are those of PHALP's image list", *found.notes)
+            return replace(found, focal=lambda w, h: PHALP_FOCAL * max(w, h), notes=notes, in_camera=True)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise InputError("body poses", expected="the layout its keys promise", got=repr(error)) from error
+    keys = ", ".join(map(str, list(content)[:6]))
+    raise InputError("body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys)
 
 
-def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
-    """The poses by ``numbers``, the ascending ones of the frames of ``source``, and what was assumed.
+def pair_with_frames(found: PoseFile, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
+    """The poses by ``numbers``, the ascending ones of the frames of ``source``, and notes.
 
-    Numbers of files may be counted from elsewhere: ``.pictures.count_shift``. Poses without numbers belong to the
-    frames from the first on; that there are more or fewer is noted.
+    Numbers of files may count from elsewhere (``images.count_shift``). Poses without numbers start at the first frame;
+    a different count is noted.
 
     Raises:
         InputError: no frame has a pose.
@@ -140,76 +137,74 @@ def paired(found: FoundPoses, numbers: Sequence[int], source: Path) -> tuple[Pos
         note = f"poses are numbered from {first}, frames from {begin}: taken for the same"
         return replace(poses, frames=poses.frames + shift), (note,)
     if not {*numbers} & {*poses.frames.tolist()}:
-        raise InputError(
-            "body poses", expected=f"some of frames {begin} … {numbers[-1]}", got=f"{first} … {last}", file=source
-        )
+        expected = f"some of frames {begin} … {numbers[-1]}"
+        raise InputError("body poses", expected=expected, got=f"{first} … {last}", file=source)
     if not found.numbered and last != numbers[-1]:
-        return poses, (f"poses end with frame {last}, pictures with frame {numbers[-1]}: both begin with frame 0",)
+        return poses, (f"poses end with frame {last}, images with frame {numbers[-1]}: both begin with frame 0",)
     return poses, ()
 
 
-def before_cameras(found: FoundPoses, lenses: Sequence[Lens], source: Path) -> Poses:
-    """The poses in the world of ``lenses``: those in a camera's axes are turned with it, where there is one.
+def poses_in_world(found: PoseFile, lenses: Sequence[Lens], source: Path) -> Poses:
+    """The poses in the world of ``lenses``; those in a camera's axes are transformed where there is one lens.
 
     Raises:
-        InputError: they are in a camera's axes and there are several, or it moves: their sizes need not agree.
+        InputError: poses in a camera's axes for several or moving cameras, whose scale may differ.
     """
     if not found.in_camera:
         return found.poses
     if len(lenses) > 1:
-        got = f"{found.kind}'s, in the camera's, of {len(lenses)} cameras or places of one"
+        got = f"{found.kind}'s, in the camera's, of {len(lenses)} cameras or camera positions"
         raise InputError("body poses", expected="some in the cameras' world", got=got, file=source)
-    return moved(found.poses, np.linalg.inv(lenses[0].camera.world_to_camera).astype(np.float64))
+    return transformed(found.poses, np.linalg.inv(lenses[0].camera.world_to_camera).astype(np.float64))
 
 
-def _refuse_number(person: int | None, of: str) -> None:
-    """Refuse ``--person`` where a file has one person, or several without numbers."""
+def _refuse_person(person: int | None, of: str) -> None:
     if person is not None:
         raise InputError("--person", expected=f"none, as {of} has no numbers of people", got=person)
 
 
-def _fitted(kind: str, fits: VideoFits) -> FoundPoses:
+def _video_fits(kind: str, fits: VideoFits) -> PoseFile:
+    shape, family = fits.betas, fits.family
     if fits.turns is None:
-        poses = smpl_poses(fits.frames, fits.axis_angles, fits.translations, fits.betas, family=fits.family)
+        poses = smpl_poses(fits.frames, fits.axis_angles, fits.translations, shape, family=family)
     else:
-        poses = easymocap_poses(
-            fits.frames, fits.axis_angles, fits.turns, fits.translations, fits.betas, family=fits.family
-        )
-    return FoundPoses(kind, poses, notes=_several(fits.person, fits.others))
+        poses = easymocap_poses(fits.frames, fits.axis_angles, fits.turns, fits.translations, shape, family=family)
+    return PoseFile(kind, poses, notes=_several(fits.person, fits.others))
 
 
-def _wham(content: dict[Any, Any], person: int | None, path: Path) -> FoundPoses:
+def _wham(content: dict[Any, Any], person: int | None, path: Path) -> PoseFile:
     tracks = {int(key): entry for key, entry in content.items()}
     chosen, others = one_of([key for key, entry in tracks.items() for _ in entry["frame_ids"]], person, path)
     entry = tracks[chosen]
     frames, members = in_order(entry["frame_ids"], *(entry[key] for key in ("pose", "trans", "betas")))
-    poses = smpl_poses(frames, *members)
     notes = _several(chosen, others)
-    return FoundPoses("WHAM", poses, focal=lambda w, h: float(np.hypot(w, h)), notes=notes, in_camera=True)
+    return PoseFile(
+        "WHAM", smpl_poses(frames, *members), focal=lambda w, h: float(np.hypot(w, h)), notes=notes, in_camera=True
+    )
 
 
-def _gvhmr(content: dict[str, Any]) -> FoundPoses:
+def _gvhmr(content: dict[str, Any]) -> PoseFile:
     entry = content["smpl_params_incam"]
     body, root, trans = (np.asarray(entry[key], np.float64) for key in ("body_pose", "global_orient", "transl"))
     angles = np.concatenate([root.reshape(-1, 3), body.reshape(len(body), -1)[:, :63]], 1)
     K = np.asarray(content["K_fullimg"], np.float64).reshape(-1, 3, 3)[0] if "K_fullimg" in content else None
     poses = smpl_poses(range(len(angles)), angles, trans.reshape(-1, 3), entry["betas"], family="SMPL-X")
-    return FoundPoses("GVHMR", poses, K=K, in_camera=True)
+    return PoseFile("GVHMR", poses, K=K, in_camera=True)
 
 
-def _romp(files: Sequence[Path]) -> FoundPoses:
+def _romp(files: Sequence[Path]) -> PoseFile:
     rows: list[tuple[int, dict[str, Any]]] = []
-    film: list[tuple[int, dict[str, Any]]] = []
+    video: list[tuple[int, dict[str, Any]]] = []
     singles = []
-    for place, file in enumerate(files):
+    for index, file in enumerate(files):
         content = _romp_content(file)
         if "smpl_thetas" in content:
-            rows.append((trailing_number(file.stem, place), content))
+            rows.append((trailing_number(file.stem, index), content))
             singles.append(file)
-        else:  # a video's results: picture name → result
-            names = sorted(content, key=lambda name: natural(str(name)))
-            film += [(k, content[name]) for k, name in enumerate(names) if content[name]]
-    rows = sorted(rows, key=lambda row: row[0]) or film  # of a video, ROMP writes both, in one folder
+        else:  # image name → result
+            names = sorted(content, key=lambda name: natural_key(str(name)))
+            video += [(k, content[name]) for k, name in enumerate(names) if content[name]]
+    rows = sorted(rows, key=lambda row: row[0]) or video  # ROMP may write both into one folder
     kept = [(k, row) for k, row in rows if len(np.atleast_2d(row["smpl_thetas"]))]
     if not kept:
         raise InputError("ROMP results", expected="smpl_thetas of at least one frame", got="none", file=files[0])
@@ -219,8 +214,8 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
     )
     poses = smpl_poses([k for k, _ in kept], thetas, trans, betas[:, :10])
     several = any(len(np.atleast_2d(row["smpl_thetas"])) > 1 for _, row in kept)
-    notes = ("ROMP saw several people in a frame: its first is taken",) if several else ()
-    return FoundPoses(
+    notes = ("ROMP found several people in a frame: the first is taken",) if several else ()
+    return PoseFile(
         "ROMP",
         poses,
         focal=lambda w, h: 0.5 * max(w, h) / float(np.tan(_ROMP_HALF_ANGLE)),
@@ -231,7 +226,7 @@ def _romp(files: Sequence[Path]) -> FoundPoses:
 
 
 def _romp_content(file: Path) -> dict[str, Any]:
-    """ROMP saves a dict as one array of Python objects, or its members; of a frame in which it saw nobody, None."""
+    """A results file: a pickled dict, its members, or None (empty dict) for a frame without people."""
     with Npz(file, what="ROMP results") as archive:
         if "results" not in archive.names:
             return {key: archive.numbers(key) for key in ("smpl_thetas", "cam_trans", "smpl_betas")}
@@ -244,23 +239,21 @@ def _romp_content(file: Path) -> dict[str, Any]:
     return content
 
 
-def _npz(path: Path) -> FoundPoses:
+def _npz(path: Path) -> PoseFile:
     with Npz(path, what="body poses") as archive:
         member = archive.first_of("poses", "thetas", "poses_all", "pose", "body_pose", "pose_body")
         if member is None:
-            raise InputError(
-                "body poses", expected="poses, thetas or body_pose", got=", ".join(archive.names), file=path
-            )
+            raise InputError("body poses", expected="poses, thetas or body_pose", got=", ".join(archive.names))
         poses = archive.numbers(member)
         if poses.ndim < 2 or not poses.size:
-            raise InputError(member, expected="a row of numbers a frame", got=list(poses.shape), file=path)
+            raise InputError(member, expected="a row of numbers a frame", got=list(poses.shape))
         poses = poses.reshape(len(poses), -1)
         root = archive.first_of("global_orient", "root_orient")
         names = None
         if "joint_names" in archive.names:
             names = names_of_joints(archive, poses.shape[1] // 3)
         elif member in ("body_pose", "pose_body") and root is not None:
-            poses = np.concatenate([threes(root, archive.numbers(root), len(poses)), poses], 1)
+            poses = np.concatenate([rows_of_three(root, archive.numbers(root), len(poses)), poses], 1)
         else:
             poses = with_root(poses)
         betas_name = archive.first_of("shapes", "betas")
@@ -268,23 +261,22 @@ def _npz(path: Path) -> FoundPoses:
         notes = () if betas is None else _gender(archive)
         smplx = _is_smplx(archive) or poses.shape[1] == 165
         fps = frame_rate(archive)
-        turn, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
-        Rh, trans = (np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (turn, shift))
+        rotation, shift = archive.first_of("Rh", "Rh_all"), archive.first_of("Th", "Th_all", "trans", "transl")
+        Rh, trans = (np.zeros((len(poses), 3)) if name is None else archive.numbers(name) for name in (rotation, shift))
     if shift is None:
-        notes += ("no trans in the file: the root stays at its rest place",)
+        notes += ("no trans in the file: the root stays at its rest position",)
     frames = range(len(poses))
     family = "SMPL-X" if smplx else "SMPL"
-    place = shift or "trans"
-    if turn is not None:
-        members = (turn, place)
-        found = easymocap_poses(frames, poses, Rh, trans, betas, family=family, members=members, joint_names=names)
-        return FoundPoses("EasyMocap's Rh and Th", found, fps=fps, notes=notes)
-    found = smpl_poses(frames, poses, trans, betas, family=family, member=place, joint_names=names)
-    return FoundPoses("SMPL", found, fps=fps, notes=notes)
+    options: dict[str, Any] = {"family": family, "joint_names": names}
+    if rotation is not None:
+        poses_found = easymocap_poses(frames, poses, Rh, trans, betas, members=(rotation, shift or "trans"), **options)
+        return PoseFile("EasyMocap's Rh and Th", poses_found, fps=fps, notes=notes)
+    poses_found = smpl_poses(frames, poses, trans, betas, member=shift or "trans", **options)
+    return PoseFile("SMPL", poses_found, fps=fps, notes=notes)
 
 
 def _is_smplx(archive: Npz) -> bool:
-    """Whether members say so that no file of SMPL's has; AMASS names the model."""
+    """Whether the file is SMPL-X's, by AMASS' model name or by members that SMPL lacks."""
     if model := _word(archive, "surface_model_type"):
         return model.startswith("smplx")
     return archive.first_of("jaw_pose", "expression", "left_hand_pose") is not None
@@ -298,7 +290,7 @@ def _gender(archive: Npz) -> tuple[str, ...]:
 
 
 def _word(archive: Npz, name: str) -> str:
-    """A member's text; empty where it has none, or stores it as a Python object."""
+    """Text of a member; empty for none and for Python objects."""
     try:
         return archive.strings(name)[0]
     except (InputError, IndexError):

@@ -1,13 +1,12 @@
-"""The import as a command shows it."""
+"""Output of ``rnd-data import``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-
-from rnd_trainer.checking.report import check_and_report, passing_progress
+from rnd_runtime.core.command import show
+from rnd_runtime.core.progress import Progress
+from rnd_trainer.checking.report import check_and_report
 
 from .importer import import_source
 from .options import ImportOptions
@@ -15,16 +14,18 @@ from .options import ImportOptions
 
 def import_and_report(source: Path, out: Path, options: ImportOptions) -> int:
     """Import, print what was found and assumed, check the result; 1 when the check finds something wrong."""
-    console = Console()
-    with passing_progress() as progress:
-        task = progress.add_task("writing")
-        scene = import_source(
-            source,
-            out,
-            options,
-            on_shot=lambda done, total: progress.update(task, completed=done, total=total),
-            on_found=lambda sentence: console.print(f"found {escape(sentence)}", soft_wrap=True),
-        )
+    phase = ""
+    with Progress() as progress:
+
+        def update(name: str, done: int, total: int) -> None:
+            nonlocal phase
+            if name != phase:
+                phase = name
+                progress.phase(name, total)
+            progress.update(done)
+
+        on_found = lambda sentence: show(f"found {sentence}")  # noqa: E731
+        scene = import_source(source, out, options, on_progress=update, on_found=on_found)
     for note in scene.notes:
-        console.print(f" note {escape(note)}", soft_wrap=True)
+        show(f" note {note}")
     return check_and_report(out, out / "check")

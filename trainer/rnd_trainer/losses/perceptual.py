@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, first_line
 from rnd_runtime.core.files import existing_file
 
 from .perceptual_nets import BACKBONES, Backbone, Tensors
@@ -179,8 +179,7 @@ def _read(path: Path) -> Tensors:
         # torchvision publishes its networks as nothing else; weights_only builds tensors and runs no code
         state = torch.load(path, map_location="cpu", weights_only=True)  # noqa: TID251
     except Exception as error:  # an unpickler answers broken bytes with whatever it stumbles over
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"not a whole {suffix} file of weights", got=reason, file=path) from error
+        raise InputError(f"not a whole {suffix} file of weights", got=first_line(error), file=path) from error
     if not isinstance(state, dict):
         raise InputError("perceptual weights", expected="a dictionary of tensors", got=type(state).__name__, file=path)
     for name, value in state.items():

@@ -16,6 +16,7 @@ from torch import Tensor
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path, existing_file, sha256_of
+from rnd_runtime.core.kinds import explained
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_trainer.config import TrainConfig, from_dict, to_dict
 
@@ -91,7 +92,10 @@ def save_checkpoint(
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
     """Read ``avatar.ckpt``; anything missing, cut short, unknown or of a newer schema is an InputError."""
-    tensors, header = read_tensors(path, SCHEMA)
+    try:
+        tensors, header = read_tensors(path, SCHEMA)
+    except InputError as error:
+        raise explained(error, path, "checkpoint") from error
     try:
         config = from_dict(header["config"])
         tree = header["skeleton"]

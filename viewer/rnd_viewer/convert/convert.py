@@ -18,10 +18,11 @@ from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.amass import write_amass
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.playback.framing import CameraOptions, CameraPath, frame_motion, front_path
 from rnd_runtime.posing.forearm import share_twists
 from rnd_runtime.shading.light import Light, light_notes
 from rnd_runtime.shading.shader import Shader
-from rnd_viewer.inputs.cameras import CameraOptions, CameraPath, file_path, frame_motion, front_path
+from rnd_viewer.inputs.cameras import file_path
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import parse_frames
 

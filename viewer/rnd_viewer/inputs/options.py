@@ -5,20 +5,22 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.motion.edit import EDIT_LIMITS, MotionEdits, edit_motion
-from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
-from rnd_runtime.motion.skeleton import Skeleton
+from rnd_runtime.playback.framing import ELEVATION, FIELD_OF_VIEW
 from rnd_runtime.shading.light import Up
+
+if TYPE_CHECKING:
+    from rnd_runtime.motion.motion import Motion
+    from rnd_runtime.motion.skeleton import Skeleton
 
 _EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
 OWN_CAMERAS = ("front", "orbit")
-ELEVATION, FIELD_OF_VIEW = 5.0, 35.0  # degrees: the usual view
 LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
 
 
@@ -58,6 +60,8 @@ class MotionOptions:
         Raises:
             InputError: for whatever cannot be used.
         """
+        from rnd_runtime.motion.motion import load_motion  # loads numba, which run_command prepares for
+
         motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
         return edit_motion(motion, self.edits)
 

@@ -23,18 +23,10 @@ from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
+from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, frame_motion, front_path, orbit_path
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Background
-from rnd_viewer.inputs.cameras import (
-    CameraOptions,
-    CameraPath,
-    Framing,
-    file_path,
-    frame_motion,
-    front_path,
-    orbit_path,
-    split_camera,
-)
+from rnd_viewer.inputs.cameras import file_path, split_camera
 from rnd_viewer.inputs.console import FRAME, LATENCY, print_summary, tell, warn, with_progress
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size

@@ -15,8 +15,8 @@ from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
 from rnd_runtime.shading.light import Light, Up, light_notes, load_light
-from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
 from rnd_viewer.play.video import clip_writer
 
 Bytes = NDArray[np.uint8]

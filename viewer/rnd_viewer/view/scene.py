@@ -1,4 +1,4 @@
-"""What ``rnd-view`` shows: an avatar, a motion, lights, a capture; and one picture of it for each state."""
+"""What ``rnd-view`` shows: an avatar, a motion, lights, a capture; and one image for each state."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from rnd_runtime.motion.edit import edit_motion
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.light import Light, downsize, light_notes, load_light
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
-from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
 
 from .options import SIZES, ViewOptions
 from .state import ViewState
@@ -37,8 +37,8 @@ Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
-SHADERS_KEPT = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
-LARGEST_SKY = 1024  # rows of a map that is shown behind the avatar and kept: 25 MB
+MAX_SHADERS = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
+LARGEST_SKY = 1024  # rows of a background map that is cached: 25 MB
 
 
 class View:
@@ -46,7 +46,7 @@ class View:
 
     Attributes:
         srgb: [H, W, 3] uint8.
-        joints: [J, 3] px, px and z in metres; what lies behind the camera has z ≤ 0.
+        joints: [J, 3] px, px and z in metres, z ≤ 0 behind the camera.
         seconds: time of each stage.
     """
 
@@ -55,7 +55,7 @@ class View:
 
 
 class Scene:
-    """Loads everything that ``options`` name; renders any ``ViewState``, one at a time.
+    """Renders any ``ViewState`` of what ``options`` name, one at a time.
 
     Args:
         ahead: the avatar's networks, where they are being loaded already.
@@ -69,20 +69,20 @@ class Scene:
         self.capture: Capture | None = load_capture(options.capture) if options.capture else None
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
-        self.name, self.size, self.threads = options.avatar.name, options.size, options.threads
-        self._shader = lru_cache(SHADERS_KEPT)(self._build_shader)
+        self.name, self.size, self.threads = options.avatar.name, options.width_height, options.threads
+        self._shader = lru_cache(MAX_SHADERS)(self._build_shader)
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
-        self._sky = lru_cache(SHADERS_KEPT // 2)(self._smaller_light)
+        self._sky = lru_cache(MAX_SHADERS // 2)(self._smaller_light)
         self._light_notes: dict[str | Path | None, list[str]] = {}
-        self._behind: tuple[tuple[Any, ...], Floats32] | None = None
+        self._background: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, PosedAvatar] | None = None
         first = self._shader(self._files[0] if self._files else None, "table+sun")
         self.renderer = FrameRenderer(self.avatar, first, raster=options.raster)
 
     def description(self) -> dict[str, Any]:
-        """What a page needs to know before it asks for pictures."""
+        """What a page needs to know before it asks for frames."""
         framing = frame_motion(self.avatar.skeleton, self.motion)
-        view = CameraOptions(self.size, self.size)
+        view = CameraOptions(*self.size)
         home = front_path(framing, view)(0, 0.0)
         return {
             "avatar": self.name,
@@ -106,12 +106,13 @@ class Scene:
         }
 
     def warm_up(self) -> None:
-        """Draw the first view once: a first run compiles the kernels, up to two minutes."""
+        """Render the first view once: a first run compiles the kernels, up to two minutes."""
         about = self.description()
-        self.render(ViewState(time=0.0, width=self.size, height=self.size, light=about["light"], **about["view"]))
+        width, height = self.size
+        self.render(ViewState(time=0.0, width=width, height=height, light=about["light"], **about["view"]))
 
     def render(self, state: ViewState) -> View:
-        """The picture of ``state`` with the time that each stage took."""
+        """The image of ``state`` with the time that each stage took."""
         seconds: dict[str, float] = {}
         if state.truth is not None:
             state = structs.replace(state, yaw=0.0, exposure=0.0)
@@ -122,12 +123,12 @@ class Scene:
             gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
         lit = state.output in ("lit", "light")
         aovs = () if lit else (state.output,)
-        self.renderer.shader = self._turned_shader(state)
+        self.renderer.shader = self._rotated_shader(state)
         frame = self.renderer.draw(PosedAvatar(gaussians, root), camera, aovs=aovs, lit=lit, srgb=False)
         started = perf_counter()
         if lit or state.output == "albedo":
             radiance = frame.radiance * np.float32(2.0**state.exposure) if lit else frame.aovs["albedo"]
-            srgb = tone_map(radiance, frame.alpha, self._radiance_behind(state, camera))
+            srgb = tone_map(radiance, frame.alpha, self._background_radiance(state, camera))
         else:
             shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
             srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))
@@ -135,13 +136,13 @@ class Scene:
         return View(srgb, self._joints(motion, time_s, camera), seconds)
 
     def notes_of_light(self, state: ViewState) -> list[str]:
-        """What the user should know of the light of a ``state`` that was drawn."""
+        """Notes on the light of a ``state`` that was rendered."""
         return self._light_notes[self._light_name(state)]
 
     def truth_file(self, index: int) -> Path:
-        """The capture's picture ``index``."""
+        """The capture's image ``index``."""
         capture, frame = self._capture_frame(index)
-        return existing_file(capture.folder / frame.image, what="picture of the capture")
+        return existing_file(capture.folder / frame.image, what="image of the capture")
 
     def close(self) -> None:
         self.renderer.close()
@@ -175,7 +176,7 @@ class Scene:
 
     def _capture_frame(self, index: int) -> tuple[Capture, Any]:
         if self.capture is None or index >= len(self.capture.frames):
-            raise InputError("truth", expected="a picture of --capture", got=index)
+            raise InputError("truth", expected="an image of --capture", got=index)
         return self.capture, self.capture.frames[index]
 
     def _view(self, state: ViewState) -> tuple[Camera, Motion, float]:
@@ -188,7 +189,7 @@ class Scene:
         return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
 
     def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> PosedAvatar:
-        """Kept while only camera and light move."""
+        """Cached while only camera and light move."""
         if self._posed is None or self._posed[0] is not motion or self._posed[1] != time_s:
             started = perf_counter()
             encoded = self.avatar.encode(motion, time_s)
@@ -197,7 +198,7 @@ class Scene:
             seconds |= {"encoders": known - started, "posing": perf_counter() - known}
         return self._posed[2]
 
-    def _turned_shader(self, state: ViewState) -> Shader:
+    def _rotated_shader(self, state: ViewState) -> Shader:
         shader = self._shader(self._light_name(state), state.shade)
         return shader.turned(shader.light.yaw + state.yaw)
 
@@ -212,7 +213,7 @@ class Scene:
 
     def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
         shader = Shader(self._light(name), shade)
-        # from here on it is only turned: its texels need not stay
+        # it is only rotated from here on: its texels need not stay
         shader.light = replace(shader.light, radiance=np.zeros((1, 2, 3), np.float32))
         self._light.cache_clear()
         return shader
@@ -237,19 +238,19 @@ class Scene:
             return light
         return replace(light, radiance=downsize(light.radiance, LARGEST_SKY, 2 * LARGEST_SKY))
 
-    def _radiance_behind(self, state: ViewState, camera: Camera) -> Floats32:
-        """The background; a map's is kept for as long as neither it nor the camera moves."""
+    def _background_radiance(self, state: ViewState, camera: Camera) -> Floats32:
+        """The background; a map's is cached while neither it nor the camera moves."""
         background = Background.parse(state.background)
         if background.kind != "hdr":
             return np.array(background.colour, np.float32)
         name = self._light_name(state)
         size = camera.width, camera.height
         key = (name, state.yaw, size, camera.K.tobytes(), camera.world_to_camera.tobytes())
-        if self._behind is None or self._behind[0] != key:
+        if self._background is None or self._background[0] != key:
             light = self._sky(name)
             turned = light.turned(light.yaw + state.yaw)
-            self._behind = key, background.radiance(camera, turned)
-        return self._behind[1] * np.float32(2.0**state.exposure)
+            self._background = key, background.radiance(camera, turned)
+        return self._background[1] * np.float32(2.0**state.exposure)
 
     def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
         now = motion.at([time_s])

@@ -10,7 +10,7 @@ export const CONSTANT_OUTPUTS = ["opacities", "albedo", "roughness"];
 export const NODE_OUTPUTS = ["node_offsets", "node_visibility"];
 export const NODE_LOGITS = "node_logits";
 export const REST_OUTPUTS = ["neighbours", "neighbour_weights", "log_template", "rest_points", "rest_factors", "rest_normals", "rest_limbs", "posing_limits"];
-// rnd_runtime.motion.readers.smpl_names
+// rnd_runtime.motion.smpl
 export const NAMES_BY_COUNT = {"22": ["pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"], "24": ["pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand"], "52": ["pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_index1", "left_index2", "left_index3", "left_middle1", "left_middle2", "left_middle3", "left_pinky1", "left_pinky2", "left_pinky3", "left_ring1", "left_ring2", "left_ring3", "left_thumb1", "left_thumb2", "left_thumb3", "right_index1", "right_index2", "right_index3", "right_middle1", "right_middle2", "right_middle3", "right_pinky1", "right_pinky2", "right_pinky3", "right_ring1", "right_ring2", "right_ring3", "right_thumb1", "right_thumb2", "right_thumb3"], "55": ["pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "jaw", "left_eye", "right_eye", "left_index1", "left_index2", "left_index3", "left_middle1", "left_middle2", "left_middle3", "left_pinky1", "left_pinky2", "left_pinky3", "left_ring1", "left_ring2", "left_ring3", "left_thumb1", "left_thumb2", "left_thumb3", "right_index1", "right_index2", "right_index3", "right_middle1", "right_middle2", "right_middle3", "right_pinky1", "right_pinky2", "right_pinky3", "right_ring1", "right_ring2", "right_ring3", "right_thumb1", "right_thumb2", "right_thumb3"]};
 export const SMPL_REST_ROOT = [-0.0018, -0.2233, 0.0282];
 export const SMPLX_REST_ROOT = [0.0031, -0.3514, 0.012];
@@ -30,11 +30,12 @@ export const LARGEST_STEP = 1.0;
 export const LARGEST_MOVE = 1.0;
 // rnd_runtime.posing.forearm
 export const FREE = 1.0471975511965976;
-export const MOST = 1.0471975511965976;
-// rnd_runtime.posing.posing
+export const MAX_SHARE = 1.0471975511965976;
+// rnd_runtime.posing.skinning
 export const SHORTEST = 9.999999717180685e-10;
 export const TWIST_STEPS = 3;
 export const SMALLEST_SQUARE = 9.999999974752427e-07;
+// rnd_runtime.posing.rest
 export const DEEPEST = 60.0;
 // rnd_runtime.core.sh
 export const SH_COUNT = 16;
@@ -52,7 +53,7 @@ export const C3_0 = 0.3731763325901154;
 export const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];
 export const REC709_LUMINANCE = [0.2126, 0.7152, 0.0722];
 export const SAME_COLOUR = 0.002;
-export const MOST_EXPOSED = 1e+30;
+export const MAX_EXPOSURE = 1e+30;
 export const DIM = 0.001;
 // rnd_runtime.shading.brdf
 export const F0 = 0.04;
@@ -69,13 +70,13 @@ export const SPECULAR_SIZE = 49;
 // rnd_runtime.shading.sum
 export const HALF_FLOOR = 9.99999993922529e-09;
 export const CUT_TEXELS = [128, 256];
-// rnd_runtime.shading.sun
+// rnd_runtime.shading.directional
 export const CAP = 0.10471975511965978;
 export const RING = 0.17453292519943295;
 export const RING_AREA = 0.0954557030567379;
 export const LARGEST = [512, 1024];
-export const LEAST_SHARE = 0.05;
-export const MOST_PEAKS = 16;
+export const MIN_SHARE = 0.05;
+export const MAX_PEAKS = 16;
 export const LAMP = 0.03490658503988659;
 // rnd_runtime.shading.shader
 export const SHADOW_RESOLUTION = 384;
@@ -89,7 +90,7 @@ export const RIM_TEXELS = 0.5;
 export const EDGE_ON = 0.019999999552965164;
 export const SOFTNESS = 0.25;
 export const SLOPE_FLOOR = 0.10000000149011612;
-// rnd_runtime.shading.sunlight
+// rnd_runtime.shading.direct
 export const TURNED_AWAY = -0.20000000298023224;
 export const AT_SILHOUETTE = 0.0;
 // rnd_runtime.raster.oracle
@@ -106,9 +107,8 @@ export const LOG2_ALPHA_MIN = -7.994353436858858;
 export const RADIX_BITS = 11;
 // rnd_runtime.playback.aov
 export const MIN_COVERAGE = 0.05;
-// rnd_viewer.inputs.cameras
+// rnd_runtime.playback.framing
 export const PADDING = 0.14;
-// rnd_viewer.inputs.options
 export const ELEVATION = 5.0;
 export const FIELD_OF_VIEW = 35.0;
 // rnd_viewer.view.scene

@@ -12,12 +12,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder
 from rnd_runtime.core.npz import Members, Npz
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-
-from .smpl_names import NAMES_BY_COUNT
-from .smpl_names import SMPL_REST_ROOT as SMPL_REST_ROOT
-from .smpl_names import SMPLH_NAMES as SMPLH_NAMES
-from .smpl_names import SMPLX_NAMES as SMPLX_NAMES
-from .smpl_names import SMPLX_REST_ROOT as SMPLX_REST_ROOT
+from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPL_REST_ROOT, SMPLX_REST_ROOT
 
 Floats = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder
 from rnd_runtime.core.npz import Members
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle, slerp_matrices
+from rnd_runtime.motion.smpl import SMPL_REST_ROOT, SMPLX_REST_ROOT
 
-from .smpl_names import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .unpickle import read_pickle
 from .video_fits import PHALP_FOCAL, VideoFits, in_order, is_phalp, read_easymocap_folder, read_phalp
 

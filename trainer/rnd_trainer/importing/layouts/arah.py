@@ -1,4 +1,4 @@
-"""ARAH's layout (also 3DGS-Avatar's): cam_params.json, a folder of pictures a camera, a model file a frame."""
+"""ARAH's layout (also 3DGS-Avatar's): cam_params.json, a folder of images a camera, a model file a frame."""
 
 from __future__ import annotations
 
@@ -9,8 +9,18 @@ import numpy as np
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import Npz
-from rnd_trainer.importing.images import camera_of, listed, read_json, read_mask, read_rgb, sized
-from rnd_trainer.importing.recording import Lens, Recording, Shot, smpl_poses
+from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
+from rnd_trainer.importing.images import (
+    camera_of,
+    distortion_of,
+    frame_number,
+    image_size,
+    list_files,
+    mask_reader,
+    read_json,
+    read_rgb,
+)
+from rnd_trainer.importing.poses import Poses, smpl_poses
 
 FPS = 50.0
 _MODELS = ("opt_models", "models")
@@ -23,54 +33,43 @@ def detect(source: Path) -> str | None:
     return None
 
 
-def read(source: Path) -> Recording:
-    """Read poses in SMPL's convention (root_orient, trans) and K, D, R, T (metres) of each camera.
+def read(source: Path) -> ImportedDataset:
+    """Read SMPL poses (root_orient, trans) and K, D, R, T (m) of each camera.
 
-    ``opt_models`` before ``models``. Masks lie beside the pictures, as PNG beside JPEG. Frame numbers name
-    the files.
+    ``opt_models`` come before ``models``. Masks are the PNG beside the JPEG. Files are named by frame number.
     """
-    models = next(source / name for name in _MODELS if (source / name).is_dir())
-    files = sorted(listed(models, (".npz",)), key=_number)
+    poses = _poses(next(source / name for name in _MODELS if (source / name).is_dir()))
+    known = set(poses.frames.tolist())
+    file = source / "cam_params.json"
+    record = read_json(file)
+    if not isinstance(record, dict):
+        raise InputError("cameras", expected="a dict by name", got=type(record).__name__, file=file)
+    lenses, samples = {}, []
+    for name in map(str, record.get("all_cam_names", [])):
+        if not (source / name).is_dir() or name not in record:
+            continue
+        images = list_files(source / name, (".jpg", ".jpeg"))
+        K, D, R, T = (record[name][key] for key in "KDRT")
+        lenses[name] = Lens(camera_of(K, R, T, image_size(images[0])), distortion_of(D))
+        for image in images:
+            mask, number = image.with_suffix(".png"), frame_number(image)
+            if number in known:
+                mask_file = mask if mask.is_file() else None
+                samples.append(Sample(name, number, partial(read_rgb, image), mask_reader(mask_file)))
+    if not lenses:
+        raise InputError("cameras", expected="all_cam_names with a folder each", got="none", file=file)
+    return ImportedDataset("ARAH / 3DGS-Avatar", lenses, samples, poses, FPS)
+
+
+def _poses(folder: Path) -> Poses:
     frames, angles, trans, betas = [], [], [], None
-    for file in files:
+    for file in sorted(list_files(folder, (".npz",)), key=frame_number):
         with Npz(file, what="model") as archive:
             parts = [
-                archive.numbers(name, (size,))
-                for name, size in (("root_orient", 3), ("pose_body", 63), ("pose_hand", 6))
+                archive.numbers(*part) for part in (("root_orient", (3,)), ("pose_body", (63,)), ("pose_hand", (6,)))
             ]
             angles.append(np.concatenate(parts))
             trans.append(archive.numbers("trans").reshape(3))
             betas = archive.numbers("betas") if "betas" in archive.names else betas
-        frames.append(_number(file))
-    record = read_json(source / "cam_params.json")
-    if not isinstance(record, dict):
-        got = type(record).__name__
-        raise InputError("cameras", expected="a dict by name", got=got, file=source / "cam_params.json")
-    lenses, shots = {}, []
-    for name in record.get("all_cam_names", []):
-        folder = source / str(name)
-        if not folder.is_dir() or str(name) not in record:
-            continue
-        pictures = listed(folder, (".jpg", ".jpeg"))
-        entry = record[str(name)]
-        lenses[str(name)] = Lens(
-            camera_of(entry["K"], entry["R"], entry["T"], sized(pictures[0])),
-            tuple(np.asarray(entry["D"], np.float64).reshape(-1).tolist()),
-        )
-        known = set(frames)
-        for picture in pictures:
-            mask, number = picture.with_suffix(".png"), _number(picture)
-            if number in known:
-                read_it = partial(read_mask, mask) if mask.is_file() else None
-                shots.append(Shot(str(name), number, partial(read_rgb, picture), read_it))
-    if not lenses:
-        raise InputError(
-            "cameras", expected="all_cam_names with a folder each", got="none", file=source / "cam_params.json"
-        )
-    return Recording("ARAH / 3DGS-Avatar", lenses, shots, smpl_poses(frames, angles, trans, betas), FPS)
-
-
-def _number(file: Path) -> int:
-    if not file.stem.isdecimal():
-        raise InputError("file name", expected="a frame number", got=file.name, file=file)
-    return int(file.stem)
+        frames.append(frame_number(file))
+    return smpl_poses(frames, angles, trans, betas)

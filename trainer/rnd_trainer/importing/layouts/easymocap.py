@@ -6,13 +6,21 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from rnd_runtime.core.errors import InputError
-from rnd_trainer.importing.images import beside, camera_of, listed, read_mask, read_rgb, sized
-from rnd_trainer.importing.pose_files import before_cameras, paired, read_poses
-from rnd_trainer.importing.recording import Floats, Lens, Recording, Shot
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
+from rnd_trainer.importing.images import (
+    camera_of,
+    distortion_of,
+    find_beside,
+    frame_number,
+    image_size,
+    list_files,
+    mask_reader,
+    read_rgb,
+)
+from rnd_trainer.importing.opencv_yaml import Calibration
+from rnd_trainer.importing.pose_files import pair_with_frames, poses_in_world, read_poses
 
 FPS = 30.0
 _FITS = ("output/smpl/smpl", "output-smpl-3d/smpl", "output/smpl", "output/smplfull", "smpl", "motion.npz", "params")
@@ -24,90 +32,53 @@ def detect(source: Path) -> str | None:
     return "intri.yml and extri.yml" if all((source / f"{k}tri.yml").is_file() for k in ("in", "ex")) else None
 
 
-def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> Recording:
-    """Read OpenCV's calibration (pixel centres at whole numbers, metres), pictures and the fits of one person.
+def read(source: Path, *, poses: Path | None = None, person: int | None = None) -> ImportedDataset:
+    """Read OpenCV's calibration (pixel centres at whole numbers, m), images and the fits of one person.
 
-    ``poses``: any file of ``pose_files.read_poses``; looked for where EasyMocap (a folder of one JSON file a frame)
-    and EasyVolcap (motion.npz) write it when not given. Poses in numbered files belong to the pictures of those
-    numbers, those in one file to the pictures in their order.
+    ``poses`` is any file of ``pose_files.read_poses``. Default: where EasyMocap (one JSON file a frame) or EasyVolcap
+    (motion.npz) writes it. Poses in numbered files belong to the images of those numbers, those in one file to the
+    images in their order.
     """
     fits = poses or next((source / name for name in _FITS if _is_fit(source / name)), None)
     if fits is None:
         raise InputError("SMPL fits", expected=" or ".join(_FITS) + ", or --poses", got="none", file=source)
     found = read_poses(fits, person=person)
-    names = _names(source / "intri.yml")
-    intrinsics, extrinsics = (_opened(source / f"{k}tri.yml") for k in ("in", "ex"))
-    lenses, shots = {}, []
+    intrinsics, extrinsics = (Calibration(source / f"{k}tri.yml") for k in ("in", "ex"))
+    names = intrinsics.strings("names")
+    if not names:
+        raise InputError("names", expected="the cameras' names", got="none", file=source / "intri.yml")
+    lenses, samples = {}, []
     for name in names:
         folder = source / "images" / name
         if not folder.is_dir():
             continue
-        pictures = listed(folder)
-        K, T = (
-            _matrix(storage, key, source) for storage, key in ((intrinsics, f"K_{name}"), (extrinsics, f"T_{name}"))
-        )
-        R = _found(extrinsics, f"Rot_{name}", source)
-        if R is None:
-            R = cv2.Rodrigues(_matrix(extrinsics, f"R_{name}", source))[0]
-        bent = next(
-            (m for k in ("dist", "D") if (m := _found(intrinsics, f"{k}_{name}", source)) is not None), np.zeros(0)
-        )
-        lenses[name] = Lens(camera_of(K, R, T, sized(pictures[0])), tuple(bent.reshape(-1).tolist()))
-        for picture in pictures:
-            mask = beside(picture, *(source / part / name for part in _MASKS))
-            read_it = None if mask is None else partial(read_mask, mask)
-            shots.append(Shot(name, _number(picture), partial(read_rgb, picture), read_it, name=picture.stem))
-    if not shots:
-        raise InputError("pictures", expected=f"images/{names[0]}/*.jpg", got="none", file=source)
-    found = replace(found, poses=before_cameras(found, list(lenses.values()), source))
-    numbers = sorted({shot.frame for shot in shots})
+        images = list_files(folder)
+        lenses[name] = _lens(intrinsics, extrinsics, name, image_size(images[0]))
+        for image in images:
+            mask = mask_reader(find_beside(image, *(source / part / name for part in _MASKS)))
+            samples.append(Sample(name, frame_number(image), partial(read_rgb, image), mask, name=image.stem))
+    if not samples:
+        raise InputError("images", expected=f"images/{names[0]}/*.jpg", got="none", file=source)
+    found = replace(found, poses=poses_in_world(found, list(lenses.values()), source))
+    numbers = sorted({sample.frame for sample in samples})
     if not found.numbered:
-        place = {number: k for k, number in enumerate(numbers)}
-        shots = [replace(shot, frame=place[shot.frame]) for shot in shots]
-        numbers = list(place.values())
-    body_poses, counted = paired(found, numbers, source)
-    return Recording("EasyMocap", lenses, shots, body_poses, found.fps or FPS, (*found.notes, *counted))
+        order = {number: k for k, number in enumerate(numbers)}
+        samples = [replace(sample, frame=order[sample.frame]) for sample in samples]
+        numbers = list(order.values())
+    body_poses, notes = pair_with_frames(found, numbers, source)
+    return ImportedDataset("EasyMocap", lenses, samples, body_poses, found.fps or FPS, (*found.notes, *notes))
+
+
+def _lens(intrinsics: Calibration, extrinsics: Calibration, name: str, size: tuple[int, int]) -> Lens:
+    R = extrinsics.optional_matrix(f"Rot_{name}")
+    if R is None:
+        R = axis_angle_to_matrix(extrinsics.matrix(f"R_{name}").reshape(-1))
+    camera = camera_of(intrinsics.matrix(f"K_{name}"), R, extrinsics.matrix(f"T_{name}"), size)
+    for key in ("dist", "D"):
+        if (coefficients := intrinsics.optional_matrix(f"{key}_{name}")) is not None:
+            return Lens(camera, distortion_of(coefficients))
+    return Lens(camera)
 
 
 def _is_fit(path: Path) -> bool:
     return path.is_file() if path.suffix else path.is_dir() and any(path.glob("*.json"))
-
-
-def _number(picture: Path) -> int:
-    try:
-        return int(picture.stem)
-    except ValueError:
-        raise InputError("picture name", expected="a frame number", got=picture.name, file=picture) from None
-
-
-def _names(file: Path) -> list[str]:
-    storage = _opened(file)
-    node = storage.getNode("names")
-    names = [node.at(k).string() for k in range(node.size())] if node.isSeq() else []
-    if not names:
-        raise InputError("names", expected="the cameras' names", got="none", file=file)
-    return names
-
-
-def _opened(file: Path) -> cv2.FileStorage:
-    try:
-        return cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError) as error:
-        raise InputError(
-            "calibration cannot be read", expected="OpenCV's YAML", got="another text", file=file
-        ) from error
-
-
-def _matrix(storage: cv2.FileStorage, key: str, source: Path) -> Floats:
-    matrix = _found(storage, key, source)
-    if matrix is None:
-        raise InputError("calibration", expected=key, got="none", file=source)
-    return matrix
-
-
-def _found(storage: cv2.FileStorage, key: str, source: Path) -> Floats | None:
-    try:
-        matrix = storage.getNode(key).mat()
-    except cv2.error as error:
-        raise InputError("calibration", expected=f"{key}, a matrix", got="a damaged one", file=source) from error
-    return None if matrix is None else np.asarray(matrix, np.float64)

@@ -1,4 +1,4 @@
-"""HumanNeRF's layout (also GoMAvatar's): pictures in a row, a camera and an EasyMocap pose for each."""
+"""HumanNeRF's layout (also GoMAvatar's): images in a row, a camera and an EasyMocap pose for each."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ import numpy as np
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.readers.unpickle import read_pickle
-from rnd_trainer.importing.images import beside, camera_of, listed, read_mask, read_rgb, sized
-from rnd_trainer.importing.recording import Lens, Recording, Shot, easymocap_poses
+from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
+from rnd_trainer.importing.images import (
+    camera_of,
+    distortion_of,
+    find_beside,
+    image_size,
+    list_files,
+    mask_reader,
+    read_rgb,
+)
+from rnd_trainer.importing.poses import easymocap_poses
 
 FPS = 30.0
 
@@ -22,32 +31,29 @@ def detect(source: Path) -> str | None:
     return " and ".join(needed) if all((source / name).is_file() for name in needed) else None
 
 
-def read(source: Path) -> Recording:
-    """Read one lens a picture (equal ones are merged) and Rh, Th, poses of the picture's name."""
+def read(source: Path) -> ImportedDataset:
+    """Read one lens an image (equal ones are merged) and Rh, Th, poses by image name."""
     cameras, meshes = (read_pickle(source / name, what=name) for name in ("cameras.pkl", "mesh_infos.pkl"))
     if not isinstance(cameras, dict) or not isinstance(meshes, dict):
-        raise InputError("cameras.pkl and mesh_infos.pkl", expected="dicts by picture name", file=source)
+        raise InputError("cameras.pkl and mesh_infos.pkl", expected="dicts by image name", file=source)
     lenses: dict[str, Lens] = {}
     names: dict[bytes, str] = {}
-    shots, kept = [], []
-    for frame, picture in enumerate(listed(source / "images")):
-        if picture.stem not in cameras or picture.stem not in meshes:
+    samples, kept = [], []
+    for frame, image in enumerate(list_files(source / "images")):
+        if image.stem not in cameras or image.stem not in meshes:
             continue
-        entry = cameras[picture.stem]
-        values = _numbers(entry, ("intrinsics", "extrinsics"), source / "cameras.pkl", frame)
-        bent = np.asarray(entry["distortions"], np.float64).reshape(-1) if "distortions" in entry else np.zeros(0)
-        key = b"".join(value.tobytes() for value in (*values, bent))
-        if key not in names:
-            names[key] = f"{len(names):04d}"
-            K, pose = values[0].reshape(3, 3), values[1].reshape(4, 4)
-            lens = Lens(camera_of(K, pose[:3, :3], pose[:3, 3], sized(picture)), tuple(bent.tolist()))
-            lenses[names[key]] = lens
-        mask = beside(picture, source / "masks")
-        read_it = None if mask is None else partial(read_mask, mask)
-        shots.append(Shot(names[key], frame, partial(read_rgb, picture), read_it, name=picture.stem))
-        kept.append((frame, _numbers(meshes[picture.stem], ("poses", "Rh", "Th"), source / "mesh_infos.pkl", frame)))
+        entry = cameras[image.stem]
+        K, pose = _numbers(entry, ("intrinsics", "extrinsics"), source / "cameras.pkl", frame)
+        distortion = distortion_of(entry.get("distortions", ()))
+        name = names.setdefault(K.tobytes() + pose.tobytes() + np.array(distortion).tobytes(), f"{len(names):04d}")
+        if name not in lenses:
+            pose = pose.reshape(4, 4)
+            lenses[name] = Lens(camera_of(K, pose[:3, :3], pose[:3, 3], image_size(image)), distortion)
+        mask = mask_reader(find_beside(image, source / "masks"))
+        samples.append(Sample(name, frame, partial(read_rgb, image), mask, name=image.stem))
+        kept.append((frame, _numbers(meshes[image.stem], ("poses", "Rh", "Th"), source / "mesh_infos.pkl", frame)))
     if not kept:
-        raise InputError("pictures", expected="names that cameras.pkl and mesh_infos.pkl know", file=source)
+        raise InputError("images", expected="names that cameras.pkl and mesh_infos.pkl know", file=source)
     poses, Rh, Th = (np.stack([values[k] for _, values in kept]) for k in range(3))
     notes: tuple[str, ...] = ()
     betas = None
@@ -55,9 +61,8 @@ def read(source: Path) -> Recording:
         betas = np.asarray(read_pickle(source / "avg_betas.npy", what="betas"), np.float64)
     else:
         notes = ("no avg_betas.npy: the mean shape is used",)
-    return Recording(
-        "HumanNeRF", lenses, shots, easymocap_poses([f for f, _ in kept], poses, Rh, Th, betas), FPS, notes
-    )
+    body_poses = easymocap_poses([frame for frame, _ in kept], poses, Rh, Th, betas)
+    return ImportedDataset("HumanNeRF", lenses, samples, body_poses, FPS, notes)
 
 
 def _numbers(entry: Any, keys: tuple[str, ...], file: Path, frame: int) -> list[np.ndarray]:

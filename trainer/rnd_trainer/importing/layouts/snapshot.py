@@ -12,9 +12,10 @@ import numpy as np
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.readers.unpickle import read_pickle
-from rnd_trainer.importing.frames import Film
-from rnd_trainer.importing.images import Bytes, camera_of
-from rnd_trainer.importing.recording import Lens, Recording, Shot, smpl_poses
+from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
+from rnd_trainer.importing.images import Bytes, camera_of, distortion_of, pinhole
+from rnd_trainer.importing.poses import smpl_poses
+from rnd_trainer.importing.video_file import VideoFile
 
 
 def detect(source: Path) -> str | None:
@@ -23,7 +24,7 @@ def detect(source: Path) -> str | None:
     return ", ".join(needed) if all((source / name).is_file() for name in needed) else None
 
 
-def read(source: Path) -> Recording:
+def read(source: Path) -> ImportedDataset:
     """Read the raw layout. Where there are more poses than masks, the last ones belong to the masks."""
     camera = read_pickle(source / "camera.pkl", what="camera")
     try:
@@ -31,12 +32,11 @@ def read(source: Path) -> Recording:
             np.asarray(camera[f"camera_{key}"], np.float64).reshape(-1) for key in ("f", "c", "k", "rt", "t")
         )
         size = int(camera["width"]), int(camera["height"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            "camera", expected="camera_f, _c, _k, _rt, _t, width, height", file=source / "camera.pkl"
-        ) from error
-    K = np.array([[f[0], 0, c[0]], [0, f[1], c[1]], [0, 0, 1]])
-    lens = Lens(camera_of(K, axis_angle_to_matrix(rt), t, size), tuple(k.tolist()))
+        K = pinhole(f[0], f[1], c[0], c[1])
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        expected = "camera_f, _c, _k, _rt, _t, width, height"
+        raise InputError("camera", expected=expected, file=source / "camera.pkl") from error
+    lens = Lens(camera_of(K, axis_angle_to_matrix(rt), t, size), distortion_of(k))
     masks = _hdf5(source / "masks.hdf5", "masks")
     pose, trans, betas = (_hdf5(source / "reconstructed_poses.hdf5", key)[:] for key in ("pose", "trans", "betas"))
     count = len(masks)
@@ -45,11 +45,12 @@ def read(source: Path) -> Recording:
     videos = sorted(source.glob("*.mp4"))
     if len(videos) != 1:
         raise InputError("video", expected="one .mp4", got=len(videos), file=source)
-    film = Film(videos[0])
+    video = VideoFile(videos[0])
     poses = smpl_poses(range(count), pose[-count:], trans[-count:], betas)
-    shots = [Shot("0", k, partial(film.frame, k), partial(_mask, masks, k)) for k in range(min(count, film.count))]
+    frames = range(min(count, len(video.numbers)))
+    samples = [Sample("0", k, partial(video.frame, k), partial(_mask, masks, k)) for k in frames]
     notes = (f"{len(pose)} poses for {count} masks: the last {count} used",) if len(pose) > count else ()
-    return Recording("PeopleSnapshot", {"0": lens}, shots, poses, film.fps, notes)
+    return ImportedDataset("PeopleSnapshot", {"0": lens}, samples, poses, video.fps, notes)
 
 
 def _mask(masks: Any, frame: int) -> Bytes:

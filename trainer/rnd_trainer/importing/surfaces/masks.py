@@ -1,9 +1,10 @@
-"""Masks for a plain video with nothing else: rough, and for a static camera best.
+"""Rough masks for images without any, best for a static camera.
 
-Where the body's poses are known, the posed template says where the person roughly is; GrabCut (Rother et al. 2004)
-then finds the outline by colour, and a guided filter (He et al. 2013) lets it follow edges finer than a pixel. A
-static camera also shows what is behind the person: pixels that look like their own median over the frames in which
-the template is elsewhere are background. A segmentation network, where the user has one, takes the template's place.
+The posed template or a segmentation network seeds GrabCut, which finds the outline by colour; a guided filter refines
+it below a pixel. Of a static camera the background is learned: pixels near their median over the frames in which the
+template is elsewhere.
+
+Source: Rother et al. 2004, GrabCut; He et al. 2013, Guided image filtering.
 """
 
 from __future__ import annotations
@@ -19,88 +20,88 @@ from rnd_runtime.core.errors import InputError
 
 from .networks import ImageNetwork
 
-Picture = NDArray[np.uint8]
+Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-# Shares of the silhouette's height; a person of 1.7 m makes them centimetres
-_SURE_INSIDE = 0.015  # 2.5 cm: farther inside the template is the person
-_CLEARANCE = 0.04  # 7 cm: farther outside is background, for learning what it looks like
-_REACH = 0.08  # 14 cm: as far may clothes, hair and badly fitted poses stand out, where the background is known
-_BLIND_REACH = 0.05  # 8.5 cm: the same where it is not, and colours alone must decide
-_WORK_SIDE = 320  # pixels: GrabCut's time grows with the area, and the guided filter brings the edge back
-_GRABCUT_ROUNDS = 2  # more forget where the template was
+# Shares of the silhouette's height; centimetres for a person of 1.7 m
+_SURE_INSIDE = 0.015  # 2.5 cm: farther inside the template is person
+_CLEARANCE = 0.04  # 7 cm: farther outside is background, when that is learned
+_REACH = 0.08  # 14 cm: extent of clothes, hair and pose errors, with a known background
+_BLIND_REACH = 0.05  # 8.5 cm: the same with an unknown one
+_WORK_SIDE = 320  # pixels: GrabCut's time grows with the area; the guided filter restores the edge
+_GRABCUT_ROUNDS = 2  # more rounds lose the template
 _BACKGROUND_FRAMES = 40
-_STRIP = 64  # rows at a time: forty frames of a large video as floats would be gigabytes
+_STRIP = 64  # rows at a time: forty frames of a large video are gigabytes as floats
 _BINS = 4  # of a histogram, for each 8-bit step
-_LEAST_NOISE = 5.0  # 8-bit steps: what a lossy video codec does to a still wall
-_STATIC_NOISE = 12.0  # median difference above which the camera must have moved
+_MIN_NOISE = 5.0  # 8-bit steps: a lossy codec's noise on a still wall
+_STATIC_NOISE = 12.0  # median difference above which the camera moved
 
 
 def make_masks(
-    pictures: Sequence[Picture], silhouettes: Sequence[Mask] | None = None, *, net: Path | None = None
-) -> Iterator[Picture]:
+    images: Sequence[Image], silhouettes: Sequence[Mask] | None = None, *, net: Path | None = None
+) -> Iterator[Image]:
     """Rough masks [H, W] uint8 (coverage, 255 is the person), one after the other.
 
-    Both sequences may be lazy: they are read by index, one picture at a time, some of them twice.
+    Both sequences may be lazy: they are read by index, one image at a time, some of them twice.
 
     Args:
-        pictures: [H, W, 3] uint8 sRGB, all of one size; more than one where neither of the others is given.
-        silhouettes: [H, W] where the posed template is, as ``silhouette.draw`` has it.
+        images: [H, W, 3] uint8 sRGB, all of one size; more than one where neither of the others is given.
+        silhouettes: [H, W] masks of the posed template.
         net: a segmentation network in ONNX (layouts: ``networks.ImageNetwork``), used in their place.
 
     Raises:
-        InputError: where there is nothing to go by: neither poses nor network, and nothing moves.
+        InputError: neither poses nor network are given, and nothing moves.
     """
-    if len(pictures) == 0:
+    if len(images) == 0:
         return
     network = None if net is None else ImageNetwork(net, outputs=(1, 2))
-    background = _learn_background(pictures, silhouettes)
+    background = _learn_background(images, silhouettes)
     if network is None and silhouettes is None and background is None:
         raise InputError(
             "masks", expected="body poses, a static camera with somebody moving, or --mask-net", got="none of them"
         )
-    for frame in range(len(pictures)):
-        picture = pictures[frame]
+    for frame in range(len(images)):
+        image = images[frame]
         silhouette = None if silhouettes is None else silhouettes[frame]
         if network is not None:
-            person = _network_says(network, picture, silhouette)
+            person = _network_mask(network, image, silhouette)
         elif silhouette is not None:
             person = silhouette
         else:
             assert background is not None
-            person = _what_moved(picture, background)
+            person = _moving_mask(image, background)
         blind = network is None and background is None
-        yield _refine(picture, _seeds(person, silhouette, picture, background, _BLIND_REACH if blind else _REACH))
+        yield _refine(image, _seeds(person, silhouette, image, background, _BLIND_REACH if blind else _REACH))
 
 
 class _Background:
-    """What a static camera sees behind the person.
+    """Background of a static camera.
 
     Attributes:
         colour: [H, W, 3] median over the frames that show it.
-        seen: [H, W] whether enough of them do.
+        seen: [H, W] whether enough frames show it.
         noise: 8-bit steps within which a pixel counts as background.
     """
 
     def __init__(self, colour: NDArray[np.float32], seen: Mask, noise: float) -> None:
         self.colour, self.seen, self.noise = colour, seen, noise
 
-    def differs(self, picture: Picture) -> Mask:
-        """[H, W] where ``picture`` shows something else, a mere shadow not counted."""
-        difference = np.abs(picture - self.colour).max(-1)
-        ratio = (picture + 1.0) / (self.colour + 1.0)
+    def differs(self, image: Image) -> Mask:
+        """[H, W] where ``image`` differs from the background; shadows do not count."""
+        difference = np.abs(image - self.colour).max(-1)
+        ratio = (image + 1.0) / (self.colour + 1.0)
         shadow = (ratio.max(-1) < 1.05) & (ratio.min(-1) > 0.45) & (np.ptp(ratio, axis=-1) < 0.12)
         differs: Mask = (difference > self.noise) & ~shadow
         return differs
 
 
-def _learn_background(pictures: Sequence[Picture], silhouettes: Sequence[Mask] | None) -> _Background | None:
-    """The background, or None where the camera moves or nothing is ever uncovered."""
-    count = len(pictures)
+def _learn_background(images: Sequence[Image], silhouettes: Sequence[Mask] | None) -> _Background | None:
+    """The background, or None for a moving camera or one that never shows it."""
+    count = len(images)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _BACKGROUND_FRAMES)).astype(int))
     if len(chosen) < 3:
         return None
-    stack = np.stack([pictures[frame] for frame in chosen])
+    stack = np.stack([images[frame] for frame in chosen])
     hidden = np.zeros(stack.shape[:3], bool)
     if silhouettes is not None:
         hidden = np.stack([_dilated(silhouettes[frame], _CLEARANCE) for frame in chosen])
@@ -118,17 +119,15 @@ def _learn_background(pictures: Sequence[Picture], silhouettes: Sequence[Mask] |
     if not differences.any():
         return None
     below = np.cumsum(differences) / differences.sum()
-    spread = float(np.searchsorted(below, 0.5)) / _BINS
-    noise = max(_LEAST_NOISE, 4 * spread)
+    median = float(np.searchsorted(below, 0.5)) / _BINS
+    noise = max(_MIN_NOISE, 4 * median)
     moves = 1 - below[min(int(noise * _BINS), 255 * _BINS)]
-    if spread > _STATIC_NOISE or (silhouettes is None and moves < 1e-3):
+    if median > _STATIC_NOISE or (silhouettes is None and moves < 1e-3):
         return None
     return _Background(colour, seen, noise)
 
 
-def _seeds(
-    person: Mask, silhouette: Mask | None, picture: Picture, background: _Background | None, reach: float
-) -> Picture:
+def _seeds(person: Mask, silhouette: Mask | None, image: Image, background: _Background | None, reach: float) -> Image:
     """GrabCut's labels [H, W]: ``person`` is probable; well inside it and the template, and by the background, sure."""
     seeds = np.full(person.shape, cv2.GC_BGD, np.uint8)
     template = person if silhouette is None else silhouette
@@ -138,7 +137,7 @@ def _seeds(
     seeds[near] = cv2.GC_PR_BGD
     seeds[near & person] = cv2.GC_PR_FGD
     if background is not None:
-        differs = background.differs(picture)
+        differs = background.differs(image)
         seeds[near & background.seen & differs] = cv2.GC_FGD
         seeds[near & background.seen & ~differs] = cv2.GC_PR_BGD
         seeds[near & ~template & background.seen & ~differs] = cv2.GC_BGD
@@ -147,22 +146,22 @@ def _seeds(
     return seeds
 
 
-def _what_moved(picture: Picture, background: _Background) -> Mask:
-    """Where ``picture`` differs from the background, without specks and with small gaps closed."""
-    differs = (background.differs(picture) & background.seen).astype(np.uint8)
+def _moving_mask(image: Image, background: _Background) -> Mask:
+    """Where ``image`` differs from the background, without specks and with small gaps closed."""
+    differs = (background.differs(image) & background.seen).astype(np.uint8)
     side = max(3, 2 * (min(differs.shape) // 120) + 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, kernel)
     return _large_parts(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel, iterations=2))
 
 
-def _network_says(network: ImageNetwork, picture: Picture, silhouette: Mask | None) -> Mask:
-    """Where a network finds the person; it looks at the template's surroundings where those are known."""
-    height, width = picture.shape[:2]
+def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) -> Mask:
+    """Where a network finds the person, in a crop around the template where there is one."""
+    height, width = image.shape[:2]
     rows, columns = slice(0, height), slice(0, width)
     if silhouette is not None and silhouette.any():
         rows, columns = _box(silhouette, 1.5 * _REACH)
-    output = network(picture[rows, columns])
+    output = network(image[rows, columns])
     if output.shape[2] == 2:  # scores of background and person
         likely = output[..., 1] > output[..., 0]
     else:
@@ -173,14 +172,14 @@ def _network_says(network: ImageNetwork, picture: Picture, silhouette: Mask | No
     return _large_parts(person)
 
 
-def _refine(picture: Picture, seeds: Picture) -> Picture:
-    """Coverage [H, W]: GrabCut from ``seeds`` at working size, its outline fitted to the picture's edges."""
+def _refine(image: Image, seeds: Image) -> Image:
+    """Coverage [H, W]: GrabCut from ``seeds`` at working size, its outline fitted to the image's edges."""
     coverage = np.zeros(seeds.shape, np.uint8)
     possible = seeds != cv2.GC_BGD
     if not possible.any():
         return coverage
     rows, columns = _box(possible, 0.05)
-    crop, labels = np.ascontiguousarray(picture[rows, columns]), seeds[rows, columns]
+    crop, labels = np.ascontiguousarray(image[rows, columns]), seeds[rows, columns]
     scale = min(1.0, _WORK_SIDE / max(labels.shape))
     small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     small_labels = cv2.resize(labels, small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -189,19 +188,19 @@ def _refine(picture: Picture, seeds: Picture) -> Picture:
     )
     radius = max(2, round(1.5 / scale))
     soft = cv2.ximgproc.guidedFilter(crop.astype(np.float32) / 255, rough, radius, 1e-4)
-    soft = np.clip((soft - 0.15) / 0.7, 0, 1)  # the filter leaves haze on both sides of the edge
+    soft = np.clip((soft - 0.15) / 0.7, 0, 1)  # the filter blurs both sides of the edge
     coverage[rows, columns] = np.round(255 * soft)
     return coverage
 
 
-def _grabcut(picture: Picture, labels: Picture) -> Mask:
-    """Where the person is; what is surely there by ``labels`` where colours say nothing."""
+def _grabcut(image: Image, labels: Image) -> Mask:
+    """Foreground after GrabCut; of one-sided ``labels`` their own."""
     person = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
     if not person.any() or person.all():
         return _large_parts(person)
-    cv2.setRNGSeed(0)  # its clusters start at random: equal pictures give equal masks
+    cv2.setRNGSeed(0)  # random initial clusters: equal images give equal masks
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    refined, *_ = cv2.grabCut(picture, labels.copy(), None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    refined, *_ = cv2.grabCut(image, labels.copy(), None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return _large_parts(np.isin(refined, (cv2.GC_FGD, cv2.GC_PR_FGD)))
 
 

@@ -1,8 +1,7 @@
-"""Normal maps from files or from a network, in whatever axes, brought to the camera's OpenCV axes.
+"""Normal maps from files or from a network, brought to OpenCV camera axes.
 
-Predictors agree on camera space and on little else: Sapiens' maps point right, up and to the viewer, others right,
-down and away, and PNGs store either. The posed template knows what each pixel's normal should roughly be, so the
-signs are those that agree with it best, and maps that agree with nothing are refused.
+Predictors differ in the signs of their axes: Sapiens' maps point right, up and to the viewer, others right, down and
+away. The signs are chosen that agree best with the posed template; maps that agree with none are refused.
 """
 
 from __future__ import annotations
@@ -18,31 +17,30 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_image
-from rnd_trainer.checking.normals import axes_in_words, best_reading
+from rnd_trainer.checking.normals import best_permutation, format_axes
+from rnd_trainer.importing.images import load_array
 
 from .networks import ImageNetwork
 
 Normals = NDArray[np.float32]
 
 _SIGNS = np.array([(x, y, z) for x in (1, -1) for y in (1, -1) for z in (1, -1)], np.float64)
-_LEAST_AGREEMENT = 0.5  # mean cosine; a good predictor on a clothed person reaches 0.85, noise 0
-_CLEAR_LEAD = 0.1  # of the best signs over the second best
-_ENOUGH_PIXELS = 100
+_MIN_COSINE = 0.5  # mean cosine; a good predictor on a clothed person reaches 0.85, noise 0
+_MIN_LEAD = 0.1  # of the best signs over the second best
+_MIN_PIXELS = 100
 
 
 @dataclass(frozen=True)
 class NormalAxes:
-    """Which way a source's axes point, told by the template.
+    """Directions of a source's axes, found by the template.
 
     Attributes:
-        signs: of x, y and z on the way to OpenCV's axes.
-        agreement: mean cosine with the template's normals after the flip.
-        lead: by how much the second best signs agree less.
+        signs: factors of x, y and z to OpenCV's axes.
+        agreement: mean cosine with the template's normals, signs applied.
     """
 
     signs: tuple[int, int, int]
     agreement: float
-    lead: float
 
     @property
     def name(self) -> str:
@@ -55,32 +53,32 @@ def find_axes(maps: Iterable[Normals], template: Iterable[NDArray[np.float64]]) 
     """The signs by which ``maps`` agree best with ``template``, over all frames given.
 
     Args:
-        maps: [H, W, 3] as the source has them; zero where it says nothing.
+        maps: [H, W, 3] in the source's axes; zero where unknown.
         template: [H, W, 3] unit normals of the posed template in OpenCV axes; zero outside.
 
     Raises:
-        InputError: when no signs make them agree, or two do equally well.
+        InputError: no signs make them agree, or two do equally well.
     """
     products, pixels = np.zeros((3, 3)), 0
     for one, wanted in zip(maps, template):
         known = wanted.any(-1) & one.any(-1)
         products += wanted[known].T.astype(np.float64) @ one[known].astype(np.float64)
         pixels += int(known.sum())
-    if pixels < _ENOUGH_PIXELS:
+    if pixels < _MIN_PIXELS:
         raise InputError("normals", expected="some on the template", got=f"{pixels} pixels that both cover")
     products /= pixels
     scores = _SIGNS @ np.diag(products)
     order = np.argsort(-scores)
     best, lead = scores[order[0]], scores[order[0]] - scores[order[1]]
     x, y, z = (int(sign) for sign in _SIGNS[order[0]])
-    axes = NormalAxes((x, y, z), float(best), float(lead))
-    if best < _LEAST_AGREEMENT or lead < _CLEAR_LEAD:
-        reading, cosine = best_reading(products)
-        swapped = cosine > max(best + _CLEAR_LEAD, _LEAST_AGREEMENT)
-        hint = f"with --normal-axes={axes_in_words(reading)} it would be {cosine:.2f}"
+    axes = NormalAxes((x, y, z), float(best))
+    if best < _MIN_COSINE or lead < _MIN_LEAD:
+        permutation, cosine = best_permutation(products)
+        swapped = cosine > max(best + _MIN_LEAD, _MIN_COSINE)
+        hint = f"with --normal-axes={format_axes(permutation)} it would be {cosine:.2f}"
         raise InputError(
             "normals",
-            expected=f"a mean cosine above {_LEAST_AGREEMENT:g} with the template's in one choice of axes",
+            expected=f"a mean cosine above {_MIN_COSINE:g} with the template's in one choice of axes",
             got=f"{best:.2f} at best ({axes.name}), {best - lead:.2f} at second best",
             hint=hint if swapped else "do they belong to these frames and poses?",
         )
@@ -88,20 +86,17 @@ def find_axes(maps: Iterable[Normals], template: Iterable[NDArray[np.float64]]) 
 
 
 def to_opencv(normals: Normals, axes: NormalAxes) -> Normals:
-    """``normals`` [H, W, 3] in OpenCV's axes; what then looks away from the viewer is turned edge-on."""
-    turned = normals * np.array(axes.signs, np.float32)
-    turned[..., 2] = np.minimum(turned[..., 2], 0)
-    return _unit(turned)
+    """``normals`` [H, W, 3] in OpenCV's axes; those that then face away are projected edge-on."""
+    flipped = normals * np.array(axes.signs, np.float32)
+    flipped[..., 2] = np.minimum(flipped[..., 2], 0)
+    return _unit(flipped)
 
 
 def read_normals(path: str | Path) -> Normals:
-    """A normal map [H, W, 3] in its own axes, unit or zero, from .npy (n, H×W×3 or 3×H×W) or a picture of (n + 1)/2."""
+    """A normal map [H, W, 3] in its own axes, unit or zero, from .npy (n, H×W×3 or 3×H×W) or a image of (n + 1)/2."""
     path = existing_file(path, what="normals")
     if path.suffix.lower() == ".npy":
-        try:
-            normals = np.load(path, allow_pickle=False).astype(np.float32)
-        except (ValueError, OSError, EOFError) as error:
-            raise InputError("normals cannot be read", expected="an array of numbers", file=path) from error
+        normals = load_array(path, "normals").astype(np.float32)
         if normals.ndim == 3 and normals.shape[0] == 3 and normals.shape[2] != 3:
             normals = normals.transpose(1, 2, 0)
     else:
@@ -110,7 +105,7 @@ def read_normals(path: str | Path) -> Normals:
             normals = pixels[..., :3].astype(np.float32)
         else:
             encoded = pixels[..., :3].astype(np.float32) / np.iinfo(pixels.dtype.name).max
-            normals = (2 * encoded - 1) * encoded.any(-1, keepdims=True)  # black is "no data"
+            normals = (2 * encoded - 1) * encoded.any(-1, keepdims=True)  # black: no data
     if normals.ndim != 3 or normals.shape[2] != 3:
         raise InputError("shape of normals", expected="H×W×3", got="×".join(map(str, normals.shape)), file=path)
     return _unit(np.nan_to_num(normals))  # Sapiens leaves NaN outside the person
@@ -121,31 +116,31 @@ def normal_network(path: Path) -> ImageNetwork:
     return ImageNetwork(path, outputs=(3,))
 
 
-def normal_map(network: ImageNetwork, picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> Normals:
-    """The map [H, W, 3] that ``network`` gives, in its own axes, zero outside the mask.
+def normal_map(network: ImageNetwork, image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> Normals:
+    """The map [H, W, 3] of ``network`` in its own axes, zero outside the mask.
 
-    The network sees the person's surroundings on grey, the way such predictors are trained.
+    The network sees a crop of the person on grey, as such predictors are trained.
 
     Args:
-        picture: [H, W, 3] uint8 sRGB.
+        image: [H, W, 3] uint8 sRGB.
         mask: [H, W] uint8 coverage.
     """
-    normals = np.zeros(picture.shape, np.float32)
+    normals = np.zeros(image.shape, np.float32)
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return normals
     margin = (rows[-1] - rows[0]) // 10 + 2
     box = tuple(slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns))
     alpha = mask[box][..., None] / np.float32(255)
-    seen = np.round(picture[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
+    seen = np.round(image[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
     output = network(seen)
-    if output.min() >= 0:  # a network that gives pictures of normals
+    if output.min() >= 0:  # the network returns (n + 1)/2
         output = 2 * output - 1
     normals[box] = _unit(output) * (mask[box] > 0)[..., None]
     return normals
 
 
-def smoothed(normals: Normals, mask: NDArray[np.uint8]) -> Normals:
+def fill_holes(normals: Normals, mask: NDArray[np.uint8]) -> Normals:
     """``normals`` with the pixels that the mask covers and the source leaves out filled from their neighbours."""
     known = normals.any(-1)
     holes = (mask > 0) & ~known

@@ -1,0 +1,147 @@
+"""Biovision's BVH."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import existing_file
+
+from .tree import Floats, MocapTree, about_axis, check_size
+
+_ROUNDED_FPS = 2e-4  # share by which 1 / 0.0083333 may miss a whole number: less than 29.97 misses 30
+
+
+@dataclass
+class _Joint:
+    name: str
+    parent: int
+    offset: Floats = field(default_factory=lambda: np.zeros(3))
+    channels: tuple[str, ...] = ()
+
+
+def read_bvh(path: str | Path) -> MocapTree:
+    """Read a Biovision file: rotations in degrees, multiplied in the order of their channels.
+
+    Raises:
+        InputError: when it is not one, is cut short, or holds numbers that are not finite or beyond any use.
+    """
+    path = existing_file(path, what="motion")
+    try:
+        return _read(iter(path.read_text(encoding="utf-8-sig", errors="replace").split()))
+    except StopIteration as error:
+        raise InputError("BVH file", expected="HIERARCHY and MOTION", got="an end before", file=path) from error
+    except ValueError as error:
+        raise InputError("BVH file", expected="numbers", got=str(error), file=path) from error
+    except InputError as error:
+        raise error.at(file=path) from error
+
+
+def _read(words: Iterator[str]) -> MocapTree:
+    joints = _hierarchy(words)
+    frames, seconds, values = _motion(words, sum(len(joint.channels) for joint in joints))
+    rotations = np.tile(np.eye(3), (frames, len(joints), 1, 1))
+    positions = np.tile([joint.offset for joint in joints], (frames, 1, 1))
+    positions[:, 0] = 0
+    column = 0
+    for number, joint in enumerate(joints):
+        for channel in joint.channels:
+            axis = "XYZ".index(channel[0])
+            if channel[1:] == "rotation":
+                rotations[:, number] = rotations[:, number] @ about_axis(axis, np.radians(values[:, column]))
+            else:
+                positions[:, number, axis] = values[:, column]
+            column += 1
+    root_positions, trunk = _root_path(joints, rotations, positions)
+    moving = [
+        joint.name
+        for number, joint in enumerate(joints)
+        if number not in trunk and any(name.endswith("position") for name in joint.channels)
+    ]
+    notes = (f"positions of joints but the root are left out: {', '.join(moving[:3])}, …",) if moving else ()
+    names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
+    offsets = np.array([joint.offset for joint in joints])
+    return MocapTree(names, parents, offsets, rotations, root_positions, _rounded(1 / seconds), notes)
+
+
+def _root_path(joints: list[_Joint], rotations: Floats, positions: Floats) -> tuple[Floats, list[int]]:
+    """The root's path [F, 3] plus that of only children below it; and the indices of these joints.
+
+    Many tools write the moving hips below a root that stands still. ``positions`` [F, J, 3] are in the parent's
+    frame and replace the offset.
+    """
+    joint, trunk, path, global_rotation = 0, [0], positions[:, 0], rotations[:, 0]
+    while len(children := [k for k, child in enumerate(joints) if child.parent == joint]) == 1:
+        (joint,) = children
+        trunk.append(joint)
+        path = path + np.einsum("fij,fj->fi", global_rotation, positions[:, joint] - joints[joint].offset)
+        global_rotation = global_rotation @ rotations[:, joint]
+    return path, trunk
+
+
+def _hierarchy(words: Iterator[str]) -> list[_Joint]:
+    joints: list[_Joint] = []
+    open_joints: list[int] = []  # −1 for an end site
+    if next(words) != "HIERARCHY":
+        raise InputError("BVH file", expected="HIERARCHY first")
+    while True:
+        word = next(words)
+        if word in ("ROOT", "JOINT"):
+            name = next(words)
+            while (more := next(words)) != "{":  # names with spaces
+                name += f" {more}"
+            joints.append(_Joint(name, open_joints[-1] if open_joints else -1))
+            open_joints.append(len(joints) - 1)
+        elif word == "End" and open_joints:
+            while next(words) != "{":
+                pass
+            open_joints.append(-1)
+        elif word == "OFFSET" and open_joints:
+            offset = np.array([float(next(words)) for _ in range(3)])
+            if not np.isfinite(offset).all():
+                raise InputError("OFFSET", expected="finite numbers", got=offset.tolist())
+            check_size("OFFSET", offset.tolist())
+            if open_joints[-1] >= 0:  # else of an end site, which is no joint
+                joints[open_joints[-1]].offset = offset
+        elif word == "CHANNELS" and open_joints:
+            names = tuple([next(words).capitalize() for _ in range(int(next(words)))])
+            known = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
+            if not set(names) <= known:
+                raise InputError("channels", expected=", ".join(sorted(known)), got=", ".join(names))
+            joints[open_joints[-1]].channels = names
+        elif word == "}" and open_joints:
+            open_joints.pop()
+        elif word == "MOTION" and joints and not open_joints:
+            return joints
+        else:
+            raise InputError("BVH hierarchy", expected="ROOT, JOINT, OFFSET, CHANNELS or }", got=word)
+
+
+def _motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats]:
+    header = [next(words) for _ in range(5)]  # Frames: N Frame Time: S
+    if (header[0], header[2], header[3]) != ("Frames:", "Frame", "Time:"):
+        raise InputError("BVH motion", expected="Frames: … Frame Time: …", got=" ".join(header))
+    frames, seconds = int(header[1]), float(header[4])
+    values = np.array([float(word) for word in words])
+    if channels == 0:
+        raise InputError("channels", expected="at least one", got="none")
+    if frames < 1 or values.size != frames * channels:
+        raise InputError("BVH motion", expected=f"{frames} frames of {channels} numbers", got=values.size)
+    if not 1e-4 <= seconds <= 10:
+        raise InputError("Frame Time", expected="seconds, 0.0001 to 10", got=seconds)
+    values = values.reshape(frames, channels)
+    finite = np.isfinite(values).all(1)
+    if not finite.all():
+        raise InputError("BVH motion", expected="finite numbers", frame=int(np.argmin(finite)))
+    frame = int(np.abs(values).max(1).argmax())
+    check_size("BVH motion", values[frame].tolist(), frame)
+    return frames, seconds, values
+
+
+def _rounded(fps: float) -> float:
+    """``fps`` without the rounding of the file's seconds."""
+    return float(round(fps)) if abs(round(fps) - fps) < _ROUNDED_FPS * fps else fps

@@ -1,0 +1,94 @@
+"""Data set as read from its layout: lenses, samples and body poses in the source's own world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.capture.format import Split
+from rnd_runtime.core.camera import Camera
+
+from .images import Bytes, check_size, undistort_image
+from .poses import Poses
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A camera as its source calibrated it.
+
+    Attributes:
+        camera: pixel centres at +0.5, metres, in the source's world.
+        distortion: OpenCV's k1 k2 p1 p2 [k3 …]; empty for images that are undistorted.
+        undone: the coefficients that ``undistort_dataset`` undid.
+    """
+
+    camera: Camera
+    distortion: tuple[float, ...] = ()
+    undone: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One image with its labels, read on demand.
+
+    Attributes:
+        camera, frame: name of the lens; number of the frame in ``Poses``.
+        image: returns [H, W, 3] uint8 sRGB.
+        mask: returns [H, W] uint8 coverage; None without a mask.
+        normals: returns [H, W, 3] in OpenCV camera axes, zero where unknown; None without normals.
+        split: None to have it chosen.
+        name: stem of the image file, which mask files may share; empty for a video's frame.
+    """
+
+    camera: str
+    frame: int
+    image: Callable[[], Bytes]
+    mask: Callable[[], Bytes] | None = None
+    normals: Callable[[], NDArray[np.float32]] | None = None
+    split: Split | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedDataset:
+    """A source, read.
+
+    Attributes:
+        kind: name of the data set's format.
+        lenses: by camera name.
+        fps: frames per second of the images.
+        notes: assumptions, one sentence each.
+        image_names: by frame, of all images of a camera where ``samples`` are a part of them; else empty.
+    """
+
+    kind: str
+    lenses: dict[str, Lens]
+    samples: Sequence[Sample]
+    poses: Poses
+    fps: float = 30.0
+    notes: tuple[str, ...] = ()
+    image_names: Mapping[int, str] = field(default_factory=dict)
+
+
+def undistort_dataset(dataset: ImportedDataset) -> ImportedDataset:
+    """``dataset`` with the distortion of every lens undone in images, masks and normals as they are read."""
+
+    def undistort(read: Callable[[], NDArray] | None, lens: Lens, what: str) -> Callable[[], NDArray] | None:
+        if read is None:
+            return None
+        return lambda: undistort_image(check_size(read(), lens.camera, what), lens.camera, lens.distortion)
+
+    samples = []
+    for sample in dataset.samples:
+        lens = dataset.lenses[sample.camera]
+        if any(lens.distortion):
+            image = undistort(sample.image, lens, "image")
+            assert image is not None
+            mask, normals = undistort(sample.mask, lens, "mask"), undistort(sample.normals, lens, "normals")
+            sample = replace(sample, image=image, mask=mask, normals=normals)
+        samples.append(sample)
+    lenses = {name: Lens(lens.camera, (), lens.distortion) for name, lens in dataset.lenses.items()}
+    return replace(dataset, lenses=lenses, samples=samples)
