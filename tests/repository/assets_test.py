@@ -14,7 +14,8 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import srgb_to_linear
 from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, SMPL_PARENTS, bone_transforms
+from rnd_runtime.motion.skeleton import bone_transforms
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 from rnd_runtime.shading.light import downsize, load_light, texel_directions, texel_solid_angles
 from support.paths import ASSETS
 

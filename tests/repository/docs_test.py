@@ -1,12 +1,11 @@
-"""The documentation is true: its commands run, their options exist, its errors are raised, its figures are the files'.
+"""The documentation: commands run, options exist, links resolve, tables are those of the files, pages are short.
 
-A fenced ``sh`` block is run line by line (``doc_commands``) in a folder that has ``assets``; blocks of one page
-share it. A ``python`` block that starts with ``# file: NAME`` is written to NAME.
+A fenced ``sh`` block is run line by line (``doc_commands``) in a folder that has ``assets``; blocks of one page share
+it. A ``python`` block runs there too; one that starts with ``# file: NAME`` is written to NAME instead.
 """
 
 from __future__ import annotations
 
-import importlib
 import re
 import runpy
 import sys
@@ -18,132 +17,119 @@ import pytest
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
-from support.doc_commands import FENCED, ROOT, SCRIPTS, blocks, copy_assets, run
+from support.doc_commands import FENCED, ROOT, SCRIPTS, blocks, copy_assets, exit_code, run
 from support.tiny import ASSETS
 from trainer.losses.perceptual_test import write_alexnet
 
-PAGES = sorted((ROOT / "docs").glob("*.md"))
-FRONT_PAGES = [ROOT / name for name in ("README.md", "viewer/web/README.md", "assets/README.md")]
+DOCS = sorted((ROOT / "docs").rglob("*.md"))
+FRONT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "viewer/web/README.md", "assets/README.md")]
+PAGES = [*FRONT, *DOCS]
+MAX_LINES = {"README.md": 110, "CHANGELOG.md": 40}
+MAX_PAGE_LINES = 250
+MAX_README_WORDS, MAX_DOCS_WORDS = 1_000, 12_000
 LOOKS_LIKE_A_COMMAND = re.compile(r"^ +(?:rnd-\w+|python|pip|npm|\./scripts/\w+) .*|^ +\./scripts/\w+$", re.MULTILINE)
 FLOAT32_STEPS = 1e-5  # m: the example computes its bones in float64, the player in its own order
 
 
-def _page(name: str) -> str:
-    return (ROOT / name).read_text(encoding="utf-8")
+def _text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
 
 
-# own-video.md needs a video and poses: tests/own_video_test.py makes them and runs its commands
-@pytest.mark.parametrize(
-    "page", [p for p in (*PAGES, *FRONT_PAGES) if p.stem != "own-video"], ids=lambda page: str(page.relative_to(ROOT))
-)
+def _name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.slow
+# own-video.md needs a video and poses: tests/trainer/importing/own_video_test.py makes them and runs its commands
+@pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "own-video"], ids=_name)
 def test_commands_run(page, tmp_path, monkeypatch):
     copy_assets(tmp_path)
     write_alexnet(tmp_path / "alexnet.safetensors")
     monkeypatch.chdir(tmp_path)
     for block in blocks(page):
+        if block.reason is not None:
+            continue
         if block.kind == "python" and block.body.startswith("# file: "):
             name = block.body.splitlines()[0].removeprefix("# file: ")
             Path(name).write_text(block.body, encoding="utf-8")
-        elif block.kind == "sh" and block.reason is None:
+        elif block.kind == "python":
+            exec(compile(block.body, _name(page), "exec"), {"__name__": "__main__"})
+        elif block.kind == "sh":
             for words in block.commands():
                 run(words, monkeypatch)
 
 
-@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_what_is_not_run_installs_or_names_the_test_that_runs_it(page):
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_what_is_not_run_names_what_runs_it(page):
     for block in blocks(page):
         if block.kind != "sh" or block.reason is None:
             continue
         named = re.search(r"(?:^|\W)((?:tests|scripts)/[\w./-]*\w|\.ci/run)", block.reason)
         assert named and (ROOT / named[1]).is_file(), (page.name, block.reason)
-        where = (ROOT / named[1]).read_text(encoding="utf-8")
+        where = _text(ROOT / named[1])
         for words in block.commands():
             name = next(word for word in words if word not in ("python", "-m")).removeprefix("./")
             assert name in where, (page.name, words, named[1])
 
 
-@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_command_stands_in_a_block_that_is_run(page):
-    """None is merely indented, where ``test_commands_run`` would not see it."""
-    outside = FENCED.sub("", page.read_text(encoding="utf-8"))
-    assert not LOOKS_LIKE_A_COMMAND.findall(outside)
-
-
-def _help(command: str, capsys, monkeypatch) -> str:
-    module, function = SCRIPTS[command.split()[0]].split(":")
-    monkeypatch.setattr(sys, "argv", [*command.split(), "--help"])
-    monkeypatch.setenv("COLUMNS", "300")
-    with pytest.raises(SystemExit):
-        raise SystemExit(getattr(importlib.import_module(module), function)())
-    return capsys.readouterr().out
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_every_command_is_in_a_fenced_block(page):
+    assert not LOOKS_LIKE_A_COMMAND.findall(FENCED.sub("", _text(page)))
 
 
 def test_options_exist(capsys, monkeypatch):
-    """Every option that a page or the README gives to a command of ours is in that command's help."""
+    """Every option that a page gives to a command of ours is in that command's help."""
     wanted: dict[str, set[str]] = {}
-    for page in [*PAGES, ROOT / "README.md"]:
-        text = page.read_text(encoding="utf-8").replace("\\\n", " ").replace("-->", "").replace("; rnd-", " | rnd-")
+    for page in PAGES:
+        text = _text(page).replace("\\\n", " ").replace("-->", "").replace("; rnd-", " | rnd-")
         for name, rest in re.findall(r"\b(rnd-[a-z]+)((?: +[^\s`|]+)*)", text):
-            if name not in SCRIPTS:
-                continue
-            words = rest.split()
-            grouped = name in ("rnd-convert", "rnd-bench", "rnd-data", "rnd-stage")
-            grouped = grouped and bool(words) and words[0].replace("-", "").isalpha()
-            if grouped and name == "rnd-stage" and words[0].startswith("--"):
-                grouped = False  # filming, which has no name of its own
-            command = f"{name} {words[0]}" if grouped else name
-            options = {word.strip("(),.;:") for word in words if word.startswith("--")}
-            wanted.setdefault(command, set()).update(options - {"--help"})
+            if name in SCRIPTS:
+                command = " ".join([name, *_subcommands(name, rest.split())])
+                options = {word.strip("(),.;:") for word in rest.split() if word.startswith("--")}
+                wanted.setdefault(command, set()).update(options - {"--help"})
     assert len(wanted) > 5
+    monkeypatch.setenv("COLUMNS", "300")
     for command, options in wanted.items():
         if options:
-            shown = _help(command, capsys, monkeypatch)
+            exit_code([*command.split(), "--help"], monkeypatch)
+            shown = capsys.readouterr().out
             missing = sorted(option for option in options if option.split("=")[0] not in shown)
             assert not missing, (command, missing)
 
 
-def test_the_errors_explained_are_those_raised():
-    """Each message in the first column of a table is made by the sources; … stands for what differs each time."""
-    sources = "\n".join(
-        file.read_text(encoding="utf-8")
-        for folder in ("runtime", "trainer", "export", "viewer")
-        for file in (ROOT / folder).rglob("*.py")
-    )
-    literals = set(re.findall(r"""["']([^"'\n]+)["']""", re.sub(r'"\s*\n\s*f?"', "", sources)))
-    fixed = {text: re.sub(r"\{.*?\}", "", text) for text in literals}
-    patterns = [
-        re.compile(re.sub(r"\\\{.*?\\\}", ".+", re.escape(text)))
-        for text in literals
-        if "{" in text and "{}" not in text and re.search(r"[a-z]{2}", fixed[text])
-    ]
-    rows = re.findall(r"^\| (`.+?) \|", _page("docs/troubleshooting.md"), re.MULTILINE)
-    messages = [message for row in rows for message in re.findall(r"`([^`]+)`", row)]
-    assert len(messages) > 40
-    for message in messages:
-        for piece in re.split(r"^expected |: expected |, got |: |, no |\(|…", message):
-            words = piece.strip()
-            made = any(words in text for text in literals) or any(p.fullmatch(words) for p in patterns)
-            assert not words or words.endswith((".json", ".onnx")) or made, (message, words)
+def _subcommands(name: str, words: list[str]) -> list[str]:
+    depth = {"rnd-convert": 1, "rnd-data": 1, "rnd-bench": 2 if words[:1] == ["study"] else 1}.get(name, 0)
+    return [word for word in words[:depth] if re.fullmatch(r"[a-z][a-z-]*", word)]
+
+
+def test_pages_are_short():
+    for page in [ROOT / "CHANGELOG.md", *PAGES]:
+        lines = len(_text(page).splitlines())
+        assert lines <= MAX_LINES.get(page.name if page.parent == ROOT else "", MAX_PAGE_LINES), (_name(page), lines)
+    assert len(_text(ROOT / "README.md").split()) <= MAX_README_WORDS
+    assert sum(len(_text(page).split()) for page in DOCS) <= MAX_DOCS_WORDS
 
 
 def test_tables_are_those_of_the_files():
     script = runpy.run_path(str(ROOT / "scripts/doc_tables.py"))
-    for page, pictures in script["PAGES"].items():
-        text = page.read_text(encoding="utf-8")
-        assert "<!-- table: " in text
-        assert script["filled"](text, ASSETS / "bench", pictures) == text, "run: python scripts/doc_tables.py"
+    assert ROOT / "README.md" in script["PAGES"]
+    for page, images in script["PAGES"].items():
+        text = _text(page)
+        for files in re.findall(r"<!-- (?:table|chart): ([^\s#|]+)", text):
+            assert all((ASSETS / "bench" / name).is_file() for name in files.split("+")), (_name(page), files)
+        assert script["filled"](text, ASSETS / "bench", images) == text, "run: python scripts/doc_tables.py"
 
 
 def _anchors(page: Path) -> set[str]:
     """What GitHub calls the headings of ``page``."""
-    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^```.*?^```", "", _text(page), flags=re.MULTILINE | re.DOTALL)
     headings = [re.sub(r"\]\([^)]*\)", "]", line) for line in re.findall(r"^#+ +(.+?) *$", text, re.MULTILINE)]
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", [*PAGES, *FRONT_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_resolve(page):
+    for target in re.findall(r"\]\(([^)]+)\)", _text(page)):
         if target.startswith("https://"):
             continue
         path, _, anchor = target.partition("#")
@@ -152,10 +138,13 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in _anchors(file), (page.name, target, sorted(_anchors(file)))
 
 
-def test_sources_that_are_named_are_there():
-    for page in PAGES:
-        for name in re.findall(r"`(?:\w+/)?(\w+\.py)`", page.read_text(encoding="utf-8")):
-            assert list(ROOT.glob(f"*/rnd_*/**/{name}")), (page.name, name)
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_sources_that_are_named_exist(page):
+    text = _text(page)
+    for name in re.findall(r"`(?:\w+/)*(\w+\.py)`", text):
+        assert list(ROOT.glob(f"*/rnd_*/**/{name}")) or list(ROOT.glob(f"assets/make/{name}")), (_name(page), name)
+    for name in re.findall(r"\btests/[\w/]+\w(?:\.py)?", FENCED.sub(lambda block: block["reason"] or "", text)):
+        assert (ROOT / name).exists(), (_name(page), name)
 
 
 def test_the_example_without_our_code_poses_as_we_do(tmp_path, monkeypatch):
@@ -165,14 +154,12 @@ def test_the_example_without_our_code_poses_as_we_do(tmp_path, monkeypatch):
     (tmp_path / "pose.py").write_text(body, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["pose.py", str(ASSETS / "avatar.onnx")])
-    theirs = runpy.run_path("pose.py")
+    example = runpy.run_path("pose.py")
     avatar = Avatar.load(ASSETS / "avatar.onnx", threads=1)
     angles = np.zeros((1, len(avatar.skeleton), 3))
     angles[0, avatar.skeleton.names.index("left_shoulder"), 2] = -1.2
     angles[0, avatar.skeleton.names.index("right_shoulder"), 2] = 1.2
     still = Motion(axis_angle_to_matrix(angles), np.zeros((1, 3)), 30.0, avatar.skeleton.names)
-    ours = avatar.pose(still, 0.0)
-    np.testing.assert_allclose(theirs["means"], ours.means, atol=FLOAT32_STEPS)
-    picture = np.frombuffer((tmp_path / "pose.ppm").read_bytes()[len(b"P6 400 400 255\n") :], np.uint8)
-    covered = picture.reshape(400, 400, 3).any(axis=2)
-    assert 0.08 < covered.mean() < 0.5
+    np.testing.assert_allclose(example["means"], avatar.pose(still, 0.0).means, atol=FLOAT32_STEPS)
+    image = np.frombuffer((tmp_path / "pose.ppm").read_bytes()[len(b"P6 400 400 255\n") :], np.uint8)
+    assert 0.08 < image.reshape(400, 400, 3).any(axis=2).mean() < 0.5

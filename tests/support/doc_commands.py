@@ -1,7 +1,7 @@
 """The commands that the documentation shows: found, made small where a page says how, and run.
 
-Above a fenced block may stand ``<!-- tested with COMMAND OPTIONS; COMMAND OPTIONS -->``: these options are added when
-the test runs it, and the later of two counts. Or ``<!-- not run: reason -->``.
+Above a fenced block may be ``<!-- tested with COMMAND OPTIONS; COMMAND OPTIONS -->``: the test adds these options.
+Or ``<!-- not run: reason -->``. Commands of ``NOT_OURS`` install, or are the tests themselves.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from support.view_process import running
 
 ROOT = ASSETS.parent
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+NOT_OURS = {"pip", "source", "pytest", "ruff", "lint-imports", "mypy", "./scripts/test"}
 FENCED = re.compile(
     r"(?:<!-- (?:not run: (?P<reason>.+?)|tested with (?P<added>.+?)) -->\n)?"
     r"```(?P<kind>\w+)\n(?P<body>.*?)```",
@@ -33,7 +34,7 @@ FENCED = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page, and what its comment says."""
+    """A fenced block of a page, and its comment."""
 
     kind: str
     body: str
@@ -43,9 +44,9 @@ class Block:
     """words of a command and the options that it gets"""
 
     def commands(self) -> list[list[str]]:
-        """Words of every line, with what is added for the test."""
+        """Words of every line but those of ``NOT_OURS``, with what is added for the test."""
         lines = (shlex.split(line, comments=True) for line in self.body.replace("\\\n", " ").splitlines())
-        return [self._smaller(words) for words in lines if words]
+        return [self._smaller(words) for words in lines if words and words[0] not in NOT_OURS]
 
     def _smaller(self, words: list[str]) -> list[str]:
         for added in self.added:
