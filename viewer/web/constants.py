@@ -19,7 +19,8 @@ FILE = Path(__file__).parent / "src/constants.js"
 # Names by module; private ones lose their underscore in JavaScript.
 SHARED = {
     "rnd_runtime.avatar.file": (
-        "SCHEMA METADATA_KEY ADVICE_KEY PROBE_SHAPE POSED_OUTPUTS CONSTANT_OUTPUTS NODE_OUTPUTS NODE_LOGITS REST_OUTPUTS"
+        "SCHEMA METADATA_KEY ADVICE_KEY PROBE_SHAPE POSED_OUTPUTS CONSTANT_OUTPUTS"
+        " NODE_OUTPUTS NODE_LOGITS REST_OUTPUTS"
     ),
     "rnd_runtime.motion.smpl": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
     "rnd_runtime.motion.readers.arrays": (

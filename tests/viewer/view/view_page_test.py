@@ -15,26 +15,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import rnd_viewer.view.server
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.images import read_image
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_viewer.play.cli import main as play
 from rnd_viewer.view.options import SIZES, ViewOptions
-from rnd_viewer.view.scene import Picture, Scene
+from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import serve
-from rnd_viewer.view.state import ViewState
 from support.browser import CHROMIUM, Page, chromium
 from support.paths import ASSETS
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 
 SIZE = 192
 FRAME = 20
 MESSAGE = "document.getElementById('message').textContent"
 OUTCOME = """Promise.race([
-    rnd.picture(false).then(() => "drawn", (error) => error.message),
+    rnd.frame(false).then(() => "drawn", (error) => error.message),
     new Promise((done) => setTimeout(() => done("nothing"), 30000)),
 ])"""
 
@@ -52,7 +50,7 @@ def motion(tmp_path_factory) -> Path:
 def scene(motion):
     """The embedded avatar with its capture."""
     files = ASSETS / "avatar.onnx", motion, (ASSETS / "sky.exr",), ASSETS / "capture"
-    scene = Scene(ViewOptions(*files, size=SIZE, raster="cpu"))
+    scene = Scene(ViewOptions(*files, size=(SIZE, None), raster="cpu"))
     yield scene
     scene.close()
 
@@ -89,7 +87,7 @@ def played(motion, tmp_path_factory) -> dict[str, Path]:
     return {name: folder / f"frames/{FRAME:06d}.png" for name, folder in folders.items()}
 
 
-def _pixels(page: Page, canvas: str = "picture") -> np.ndarray:
+def _pixels(page: Page, canvas: str = "frame") -> np.ndarray:
     """[H, W, 3] of a canvas as it is now."""
     url = page.run(f"document.getElementById('{canvas}').toDataURL()")
     return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
@@ -107,8 +105,8 @@ def _screenshot_name(page: Page) -> str:
     })""")
 
 
-def _picture(page: Page, changes: str = "") -> np.ndarray:
-    page.run(f"Object.assign(rnd.state, {{{changes}}}); rnd.picture().then(() => 1)")
+def _frame(page: Page, changes: str = "") -> np.ndarray:
+    page.run(f"Object.assign(rnd.state, {{{changes}}}); rnd.frame().then(() => 1)")
     return _pixels(page)
 
 
@@ -121,47 +119,14 @@ def _set(page: Page, control: str, value: str) -> None:
 def test_the_canvas_shows_rnd_plays_frame_and_relights(page, played):
     page.run("rnd.play(false)")
     fps = page.run("rnd.scene().motion.fps")
-    assert (_picture(page, f"time: {FRAME} / {fps}") == read_image(played["straight"])).all()
+    assert (_frame(page, f"time: {FRAME} / {fps}") == read_image(played["straight"])).all()
     _set(page, "yaw", "90")
-    assert (_picture(page) == read_image(played["turned"])).all()
+    assert (_frame(page) == read_image(played["turned"])).all()
     # shift and drag turn the light too: 0.01 rad for each pixel
     page.drag((300, 300), (-100, 0), shift=True)
     assert page.run("rnd.state.yaw") == pytest.approx(np.pi / 2 - 1)
     _set(page, "yaw", "0")
-    assert (_picture(page) == read_image(played["straight"])).all()
-
-
-@contextmanager
-def _held(scene: Scene, monkeypatch) -> Iterator[None]:
-    """Pictures are not drawn before the block ends."""
-    go, render = threading.Event(), scene.render
-
-    def later(state: ViewState) -> Picture:
-        go.wait(60)
-        return render(state)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(scene, "render", later)
-        try:
-            yield
-        finally:
-            go.set()
-
-
-def test_it_is_loading_until_its_first_picture_and_drawing_while_one_takes_long(page, scene, monkeypatch):
-    back = page.run("location.href")
-    with _held(scene, monkeypatch):
-        page.open(f"{back}?again")
-        page.wait("location.search && window.rnd && rnd.scene()")
-        assert page.run(f"new Promise((done) => setTimeout(done, 1500)).then(() => {MESSAGE})") == "loading …"
-    page.wait(f"!{MESSAGE}")
-    with _held(scene, monkeypatch):
-        page.run("rnd.redraw()")
-        assert page.run(f"new Promise((done) => setTimeout(done, 500)).then(() => {MESSAGE})") == ""
-        page.wait(f"{MESSAGE} === 'drawing …'")
-    page.wait(f"!{MESSAGE}")
-    page.open(back)
-    page.wait("!location.search && window.rnd && rnd.scene()")
+    assert (_frame(page) == read_image(played["straight"])).all()
 
 
 def test_it_plays_and_stops(page):
@@ -175,46 +140,32 @@ def test_it_plays_and_stops(page):
     stopped = page.run("rnd.state.time")
     _set(page, "time", "0.5")
     assert page.run("rnd.state.time") == pytest.approx(0.5, abs=0.02) != stopped
-    assert (_picture(page) != first).any()
+    assert (_frame(page) != first).any()
 
 
 def test_drag_turns_and_reset_comes_back(page):
-    before = _picture(page)
+    before = _frame(page)
     page.drag((300, 300), (80, 30))
-    turned = _picture(page)
+    turned = _frame(page)
     assert (turned != before).any() and page.run("rnd.state.elevation") > 0.3
     page.run("Object.assign(rnd.state, { yaw: 1, exposure: 2 })")
     page.press("KeyR")
-    assert (_picture(page) == before).all() and page.run("[rnd.state.yaw, rnd.state.exposure]") == [0, 0]
-
-
-def test_keys_are_the_pages_where_they_are_nobody_elses(page):
-    page.run("document.getElementById('skeleton').focus()")
-    page.press("Space")  # presses the box
-    assert page.run("rnd.picture().then(() => document.getElementById('play').textContent)") == "▶"
-    page.run("document.activeElement.blur(); rnd.state.azimuth += 1")
-    turned = page.run("rnd.state.azimuth")
-    for held in ("ctrlKey", "metaKey"):
-        key = f"new KeyboardEvent('keydown', {{ code: 'KeyR', {held}: true, bubbles: true }})"
-        page.run(f"document.body.dispatchEvent({key})")
-        assert page.run("rnd.state.azimuth") == turned
-    page.press("KeyR")
-    assert page.run("rnd.state.azimuth") != turned
+    assert (_frame(page) == before).all() and page.run("[rnd.state.yaw, rnd.state.exposure]") == [0, 0]
 
 
 def test_outputs_sliders_and_skeleton(page):
-    seen = {_picture(page).tobytes()}
+    seen = {_frame(page).tobytes()}
     for name in ("light", "albedo", "normal", "roughness", "visibility", "lit"):
         page.run(f"document.querySelector('[data-value={name}]').click()")
-        seen.add(_picture(page).tobytes())
+        seen.add(_frame(page).tobytes())
     assert len(seen) == 6
     _set(page, "size", "256")
     sizes = "(({ min, max }) => [Number(min), Number(max)])(document.getElementById('size'))"
     assert page.run(sizes) == list(SIZES)
     _set(page, "gaussians", "20")
-    assert page.run("rnd.picture().then(p => [p.width, p.height])") == [256, 256]
+    assert page.run("rnd.frame().then(p => [p.width, p.height])") == [256, 256]
     assert page.run("rnd.state.gaussians") == round(page.run("rnd.scene().gaussians") / 5)
-    page.run("document.getElementById('skeleton').click(); rnd.picture().then(() => 1)")
+    page.run("document.getElementById('skeleton').click(); rnd.frame().then(() => 1)")
     assert _pixels(page, "overlay").any()
     page.run("document.getElementById('skeleton').click()")
     _set(page, "gaussians", "100")
@@ -227,10 +178,10 @@ def test_ground_truth_stands_beside(page):
     _set(page, "truth-index", str(index))
     page.wait(f"document.getElementById('truth').dataset.index === '{index}'")
     image = read_image(capture.folder / capture.frames[index].image)
-    picture = _picture(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
+    picture = _frame(page, f"width: {image.shape[1]}, height: {image.shape[0]}")
     assert picture.shape == image.shape
     assert (_pixels(page, "truth") == image).all()
-    assert (_picture(page, "yaw: 2, exposure: 3") == picture).all()  # its light stays as it was
+    assert (_frame(page, "yaw: 2, exposure: 3") == picture).all()  # its light stays as it was
     for control in ("light", "yaw", "exposure"):
         assert page.run(f"document.getElementById('{control}').disabled"), control
     assert page.run("[document.getElementById('yaw').value, document.getElementById('exposure').value]") == ["0", "0"]
@@ -240,7 +191,7 @@ def test_ground_truth_stands_beside(page):
     page.run("document.getElementById('stage').dispatchEvent(new WheelEvent('wheel', { deltaY: 500 }))")
     for key in ("Space", "Period", "KeyR"):
         page.press(key)
-    assert page.run("({ ...rnd.state })") == page.run("rnd.picture().then(() => ({ ...rnd.state }))") == before
+    assert page.run("({ ...rnd.state })") == page.run("rnd.frame().then(() => ({ ...rnd.state }))") == before
     for control in ("clip", "play", "time"):  # they would film or move something else
         assert page.run(f"document.getElementById('{control}').disabled"), control
     frame = capture.frames[index]
@@ -260,7 +211,7 @@ def test_ground_truth_stands_beside(page):
         assert not page.run(f"document.getElementById('{control}').disabled"), control
     page.press("KeyR")
     assert not page.run("document.getElementById('hint').hidden")
-    assert "of" in page.run("rnd.picture().then(() => document.getElementById('clock').textContent)")
+    assert "of" in page.run("rnd.frame().then(() => document.getElementById('clock').textContent)")
     _set(page, "size", str(SIZE))
 
 
@@ -277,7 +228,7 @@ def test_ground_truth_that_the_browser_cannot_decode_is_said_and_leaves_its_pane
         _set(page, "truth-index", str(index + 1))
         page.wait("document.getElementById('message').classList.contains('wrong')")
     label = page.run(f"rnd.scene().truths[{index + 1}].label")
-    assert page.run(MESSAGE) == f"{label}: this browser cannot decode the picture"
+    assert page.run(MESSAGE) == f"{label}: this browser cannot decode the image"
     assert not _pixels(page, "truth").any()
     _set(page, "truth-index", str(index))
     page.wait(f"document.getElementById('truth').dataset.index === '{index}'")
@@ -288,7 +239,7 @@ def test_ground_truth_that_the_browser_cannot_decode_is_said_and_leaves_its_pane
 
 def test_screenshot_and_clip_are_downloads(page, tmp_path):
     page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    shown = _picture(page)
+    shown = _frame(page)
     time_s = page.run("rnd.state.time")
     page.run("document.getElementById('screenshot').click(); rnd.state.time += 0.1")
     _set(page, "size", "128")
@@ -304,37 +255,16 @@ def test_screenshot_and_clip_are_downloads(page, tmp_path):
     assert files[".mp4"].stat().st_size > 10_000
 
 
-def test_a_clip_has_no_more_frames_than_screens_show(page):
-    page.run("""
-        rnd.scene().motion.fps = 120;
-        window.asked = [];
-        const { send } = WebSocket.prototype;
-        WebSocket.prototype.send = function (text) { asked.push(JSON.parse(text)); send.call(this, text); };
-        document.getElementById("clip").click();
-    """)
-    page.wait("!document.getElementById('clip').disabled")
-    assert page.run("asked.filter(({ ask }) => ask === 'clip').map(({ fps }) => fps)") == [60]
-    page.run("WebSocket.prototype.send = send; rnd.scene().motion.fps = 30")
-
-
-def test_a_loop_that_does_not_go_round_in_its_clip_is_said(page, scene, monkeypatch):
-    monkeypatch.setattr(scene, "motion", replace(scene.motion, closed=True))
-    page.run("rnd.scene().motion.fps = 24; document.getElementById('clip').click()")
-    page.wait("!document.getElementById('clip').disabled")
-    assert page.run(MESSAGE) == scene.motion.loop_notes(24)[0]
-    page.run("rnd.scene().motion.fps = 30; rnd.picture().then(() => 1)")
-
-
 def test_with_a_token_and_in_jpeg(page, scene):
-    exact = _picture(page, f"width: {SIZE}, height: {SIZE}, time: 0.5").astype(int)
+    exact = _frame(page, f"width: {SIZE}, height: {SIZE}, time: 0.5").astype(int)
     back = page.run("location.href")
     with _serving(scene, token="s3cret") as url:
         page.open(f"{url}&encoding=jpeg")
         page.wait("location.search.includes('s3cret') && window.rnd && rnd.scene()")
-        page.run("Object.assign(rnd.state, {time: 0.5}); rnd.picture(false).then(() => 1)")
+        page.run("Object.assign(rnd.state, {time: 0.5}); rnd.frame(false).then(() => 1)")
         error = np.abs(_pixels(page) - exact)
         assert 0 < error.mean() < 2  # halved chroma at the edges
-        assert (_picture(page) == exact).all()  # a screenshot is exact all the same
+        assert (_frame(page) == exact).all()  # a screenshot is exact all the same
         page.open(url.split("?")[0])  # the cookie is enough
         page.wait("!location.search && window.rnd && rnd.scene()")
     page.open(back)
@@ -346,7 +276,7 @@ def test_what_is_asked_of_a_viewer_that_is_gone_fails_at_once(page, scene):
     page.run("""
         const { send: sendOn } = WebSocket.prototype;
         WebSocket.prototype.send = function (text) { window.socket = this; sendOn.call(this, text); };
-        rnd.picture().then(() => new Promise((done) => {
+        rnd.frame().then(() => new Promise((done) => {
             socket.addEventListener("close", done);
             socket.close();
         })).then(() => 1);
@@ -359,18 +289,3 @@ def test_what_is_asked_of_a_viewer_that_is_gone_fails_at_once(page, scene):
     assert page.run(f"rnd.play(true); {shown}") == "▶"  # and not said once more for every picture
     page.open(back)
     page.wait("!window.socket && window.rnd && rnd.scene()")
-
-
-def test_a_picture_that_the_browser_cannot_decode_is_said(page, scene, monkeypatch):
-    back = page.run("location.href")
-    with _serving(scene) as url:
-        page.open(f"{url}?encoding=jpeg")
-        page.wait("location.search && window.rnd && rnd.scene()")
-        assert page.run(OUTCOME) == "drawn"
-        monkeypatch.setattr(rnd_viewer.view.server, "_jpeg", lambda srgb: b"torn")
-        wrong = "this browser cannot decode a picture that rnd-view sent"
-        assert page.run(OUTCOME) == wrong == page.run(MESSAGE)
-        monkeypatch.undo()
-        assert page.run(OUTCOME) == "drawn" and page.run(MESSAGE) == ""
-        page.open(back)
-        page.wait("!location.search && window.rnd && rnd.scene()")

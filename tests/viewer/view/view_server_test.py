@@ -1,4 +1,4 @@
-"""rnd-view's server: what it answers, whom it refuses, and that pictures are rnd-play's."""
+"""rnd-view's server: what it answers, whom it refuses, and that its frames are rnd-play's."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import os
 import re
 import socket
+import sys
 import threading
 import urllib.request
 from collections.abc import Iterator
@@ -28,23 +29,19 @@ from websockets.sync.client import connect
 
 import rnd_viewer.view.cli
 import rnd_viewer.view.scene
-from rnd_runtime.avatar.avatar import Avatar
-from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_runtime.core.kernels import COMPILING
 from rnd_runtime.motion.edit import MotionEdits, edit_motion
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.shading.light import load_light
-from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
-from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
 from rnd_viewer.play.player import Player
 from rnd_viewer.view.cli import main
 from rnd_viewer.view.options import ViewOptions
-from rnd_viewer.view.scene import Scene, _fewer
+from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import Access, serve
 from support.play_fakes import FakeAvatar, fake_motion
 from support.tiny import ASSETS
@@ -81,21 +78,29 @@ def options(tmp_path, monkeypatch) -> ViewOptions:
     sky = np.random.default_rng(0).uniform(0.2, 1, (16, 32, 3)).astype(np.float32)
     sky[5, 9] = 200  # a sun
     write_image(tmp_path / "sky.exr", sky)
-    return ViewOptions(Path("avatar.onnx"), tmp_path / "walk.npz", (tmp_path / "sky.exr",), size=SIZE, raster="cpu")
+    return ViewOptions(
+        Path("avatar.onnx"), tmp_path / "walk.npz", (tmp_path / "sky.exr",), size=(SIZE, None), raster="cpu"
+    )
+
+
+@contextmanager
+def _running(shown: Scene, token: str | None = None, fps_floor: float | None = None) -> Iterator[int]:
+    with serve(shown, "127.0.0.1", 0, token, fps_floor) as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield int(url.split(":")[2].split("/")[0])
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 @contextmanager
 def _serving(options: ViewOptions, token: str | None = None) -> Iterator[tuple[int, Scene]]:
     scene = Scene(options)
-    with serve(scene, "127.0.0.1", 0, token) as (server, url):
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield int(url.split(":")[2].split("/")[0]), scene
-        finally:
-            server.shutdown()
-            thread.join()
-            scene.close()
+    with _running(scene, token) as port:
+        yield port, scene
+    scene.close()
 
 
 class Visitor:
@@ -112,10 +117,10 @@ class Visitor:
         self.socket.send(json.dumps(request))
         return json.loads(self.socket.recv())
 
-    def picture(self, **changes: Any) -> np.ndarray:
+    def frame(self, **changes: Any) -> np.ndarray:
         """[H, W, 3] of the state with ``changes``."""
         header = self.ask(ask="render", number=7, state=self.state(**changes))
-        assert header["kind"] == "picture" and header["number"] == 7, header
+        assert header["kind"] == "frame" and header["number"] == 7, header
         data = self.socket.recv()
         if header["encoding"] == "jpeg":
             return np.asarray(Image.open(BytesIO(data)))
@@ -147,20 +152,20 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
 def test_the_first_view_is_rnd_plays_to_the_bit(options):
     with _serving(options) as (port, _), _visiting(port) as visitor:
         for time in (0.0, 0.1):
-            assert (visitor.picture(time=time) == _played(options, time)).all()
-        hdr = visitor.picture(background="hdr", yaw=0.7, shade="table")
+            assert (visitor.frame(time=time) == _played(options, time)).all()
+        hdr = visitor.frame(background="hdr", yaw=0.7, shade="table")
         expected = _played(options, 0.0, yaw=0.7, shade="table", background=Background("hdr"))
         assert (hdr == expected).all()
-        bright = visitor.picture(exposure=1.3)
+        bright = visitor.frame(exposure=1.3)
         # the light is scaled before or after shading: float32 rounds differently
         assert np.abs(bright.astype(int) - _played(options, 0.0, exposure=1.3)).max() <= 1
-        assert np.abs(bright.astype(int) - visitor.picture()).max() > 20
+        assert np.abs(bright.astype(int) - visitor.frame()).max() > 20
 
 
 def test_a_probe_made_for_a_z_up_world_lights_as_rnd_play_has_it(options):
     turned = replace(options, hdr_up="z")
     with _serving(turned) as (port, _), _visiting(port) as visitor:
-        assert (visitor.picture() == _played(turned, 0.0)).all()
+        assert (visitor.frame() == _played(turned, 0.0)).all()
     assert (_played(turned, 0.0) != _played(options, 0.0)).any()
     with pytest.raises(InputError, match=r"--hdr-up: .* \(needs --hdr\)"):
         replace(turned, hdr=())
@@ -169,8 +174,7 @@ def test_a_probe_made_for_a_z_up_world_lights_as_rnd_play_has_it(options):
 def test_every_output_fewer_gaussians_and_jpeg(options):
     with _serving(options) as (port, scene), _visiting(port) as visitor:
         pictures = {
-            name: visitor.picture(output=name)
-            for name in ("lit", "light", "albedo", "normal", "roughness", "visibility")
+            name: visitor.frame(output=name) for name in ("lit", "light", "albedo", "normal", "roughness", "visibility")
         }
         body = pictures["normal"].any(-1)
         assert 0.1 < body.mean() < 0.6
@@ -180,25 +184,10 @@ def test_every_output_fewer_gaussians_and_jpeg(options):
         for channel, albedo in enumerate((0.6, 0.4, 0.2)):
             srgb = round(255 * (1.055 * albedo ** (1 / 2.4) - 0.055))
             assert abs(int(pictures["albedo"][..., channel].max()) - srgb) <= 1
-        half = visitor.picture(gaussians=scene.avatar.gaussians // 2)
+        half = visitor.frame(gaussians=scene.avatar.gaussians // 2)
         assert half.any() and (half != pictures["lit"]).any()
-        smooth = visitor.picture(encoding="jpeg")
+        smooth = visitor.frame(encoding="jpeg")
         assert np.abs(smooth.astype(int) - pictures["lit"]).mean() < JPEG_MEAN_ERROR
-
-
-def test_fewer_gaussians_are_of_the_whole_body():
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
-    posed = avatar.pose(load_motion(ASSETS / "walk.npz", avatar.skeleton), 0.3)
-    low, high = posed.means.min(0), posed.means.max(0)
-    camera = Camera.look_at((low + high) / 2 + [0, 0, 3], (low + high) / 2, width=96, height=128, fov_y=0.75)
-
-    def covered(gaussians):
-        colour = np.ones((len(gaussians.means), 1), np.float32)
-        return rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, colour, camera).alpha > 0.5
-
-    whole, few = covered(posed), covered(_fewer(posed, len(posed.means) // 8))
-    assert whole.sum() > 500 and (whole & few).sum() / (whole | few).sum() > LEAST_OVERLAP
-    assert _fewer(posed, None) is posed
 
 
 def test_the_clip_has_every_frame(options):
@@ -214,7 +203,7 @@ def test_the_clip_has_every_frame(options):
         assert np.abs(frames[0].astype(int) - frames[3]).max() > 50  # the camera has turned
 
 
-def test_a_clip_that_the_disk_has_no_room_for_is_told_in_one_line(options, monkeypatch):
+def test_a_clip_that_the_disk_has_no_space_for_is_one_line(options, monkeypatch):
     def full(file, fps):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(file))
 
@@ -222,7 +211,7 @@ def test_a_clip_that_the_disk_has_no_room_for_is_told_in_one_line(options, monke
     with _serving(options) as (port, _), _visiting(port) as visitor:
         answer = visitor.ask(ask="clip", state=visitor.state(), fps=30)
         assert answer["kind"] == "error" and answer["message"].endswith("clip.mp4: No space left on device")
-        assert visitor.picture().any()  # and the connection lives
+        assert visitor.frame().any()  # and the connection lives
 
 
 def test_however_much_is_asked_meanwhile_the_page_is_not_taken_for_gone(options, monkeypatch):
@@ -239,17 +228,6 @@ def test_however_much_is_asked_meanwhile_the_page_is_not_taken_for_gone(options,
         for _ in range(42):
             visitor.socket.recv()
         assert heard
-
-
-def test_a_clip_of_a_loop_that_does_not_go_round_says_so(options):
-    save_motion(options.motion, fake_motion(12))
-    with _serving(replace(options, loop=True)) as (port, scene), _visiting(port) as visitor:
-        for fps, notes in ((30, ()), (24, scene.motion.loop_notes(24))):
-            header = visitor.ask(ask="clip", state=visitor.state(), fps=fps)
-            while header["kind"] == "progress":
-                header = json.loads(visitor.socket.recv())
-            assert header == {"kind": "clip", "notes": list(notes)} and len(notes) == (fps == 24)
-            visitor.socket.recv()
 
 
 @pytest.mark.parametrize(
@@ -269,7 +247,7 @@ def test_a_request_that_makes_no_sense_is_answered_with_one_line(options, change
     with _serving(options) as (port, _), _visiting(port) as visitor:
         answer = visitor.ask(ask="render", number=1, state=visitor.state(**changes))
         assert answer["kind"] == "error" and reason in answer["message"] and "\n" not in answer["message"]
-        assert visitor.picture().any()  # and the connection lives
+        assert visitor.frame().any()  # and the connection lives
 
 
 def _knock(port: int, **headers: Any) -> None:
@@ -316,23 +294,6 @@ def test_what_is_no_request_is_answered_as_such(options):
             with socket.create_connection(("127.0.0.1", port), timeout=10) as knocking:
                 knocking.sendall(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n")
                 assert knocking.recv(1000).startswith(b"HTTP/1.1 400 ")
-
-
-def test_what_is_wrong_with_a_light_is_told_with_its_pictures_and_the_whole_map_is_not_kept(options, tmp_path):
-    broken = np.ones((16, 32, 3), np.float32)
-    broken[3, 4] = np.nan
-    write_image(tmp_path / "nan.exr", broken)
-    with _serving(replace(options, hdr=(*options.hdr, tmp_path / "nan.exr"))) as (port, scene):
-        with _visiting(port) as visitor:
-            for light, notes in (
-                (1, []),
-                (2, ["1 texels of the light were NaN, infinite or negative and were filled in"]),
-            ):
-                header = visitor.ask(ask="render", number=1, state=visitor.state(light=light))
-                assert header["notes"] == notes
-                assert max(len(str(x)) for joint in header["joints"] for x in joint) < 9
-                visitor.socket.recv()
-        assert scene._light.cache_info().currsize == 0
 
 
 def test_on_the_port_of_http_browsers_name_no_port():
@@ -394,28 +355,8 @@ def test_threads_hold_for_every_visitor(options, monkeypatch):
     with _serving(replace(options, threads=1)) as (port, _):
         for _ in range(2):
             with _visiting(port) as visitor:
-                visitor.picture()
+                visitor.frame()
     assert counts == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("changes", "line"),
-    [
-        ({"motion_up": "z"}, "--motion-up: expected the default, got z"),
-        ({"joint_map": Path("t.toml")}, "--joint-map"),
-        ({"loop": True}, "--loop: expected the default, got True"),
-    ],
-)
-def test_options_of_a_motion_that_is_not_there_are_refused(changes, line):
-    with pytest.raises(InputError, match=line):
-        ViewOptions(Path("avatar.onnx"), **changes)
-
-
-def test_a_captures_motion_is_edited_and_read_by_its_own_rules():
-    edited = ViewOptions(Path("a"), capture=Path("b"), loop=True, smooth=2.0, speed=2.0, in_place=True)
-    assert edited.edits == MotionEdits(2.0, 2.0, True, True)
-    with pytest.raises(InputError, match=r"--motion-up: .* \(needs --motion: the capture's own"):
-        replace(edited, motion_up="z")
 
 
 def test_a_token_is_asked_for_everywhere(options):
@@ -430,7 +371,7 @@ def test_a_token_is_asked_for_everywhere(options):
         given = {"Cookie": f'a b=1; json={{"x": [1]}}; {cookie.split(";")[0]}; other=2'}  # beside other programs'
         assert _get(port, "/app.js", **given)[0] == 200
         with _visiting(port, additional_headers=given) as visitor:
-            assert visitor.picture().any()
+            assert visitor.frame().any()
         with pytest.raises(InvalidStatus, match="403"):
             _knock(port, additional_headers=given, origin="http://evil.example")
 
@@ -444,6 +385,39 @@ def test_any_other_address_asks_for_the_token_that_is_printed():
         assert _get(int(port), f"/?token={token}")[0] == 200
 
 
+def test_without_motion_or_light_the_avatar_stands_in_its_own(options):
+    bare = ViewOptions(Path("avatar.onnx"), size=(SIZE, None), raster="cpu")
+    with _serving(bare) as (port, _), _visiting(port) as visitor:
+        assert visitor.scene["motion"]["duration"] == 0 and visitor.scene["light"] == 0
+        assert visitor.frame(light=0).any()
+
+
+def test_a_note_on_the_light_comes_with_its_frames(options, tmp_path):
+    broken = np.ones((16, 32, 3), np.float32)
+    broken[3, 4] = np.nan
+    write_image(tmp_path / "nan.exr", broken)
+    with _serving(replace(options, hdr=(*options.hdr, tmp_path / "nan.exr"))) as (port, _), _visiting(port) as visitor:
+        for light, noted in ((1, False), (2, True)):
+            header = visitor.ask(ask="render", number=1, state=visitor.state(light=light))
+            assert any("NaN" in note for note in header["notes"]) == noted
+            visitor.socket.recv()
+
+
+def test_live_frames_get_smaller_to_hold_the_frame_rate_and_exact_ones_do_not(options):
+    scene = Scene(replace(options, size=(2 * SIZE, None)))
+    with _running(scene, fps_floor=1000.0) as port, _visiting(port) as visitor:
+
+        def width(live: bool) -> int:
+            state = visitor.state(width=2 * SIZE, height=2 * SIZE)
+            header = visitor.ask(ask="render", number=1, live=live, state=state)
+            visitor.socket.recv()
+            return header["width"]
+
+        assert [width(True) for _ in range(12)][-1] == SIZE
+        assert width(False) == 2 * SIZE
+    scene.close()
+
+
 def test_the_motion_is_edited_as_rnd_play_does(options):
     edits = MotionEdits(speed=2.0, in_place=True)
     scene = Scene(replace(options, speed=edits.speed, in_place=edits.in_place))
@@ -452,48 +426,40 @@ def test_the_motion_is_edited_as_rnd_play_does(options):
     assert scene.motion.duration == expected.duration < untouched.duration
     assert (scene.motion.translations == expected.translations).all()
     scene.close()
-    with pytest.raises(InputError, match=r"--smooth: expected 0\.01 to 1000, got 0"):
-        replace(options, smooth=0)
 
 
-def test_of_a_large_probe_a_smaller_one_is_kept_and_its_light_is_the_files(options, tmp_path):
-    rng = np.random.default_rng(1)
-    write_image(tmp_path / "large.exr", rng.uniform(0.2, 1, (1100, 2200, 3)).astype(np.float32))
-    scene = Scene(replace(options, hdr=(tmp_path / "large.exr",)))
-    shader, light = scene._shader(tmp_path / "large.exr", "table"), load_light(tmp_path / "large.exr")
-    assert scene._sky(tmp_path / "large.exr").radiance.shape == (1024, 2048, 3)
-    assert shader.light.radiance.size == 6  # it is only turned: what it needs of the texels is in its tables
-    np.testing.assert_array_equal(shader.sky.diffuse, Shader(light, "table").sky.diffuse)
-    scene.close()
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"motion_up": "z"}, "--motion-up"),
+        ({"joint_map": Path("t.toml")}, "--joint-map"),
+        ({"loop": True}, "--loop"),
+        ({"capture": Path("b"), "motion_up": "z"}, "--motion-up"),
+        ({"motion": Path("b"), "smooth": 0}, "--smooth"),
+        ({"port": 99999}, "--port"),
+        ({"size": (8, None)}, "--size"),
+        ({"fps_floor": 0}, "--fps-floor"),
+    ],
+)
+def test_options_that_do_nothing_or_make_no_sense_are_refused(changes, line):
+    with pytest.raises(InputError, match=line):
+        ViewOptions(Path("avatar.onnx"), **changes)
 
 
-def test_options_and_refusals(options, capsys, tmp_path, monkeypatch):
+def test_refusals_of_the_command(options, capsys, tmp_path, monkeypatch):
     assert ViewOptions(Path("a")).local and ViewOptions(Path("a"), host="::1").local
     assert not ViewOptions(Path("a"), host="0.0.0.0").local
-    assert not ViewOptions(Path("a"), host="example.org").local
     assert main(["avatar.onnx", "--motion", str(tmp_path / "none.npz")]) == 2
-    assert main(["avatar.onnx", "--port", "99999"]) == 2
     monkeypatch.setattr(rnd_viewer.view.cli, "kernels_are_cold", lambda: True)
     with _serving(options) as (port, _):
-        arguments = ["avatar.onnx", "--port", str(port), "--no-browser"]
-        assert main(arguments) == 2
+        assert main(["avatar.onnx", "--port", str(port), "--no-browser"]) == 2
     errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 4 and "--port" in errors[1] and errors[2] == f"rnd-view: {COMPILING}"
-    assert "cannot listen" in errors[3] and errors[3].endswith("(--port picks another)")
-    monkeypatch.setitem(__import__("sys").modules, "websockets.sync.server", None)
+    assert len(errors) == 3 and errors[1] == f"rnd-view: {COMPILING}" and "--port picks another" in errors[2]
+    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
     assert main(["avatar.onnx"]) == 2
     assert "rnd-avatar[view]" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("host", ["192.0.2.1", "2001:db8::1", "nobody.invalid"])
-def test_an_address_of_another_machine_is_not_blamed_on_the_port(options, host):
-    hint = r"\(--host takes an address of this machine\)$"
-    with pytest.raises(InputError, match=hint), serve(Scene(options), host, 0, "token"):
+def test_an_address_of_another_machine_is_not_blamed_on_the_port(options):
+    with pytest.raises(InputError, match="--host"), serve(Scene(options), "192.0.2.1", 0, "token"):
         pass
-
-
-def test_without_motion_or_light_the_avatar_stands_in_its_own(options):
-    bare = ViewOptions(Path("avatar.onnx"), size=SIZE, raster="cpu")
-    with _serving(bare) as (port, _), _visiting(port) as visitor:
-        assert visitor.scene["motion"]["duration"] == 0 and visitor.scene["light"] == 0
-        assert visitor.picture(light=0).any()

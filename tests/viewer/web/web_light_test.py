@@ -14,10 +14,10 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.light import REC709, light_notes, load_light
-from rnd_runtime.shading.sun import extract_suns
-from runtime.shading.sun_test import beside_a_lamp
 from support.paths import ROOT
+from support.sun_scenes import beside_a_lamp
 
 WEB = ROOT / "viewer/web"
 NODE = shutil.which("node")
@@ -258,7 +258,7 @@ def test_what_a_radiance_file_states_is_taken_alike(tmp_path, stated):
 def test_a_sun_is_taken_out_beside_a_lamp_of_brighter_texels(tmp_path: Path) -> None:
     radiance, _ = beside_a_lamp()
     file = _exr(tmp_path / "sun.exr", radiance, kind="float")
-    rest, suns = extract_suns(load_light(file))
+    rest, suns = extract_directional(load_light(file))
     got = _page(file, _SUNS)
     assert len(got["suns"]) == len(suns) == 1
     for name in ("direction", "irradiance", "spread"):

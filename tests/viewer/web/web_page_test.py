@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import http.server
 import json
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -16,7 +15,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import av
 import msgspec
 import numpy as np
 import onnx
@@ -41,16 +39,14 @@ from support.paths import ASSETS, ROOT
 DIST = ROOT / "viewer/web/dist"
 SIZE, FRAME = 192, 20
 
-TOLERANCE = 3  # of 255; measured 1
+TOLERANCE = 3  # of 255
 MEAN_TOLERANCE = 1e-3  # of 255; measured 1e-4
 
-RANDOM_STATES = int(os.environ.get("RND_RANDOM_STATES", 25))
-RANDOM_SEED = 11
-# Of all pixels; none of 25 states. What covers less than 1/255 of a pixel is left out, and the last bits of networks,
-# which are other ones in every build of onnxruntime, may decide on that.
-RARE = 1e-7
+# Pixels of a frame that may miss it: float32 and float64 order a few pairs of Gaussians at one depth differently.
+MAX_FLIPPED = 10
 
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
     pytest.mark.skipif(not (DIST / "worker.js").is_file(), reason="needs npm ci && npm run build in viewer/web"),
 ]
@@ -77,13 +73,8 @@ def site(tmp_path_factory) -> Path:
     walk = load_motion(ASSETS / "walk.npz", avatar.skeleton)
     first = replace(walk, rotations=walk.rotations[:31], translations=walk.translations[:31])
     save_motion(folder / "walk.npz", first)
-    fast = replace(walk, rotations=walk.rotations[:61], translations=walk.translations[:61], fps=120.0)
-    save_motion(folder / "fast.npz", fast)
-    slow = replace(walk, rotations=walk.rotations[:21], translations=walk.translations[:21], fps=10.0)
-    save_motion(folder / "slow.npz", slow)
     save_motion(folder / "whole.npz", walk)
     save_motion(folder / "a #1, 50%.npz", first)
-    save_motion(folder / "what? 1:2.npz", first)
     rng = np.random.default_rng(3)
     # AMASS' SMPL-H: Z up, joints by number, fingers beside
     poses = np.zeros((8, 52, 3))
@@ -109,11 +100,9 @@ def site(tmp_path_factory) -> Path:
     (folder / "torn.onnx").write_bytes((ASSETS / "avatar.onnx").read_bytes()[:100_000])
     _write_advice(folder / "advised.onnx", '{"cull": -0.2}')
     _write_advice(folder / "misled.onnx", '{"cull": 3}')
-    _write_advice(folder / "nothing.onnx", "null")
     _write_avatar(folder / "other.onnx", _raise_and_dim)
     _write_avatar(folder / "stranger.onnx", _rename)
-    _write_avatar(folder / "later.onnx", lambda about: about.update(hair=1))
-    _write_avatar(folder / "joined.onnx", lambda about: about["skeleton"].pop("parents"))
+    _write_avatar(folder / "later.onnx", lambda about: about.update(schema="rnd-avatar/9"))
     _write_broken_avatar(folder / "holes.onnx")
     _write_avatar_of_a_graph(folder / "graph.onnx")
     ends = {"left_elbow": 1.6, "right_wrist": -1.9}  # radians about what is nearly the forearm's axis
@@ -279,10 +268,10 @@ def _is_refusal(page: Page) -> bool:
     return page.run("document.getElementById('message').classList.contains('wrong')")
 
 
-def _picture(page: Page, **changes: Any) -> np.ndarray:
+def _frame(page: Page, **changes: Any) -> np.ndarray:
     """[H, W, 3] of the state with ``changes``."""
-    page.run(f"Object.assign(rnd.state, {json.dumps(changes)}); rnd.picture().then(() => 1)")
-    url = page.run("document.getElementById('picture').toDataURL()")
+    page.run(f"Object.assign(rnd.state, {json.dumps(changes)}); rnd.frame().then(() => 1)")
+    url = page.run("document.getElementById('frame').toDataURL()")
     return np.asarray(Image.open(BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB"))
 
 
@@ -297,22 +286,23 @@ def loaded(page, site) -> Page:
 def _assert_close(got: np.ndarray, expected: np.ndarray) -> None:
     assert got.shape == expected.shape
     error = np.abs(got.astype(int) - expected)
-    assert error.max() <= TOLERANCE and error.mean() < MEAN_TOLERANCE, (error.max(), error.mean())
+    flipped = int((error.max(-1) > TOLERANCE).sum())
+    assert flipped <= MAX_FLIPPED and error.mean() < MEAN_TOLERANCE, (flipped, error.max(), error.mean())
 
 
 def _scene(site: Path, motion: str = "walk.npz", avatar: str = "avatar.onnx") -> Scene:
     lights = (site / "sky.exr", site / "window.hdr", site / "broken.exr")
-    return Scene(ViewOptions(site / avatar, site / motion, lights, size=SIZE, raster="cpu"))
+    return Scene(ViewOptions(site / avatar, site / motion, lights, size=(SIZE, None), raster="cpu"))
 
 
-def _python_picture(page: Page, scene: Scene) -> np.ndarray:
+def _python_frame(page: Page, scene: Scene) -> np.ndarray:
     """What rnd-view draws of the page's state."""
     return scene.render(msgspec.convert(page.run("rnd.state"), ViewState)).srgb
 
 
 def _assert_agreed(page: Page, got: np.ndarray, scene: Scene) -> None:
     """The page's picture ``got`` is rnd-view's."""
-    _assert_close(got, _python_picture(page, scene))
+    _assert_close(got, _python_frame(page, scene))
 
 
 def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
@@ -321,11 +311,11 @@ def test_the_pixels_are_rnd_plays(loaded, site, tmp_path):
     light = ["--background", "hdr", "--hdr-yaw", "40", "--exposure", "0.5"]
     assert play([*inputs, *options, *light, "--out", str(tmp_path)]) == 0
     state = {"width": SIZE, "height": SIZE, "time": FRAME / 30, "light": 1}
-    got = _picture(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
+    got = _frame(loaded, **state, background="hdr", yaw=np.radians(40), exposure=0.5)
     expected = read_image(tmp_path / f"frames/{FRAME:06d}.png")
     _assert_close(got, expected)
     # were the light not turned, or the frame its neighbour, hundreds of pixels would be off
-    assert (np.abs(_picture(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
+    assert (np.abs(_frame(loaded, yaw=0).astype(int) - expected).max(-1) > TOLERANCE).sum() > 1000
 
 
 def test_every_state_has_rnd_views_pixels(loaded, site):
@@ -359,40 +349,17 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
     ]
     seen = set()
     for changes in states:
-        got = _picture(loaded, **(straight | changes))
+        got = _frame(loaded, **(straight | changes))
         _assert_agreed(loaded, got, scene)
         seen.add(got.tobytes())
     assert len(seen) == len(states)
     scene.close()
 
 
-def test_states_drawn_at_random_have_rnd_views_pixels(loaded, site):
-    scene, rng, wrong = _scene(site), np.random.default_rng(RANDOM_SEED), []
-    for _ in range(RANDOM_STATES):
-        state = {
-            "light": int(rng.integers(0, 3)),
-            "yaw": rng.uniform(-np.pi, np.pi),
-            "exposure": rng.uniform(-1, 2),
-            "output": str(rng.choice(["lit", "light"])),
-            "shade": "table+sun",  # what tells apart most
-            "gaussians": [None, None, 3000, 8000][rng.integers(0, 4)],
-            "time": rng.uniform(0, 1),
-            "azimuth": rng.uniform(-np.pi, np.pi),
-            "elevation": rng.uniform(-1.2, 1.2),
-            "distance": rng.uniform(0.7, 4),
-            "fov": rng.uniform(0.3, 1),
-        }
-        got = _picture(loaded, background="none", width=SIZE, height=SIZE, **state)
-        error = np.abs(got.astype(int) - _python_picture(loaded, scene)).max(-1)
-        wrong += [(int(pixel), state) for pixel in error[error > TOLERANCE]]
-    assert len(wrong) <= RARE * RANDOM_STATES * SIZE**2, wrong
-    scene.close()
-
-
 def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receive_shadows(fresh, site):
     _drop(fresh, "holes.onnx", "walk.npz", "sky.exr")
     avatar, sky = site / "holes.onnx", site / "sky.exr"
-    scene = Scene(ViewOptions(avatar, site / "walk.npz", (sky,), size=SIZE, raster="cpu"))
+    scene = Scene(ViewOptions(avatar, site / "walk.npz", (sky,), size=(SIZE, None), raster="cpu"))
     straight = {"time": 0.4, "light": 1, "shade": "table+sun", "output": "light", "gaussians": None}
     straight |= {"width": SIZE, "height": SIZE}
     states: list[dict[str, Any]] = [
@@ -403,7 +370,7 @@ def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receiv
         {"output": "albedo"},
     ]
     for changes in states:
-        got = _picture(fresh, **(straight | changes))
+        got = _frame(fresh, **(straight | changes))
         assert got.any()
         _assert_agreed(fresh, got, scene)
     scene.close()
@@ -412,11 +379,11 @@ def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receiv
 def test_what_the_file_advises_to_leave_out_is_left_out_as_in_rnd_view(fresh, site):
     _drop(fresh, "avatar.onnx", "walk.npz", "sky.exr")
     state: dict[str, Any] = {"width": SIZE, "height": SIZE, "time": 0.4, "azimuth": 1.1}
-    whole = {output: _picture(fresh, **state, output=output) for output in ("lit", "normal")}
+    whole = {output: _frame(fresh, **state, output=output) for output in ("lit", "normal")}
     _drop(fresh, "advised.onnx")
     scene = _scene(site, avatar="advised.onnx")
     for output, everything in whole.items():
-        got = _picture(fresh, **state, output=output)
+        got = _frame(fresh, **state, output=output)
         _assert_agreed(fresh, got, scene)
         assert (np.abs(got.astype(int) - everything).max(-1) > TOLERANCE).sum() > 100
     scene.close()
@@ -424,13 +391,11 @@ def test_what_the_file_advises_to_leave_out_is_left_out_as_in_rnd_view(fresh, si
 
 def test_a_file_that_only_its_graph_can_pose_is_posed_by_it(fresh, site):
     _drop(fresh, "graph.onnx", "walk.npz", "sky.exr")
-    scene = Scene(ViewOptions(site / "graph.onnx", site / "walk.npz", size=SIZE, raster="cpu"))
-    got = _picture(fresh, width=SIZE, height=SIZE, light=0, shade="table", time=0.4)
-    expected = _python_picture(fresh, scene)
+    scene = Scene(ViewOptions(site / "graph.onnx", site / "walk.npz", size=(SIZE, None), raster="cpu"))
+    got = _frame(fresh, width=SIZE, height=SIZE, light=0, shade="table", time=0.4)
+    assert got.any()
+    _assert_agreed(fresh, got, scene)
     scene.close()
-    off = np.abs(got.astype(int) - expected).max(axis=-1) > TOLERANCE
-    # two builds of onnxruntime add in different orders: a few pairs of Gaussians change places
-    assert got.any() and off.sum() <= 10
 
 
 def test_it_plays_and_relights_by_hand(loaded):
@@ -438,9 +403,9 @@ def test_it_plays_and_relights_by_hand(loaded):
     loaded.wait("rnd.state.time > 0.3")
     loaded.wait("rnd.rate() > 1 && document.querySelectorAll('#times tr').length > 4")
     loaded.run("rnd.play(false)")
-    before = _picture(loaded, time=0.5, output="lit")
+    before = _frame(loaded, time=0.5, output="lit")
     loaded.drag((300, 300), (-100, 0), shift=True)
-    assert (_picture(loaded) != before).mean() > 0.02
+    assert (_frame(loaded) != before).mean() > 0.02
 
 
 def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
@@ -454,7 +419,7 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
     view = loaded.run("rnd.scene().view")
     for name, value in scene.description()["view"].items():
         assert view[name] == pytest.approx(value, abs=1e-9), name
-    got = _picture(loaded, time=0.1, yaw=1.0)
+    got = _frame(loaded, time=0.1, yaw=1.0)
     assert got.any()
     _assert_agreed(loaded, got, scene)
     scene.close()
@@ -464,7 +429,7 @@ def test_a_motion_of_another_family_and_a_broken_light(loaded, site):
 def test_twisted_forearms(fresh, site):
     _drop(fresh, "avatar.onnx", "twisted.npz", "sky.exr")
     scene = _scene(site, "twisted.npz")
-    _assert_agreed(fresh, _picture(fresh, time=0.4, azimuth=0.5), scene)
+    _assert_agreed(fresh, _frame(fresh, time=0.4, azimuth=0.5), scene)
     scene.close()
 
 
@@ -482,29 +447,6 @@ def test_the_time_slider_reaches_the_last_frame_and_is_off_without_a_motion(fres
     assert not fresh.run("slider.disabled")
 
 
-def test_a_light_that_came_before_the_avatar_shines_and_comes_again_in_its_own_place(fresh):
-    _drop(fresh, "window.hdr")
-    _drop(fresh, "avatar.onnx", "walk.npz")
-    for _ in range(2):
-        assert fresh.run("[rnd.state.light, ...rnd.scene().lights]") == [1, "the avatar's own", "window.hdr"]
-        _drop(fresh, "window.hdr")
-    _drop(fresh, "walk.npz")
-    assert fresh.run("rnd.state.light") == 1
-
-
-def test_files_are_chosen_by_keyboard_and_the_same_ones_again(fresh):
-    fresh.run("document.getElementById('choose').focus()")
-    assert fresh.run("document.activeElement.id") == "choose"
-    fresh.run("""
-        const choose = document.getElementById("choose"), data = new DataTransfer();
-        data.items.add(new File(["?"], "torn.npz"));
-        choose.files = data.files;
-        choose.dispatchEvent(new Event("change"));
-    """)
-    fresh.wait("document.getElementById('message').textContent.includes('torn.npz: ')")
-    assert fresh.run("choose.files.length") == 0
-
-
 def test_addresses_name_files_of_any_name(address, tmp_path):
     with chromium(tmp_path, webgl=True) as browser:
         browser.open(f"{address}?avatar=avatar.onnx&motion={quote('a #1, 50%.npz')}&hdr=sky.exr,window.hdr")
@@ -512,9 +454,6 @@ def test_addresses_name_files_of_any_name(address, tmp_path):
         assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
         assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
         assert browser.run("rnd.state.light") == 1  # the first that is named, as in rnd-view
-        browser.open(f"{address}?avatar=avatar.onnx&motion={quote('what? 1:2.npz')}")
-        browser.wait("window.rnd && rnd.scene()")
-        assert browser.run("rnd.scene().motion.name") == "what? 1:2.npz"
 
 
 def test_without_webgl_the_reason_stays(address, site, tmp_path):
@@ -552,12 +491,12 @@ def test_a_lost_context_is_asked_for_again(address, site, tmp_path):
         _open(browser, address + "lost/")
         assert _drop(browser, "avatar.onnx", "walk.npz", "window.hdr") == ""
         asked = {"width": 96, "height": 96, "background": "hdr"}
-        before = _picture(browser, **asked)
+        before = _frame(browser, **asked)
         assert browser.run("""new Promise((done) => {
             new BroadcastChannel("gone").onmessage = ({ data }) => done(data);
             new BroadcastChannel("lose").postMessage(1);
         })""")
-        assert before.any() and (_picture(browser, **asked) == before).all()
+        assert before.any() and (_frame(browser, **asked) == before).all()
 
 
 def _clip(page: Page, folder: Path, size: int) -> Path:
@@ -578,38 +517,12 @@ def test_the_clip_is_a_download(loaded, tmp_path):
     assert file.suffix in (".webm", ".mp4") and file.stat().st_size > 5_000
 
 
-def test_a_clip_lasts_as_long_as_its_motion_though_timers_are_late(fresh, tmp_path):
-    _drop(fresh, "avatar.onnx", "slow.npz")
-    fresh.run("const timer = setTimeout; window.setTimeout = (done, ms) => timer(done, Math.max(ms, 0) + 50)")
-    with av.open(str(_clip(fresh, tmp_path, 64))) as clip:
-        times = [frame.time for frame in clip.decode(video=0)]
-    assert times[-1] - times[0] == pytest.approx(2, abs=0.4)  # 3 if the lateness of 21 frames adds up
-
-
-def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_held(fresh, tmp_path):
-    _drop(fresh, "avatar.onnx", "fast.npz")
-    fresh.run("""
-        const message = document.getElementById("message"), { close } = ImageBitmap.prototype;
-        let closed = 0;
-        ImageBitmap.prototype.close = function () { closed += 1; close.call(this); };
-        window.said = [];
-        new MutationObserver(() => said.push([message.textContent, closed])).observe(message, { childList: true });
-    """)
-    _clip(fresh, tmp_path, 64)
-    progress = [(text, closed) for text, closed in fresh.run("said") if " of 16" in text]
-    note = "keep this tab in view"  # browsers slow down a hidden one
-    assert [text for text, _ in progress] == [f"making a clip: {done} of 16 · {note}" for done in range(1, 17)]
-    assert all(closed >= done for done, (_, closed) in enumerate(progress, 1))  # and the page's own
-
-
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
         ("torn.onnx", "torn.onnx: the .onnx file is cut short"),
-        ("later.onnx", "later.onnx: metadata: got unknown field `hair`"),
+        ("later.onnx", "later.onnx: schema rnd-avatar/9"),
         ("misled.onnx", "metadata 'rnd_player': expected an object whose cull is -1 to 1, got {"),
-        ("nothing.onnx", "metadata 'rnd_player': expected an object whose cull is -1 to 1, got null"),
-        ("joined.onnx", "joined.onnx: metadata.skeleton: got no field `parents`"),
         ("torn.hdr", "torn.hdr: the .hdr file is cut short"),
         ("nan.npz", "nan.npz: frame 7: trans: expected finite numbers, got nan"),
         ("nobodys.npz", "expected some of the avatar's"),
@@ -619,7 +532,7 @@ def test_a_clip_of_a_fast_motion_has_thirty_frames_a_second_and_few_of_them_are_
 def test_a_file_that_is_none_of_ours_is_refused_in_one_line(loaded, name, reason):
     message = _drop(loaded, "window.hdr", name)  # of several files it is named
     assert reason in message and "\n" not in message and _is_refusal(loaded)
-    assert _picture(loaded).any()  # what was there still plays
+    assert _frame(loaded).any()  # what was there still plays
 
 
 def test_what_is_no_file_is_refused_in_one_line(loaded, tmp_path):
@@ -632,72 +545,11 @@ def test_what_is_no_file_is_refused_in_one_line(loaded, tmp_path):
     assert loaded.run("document.getElementById('message').textContent") == "expected files, got something else"
 
 
-def test_files_that_are_dropped_while_a_clip_is_made_wait_for_its_end(fresh, tmp_path):
-    fresh.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "clips"))
-    _drop(fresh, "avatar.onnx", "walk.npz")
-    fresh.run("""
-        Object.assign(rnd.state, { width: 64, height: 64 });
-        const message = document.getElementById("message"), clip = document.getElementById("clip");
-        window.said = [];
-        const listen = () => said.push([message.textContent, clip.disabled]);
-        new MutationObserver(listen).observe(message, { childList: true });
-        clip.click();
-        1;
-    """)
-    _let_go(fresh, "nan.npz")
-    fresh.wait("document.getElementById('message').classList.contains('wrong')")
-    said = fresh.run("said")
-    assert all(busy for text, busy in said if text.startswith("making a clip")), said
-    reading = next(k for k, (text, _) in enumerate(said) if text.startswith("reading"))
-    assert not any(text.startswith("making a clip") for text, _ in said[reading:])  # it was done
-    assert not fresh.run("document.getElementById('clip').disabled")
-
-
-def test_a_clip_that_fails_says_so_and_frees_its_button(fresh):
-    _drop(fresh, "avatar.onnx", "walk.npz")
-    fresh.run("rnd.state.light = 99; document.getElementById('clip').click()")
-    fresh.wait("document.getElementById('message').classList.contains('wrong')")
-    assert not fresh.run("document.getElementById('clip').disabled")
-    assert _picture(fresh, light=0, width=64, height=64).any()
-
-
-def test_a_motion_is_refused_before_there_is_an_avatar(fresh):
-    assert "frame 7: trans: expected finite numbers" in _drop(fresh, "nan.npz") and _is_refusal(fresh)
-    assert _drop(fresh, "avatar.onnx") == ""
-    assert fresh.run("rnd.scene().motion.name") == "at rest"
-
-
-def test_a_motion_that_does_not_fit_keeps_the_avatar_out_until_another_comes(fresh):
-    assert "drop an avatar" in _drop(fresh, "nobodys.npz")
-    assert "expected some of the avatar's" in _drop(fresh, "avatar.onnx") and _is_refusal(fresh)
-    assert "drop an avatar" in _drop(fresh, "window.hdr") and not _is_refusal(fresh)
-    fresh.wait("sessions.opened === 3 && sessions.released === 3")
-    assert _drop(fresh, "avatar.onnx", "walk.npz") == ""
-    assert fresh.run("rnd.scene().lights") == ["the avatar's own", "window.hdr"]
-    assert _picture(fresh, width=SIZE, height=SIZE).any()
-
-
-def test_the_slider_keeps_its_share_of_another_avatars_gaussians(fresh, site, tiny_avatar):
-    (site / "tiny.onnx").symlink_to(tiny_avatar)
-    _drop(fresh, "avatar.onnx", "walk.npz")
-    fresh.run("""
-        const slider = document.getElementById("gaussians");
-        slider.value = 20;
-        slider.dispatchEvent(new Event("input"));
-    """)
-    for name in ("tiny.onnx", "avatar.onnx"):
-        assert _drop(fresh, name) == ""
-        assert fresh.run("rnd.state.gaussians") == fresh.run("rnd.scene().gaussians") / 5
-    fresh.run("slider.value = 100; slider.dispatchEvent(new Event('input'))")
-    assert _drop(fresh, "tiny.onnx") == ""
-    assert fresh.run("rnd.state.gaussians") is None
-
-
 def test_a_refused_drop_changes_nothing(fresh):
     _drop(fresh, "avatar.onnx", "walk.npz")
     scene = fresh.run("rnd.scene()")
     state = {"width": SIZE, "height": SIZE, "light": 0, "time": 0.3}
-    before = _picture(fresh, **state)
+    before = _frame(fresh, **state)
     for names, reason in [
         (("other.onnx", "nan.npz"), "expected finite numbers"),
         (("window.hdr", "other.onnx", "torn.onnx"), "cut short"),
@@ -705,8 +557,8 @@ def test_a_refused_drop_changes_nothing(fresh):
         (("amass.npz", "index.html"), "expected .onnx, .npz, .hdr or .exr"),
     ]:
         assert reason in _drop(fresh, *names) and _is_refusal(fresh), names
-        assert (_picture(fresh, time=0.1) != before).any()  # and not a picture kept from before
-        assert (_picture(fresh, **state) == before).all(), names
+        assert (_frame(fresh, time=0.1) != before).any()  # and not a picture kept from before
+        assert (_frame(fresh, **state) == before).all(), names
     fresh.wait("sessions.opened === sessions.released + 1")
     assert _drop(fresh, "walk.npz") == ""
     assert fresh.run("rnd.scene()") == scene
@@ -717,8 +569,8 @@ def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released
     _drop(fresh, "other.onnx")
     fresh.wait("sessions.opened === 6 && sessions.released === 5")
     assert fresh.run("[rnd.scene().avatar, rnd.scene().motion.name]") == ["other.onnx", "amass.npz"]
-    scene = Scene(ViewOptions(site / "other.onnx", site / "amass.npz", size=SIZE, raster="cpu"))
-    got = _picture(fresh, width=SIZE, height=SIZE, light=0, time=0.1)
+    scene = Scene(ViewOptions(site / "other.onnx", site / "amass.npz", size=(SIZE, None), raster="cpu"))
+    got = _frame(fresh, width=SIZE, height=SIZE, light=0, time=0.1)
     _assert_agreed(fresh, got, scene)
     scene.close()
     _drop(fresh, "avatar.onnx", "other.onnx", "stranger.onnx", "nobodys.npz", "avatar.onnx")  # the last one counts

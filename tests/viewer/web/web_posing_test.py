@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from rnd_runtime.posing.posing import Posed, RestPose
-from runtime.posing.posing_test import posing_scene
+from rnd_runtime.posing.rest import RestPose
+from rnd_runtime.posing.skinning import PosedArrays
 from support.paths import ROOT
+from support.posing_scenes import posing_scene
 
 NODE = shutil.which("node")
 ROUND_OFF = 3e-5  # of the largest value: the page computes in float64, the pass in float32
@@ -37,7 +38,7 @@ new RestPose(count[0], arrays.slice(0, 8)).pose(arrays.slice(8), bones)
 """
 
 
-def _page(folder: Path, rest: RestPose, logits: Any, *fields: Any) -> Posed:
+def _page(folder: Path, rest: RestPose, logits: Any, *fields: Any) -> PosedArrays:
     """What the page's code makes of it, in Node.js."""
     assert NODE is not None
     *nodes, bones = fields
@@ -63,10 +64,10 @@ def _page(folder: Path, rest: RestPose, logits: Any, *fields: Any) -> Posed:
     source = (ROOT / "viewer/web/src").as_uri()
     subprocess.run([NODE, "--input-type=module", "--eval", _POSE, source, str(folder)], check=True, timeout=60)
     made = (np.fromfile(folder / f"posed{k}", np.float32).reshape(count, -1) for k in range(4))
-    return Posed(*made)
+    return PosedArrays(*made)
 
 
-def _assert_close(ours: Posed, theirs: Posed) -> None:
+def _assert_close(ours: PosedArrays, theirs: PosedArrays) -> None:
     for a, b in zip(ours, theirs):
         assert_allclose(a, b, rtol=0, atol=ROUND_OFF * np.nanmax(np.abs(b)))
 

@@ -7,57 +7,47 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from rnd_runtime.core.files import is_folder, sha256_of
+from rnd_runtime.core.files import sha256_of
 
 from .html_parts import data_uri, figure, missing, number, table
 from .run_files import read_rows
 
 TITLE = "Speed, accuracy, stability"
-CHARTS = ("crossed.svg", "grid.svg")  # the first that is there: both say the same, of more or fewer points
-CHECKOUT = Path("assets/bench")
+CHARTS = ("crossed.svg", "grid.svg")  # the first that exists: both show the same, with more or fewer points
 STABILITY = "stability.json"
-HEAD = ("id", "failure", "what was measured", "measured", "limit", "verdict", "the plain method")
+HEAD = ("id", "failure", "what was measured", "measured", "limit", "verdict", "baseline")
 WORDS = (0, 1, 2, 5, 6)
 MARKS = {"pass": "✓", "fail": "✗"}
 
 
-def find_bench(run: Path) -> Path | None:
-    """The folder of charts where none is named: that of ``run``, else a checkout's in the current folder."""
-    return next((folder for folder in (run / "bench", CHECKOUT) if is_folder(folder)), None)
-
-
-def bench_section(folder: Path | None, run: Path) -> str:
-    """Chart and table of ``folder``, each with the file it comes from and on whose avatar it was measured."""
-    if folder is None:
-        return missing(TITLE, f"neither {run / 'bench'} nor {CHECKOUT} is there: --bench FOLDER names another")
+def bench_section(folder: Path, run: Path) -> str:
+    """Chart and table of ``folder``, each with its file and the avatar it was measured on."""
     parts = []
     if chart := next((folder / name for name in CHARTS if (folder / name).is_file()), None):
         parts.append(_chart(chart, run))
     if (stability := folder / STABILITY).is_file():
         parts.append(_stability(stability, run))
     if not parts:
-        return missing(TITLE, f"neither {' nor '.join((*CHARTS, STABILITY))} in {folder}")
+        return missing(TITLE, f"neither {' nor '.join((*CHARTS, STABILITY))} in {folder}: --bench FOLDER")
     return f"<h2>{TITLE}</h2>" + "".join(parts)
 
 
 def _chart(file: Path, run: Path) -> str:
-    said = file.with_suffix(".json")
-    rows = read_rows(said, "rows of rnd-bench") if said.is_file() else []
+    data = file.with_suffix(".json")
+    rows = read_rows(data, "rows of rnd-bench") if data.is_file() else []
     machines = "; ".join(dict.fromkeys(str(row["machine"]) for row in rows if "machine" in row))
     caption = (
-        "Time of a frame against its accuracy; each point is one way to play. "
+        "Time of a frame against its accuracy; each point is one configuration. "
         f"From {file}{machines and f', measured on {machines}'}. {measured_on(rows, run)}"
     )
-    # a picture, not inline: its ids could be those of the page
+    # as an image, not inline: its ids could be those of the page
     source = data_uri(file.read_bytes(), "image/svg+xml")
     return figure(f'<img class="chart" alt="{escape(file.stem)}" src="{source}">', caption)
 
 
 def _stability(file: Path, run: Path) -> str:
     rows = read_rows(file, "rows of rnd-bench stability", "id", "what")
-    caption = (
-        f"From {file}. {measured_on(rows, run)} ✓ keeps its limit, ✗ does not; what has no limit is only reported."
-    )
+    caption = f"From {file}. {measured_on(rows, run)} ✓ within its limit, ✗ not; without a limit it is only reported."
     cells = [
         (
             row["id"],
@@ -74,7 +64,7 @@ def _stability(file: Path, run: Path) -> str:
 
 
 def _amount(row: dict[str, Any], name: str = "measured") -> str:
-    """A figure with its unit. JSON has null for NaN: the verdict tells it from what was not measured."""
+    """A figure with its unit. JSON has null for NaN; the verdict distinguishes it from an unmeasured row."""
     if row.get(name) is None:
         return "not measured" if row.get("verdict") == "not measured" else "not a number"
     return f"{number(row[name])}\N{NO-BREAK SPACE}{row.get('unit') or ''}".rstrip()
@@ -86,10 +76,10 @@ def _plain(row: dict[str, Any]) -> str:
 
 
 def measured_on(rows: Sequence[dict[str, Any]], run: Path) -> str:
-    """A sentence: whether ``rows`` were measured on the avatar of ``run`` or another, as their checkpoints say."""
+    """A sentence on whose avatar ``rows`` were measured, by their checkpoints' hashes."""
     named = [row["checkpoint_sha256"] for row in rows if row.get("checkpoint_sha256")]
     if not named:
-        return "On which avatar is not said: perhaps not on this run's."
+        return "The rows do not name the avatar: perhaps not this run's."
     checkpoint = run / "avatar.ckpt"
     own = sha256_of(checkpoint) if checkpoint.is_file() else None
     others = [str(name) for name in named if name != own]

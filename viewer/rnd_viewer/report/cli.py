@@ -10,68 +10,77 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.core.errors import InputError, check_option, flag, parse_options, run_command
+from rnd_runtime.core.command import (
+    Count,
+    Files,
+    OptionalFile,
+    OptionalFolder,
+    finish,
+    option,
+    parse,
+    run_command,
+    warn,
+)
+from rnd_runtime.core.errors import InputError, check_option, flag
 from rnd_runtime.core.files import is_folder, output_file
 from rnd_viewer.inputs.options import LitOptions
-
-_NO_HINT = tyro.conf.arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
 class ReportOptions(LitOptions):
-    """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options."""
+    """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options.
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """folder of rnd-train"""
-    out: Annotated[Path | None, _NO_HINT] = None
-    """the page. Default: report.html in RUN"""
-    motion: Annotated[Path | None, _NO_HINT] = None
-    """body poses for the turntable. Default: the rest pose"""
-    hdr: tuple[Path, ...] = ()
-    """light probes to show the avatar under, beside the learned light"""
-    bench: Annotated[Path | None, _NO_HINT] = None
-    """folder with crossed.svg or grid.svg, and stability.json. Default: RUN/bench, else assets/bench if it is there"""
-    pictures: int = 3
-    """pictures of each held-out split"""
+    rnd-report runs/me --motion walk.npz --hdr sky.exr
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], option("RUN")]
+    """Folder of rnd-train."""
+    out: OptionalFile = None
+    """The page. Default: report.html in RUN."""
+    motion: OptionalFile = None
+    """Body poses for the turntable. Default: the rest pose."""
+    hdr: Files = ()
+    """Light probes to show the avatar under, beside the learned light."""
+    bench: OptionalFolder = None
+    """Folder of rnd-bench with crossed.svg or grid.svg, and stability.json. Default: RUN/bench."""
+    images: Count = 3
+    """Images of each held-out split."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_option(self.images >= 0, "--images", "0 or more", self.images)
+        if self.motion is None:
+            self.refuse_unread("needs --motion: the rest pose does not move")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rnd-report`` with ``arguments`` (the process's own when None) and return its exit code."""
+    return run_command("rnd-report", lambda: _report(parse(ReportOptions, "rnd-report", arguments)))
 
-    def command() -> int:
-        options = parse_options(lambda: tyro.cli(ReportOptions, prog="rnd-report", args=arguments))
-        if options.pictures < 0:
-            raise InputError("--pictures", expected="0 or more", got=options.pictures)
-        if options.motion is None:
-            options.refuse_unread("needs --motion: the rest pose does not move")
-        if options.bench is not None and not is_folder(options.bench):
-            raise InputError("folder of --bench not found", file=options.bench)
-        from rnd_viewer.inputs.console import say
 
-        from .bench import find_bench
-        from .run_files import read_config
-        from .run_report import why_no_avatar, write_run_report
+def _report(options: ReportOptions) -> int:
+    from .run_files import read_config
+    from .run_report import why_no_avatar, write_run_report
 
-        out = options.out or options.run / "report.html"
-        check_option(out.suffix.lower() == ".html", "--out", "a name in .html", out)
-        if why_not := why_no_avatar(options.run, read_config(options.run)):
-            for name in ("motion", "hdr"):  # played and lit by the avatar alone
-                if getattr(options, name):
-                    raise InputError(flag(name), expected="an avatar that can be shown", hint=why_not)
-        output_file(out)
-        motion = None if options.motion is None else partial(options.read_motion, options.motion)
-        notes = write_run_report(
-            options.run,
-            out,
-            motion=motion,
-            hdrs=options.hdr,
-            hdr_up=options.hdr_up,
-            bench=options.bench or find_bench(options.run),
-            pictures=options.pictures,
-        )
-        for note in notes:
-            say(f"note: {note}")
-        say(f"{out}: {out.stat().st_size / 1e6:.1f} MB")
-        return 0
-
-    return run_command("rnd-report", command)
+    if options.bench is not None and not is_folder(options.bench):
+        raise InputError("folder of --bench not found", file=options.bench)
+    out = options.out or options.run / "report.html"
+    check_option(out.suffix.lower() == ".html", "--out", "a name in .html", out)
+    if why_not := why_no_avatar(options.run, read_config(options.run)):
+        for name in ("motion", "hdr"):  # played and lit by the avatar alone
+            if getattr(options, name):
+                raise InputError(flag(name), expected="an avatar that can be shown", hint=why_not)
+    output_file(out)
+    notes = write_run_report(
+        options.run,
+        out,
+        motion=None if options.motion is None else partial(options.read_motion, options.motion),
+        hdrs=options.hdr,
+        hdr_up=options.hdr_up,
+        bench=options.bench,
+        images=options.images,
+    )
+    for note in notes:
+        warn(note)
+    finish(out, f"{out.stat().st_size / 1e6:.1f} MB")
+    return 0

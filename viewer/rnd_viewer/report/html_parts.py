@@ -1,4 +1,4 @@
-"""Pieces of an HTML page that needs no other file: tables, curves as SVG, pictures and clips as data URIs."""
+"""Pieces of an HTML page that needs no other file: tables, curves as SVG, images and clips as data URIs."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rnd_runtime.core.images import write_image
 WIDTH, HEIGHT = 320, 150  # of a curve, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 42, 8, 8, 16  # margins for ticks
 POINTS = 300  # of a curve
-LARGEST = 1e300  # value of a curve: its ticks and margins are floats too
+LARGEST = 1e300  # value of a curve: ticks and margins stay finite
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]], words: Collection[int] = (0,)) -> str:
-    """A table of anything; numbers are shown as ``number`` does. The columns ``words`` stand to the left."""
+    """A table of anything; numbers as of ``number``. The columns ``words`` are left-aligned."""
     titles = _cells("th", head, words)
     body = "".join(f"<tr>{_cells('td', row, words)}</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
@@ -60,7 +60,7 @@ def figure(content: str, caption: str) -> str:
 
 
 def missing(title: str, reason: str) -> str:
-    """A section that is not there, and why."""
+    """A missing section, and why."""
     return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
 
 
@@ -71,9 +71,9 @@ def compare(left: str, right: str, label: str) -> str:
 
 
 def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | None) -> str:
-    """``values`` over ``steps`` with a logarithmic scale, as SVG; ``mark``: a step with a line through it.
+    """``values`` over ``steps`` on a logarithmic scale, as SVG; ``mark``: a step with a line through it.
 
-    Each point is the mean of its bin; what is not a positive number, 1e300 at most, is left out.
+    Each point is the mean of its bin, of positive values up to 1e300.
     """
     last = max(steps, default=0)
     width = max(1, math.ceil((last + 1) / POINTS))
@@ -82,7 +82,7 @@ def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | 
         if 0 < value < LARGEST:
             bins.setdefault(step // width, []).append(math.log10(value))
     if not bins:
-        return figure("", f"{name}: nothing to draw")
+        return figure("", f"{name}: no positive values")
     points = [(k * width / max(last, 1), sum(logs) / len(logs)) for k, logs in sorted(bins.items())]
     low, high = (choose(y for _, y in points) for choose in (min, max))
     low, high = low - 0.03, max(high, low + 0.1) + 0.03
@@ -109,7 +109,7 @@ def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | 
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Logarithms of round numbers between ``low`` and ``high``, two to six of them where they fit."""
+    """Logarithms of round numbers between ``low`` and ``high``, two to six where they fit."""
     ticks: list[float] = []
     for mantissas in ((1,), (1, 3), (1, 2, 5), tuple(range(1, 10)), tuple(k / 5 for k in range(5, 50))):
         decades = range(math.floor(low), math.ceil(high) + 1)

@@ -1,4 +1,4 @@
-"""What a report shows of the avatar itself: a turntable clip, and the same pose under turned and other lights."""
+"""Images of a report: a turntable clip, one pose under rotated and other lights, and the materials."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from rnd_viewer.play.video import clip_writer
 
 Bytes = NDArray[np.uint8]
 SIDE, FPS, SECONDS = 448, 24, 5.0
-YAWS = (0, 90, 180, 270)  # degrees: the learned light from all sides
+YAWS = (0, 90, 180, 270)  # degrees: the learned light from four sides
 AOVS = ("albedo", "normal", "roughness", "visibility")
 MODE = "table+sun"
 
 
-class Shots:
-    """An avatar in one motion (the rest pose where none is given), ready to be filmed.
+class AvatarRenders:
+    """An avatar in one motion, the rest pose by default.
 
     Attributes:
-        notes: what is to be said of the motion, and of every light that was read.
+        notes: on the motion, and on every light that was read.
     """
 
     def __init__(self, avatar_file: Path, read_motion: Callable[[Skeleton], Motion] | None) -> None:
@@ -49,7 +49,7 @@ class Shots:
         self._learned = Light(self.avatar.trained_light)
 
     def turntable(self) -> bytes:
-        """An mp4 of one turn while the motion plays, under the learned light. Needs PyAV (else InputError)."""
+        """An mp4 of one orbit while the motion plays, under the learned light. Needs PyAV (else InputError)."""
         with tempfile.TemporaryDirectory() as folder, self._renderer(MODE) as renderer:
             path = Path(folder) / "turntable.mp4"
             with clip_writer(path, fps=FPS) as append:
@@ -59,9 +59,9 @@ class Shots:
             return path.read_bytes()
 
     def relights(self, hdrs: tuple[Path, ...], up: Up) -> Iterator[tuple[str, Bytes]]:
-        """Captions and pictures of the motion's middle: the learned light turned, then each of ``hdrs``.
+        """Captions and images of the motion's middle: the learned light rotated, then each of ``hdrs``.
 
-        ``up`` is the axis that points up in their files.
+        ``up``: the axis that points up in their files.
         """
         lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
         lights += [(hdr.stem, self._read_light(hdr, up)) for hdr in hdrs]
@@ -81,10 +81,10 @@ class Shots:
         return light
 
     def materials(self) -> Iterator[tuple[str, Bytes]]:
-        """Captions and pictures of what the light is taken from: albedo, normals, roughness, visibility."""
+        """Captions and images of albedo, normals, roughness and visibility."""
         time_s = self.motion.duration / 2
         with self._renderer("ao") as renderer:
             frame = renderer.render(self.motion, time_s, self._front(0, time_s), aovs=AOVS)
         for name, values in frame.aovs.items():
-            picture = aov_image(name, values, frame.alpha)
-            yield name, np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3)))
+            image = aov_image(name, values, frame.alpha)
+            yield name, np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))

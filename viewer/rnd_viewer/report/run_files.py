@@ -1,4 +1,4 @@
-"""The files of a training's folder that are JSON, held against what a report makes of them."""
+"""The JSON files of a training's folder, checked as far as a report reads them."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import are_rows, existing_file
 
 Row = dict[str, Any]
-MOST_STEPS = 1e12
-LARGEST_NUMBER = 1e300  # of whole numbers, which JSON does not bound
+MAX_STEPS = 1e12
+LARGEST_NUMBER = 1e300  # of integers, which JSON does not bound
 
 
 def read_config(run: Path) -> Row:
     """``config.json``: the options of the training in ``run``.
 
     Raises:
-        InputError: there is none, or it is not one; as all functions here, naming the file.
+        InputError: it is missing or damaged; as of all functions here.
     """
     file = existing_file(run / "config.json", what="config.json of rnd-train")
     config = _json(file)
@@ -32,7 +32,7 @@ def read_config(run: Path) -> Row:
 def read_scores(run: Path, words: Sequence[str], numbers: Iterable[str]) -> list[Row]:
     """``eval.json``: rows of rnd-eval, none where there is no such file.
 
-    ``words`` and ``numbers`` are what a row may say; each may be missing or null.
+    ``words`` and ``numbers`` name a row's fields; each may be missing or null.
     """
     file = run / "eval.json"
     if not file.is_file():
@@ -49,7 +49,7 @@ def read_scores(run: Path, words: Sequence[str], numbers: Iterable[str]) -> list
 def read_losses(run: Path) -> list[Row]:
     """``metrics.jsonl``: one row of numbers for each step, none where there is no such file.
 
-    A last line that was begun when the training was ended is left out.
+    An incomplete last line is left out.
     """
     file = run / "metrics.jsonl"
     if not file.is_file():
@@ -66,14 +66,14 @@ def read_losses(run: Path) -> list[Row]:
     if any(row["step"] is None for row in rows):
         raise InputError("step", expected="a number", got="null", file=file)
     for row in rows:
-        if not 0 <= row["step"] <= MOST_STEPS:  # true for NaN
+        if not 0 <= row["step"] <= MAX_STEPS:  # true for NaN
             got = json.dumps(row["step"])[:80]
-            raise InputError("step", expected=f"a number, 0 to {MOST_STEPS:g}", got=got, file=file)
+            raise InputError("step", expected=f"a number, 0 to {MAX_STEPS:g}", got=got, file=file)
     return rows
 
 
 def read_rows(file: Path, what: str, *names: str) -> list[Row]:
-    """A list of objects that have all of ``names``; ``what`` such a file is."""
+    """A list of objects that have all of ``names``; ``what`` names such a file."""
     rows = _json(file)
     _check_rows(rows, file, what, *names)
     return rows

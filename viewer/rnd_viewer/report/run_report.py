@@ -24,14 +24,14 @@ from rnd_viewer.play.video import INSTALL
 
 from .bench import bench_section
 from .html_parts import compare, curve, data_uri, figure, missing, png, table
-from .renders import Shots
+from .renders import AvatarRenders
 from .run_files import read_config, read_losses, read_scores
 
 Bytes = NDArray[np.uint8]
 TILES = ("truth", "render", "normals", "albedo", "error")  # side by side in rnd-eval's strips
 MARGIN = 8  # pixels kept around the person
 DARK = 8  # of 255; what is brighter in any tile is the person
-# Columns of rnd-eval's rows, and what else a row says of the run as a whole.
+# Columns of rnd-eval's rows; FACTS are about the whole run.
 METRICS = {
     "split": ("split", "{}"),
     "frames": ("frames", "{}"),
@@ -40,9 +40,9 @@ METRICS = {
     "lpips": ("LPIPS", "{:.4f}"),
     "psnr_box": ("PSNR in the box, dB", "{:.2f}"),
     "psnr_n": ("PSNR of normals, dB", "{:.2f}"),
-    "normal_deg": ("normals off by, °", "{:.1f}"),
+    "normal_deg": ("normal error, °", "{:.1f}"),
     "psnr_albedo": ("PSNR of albedo, dB", "{:.2f}"),
-    "outline_px": ("outline off by, px", "{:.2f}"),
+    "outline_px": ("outline error, px", "{:.2f}"),
 }
 FACTS = {
     "capture": "trained on {}",
@@ -52,11 +52,11 @@ FACTS = {
     "seed": "seed {}",
     "file_mb": "avatar.onnx {:.1f} MB",
     "fps": "plays at {:.0f} frames a second",
-    "flicker": "flicker {:.2f} of 255 (what jumps from frame to frame; most of it is moving texture)",
+    "flicker": "flicker {:.2f} of 255 (change from frame to frame; most of it is moving texture)",
     "machine": "{}",
 }
-SCALED = "relight_albedo_scaled"  # rnd-eval's folder of relight once more
-WORDS = ("split", "capture", "machine")  # of these, those that are no numbers
+SCALED = "relight_albedo_scaled"  # rnd-eval's second folder of relight
+WORDS = ("split", "capture", "machine")  # fields that are no numbers
 
 
 def write_run_report(
@@ -67,17 +67,18 @@ def write_run_report(
     hdrs: tuple[Path, ...] = (),
     hdr_up: Up = "y",
     bench: Path | None = None,
-    pictures: int = 3,
+    images: int = 3,
 ) -> list[str]:
-    """Write the report of the training in ``run`` to ``out``; what the run lacks is named where it would stand.
-
-    What is to be said of the avatar, its motion and its lights, which the page says too.
+    """Write the report of the training in ``run`` to ``out``; it names what the run lacks.
 
     Args:
         motion: played in the turntable, read for the avatar's skeleton.
         hdrs, hdr_up: relit under these; which axis points up in their files.
-        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; see ``.find_bench``.
-        pictures: shown of each held-out split.
+        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; ``run / "bench"`` by default.
+        images: shown of each held-out split.
+
+    Returns:
+        Notes on the avatar, its motion and its lights, which are on the page too.
 
     Raises:
         InputError: ``run`` holds no training, or a file of it is damaged.
@@ -85,14 +86,14 @@ def write_run_report(
     config = read_config(run)
     rows = read_scores(run, WORDS, ({"step"} | METRICS.keys() | FACTS.keys()) - {*WORDS})
     name = run.resolve().name
-    # before the avatar is filmed: what is damaged is found at once
-    read = [_metrics(rows), _comparisons(run / "eval", pictures), _curves(read_losses(run))]
-    read += [bench_section(bench, run), _configuration(config)]
+    # before the avatar is rendered: damaged files are found at once
+    read = [_metrics(rows), _comparisons(run / "eval", images), _curves(read_losses(run))]
+    read += [bench_section(bench or run / "bench", run), _configuration(config)]
     if why_not := why_no_avatar(run, config):
         avatar, notes = missing("The avatar", why_not), [why_not]
     else:
-        shots = Shots(run / "avatar.onnx", motion)
-        avatar, notes = _turntable_and_relights(shots, hdrs, hdr_up), shots.notes
+        renders = AvatarRenders(run / "avatar.onnx", motion)
+        avatar, notes = _turntable_and_relights(renders, hdrs, hdr_up), renders.notes
     sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
     page = Template(files("rnd_viewer.report").joinpath("page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
@@ -108,11 +109,11 @@ def _facts(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _steps(row: dict[str, Any]) -> str | None:
-    """Steps with a picture are what is asked for; ``step`` counts those without one too, where it is known."""
+    """``steps`` counts those with an image; ``step``, where known, those of unseen poses too."""
     asked, taken = row.get("steps"), row.get("step")
     if asked is None or taken in (None, asked):
         return None if asked is None else f"{asked} steps"
-    return f"{taken} of {asked} steps" if taken < asked else f"{taken} steps, {asked} of them with a picture"
+    return f"{taken} of {asked} steps" if taken < asked else f"{taken} steps, {asked} of them with an image"
 
 
 def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
@@ -127,21 +128,21 @@ def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
     return ""
 
 
-def _turntable_and_relights(shots: Shots, hdrs: tuple[Path, ...], hdr_up: Up) -> str:
+def _turntable_and_relights(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_up: Up) -> str:
     """The section of the avatar, with the notes that it ends with."""
-    cells = [figure(png(picture, caption), caption) for caption, picture in shots.relights(hdrs, hdr_up)]
+    cells = [figure(png(image, caption), caption) for caption, image in renders.relights(hdrs, hdr_up)]
     if importlib.util.find_spec("av"):
-        clip = data_uri(shots.turntable(), "video/mp4")
+        clip = data_uri(renders.turntable(), "video/mp4")
         video = f'<video src="{clip}" autoplay loop muted playsinline controls></video>'
         cells.insert(0, figure(video, "turntable, learned light"))
     else:
         cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
-    materials = [figure(png(picture, caption), caption) for caption, picture in shots.materials()]
+    materials = [figure(png(image, caption), caption) for caption, image in renders.materials()]
     html = (
         f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
-        f'<h3>What the light falls on</h3><div class="grid tiles">{"".join(materials)}</div>'
+        f'<h3>Materials</h3><div class="grid tiles">{"".join(materials)}</div>'
     )
-    return html + "".join(f"<p>Note: {escape(note)}</p>" for note in shots.notes)
+    return html + "".join(f"<p>Note: {escape(note)}</p>" for note in renders.notes)
 
 
 def _metrics(rows: Sequence[dict[str, Any]]) -> str:
@@ -149,7 +150,7 @@ def _metrics(rows: Sequence[dict[str, Any]]) -> str:
         return missing("Held-out quality", "no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json")
     names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
     cells = [["" if row.get(name) is None else METRICS[name][1].format(row[name]) for name in names] for row in rows]
-    box = "<p>In the box: in the rectangle around the person alone.</p>" if "psnr_box" in names else ""
+    box = "<p>In the box: in the rectangle around the person.</p>" if "psnr_box" in names else ""
     return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells) + box
 
 
@@ -158,38 +159,36 @@ def _comparisons(folder: Path, count: int) -> str:
         return ""
     splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not splits:
-        return missing("Truth and render", "no pictures: rnd-eval RUN CAPTURE --pictures RUN/eval")
-    how = "Drag across a picture: truth to the left, render to the right; then normals, albedo, error × 4."
+        return missing("Truth and render", "no images: rnd-eval RUN CAPTURE --strips RUN/eval")
+    how = "Drag across an image: truth to the left, render to the right; then normals, albedo, error × 4."
     parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
     seen = set()
     for split in splits:
         strips = sorted(split.glob("*.png"))
         shown = min(count, len(strips))
         chosen = [strips[k * len(strips) // shown] for k in range(shown)]
-        pictures = tuple((strip.name, sha256_of(strip)) for strip in chosen)
-        if pictures in seen:
+        hashes = tuple((strip.name, sha256_of(strip)) for strip in chosen)
+        if hashes in seen:
             continue
-        seen.add(pictures)
+        seen.add(hashes)
         title, note = split.name.replace("_", " "), ""
         if split.name == SCALED:
             title = "relight, albedo scaled"
             note = "<p>The same frames, with the learned albedo brought to the scale of the true one.</p>"
-        shots = "".join(_shot(strip) for strip in chosen)
-        parts.append(f'<h3>{escape(title)}</h3>{note}<div class="grid shots">{shots}</div>')
+        figures = "".join(_strip(strip) for strip in chosen)
+        parts.append(f'<h3>{escape(title)}</h3>{note}<div class="grid shots">{figures}</div>')
     return "".join(parts)
 
 
-def _shot(strip: Path) -> str:
+def _strip(strip: Path) -> str:
     """One strip of rnd-eval, cropped to the person: a slider between truth and render, then the other tiles."""
     pixels = read_image(strip)[..., :3]
     if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
-        raise InputError("picture of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
+        raise InputError("strip of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
     tiles: list[Bytes] = np.split(pixels.astype(np.uint8), len(TILES), axis=1)
     rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > DARK)
     if len(rows):
-        window = tuple(
-            slice(max(int(places.min()) - MARGIN, 0), int(places.max()) + 1 + MARGIN) for places in (rows, columns)
-        )
+        window = tuple(slice(max(int(at.min()) - MARGIN, 0), int(at.max()) + 1 + MARGIN) for at in (rows, columns))
         tiles = [np.ascontiguousarray(tile[window]) for tile in tiles]
     truth, render, *others = (png(tile, f"{what}, {strip.stem}") for what, tile in zip(TILES, tiles))
     pair = compare(truth, render, f"truth or render of {strip.stem}")
@@ -200,7 +199,7 @@ def _curves(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
         return missing("Losses", "no metrics.jsonl in the run")
     terms = dict.fromkeys(name for row in rows for name in row)
-    terms = dict.fromkeys(["image", *terms])  # what everybody looks for comes first
+    terms = dict.fromkeys(["image", *terms])
     for name in ("step", "stage", "seconds", "skipped"):
         terms.pop(name, None)
     mark = next((row["step"] for row in rows if row.get("stage") == 2), None)
@@ -211,9 +210,9 @@ def _curves(rows: Sequence[dict[str, Any]]) -> str:
             figures.append(curve([row["step"] for row in having], [row[term] for row in having], term, mark))
     skipped = sum(bool(row.get("skipped")) for row in rows)
     note = f" {skipped} steps were not finite and were skipped." if skipped else ""
-    dashed = "" if mark is None else "; the dashed line is where the second stage, the light, begins"
+    dashed = "" if mark is None else "; the dashed line marks the second stage, the light"
     return (
-        f"<h2>Losses</h2><p>Weighted terms of what is minimised, on a logarithmic scale{dashed}.{note}</p>"
+        f"<h2>Losses</h2><p>Weighted loss terms on a logarithmic scale{dashed}.{note}</p>"
         f'<div class="grid curves">{"".join(figures)}</div>'
     )
 

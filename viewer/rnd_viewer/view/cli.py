@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import secrets
-import sys
 import webbrowser
 from collections.abc import Sequence
 from threading import Thread
 
-import tyro
 from rich.console import Console
 
-from rnd_runtime.core.command import parse_options, run_command
-from rnd_runtime.core.console import print_plain
+from rnd_runtime.core.command import is_quiet, log, parse, run_command
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.playback.start import load_ahead
@@ -22,12 +19,7 @@ from .options import ViewOptions
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rnd-view`` with ``arguments`` (the process's own when None) until Ctrl-C; 2 for unusable input."""
-
-    def command() -> int:
-        options = parse_options(lambda: tyro.cli(ViewOptions, prog="rnd-view", args=arguments))
-        return view(options)
-
-    return run_command("rnd-view", command)
+    return run_command("rnd-view", lambda: view(parse(ViewOptions, "rnd-view", arguments)))
 
 
 def view(options: ViewOptions) -> int:
@@ -44,21 +36,20 @@ def view(options: ViewOptions) -> int:
 
     load_websockets()
     set_threads(options.threads)
-    console = Console(highlight=False)
     shown: Scene | Training
     if watching:
         shown = Training(options)
     else:
         cold = kernels_are_cold()
-        with console.status("loading"):
+        with Console(stderr=True, quiet=is_quiet()).status("loading"):
             shown = Scene(options, ahead)
             if cold:
-                print(f"rnd-view: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
+                log(COMPILING)
             shown.warm_up()
     try:
         token = None if options.local else secrets.token_urlsafe(16)
         with serve(shown, options.host, options.port, token, options.fps_floor) as (server, url):
-            print_plain(console, f"rnd-view: {url}")
+            print(f"rnd-view: {url}", flush=True)  # noqa: T201
             if options.browser and options.local:
                 Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
             server.serve_forever()

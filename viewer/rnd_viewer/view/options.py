@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
+from rnd_runtime.core.command import (
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalNumber,
+    Size,
+    option,
+    size_text,
+)
 from rnd_runtime.core.errors import InputError, refuse_outside
-from rnd_viewer.inputs.options import LitOptions, option
+from rnd_viewer.inputs.options import LitOptions
 
-SIZES = 64, 2048  # px: the least and the largest side of a picture
+SIZES = 64, 2048  # px: the least and the largest side of a frame
 
 
 @dataclass(frozen=True)
@@ -24,41 +33,47 @@ class ViewOptions(LitOptions):
 
     avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx|RUN")]
     """An avatar of rnd-export, or a folder of rnd-train: its losses and previews while it trains, then its avatar."""
-    motion: Annotated[Path | None, option("FILE")] = None
-    """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the pose at rest."""
-    hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = field(default_factory=tuple)
+    motion: OptionalFile = None
+    """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the rest pose."""
+    hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = ()
     """Light probes to choose from, .exr or .hdr, or folders of them. The avatar's own light is always there."""
-    capture: Annotated[Path | None, option("FOLDER")] = None
-    """A capture: its pictures can be shown beside the avatar, from their cameras and under their lights."""
+    capture: OptionalFolder = None
+    """A capture: its images can be shown beside the avatar, from their cameras and under their lights."""
 
-    host: str = "127.0.0.1"
+    host: Annotated[str, option("ADDRESS")] = "127.0.0.1"
     """Address to listen on. Anything but this machine's own asks every visitor for a token, which is printed."""
-    port: int = 8008
+    port: Annotated[int, option("N")] = 8008
     """Port to listen on; 0 takes any that is free."""
-    size: int = 512
-    """Picture size in pixels to begin with."""
-    raster: Literal["auto", "gl", "cpu"] = "auto"
-    """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
-    threads: Annotated[int | None, option("INT")] = None
-    """CPU threads. Default: all."""
-    fps_floor: Annotated[float | None, option("FLOAT")] = None
-    """Frames per second to hold while the avatar plays, at a lower resolution where needed. Screenshots and clips
-    keep the full one."""
     browser: bool = True
     """Open the page in this machine's browser."""
+
+    size: Size = (512, None)
+    """Size of a frame in pixels to begin with."""
+    fps_floor: OptionalNumber = None
+    """Frames per second to hold, at a lower resolution where needed. Screenshots and clips keep the full one."""
+    raster: Literal["auto", "gl", "cpu"] = "auto"
+    """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
+    threads: OptionalCount = None
+    """CPU threads. Default: all."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.motion is None:
             captured = self.capture is not None
-            ours = "the capture's own is read by its rules" if captured else "the pose at rest does not move"
+            ours = "the capture's own is read by its rules" if captured else "the rest pose does not move"
             self.refuse_unread(f"needs --motion: {ours}", edited=captured)
         refuse_outside(self, {"fps_floor": (1e-3, 1000)})
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         low, high = SIZES
-        if not low <= self.size <= high:
-            raise InputError("--size", expected=f"{low} to {high}", got=self.size)
+        if not all(low <= side <= high for side in self.width_height):
+            raise InputError("--size", expected=f"{low} to {high}", got=size_text(self.size))
+
+    @property
+    def width_height(self) -> tuple[int, int]:
+        """Of a frame, px."""
+        width, height = self.size
+        return width, height or width
 
     @property
     def local(self) -> bool:

@@ -286,7 +286,7 @@ class _Visitor:
             notes = scene.notes_of_light(state)
         pixels, encoding_ms = encode(view.srgb, state.encoding)
         header = {
-            "kind": "picture",
+            "kind": "frame",
             "number": request.number,
             "width": view.srgb.shape[1],
             "height": view.srgb.shape[0],

@@ -1,4 +1,4 @@
-"""What a page may ask of ``rnd-view``: one message for each picture, one for each clip."""
+"""What a page may ask of ``rnd-view``: one message for each frame, one for each clip."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ _Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
 
 
 class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that one picture depends on.
+    """Everything that one frame depends on.
 
     Attributes:
         time: s into the motion. width, height: px.
-        azimuth, elevation: rad; where the camera stands as seen from ``target`` [3] m, ``distance`` m away.
+        azimuth, elevation: rad, of the camera around ``target`` [3] m, ``distance`` m away.
         fov: vertical field of view, rad.
-        truth: index of a picture of the capture, which then decides camera, pose and light, neither turned nor
-            exposed; None for none of them.
+        truth: index of an image of the capture, which then decides camera, pose and light (no yaw, no exposure);
+            None for none of them.
         light: index among the scene's lights. yaw: rad. exposure: stops.
-        output: the lit picture, the light alone (on a body of one colour), or one of its materials.
+        output: the lit frame, the light alone (on a body of one colour), or one of its materials.
         background: as ``rnd-play --background``, ``none`` being black.
-        gaussians: how many to draw; fewer are drawn larger.
+        gaussians: how many to render; fewer are enlarged.
         encoding: of the pixels in the answer.
     """
 
@@ -74,7 +74,7 @@ class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="clip", tag_field="ask"):
-    """The whole motion as an mp4, seen as ``state`` says; ``turn``: rad that the camera goes round meanwhile."""
+    """The whole motion as an mp4, seen as ``state`` says; ``turn``: rad that the camera orbits meanwhile."""
 
     state: ViewState
     fps: Annotated[float, Meta(ge=1, le=240)]
@@ -82,7 +82,7 @@ class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
 
 class TruthRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="truth", tag_field="ask"):
-    """The capture's picture ``index`` as its file has it."""
+    """The capture's image ``index`` as its file has it."""
 
     index: Annotated[int, Meta(ge=0)]
 

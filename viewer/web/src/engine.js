@@ -1,20 +1,20 @@
-// The pictures come from a worker of this page: nothing is asked of any server once the files are here.
+// The frames come from a worker of this page: nothing is asked of any server once the files are here.
 
-const MOST_CLIP_FRAMES = 900;
-const MOST_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
+const MAX_CLIP_FRAMES = 900;
+const MAX_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
 const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder; it halves the chroma as well
 const KEEP_IN_VIEW = " · keep this tab in view";  // browsers slow a hidden one down to about a frame a second
 // H.264 of level 4.0, which 1024² at 30 fps need, before 3.0; then what has none
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E028", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
- * Start the worker. `on` gets: scene, picture, progress, clip, error as from rnd-view, message(text), and refused(text) of
+ * Start the worker. `on` gets: scene, frame, progress, clip, error as from rnd-view, message(text), and refused(text) of
  * files that cannot be used. `load` takes files in once they are read and `idle()`, a promise, is kept.
  * Files named in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
  */
 export async function connect(on) {
   const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
-  const taken = new Map();  // pictures that are not for the page: number → {done, failed}
+  const taken = new Map();  // frames that are not for the page: number → {done, failed}
   let answered = false, dead = null;  // why the worker could not start
   worker.onerror = (event) => {
     const what = event.message || "the worker cannot start";
@@ -29,7 +29,7 @@ export async function connect(on) {
     else if (data.kind === "message") on.message(data.text);
     else if (taken.has(data.number)) settle(taken, data);
     else if (data.kind === "error") (data.number === undefined ? on.refused : on.error)(data.message, false);
-    else on.picture(data);
+    else on.frame(data);
   };
   const render = (number, state) => worker.postMessage({ ask: "render", number, state });
   const load = async (files, idle) => {
@@ -39,13 +39,13 @@ export async function connect(on) {
     else if (contents) worker.postMessage({ ask: "load", files: contents }, contents.map(({ bytes }) => bytes.buffer));
   };
   let clipNumber = 0;
-  const picture = (state) => new Promise((done, failed) => {
+  const renderFrame = (state) => new Promise((done, failed) => {
     clipNumber -= 1;  // the page's own numbers are positive
     taken.set(clipNumber, { done, failed });
     render(clipNumber, state);
   });
   const clip = (state, fps, turn, duration) =>
-    record(picture, state, { fps: Math.min(fps, MOST_CLIP_FPS), turn, duration }, on).catch((error) => on.error(error.message));
+    record(renderFrame, state, { fps: Math.min(fps, MAX_CLIP_FPS), turn, duration }, on).catch((error) => on.error(error.message));
 
   const named = addressed();
   if (named.length) fetchFiles(named).then(load).catch((error) => on.refused(error.message));
@@ -96,11 +96,11 @@ function fetchFiles(names) {
 }
 
 /** All frames first, then played to a recorder at their own pace: it stamps them with the time of day. */
-async function record(picture, state, { fps, turn, duration }, on) {
+async function record(renderFrame, state, { fps, turn, duration }, on) {
   const type = CLIP_TYPES.find((name) => globalThis.MediaRecorder?.isTypeSupported(name));
   if (!type) throw new Error("this browser cannot record a clip");
   const count = Math.floor(duration * fps + 1e-6) + 1;
-  if (count > MOST_CLIP_FRAMES) throw new Error(`a clip has at most ${MOST_CLIP_FRAMES} frames`);
+  if (count > MAX_CLIP_FRAMES) throw new Error(`a clip has at most ${MAX_CLIP_FRAMES} frames`);
   const canvas = document.createElement("canvas"), context = canvas.getContext("2d");
   Object.assign(canvas, { width: state.width, height: state.height });
   const show = (image) => {
@@ -109,7 +109,7 @@ async function record(picture, state, { fps, turn, duration }, on) {
   };
   const frames = [];  // coded: 900 of 1024² pixels would be 3.8 GB
   for (let k = 0; k < count; k++) {
-    show((await picture({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
+    show((await renderFrame({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
     frames.push(await new Promise((done) => { canvas.toBlob(done, "image/jpeg", FRAME_QUALITY); }));
     on.progress(k + 1, count, KEEP_IN_VIEW);
   }

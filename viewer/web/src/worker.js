@@ -13,7 +13,7 @@ import { shBasis } from "./shading/sh.js";
 import { makeShader } from "./shading/shader.js";
 import { Splatter } from "./raster/splat.js";
 
-const SIZE = 512, SIZES = [64, 1024];  // px: to begin with, the least and the largest
+const SIZE = [512, 512], SIZES = [64, 1024];  // px: to begin with, the least and the largest
 
 let splatter = new Splatter();
 // What is shown: the motion as its file has it (null: at rest) and for the avatar, and
@@ -96,7 +96,7 @@ async function render({ number, state }) {
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
   const { notes } = scene.lights[state.light];
-  const answer = { kind: "picture", number, width: state.width, height: state.height, image, joints, notes, times: clock.times };
+  const answer = { kind: "frame", number, width: state.width, height: state.height, image, joints, notes, times: clock.times };
   postMessage(answer, [image]);
 }
 

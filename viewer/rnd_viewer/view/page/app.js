@@ -1,11 +1,11 @@
-// The page: its controls make a state, an engine makes pictures of states.
+// The page: its controls make a state, an engine renders states.
 
 import { connect } from "./engine.js";
 import { orbit, wrapped } from "./orbit.js";
 
-const IN_FLIGHT = 2;  // one picture is drawn while the next is made
-const LONG_MS = 1000;  // after which a picture that is not there yet is said to be drawn
-const MOST_CLIP_FPS = 60;  // what most screens show; motions have 120
+const IN_FLIGHT = 2;  // one frame is shown while the next is rendered
+const LONG_MS = 1000;  // after which a frame in the making is announced
+const MAX_CLIP_FPS = 60;  // what most screens show; motions have 120
 const RADIANS = Math.PI / 180;
 const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
 const $ = (id) => document.getElementById(id);
@@ -16,10 +16,10 @@ const state = {
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
-let waiting = [];  // {number, done, failed} of those who want a picture for themselves
+let waiting = [];  // {number, done, failed} of those who await a frame
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [], shownAt = 0;
-let passing = true;  // the message goes when a picture comes
+let passing = true;  // the message goes when a frame comes
 
 function redraw() { wanted = true; }
 
@@ -43,65 +43,65 @@ function ask(exact) {
   return number;
 }
 
-function show(picture) {
-  if (picture.number < shown) return picture.image.close?.();  // it took longer to decode than the one after it
-  shown = picture.number;
-  const sent = flying.get(picture.number) ?? performance.now();  // forgotten where the one before it failed
-  for (const old of [...flying.keys()]) if (old <= picture.number) flying.delete(old);
-  const canvas = $("picture"), context = canvas.getContext("2d");
-  if (canvas.width !== picture.width || canvas.height !== picture.height) {
-    canvas.width = picture.width;
-    canvas.height = picture.height;
+function show(frame) {
+  if (frame.number < shown) return frame.image.close?.();  // it took longer to decode than the one after it
+  shown = frame.number;
+  const sent = flying.get(frame.number) ?? performance.now();  // forgotten where the one before it failed
+  for (const old of [...flying.keys()]) if (old <= frame.number) flying.delete(old);
+  const canvas = $("frame"), context = canvas.getContext("2d");
+  if (canvas.width !== frame.width || canvas.height !== frame.height) {
+    canvas.width = frame.width;
+    canvas.height = frame.height;
   }
-  if (picture.image instanceof ImageData) context.putImageData(picture.image, 0, 0);
-  else context.drawImage(picture.image, 0, 0);
-  picture.image.close?.();
-  drawSkeleton(picture);
-  showNotes(picture.notes);
+  if (frame.image instanceof ImageData) context.putImageData(frame.image, 0, 0);
+  else context.drawImage(frame.image, 0, 0);
+  frame.image.close?.();
+  drawSkeleton(frame);
+  showNotes(frame.notes);
   const now = performance.now();
   shownAt = now;
   rates = [...rates.filter((at) => now - at < 1000), now];
-  times = picture.times;
+  times = frame.times;
   times["to the page and back"] = Math.max(now - sent - Object.values(times).reduce((a, b) => a + b, 0), 0);
-  for (const one of waiting) if (one.number <= picture.number) one.done(picture);
-  waiting = waiting.filter((one) => one.number > picture.number);
+  for (const one of waiting) if (one.number <= frame.number) one.done(frame);
+  waiting = waiting.filter((one) => one.number > frame.number);
   if ($("message").textContent && passing) say("");
 }
 
-/** Say so where a picture takes long; the picture takes the message away. */
-function sayWhatTakesLong() {
+/** Announce a frame that takes long; it clears the message. */
+function announceSlowFrame() {
   const since = Math.max(Math.min(...flying.values()), shownAt);  // infinite where nothing is asked for
-  if (!$("message").textContent && performance.now() - since > LONG_MS) say("drawing …", { untilPicture: true });
+  if (!$("message").textContent && performance.now() - since > LONG_MS) say("rendering …", { untilFrame: true });
 }
 
-/** What is to be said of the scene, and of the light of a picture. */
+/** Notes on the scene and on the light of a frame. */
 function showNotes(ofLight = []) {
   const text = [...scene.notes, ...ofLight].join(" · ");
   if ($("notes").textContent !== text) $("notes").textContent = text;
 }
 
-function drawSkeleton(picture) {
+function drawSkeleton(frame) {
   const canvas = $("overlay"), context = canvas.getContext("2d");
-  const scale = Math.max(1, Math.round(1024 / picture.height));
-  canvas.width = picture.width * scale;
-  canvas.height = picture.height * scale;
+  const scale = Math.max(1, Math.round(1024 / frame.height));
+  canvas.width = frame.width * scale;
+  canvas.height = frame.height * scale;
   if (!$("skeleton").checked) return;
   context.scale(scale, scale);
-  context.lineWidth = picture.height / 300;
+  context.lineWidth = frame.height / 300;
   context.strokeStyle = "#f2b25c";
   context.fillStyle = "#fff";
-  picture.joints.forEach(([x, y, z], joint) => {
+  frame.joints.forEach(([x, y, z], joint) => {
     const parent = scene.parents[joint];
-    if (parent < 0 || z <= 0 || picture.joints[parent][2] <= 0) return;
+    if (parent < 0 || z <= 0 || frame.joints[parent][2] <= 0) return;
     context.beginPath();
     context.moveTo(x, y);
-    context.lineTo(picture.joints[parent][0], picture.joints[parent][1]);
+    context.lineTo(frame.joints[parent][0], frame.joints[parent][1]);
     context.stroke();
   });
-  for (const [x, y, z] of picture.joints) {
+  for (const [x, y, z] of frame.joints) {
     if (z <= 0) continue;
     context.beginPath();
-    context.arc(x, y, picture.height / 200, 0, 2 * Math.PI);
+    context.arc(x, y, frame.height / 200, 0, 2 * Math.PI);
     context.fill();
   }
 }
@@ -110,7 +110,7 @@ function showTimes() {
   const now = performance.now();
   rates = rates.filter((at) => now - at < 1000);
   const rows = Object.entries(times).map(([name, ms]) => [name, `${ms.toFixed(1)} ms`]);
-  rows.push(["pictures a second", playing || rates.length > 1 ? String(rates.length) : "–"]);
+  rows.push(["frames/s", playing || rates.length > 1 ? String(rates.length) : "–"]);
   $("times").replaceChildren(...rows.map((cells) => {
     const row = document.createElement("tr");
     for (const text of cells) row.appendChild(document.createElement("td")).textContent = text;
@@ -141,9 +141,9 @@ function play(on) {
   redraw();
 }
 
-/** Show a message until another comes, or a picture where it is `untilPicture`. */
-function say(text, { wrong = false, untilPicture = false } = {}) {
-  passing = untilPicture;
+/** Show a message until the next one, or until the next frame where it is `untilFrame`. */
+function say(text, { wrong = false, untilFrame = false } = {}) {
+  passing = untilFrame;
   $("message").textContent = text;
   $("message").classList.toggle("wrong", wrong);
 }
@@ -157,7 +157,7 @@ function home() {
   redraw();
 }
 
-/** The camera where it was at first, and the light neither turned nor exposed; which light it is stays. */
+/** The first camera, and the light neither rotated nor exposed. */
 function reset() {
   Object.assign(state, { yaw: 0, exposure: 0 });
   home();
@@ -181,14 +181,14 @@ function setScene(description) {
   state.light = scene.light ?? Math.min(state.light, scene.lights.length - 1);
   setGaussians();
   [$("size").min, $("size").max] = scene.sizes;
-  if (first) Object.assign(state, { width: scene.size, height: scene.size });
+  if (first) [state.width, state.height] = scene.size;
   if (moved) home();
   showNotes();
-  say(first ? "loading …" : "", { untilPicture: true });
+  say(first ? "loading …" : "", { untilFrame: true });
   redraw();
 }
 
-/** As many as the slider's share of this avatar's. */
+/** The slider's share of this avatar's Gaussians. */
 function setGaussians() {
   const percent = Number($("gaussians").value);
   state.gaussians = percent < 100 ? Math.max(Math.round(scene.gaussians * percent / 100), 1) : null;
@@ -199,8 +199,8 @@ async function setTruth() {
   state.truth = on ? index : null;
   $("truth-pane").hidden = !on;
   $("truth-name").textContent = on ? scene.truths[index].label : "";
-  for (const name of ["light", "yaw", "exposure"]) $(name).disabled = on;  // the picture's own shines, as it is
-  say("");  // what was said of another picture
+  for (const name of ["light", "yaw", "exposure"]) $(name).disabled = on;  // the image's own light is shown
+  say("");
   freeMotion();
   if (on) {
     play(false);
@@ -215,7 +215,7 @@ function showTruth(index, bitmap) {
   canvas.dataset.index = index;
   canvas.width = bitmap?.width ?? width;  // and it is blank
   canvas.height = bitmap?.height ?? height;
-  if (!bitmap) return say(`${label}: this browser cannot decode the picture`, { wrong: true });
+  if (!bitmap) return say(`${label}: this browser cannot decode the image`, { wrong: true });
   canvas.getContext("2d").drawImage(bitmap, 0, 0);
   bitmap.close();
 }
@@ -228,18 +228,18 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/** A promise of the picture of the state as it is now; with exact pixels unless told otherwise. */
-function picture(exact = true) {
+/** A promise of the current state's frame, with exact pixels by default. */
+function frame(exact = true) {
   return new Promise((done, failed) => { waiting.push({ number: ask(exact), done, failed }); });
 }
 
 async function screenshot() {
   const truth = state.truth === null ? null : scene.truths[state.truth].label.replaceAll(/[^\p{L}\p{N}._-]+/gu, "_");
   const name = `avatar_${truth ?? `${state.time.toFixed(2)}s`}.png`;
-  if (!await picture().catch(() => null)) return;  // the page says why
+  if (!await frame().catch(() => null)) return;  // the page says why
   const canvas = document.createElement("canvas");
-  Object.assign(canvas, { width: $("picture").width, height: $("picture").height });
-  canvas.getContext("2d").drawImage($("picture"), 0, 0);
+  Object.assign(canvas, { width: $("frame").width, height: $("frame").height });
+  canvas.getContext("2d").drawImage($("frame"), 0, 0);
   canvas.getContext("2d").drawImage($("overlay"), 0, 0, canvas.width, canvas.height);
   canvas.toBlob((blob) => download(blob, name));
 }
@@ -251,7 +251,7 @@ function clip() {
   freeMotion();
   say("making a clip …");
   const turn = $("turntable").checked ? 2 * Math.PI : 0;
-  const fps = Math.min(Math.max(scene.motion.fps, 1), MOST_CLIP_FPS);
+  const fps = Math.min(Math.max(scene.motion.fps, 1), MAX_CLIP_FPS);
   engine.clip({ ...state }, fps, turn, scene.motion.duration);
 }
 
@@ -261,7 +261,7 @@ function endClip() {
   freeMotion();
 }
 
-/** What moves the avatar or films it: not beside a truth, whose pose and camera are shown. */
+/** Controls that move or film the avatar are off beside a truth, whose pose and camera are shown. */
 function freeMotion() {
   const compared = state.truth !== null, still = !scene?.motion.duration;
   $("play").disabled = $("time").disabled = compared || still;
@@ -277,7 +277,10 @@ function slider(id, apply) {
 function bind() {
   slider("yaw", (degrees) => { state.yaw = wrapped(degrees * RADIANS); });
   slider("exposure", (stops) => { state.exposure = stops; });
-  slider("size", (pixels) => { state.width = state.height = pixels; });
+  slider("size", (pixels) => {
+    const [width, height] = scene.size, [least, most] = scene.sizes;
+    Object.assign(state, { width: Math.min(Math.max(Math.round(pixels * width / height), least), most), height: pixels });
+  });
   slider("gaussians", setGaussians);
   slider("time", (seconds) => { state.time = Math.min(seconds, scene.motion.duration); play(false); });
   for (const name of ["shade", "background"])
@@ -335,8 +338,8 @@ function bindFiles() {
 }
 
 function fail(text, endsClip = true) {
-  say(text, { wrong: true, untilPicture: !(endsClip && clipMade) });
-  playing = false;  // or it would fail for every picture of a second
+  say(text, { wrong: true, untilFrame: !(endsClip && clipMade) });
+  playing = false;  // or every frame would fail
   if (scene) showState();
   if (endsClip) endClip();
   flying.clear();
@@ -346,9 +349,9 @@ function fail(text, endsClip = true) {
 
 const handlers = {
   scene: setScene,
-  picture: show,
+  frame: show,
   truth: showTruth,
-  message: (text) => say(text, { untilPicture: true }),
+  message: (text) => say(text, { untilFrame: true }),
   progress: (done, of, note = "") => say(`making a clip: ${done} of ${of}${note}`),
   clip: (blob, name, notes = []) => { endClip(); say(notes.join(" · ")); download(blob, name); },
   refused: (text) => say(text, { wrong: true }),
@@ -361,6 +364,6 @@ if (engine.load) bindFiles();
 requestAnimationFrame(step);
 setInterval(() => {
   if (scene) showTimes();
-  sayWhatTakesLong();
+  announceSlowFrame();
 }, 250);
-window.rnd = { state, redraw, picture, play, scene: () => scene, times: () => times, rate: () => rates.length };
+window.rnd = { state, redraw, frame, play, scene: () => scene, times: () => times, rate: () => rates.length };

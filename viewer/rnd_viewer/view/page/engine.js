@@ -1,12 +1,12 @@
-// The pictures come from rnd-view over a websocket. A page served without it brings an engine.js of its own.
+// Frames come from rnd-view over a websocket. A page served without it brings an engine.js of its own.
 
-const WITH_BODY = ["picture", "clip", "truth"];
+const WITH_BODY = ["frame", "clip", "truth"];
 const UNREACHABLE = "rnd-view does not answer; is it still running?";
 
 /**
- * Connect. `on` gets: scene(description), picture({number, width, height, joints, times, image}), truth(index, bitmap or
+ * Connect. `on` gets: scene(description), frame({number, width, height, joints, times, image}), truth(index, bitmap or
  * null where the browser cannot decode it), progress(done, of, note or nothing), clip(blob, name, notes), error(text, ends):
- * of a picture or of a clip, which ends with it unless told otherwise. None of them is called before what asks for it has
+ * of a frame or of a clip, which ends with it by default. None of them is called before what asks for it has
  * returned.
  */
 export async function connect(on) {
@@ -46,8 +46,8 @@ async function receive(header, body, on) {
   else if (header.kind === "truth") on.truth(header.index, await createImageBitmap(new Blob([body])).catch(() => null));
   else {
     const image = await pixels(header, body).catch(() => null);
-    if (image) on.picture({ ...header, image });
-    else on.error("this browser cannot decode a picture that rnd-view sent", false);
+    if (image) on.frame({ ...header, image });
+    else on.error("this browser cannot decode an image that rnd-view sent", false);
   }
 }
 

@@ -1,15 +1,15 @@
-// Pointer and wheel → the camera's place on its orbit, and the light's turn.
+// Pointer and wheel → the camera's orbit and the light's rotation.
 
 const LIMIT = 89 * Math.PI / 180;
 const PER_PIXEL = 0.01;  // rad
 const NEAREST = 0.2, FARTHEST = 100;  // m
 
 /**
- * Lets `element` turn `state` (azimuth, elevation, distance, target, yaw in rad and m), unless a truth stands beside, whose
- * camera and light are shown; calls `changed` after.
+ * Let `element` change `state` (azimuth, elevation, distance, target, yaw in rad and m), then call `changed`. Beside a truth,
+ * whose camera and light are shown, it does nothing.
  */
 export function orbit(element, state, changed) {
-  const fingers = new Map();  // pointer → its last place
+  const fingers = new Map();  // pointer → its last position
   element.addEventListener("contextmenu", (event) => event.preventDefault());
   element.addEventListener("pointerdown", (event) => {
     fingers.set(event.pointerId, [event.clientX, event.clientY]);

@@ -12,13 +12,13 @@ function duration(seconds) {
 }
 
 function show(run) {
-  const percent = Math.floor(100 * run.done / run.total), known = run.total > run.done || run.ended;
-  document.title = `${run.ended ?? (known ? `${percent} %` : run.done)} · ${run.name}`;
+  const percent = Math.floor(100 * run.done / run.total);
+  document.title = `${run.ended ?? `${percent} %`} · ${run.name}`;
   $("title").textContent = run.name;
   $("subtitle").textContent = run.phase ?? PHASES[run.stage] ?? "";
-  $("progress").value = known ? run.done / run.total : 0;
+  $("progress").value = run.done / run.total;
   rows({
-    step: known ? `${run.done} of ${run.total}` : run.done,
+    step: `${run.done} of ${run.total}`,
     trained: duration(run.seconds),
     "time left": run.ended || run.seconds_left === null ? "–" : duration(run.seconds_left),
     "steps skipped (not finite)": run.skipped || null,

@@ -1,4 +1,4 @@
-// OpenEXR pictures ("OpenEXR File Layout", the Academy Software Foundation): their header is held against what parse-exr
+// OpenEXR images ("OpenEXR File Layout", the Academy Software Foundation): their header is held against what parse-exr
 // reads rightly, the pixels are parse-exr's.
 
 import parseExr from "parse-exr";
@@ -11,7 +11,7 @@ const COMPRESSIONS = ["none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A
 const BLOCK_LINES = { none: 1, RLE: 1, ZIPS: 1, ZIP: 16, PIZ: 32, PXR24: 16, DWAA: 32, DWAB: 256 };  // of those that it reads
 
 /**
- * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat picture with channels R, G and B; the last
+ * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat image with channels R, G and B; the last
  * [8] are x and y of red, green, blue and white, where the file states them.
  */
 export function readExr(file) {
@@ -74,7 +74,7 @@ function check({ flat, channels, compression, data, canvas }) {
     throw refusal("light probe", { expected: "channels R, G and B, of no layer", got: names.join(", ") || "none" });
   if (!flat || String(data) !== String(canvas)) {
     const got = flat ? `pixels ${data} of canvas ${canvas}` : "a deep one, or several";
-    throw refusal("image layout", { expected: "one flat picture that fills its canvas", got });
+    throw refusal("image layout", { expected: "one flat image that fills its canvas", got });
   }
   const odd = channels.find(({ type, sampling }) => type === UINT || sampling.some((step) => step !== 1));
   if (odd || own.some(({ type }) => type !== own[0].type)) {

@@ -11,15 +11,6 @@ import { OnnxFile } from "../files/onnx.js";
 import { RestPose } from "./posing.js";
 import { multiply, rotate } from "../rotations.js";
 
-// What the metadata may say (AvatarMetadata of rnd_runtime/avatar/file.py): true for a value, an object for one inside.
-const FIELDS = {
-  schema: true, gaussians: true, spacing_m: true, window_poses: true, window_seconds: true, trained_light: true,
-  body_license: true, checkpoint_sha256: true, conventions: true, generator: true,
-  skeleton: { names: true, parents: true, rest_joints: true },
-  variant: { encoder: true, precision: true, nodes: true, dynamic_nodes: true, visibility_degree: true },
-};
-const DEFAULTED = ["variant", ...Object.keys(FIELDS.variant)];
-
 const EVERYTHING = -2;  // n·v that nothing is below
 
 export class Avatar {
@@ -29,7 +20,6 @@ export class Avatar {
     if (!text) throw new Error(`${name} is not an RnD avatar`);
     const about = JSON.parse(text);
     if (about.schema !== SCHEMA) throw new Error(`${name}: schema ${about.schema}, expected ${SCHEMA}`);
-    checkFields(about, FIELDS, "metadata");
     ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
     // Threads need the headers COOP and COEP, which a static host may not send.
     ort.env.wasm.numThreads = globalThis.crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, 4) : 1;
@@ -105,18 +95,6 @@ async function constants(file, names) {
     return names.map((name) => values[name].data.slice());
   } finally {
     await session.release();
-  }
-}
-
-/** Refuse an object that has other fields than `known`, or lacks one without a default. */
-function checkFields(value, known, what) {
-  if (value === null || typeof value !== "object") throw refusal(what, { expected: "an object", got: typeof value });
-  const strange = Object.keys(value).find((name) => !Object.hasOwn(known, name));
-  if (strange !== undefined) throw refusal(what, { got: `unknown field \`${strange}\`` });
-  for (const [name, inner] of Object.entries(known)) {
-    if (value[name] === undefined) {
-      if (!DEFAULTED.includes(name)) throw refusal(what, { got: `no field \`${name}\`` });
-    } else if (inner !== true) checkFields(value[name], inner, `${what}.${name}`);
   }
 }
 

@@ -1,6 +1,6 @@
 // Forearms that share a twist between elbow and wrist (rnd_runtime/posing/forearm.py, which has the formulas).
 
-import { FREE, MOST } from "../constants.js";
+import { FREE, MAX_SHARE } from "../constants.js";
 import { axisAngleToMatrix, multiply, transposed, unit } from "../rotations.js";
 
 const SIDES = ["left", "right"];
@@ -32,6 +32,6 @@ function handedOn(m, at, axis) {
   const twist = Math.atan2(sine, m[at] + m[at + 4] + m[at + 8] - along);
   const beyond = (Math.abs(twist) - FREE) / (Math.PI - FREE);
   if (beyond <= 0) return 0;
-  const share = MOST * Math.sin(Math.PI * beyond) ** 2 * Math.max(Math.min(1, 2 * (1 + along)), 0);
+  const share = MAX_SHARE * Math.sin(Math.PI * beyond) ** 2 * Math.max(Math.min(1, 2 * (1 + along)), 0);
   return twist > 0 ? share : -share;
 }

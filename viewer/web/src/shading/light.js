@@ -1,6 +1,6 @@
 // Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/shading/light.py).
 
-import { DIM, MOST_EXPOSED, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
+import { DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
 import { refusal, short } from "../errors.js";
 import { readExr } from "../files/exr.js";
 
@@ -52,8 +52,8 @@ function readHdr(bytes) {
     if (name === "PRIMARIES" && numbers.length === 8 && numbers.every(Number.isFinite) && numbers.some(Boolean))
       chromaticities = numbers;  // zeros state nothing
   }
-  if (!(exposure >= 1 / MOST_EXPOSED && exposure <= MOST_EXPOSED)) {
-    const expected = `numbers whose product is ${short(1 / MOST_EXPOSED, 6)} to ${short(MOST_EXPOSED, 6)}`;
+  if (!(exposure >= 1 / MAX_EXPOSURE && exposure <= MAX_EXPOSURE)) {
+    const expected = `numbers whose product is ${short(1 / MAX_EXPOSURE, 6)} to ${short(MAX_EXPOSURE, 6)}`;
     throw refusal("EXPOSURE of the light probe", { expected, got: short(exposure, 6) });
   }
   const size = /^-Y (\d+) \+X (\d+)/.exec(line());

@@ -104,7 +104,7 @@ function lookUp({ depth, width, texel }, position, normal, k, radius) {
   return Math.min(lit, 1);
 }
 
-/** Lambert and GGX under one sun, whose disc widens the highlight (sunlight.py, add_suns). */
+/** Lambert and GGX under one sun, whose disc widens the highlight (sunlight.py, add_directional). */
 function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibility, radiance) {
   const [lx, ly, lz] = sun.direction, spread = sun.spread ** 2;
   for (let i = 0; i < count; i++) {

@@ -1,6 +1,6 @@
 // Taking the sun out of a light probe (rnd_runtime/shading/sun.py): sky + suns = map.
 
-import { CAP, LAMP, LARGEST, LEAST_SHARE, MOST_PEAKS, RING, RING_AREA } from "../constants.js";
+import { CAP, LAMP, LARGEST, MIN_SHARE, MAX_PEAKS, RING, RING_AREA } from "../constants.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
 
 const LIMIT = 2;  // suns
@@ -16,8 +16,8 @@ export function extractSuns(light) {
     bright[k] = luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]);
     total += bright[k] * angles[Math.floor(k / width)];
   }
-  const suns = [], least = LEAST_SHARE * total;
-  for (let tried = 0; tried < MOST_PEAKS && suns.length < LIMIT; tried++) {
+  const suns = [], least = MIN_SHARE * total;
+  for (let tried = 0; tried < MAX_PEAKS && suns.length < LIMIT; tried++) {
     let peak = 0;
     for (let k = 1; k < height * width; k++) if (bright[k] > bright[peak]) peak = k;
     if (!(bright[peak] * RING_AREA >= least)) break;
