@@ -46,23 +46,13 @@ class BakedSkinning:
     heads: int
 
 
-@dataclass(frozen=True)
-class Rates:
-    """At how many nodes, the first in farthest-point order, each network is evaluated; the others interpolate."""
-
-    skinning: int
-    offsets: int
-    visibility: int
-
-
 @dataclass(frozen=True, eq=False)
 class BakedAvatar:
     """The constants of an avatar: N Gaussians, M nodes, J joints.
 
     Attributes:
         codes: encoded positions of the nodes [M, 3] m. all_codes: of the Gaussians [N, 3] m.
-        node_rows: the Gaussian at each node [M]. node_ranks: rank of each node in farthest-point order [M].
-        rates: nodes of each network. dynamic_nodes: the first so many nodes have dynamic skinning.
+        node_rows: the Gaussian at each node [M]. dynamic_nodes: the first so many nodes have dynamic skinning.
         skinning: None for the template's weights. offsets, visibility: a ``PoseConditioned`` each.
         neighbours, neighbour_weights: nodes that a Gaussian interpolates [N, K].
         weights: template skinning [N, J]. points: rest positions [N, 3] m. factors: R S at rest [N, 3, 3] m.
@@ -74,8 +64,6 @@ class BakedAvatar:
     all_codes: Floats
     frequencies: int
     node_rows: NDArray[np.int64]
-    node_ranks: NDArray[np.int64]
-    rates: Rates
     dynamic_nodes: int
     skinning: BakedSkinning | None
     offsets: dict[str, Floats]
@@ -128,8 +116,6 @@ def bake(model: AvatarModel) -> BakedAvatar:
         all_codes=_array(model.codes),
         frequencies=config.frequencies,
         node_rows=np.arange(config.nodes),
-        node_ranks=np.arange(config.nodes),
-        rates=Rates(config.nodes, config.nodes, config.nodes),
         dynamic_nodes=config.nodes if config.dynamic_skinning else 0,
         skinning=_skinning(model) if config.dynamic_skinning else None,
         offsets=_weights(model.offsets),

@@ -45,10 +45,6 @@ class Reduction:
     """Networks at every node, at a quarter of them (coarse), or the template's skinning weights (static)."""
     precision: Precision = "f32"
     """Of stored constants; f16 must keep 99 % of all positions within 1 mm, int8 within 3 mm."""
-    skinning_nodes: OptionalCount = None
-    """Nodes at which the skinning network is evaluated; the others interpolate."""
-    offset_nodes: OptionalCount = None
-    """The same for the pose offsets."""
     window_poses: OptionalCount = None
     """Poses in the motion window; fewer span the same time."""
 

@@ -29,7 +29,7 @@ from rnd_runtime.motion.motion import Motion
 from rnd_trainer.model.checkpoint import Checkpoint
 
 from .bake import BakedAvatar, bake
-from .order import moving_sites, order_gaussians, order_nodes
+from .order import order_gaussians, order_nodes
 from .parity import ParityError, measure_parity, random_motion
 
 CONVENTIONS = (
@@ -109,8 +109,7 @@ def build(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> onnx.
 
 def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> str:
     skeleton, config = checkpoint.skeleton, checkpoint.config.model
-    moving, rates = len(moving_sites(baked)), baked.rates
-    nodes = max(moving, rates.offsets, rates.visibility)
+    nodes = len(baked.codes)
     metadata = AvatarMetadata(
         schema=SCHEMA,
         gaussians=len(baked.points),
@@ -131,7 +130,7 @@ def _metadata(checkpoint: Checkpoint, baked: BakedAvatar, variant: Variant) -> s
             encoder="static" if baked.skinning is None else "coarse" if nodes < config.nodes else "full",
             precision=variant.precision,
             nodes=nodes,
-            dynamic_nodes=moving,
+            dynamic_nodes=baked.dynamic_nodes,
             visibility_degree=variant.visibility_degree,
         ),
     )

@@ -35,23 +35,8 @@ def order_nodes(baked: BakedAvatar) -> BakedAvatar:
 def permute_nodes(baked: BakedAvatar, order: Integers) -> BakedAvatar:
     """``baked`` with its nodes in ``order`` [M]."""
     return dataclasses.replace(
-        baked,
-        codes=baked.codes[order],
-        node_rows=baked.node_rows[order],
-        node_ranks=baked.node_ranks[order],
-        neighbours=_inverse(order)[baked.neighbours],
+        baked, codes=baked.codes[order], node_rows=baked.node_rows[order], neighbours=_inverse(order)[baked.neighbours]
     )
-
-
-def node_sites(baked: BakedAvatar, count: int) -> Integers:
-    """Indices of the nodes that are the first ``count`` in farthest-point order."""
-    return np.flatnonzero(baked.node_ranks < count)
-
-
-def moving_sites(baked: BakedAvatar) -> Integers:
-    """Indices of the nodes at which the skinning network is evaluated."""
-    sites = node_sites(baked, baked.rates.skinning)
-    return sites[sites < baked.dynamic_nodes]
 
 
 def _inverse(order: Integers) -> Integers:

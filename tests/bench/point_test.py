@@ -220,5 +220,3 @@ def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
     close = distances.min(1) < 0.01
     ours, theirs = looks[0][close], looks[1][near[close]]
     assert close.sum() > 10 and np.median(np.abs(ours - theirs)) < 0.05
-    rates = Encoders("rates").words(seeded_checkpoint(800, ASSETS / "body.npz", tmp_path))
-    assert rates[4:] == ["--skinning-nodes", "25", "--offset-nodes", "12"] and rates[1] == "full"

@@ -28,7 +28,7 @@ from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_runtime.posing.window import motion_window
 from rnd_trainer.model.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
 from rnd_trainer.model.model import AvatarModel
-from rnd_trainer.model.template import along_curve, node_interpolation, sample_template
+from rnd_trainer.model.template import along_curve, sample_template
 from rnd_trainer.training.data import pose_input
 from support.tiny import body, motion
 
@@ -144,57 +144,19 @@ def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
         assert np.abs(coarse - same).max() < MAX_WEIGHT_ERROR / 10 < np.abs(coarse - others).max()
 
 
-@pytest.mark.parametrize("network", ["skinning", "offset", "visibility"])
-def test_each_network_may_have_fewer_nodes_of_its_own(network, tiny_checkpoint, tiny_avatar, tmp_path) -> None:
-    """It says the same at those, what they say lies between them, and the other networks say what they said."""
-    checkpoint, fewer = load_checkpoint(tiny_checkpoint), tmp_path / "fewer.onnx"
-    export(load_checkpoint(tiny_checkpoint), fewer, motion(body()), Variant(**{f"{network}_nodes": 50}))
-    codes = bake(checkpoint.model).all_codes[:200]
-    order = along_curve(codes)  # the file's, of nodes that stand farthest first
-    area = checkpoint.config.model.gaussians * float(checkpoint.model.spacing) ** 2
-    neighbours, shares = node_interpolation(codes[order], codes[:50], area)
-    fields = {"skinning": "node_logits", "offset": "node_offsets", "visibility": "node_visibility"}
-    for name, field in fields.items():
-        ours, whole = (_output(path, motion(body()), checkpoint, field) for path in (fewer, tiny_avatar))
-        at_sites = whole[np.argsort(order)[:50]]
-        wanted = np.einsum("mk,mkc->mc", shares, at_sites[neighbours]) if name == network else whole
-        assert np.abs(ours - wanted).max() < MAX_WEIGHT_ERROR / 10
-        assert name != network or np.abs(ours - whole).max() > MAX_WEIGHT_ERROR
-
-
 @pytest.mark.parametrize(
     ("variant", "encoder", "nodes", "dynamic_nodes"),
     [
         (Variant(), "full", 200, 200),
-        (Variant(skinning_nodes=50, offset_nodes=25), "full", 200, 50),
-        (Variant(skinning_nodes=50, offset_nodes=25, visibility_nodes=25), "coarse", 50, 50),
-        (Variant(skinning_nodes=4, offset_nodes=4, visibility_nodes=4), "coarse", 4, 4),
-        (Variant("coarse", nodes=100, skinning_nodes=50), "coarse", 100, 50),
-        (Variant("static", offset_nodes=50, visibility_nodes=25), "static", 50, 0),
+        (Variant("coarse", nodes=100), "coarse", 100, 100),
+        (Variant("static"), "static", 200, 0),
     ],
 )
-def test_nodes_are_the_most_at_which_any_network_is_evaluated(
-    variant, encoder, nodes, dynamic_nodes, tiny_checkpoint, tmp_path
-) -> None:
+def test_the_metadata_states_the_nodes(variant, encoder, nodes, dynamic_nodes, tiny_checkpoint, tmp_path) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     baked = reduced(bake(checkpoint.model), checkpoint.config.model, variant)
     stated = read_metadata(OnnxFile(build(checkpoint, baked, variant).SerializeToString())).variant
     assert (stated.encoder, stated.nodes, stated.dynamic_nodes) == (encoder, nodes, dynamic_nodes)
-
-
-def test_networks_with_as_many_nodes_are_interpolated_together(tiny_checkpoint, tmp_path) -> None:
-    both = tmp_path / "both.onnx"
-    export(
-        load_checkpoint(tiny_checkpoint),
-        both,
-        motion(body()),
-        Variant(offset_nodes=50, visibility_nodes=50, skinning_nodes=100),
-    )
-    joined = [node for node in onnx.load(both).graph.node if node.name.endswith("_nodes/fields")]
-    assert [(node.name, len(node.input)) for node in joined] == [
-        ("from_50_nodes/fields", 2),
-        ("from_100_nodes/fields", 1),
-    ]
 
 
 def _weights(path, moves: Motion, checkpoint) -> np.ndarray:

@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 
 from rnd_export.bake import BakedAvatar, bake
 from rnd_export.cli import main
-from rnd_export.order import moving_sites, order_gaussians
+from rnd_export.order import order_gaussians
 from rnd_export.parity import random_motion
 from rnd_export.reduce.merge import fitted_albedo, merged
-from rnd_export.reduce.variant import OWN_NODES, Variant, reduced, static_where
+from rnd_export.reduce.variant import Variant, static_where
 from rnd_export.reduce.views import COUNT, FIT_COUNT, resized, views_around, views_of
 from rnd_export.search.budget import LADDERS, Bound, Found, Plan, given_up, search
 from rnd_export.search.candidates import Measured, Recipe, SearchScene, Workbench
@@ -271,7 +271,7 @@ def test_a_file_that_fails_unseen_is_given_up_for_the_one_before() -> None:
 
 def test_dynamic_skinning_stays_where_it_moves_something(bench) -> None:
     """By its own measure: nothing in the poses searched moves by more than the limit."""
-    moves = bench._site_moves(bench._baked)
+    moves = bench._node_moves(bench._baked)
     limit = float(np.median(moves))
     some = Recipe(dynamic_mm=limit)
     model, share = bench.model(some), bench.still_share(some)
@@ -287,44 +287,9 @@ def _sites(model: onnx.ModelProto) -> dict[str, int]:
     return {tensor.name.partition("/")[0]: tensor.dims[0] for tensor in stored}
 
 
-def test_where_no_node_of_its_own_moves_the_file_is_static(tiny_checkpoint) -> None:
-    config = ModelConfig(gaussians=800, nodes=200)
-    baked = reduced(bake(load_checkpoint(tiny_checkpoint).model), config, Variant(skinning_nodes=50))
-    still = np.ones(200, bool)
-    still[60:90] = False  # of the nodes that are not sites
-    assert static_where(baked, still).skinning is None
-    still[40] = False
-    some = static_where(baked, still)
-    assert some.skinning is not None and len(moving_sites(some)) == 1
-
-
-class _OwnRates(_Formula):
-    """Offsets may be coarse for nothing and visibility for very little; skinning may not."""
-
-    def measure(self, recipe: Recipe, views: str) -> Measured:
-        what, variant = super().measure(recipe, views), recipe.variant
-        most = variant.nodes or self.config.nodes
-        skinning, offsets, visibility = (
-            1 - (count or most) / most
-            for count in (variant.skinning_nodes, variant.offset_nodes, variant.visibility_nodes)
-        )
-        square = 10 ** (-what.psnr / 10) + 1e-4 * skinning + 1e-7 * visibility
-        saved = 2.0 * skinning + 1.0 * offsets + 1.0 * visibility
-        return Measured(float(-10 * np.log10(square)), what.ms - saved, what.mb)
-
-
-def test_each_network_gets_as_few_nodes_as_it_can_do_with() -> None:
-    bench = _OwnRates()
-    found = search(bench, Bound("ms", 13.5), lambda found: None)
-    assert found.plan.offset_nodes == found.plan.visibility_nodes == 2 and found.plan.skinning_nodes == 0
-    assert found.plan.nodes == 0 and found.measured.psnr > 65
-    assert given_up(bench, found.plan)[0] == "offsets at 1875 of 7500 nodes"
-
-
-@pytest.mark.parametrize(("formula", "most_ms"), [(_Formula, 9.5), (_OwnRates, 12.0)])
-def test_what_a_bound_does_not_need_is_taken_back(formula, most_ms) -> None:
+def test_what_a_bound_does_not_need_is_taken_back() -> None:
     """What the search ends with has no step that could be taken back: each would break the bound or gain nothing."""
-    bench, steps = formula(), []
+    bench, steps, most_ms = _Formula(), [], 9.5
     found = search(bench, Bound("ms", most_ms), steps.append)
     assert steps[-2].measured.psnr < steps[-1].measured.psnr and steps[-1].plan == found.plan
     for name in LADDERS:
@@ -430,11 +395,7 @@ def test_every_rung_is_a_file(bench) -> None:
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
     what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
     assert 5 < what.psnr < 60
-    # no window and no nodes of skinning's own where nothing is dynamic
-    assert len(given_up(bench, deepest)) == len(LADDERS) - 2
-    own = Plan(**dict.fromkeys(OWN_NODES, 3))
-    assert given_up(bench, own) == [f"{name} at 25 of 200 nodes" for name in ("skinning", "offsets", "visibility")]
-    assert 5 < bench.measure(bench.model(own.recipe(bench.config)), bench.seen).psnr < 60
+    assert len(given_up(bench, deepest)) == len(LADDERS) - 1  # no window where nothing is dynamic
 
 
 def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:

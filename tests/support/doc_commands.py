@@ -11,7 +11,6 @@ import os
 import re
 import runpy
 import shlex
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -70,13 +69,9 @@ def blocks(page: Path) -> list[Block]:
 
 
 def copy_assets(folder: Path) -> None:
-    """``folder``/assets, in which ``bench`` may be written to."""
-    (folder / "assets").mkdir()
-    for entry in ASSETS.iterdir():
-        if entry.name != "bench":
-            (folder / "assets" / entry.name).symlink_to(entry)
-    shutil.copytree(ASSETS / "bench", folder / "assets" / "bench")
-    (folder / "scripts").symlink_to(ROOT / "scripts")
+    """``folder``/assets and ``folder``/scripts, as links."""
+    for name in ("assets", "scripts"):
+        (folder / name).symlink_to(ROOT / name)
 
 
 def run(words: list[str], monkeypatch) -> None:

@@ -64,8 +64,8 @@ class Frame:
     shade: Annotated[str, option("MODE")] = "table"
     """ao, table, table+sun, lights:K or brute. The error is that to the sum over all texels with the avatar's own
     visibility; that of table+sun's other shadows is reported besides"""
-    encoder: Literal["full", "rates", "coarse", "static"] = "full"
-    """as of rnd-export; 'rates': skinning at a quarter of the nodes, offsets at an eighth, the rest in full"""
+    encoder: Literal["full", "coarse", "static"] = "full"
+    """as of rnd-export"""
     precision: Literal["f32", "f16", "int8"] = "f32"
     """as of rnd-export"""
     window: OptionalCount = None

@@ -6,12 +6,11 @@ import numpy as np
 import onnx
 
 from rnd_export.bake import BakedAvatar
-from rnd_export.order import Integers, moving_sites, node_sites
 from rnd_runtime.avatar.file import Precision
 from rnd_runtime.core.sh import SH_COUNT
-from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
+from rnd_trainer.model.template import NEIGHBOURS
 
-from .builder import GraphBuilder, Storage
+from .builder import GraphBuilder
 from .networks import Networks
 from .posing import Posing
 from .rest import STORAGE, RestConstants
@@ -31,7 +30,6 @@ def build_model(baked: BakedAvatar, precision: Precision, poses: int, metadata: 
     networks = Networks(graph, STORAGE[precision][2])
     sizes = {"node_logits": joints, "node_offsets": 6, "node_visibility": len(baked.visibility["out.bias"])}
     fields = _node_fields(graph, baked, rest, (window, velocity, bones), networks)
-    fields = _at_all_nodes(graph, baked, fields, sizes, networks.storage)
     with graph.scope("interpolate"):
         parts = _interpolated(graph, fields, sizes, rest["neighbours"], rest["neighbour_weights"])
         visibility = _padded(graph, parts["node_visibility"], count, SH_COUNT - sizes["node_visibility"])
@@ -60,14 +58,13 @@ def _node_fields(
     fields = {}
     encoded = networks.encoded(baked.codes, baked.frequencies)
 
-    def at(sites: Integers) -> str:
-        return encoded if len(sites) == len(baked.codes) else graph.rows(encoded, sites, "sites")
-
     if baked.skinning is not None:
         with graph.scope("skinning"):
-            moving = moving_sites(baked)
-            logits = networks.skinning(baked.skinning, at(moving), window, velocity)
-            if still := baked.rates.skinning - len(moving):  # the last ones have the template's weights
+            sites, still = encoded, len(baked.codes) - baked.dynamic_nodes
+            if still:
+                sites = graph.rows(encoded, np.arange(baked.dynamic_nodes), "sites")
+            logits = networks.skinning(baked.skinning, sites, window, velocity)
+            if still:  # the last ones have the template's weights
                 zeros = graph.filled("static_logits", (still, baked.weights.shape[1]), 0.0)
                 logits = graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
             fields["node_logits"] = logits
@@ -75,29 +72,11 @@ def _node_fields(
         now = graph.op("Gather", window, graph.constant("last", np.int64(-1)), name="now", axis=0)
         now = graph.reshape(now, (1, -1), "now_flat")
     with graph.scope("offsets"):
-        sites = node_sites(baked, baked.rates.offsets)
-        fields["node_offsets"] = networks.conditioned(baked.offsets, at(sites), now, None)
+        fields["node_offsets"] = networks.conditioned(baked.offsets, encoded, now, None)
     with graph.scope("visibility"):
-        sites = node_sites(baked, baked.rates.visibility)
-        normals = _root_normals(graph, baked, rest, bones, sites)
-        fields["node_visibility"] = networks.conditioned(baked.visibility, at(sites), now, normals)
+        normals = _root_normals(graph, baked, rest, bones)
+        fields["node_visibility"] = networks.conditioned(baked.visibility, encoded, now, normals)
     return fields
-
-
-def _at_all_nodes(
-    graph: GraphBuilder, baked: BakedAvatar, fields: dict[str, str], sizes: dict[str, int], storage: Storage
-) -> dict[str, str]:
-    """``fields`` at all nodes: those of networks with fewer nodes are interpolated, jointly for equal counts."""
-    rates, at_all = baked.rates, dict(fields)
-    counts = {"node_logits": rates.skinning, "node_offsets": rates.offsets, "node_visibility": rates.visibility}
-    for count in sorted({counts[name] for name in fields} - {len(baked.codes)}):
-        with graph.scope(f"from_{count}_nodes"):
-            sites = node_sites(baked, count)
-            neighbours, weights = node_interpolation(baked.codes, baked.codes[sites], baked.area)
-            coarse = {name: value for name, value in fields.items() if counts[name] == count}
-            read, shares = graph.packed("neighbours", neighbours), graph.stored("shares", weights, storage)
-            at_all |= _interpolated(graph, coarse, sizes, read, shares)
-    return at_all
 
 
 def _posed(
@@ -126,10 +105,10 @@ def _posed(
     return posing.points(blend, linear, points), covariances, posing.by_gaussian(normals, "normals")
 
 
-def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, bones: str, sites: Integers) -> str:
-    """Normals of the nodes ``sites`` [m, 3], posed by the template's weights, in the root's frame."""
+def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, bones: str) -> str:
+    """Normals of the nodes [M, 3], posed by the template's weights, in the root's frame."""
     posing = Posing(graph)
-    weights = graph.rows(rest["log_template"], baked.node_rows[sites], "nodes")
+    weights = graph.rows(rest["log_template"], baked.node_rows, "nodes")
     weights = graph.op("Softmax", weights, name="weights", axis=1)
     root = graph.rows(graph.rows(bones, [0], "root_bone"), [0, 1, 2], "root_columns", axis=2)
     root = graph.reshape(root, (3, 3), "root")
@@ -137,7 +116,7 @@ def _root_normals(graph: GraphBuilder, baked: BakedAvatar, rest: RestConstants, 
     to_root = graph.op("Transpose", root, name="to_root", perm=[1, 0])
     in_root = graph.op("MatMul", to_root, bones, name="bones_in_root")
     linear = posing.linear(posing.blend(weights, in_root))
-    normals = graph.rows(rest.by_component("rest_normals"), baked.node_rows[sites], "rest_normals", axis=1)
+    normals = graph.rows(rest.by_component("rest_normals"), baked.node_rows, "rest_normals", axis=1)
     return posing.by_gaussian(posing.normals(linear, posing.cofactors(linear), normals), "root_normals")
 
 

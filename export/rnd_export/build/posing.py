@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rnd_runtime.posing.posing import SMALLEST_SQUARE, TWIST_STEPS
+from rnd_runtime.posing.skinning import SMALLEST_SQUARE, TWIST_STEPS
 from rnd_trainer.model.skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 
 from .builder import GraphBuilder

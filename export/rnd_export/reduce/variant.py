@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_export.bake import BakedAvatar, BakedSkinning, Rates
-from rnd_export.order import moving_sites, permute_nodes
+from rnd_export.bake import BakedAvatar, BakedSkinning
+from rnd_export.order import permute_nodes
 from rnd_runtime.avatar.file import EncoderKind, Precision
 from rnd_runtime.core.errors import InputError, flag
 from rnd_runtime.core.sh import SH_DEGREE
@@ -19,9 +19,6 @@ from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
 
 COARSE_SHARE = 4
 """``coarse`` evaluates the networks at one of this many nodes"""
-
-OWN_NODES = {"skinning_nodes": "skinning", "offset_nodes": "offsets", "visibility_nodes": "visibility"}
-"""fields of ``Variant`` → fields of ``Rates``"""
 
 
 @dataclass(frozen=True)
@@ -33,7 +30,6 @@ class Variant:
             ``static``: the template's skinning weights, no attention.
         precision: of stored constants; arithmetic is float32.
         nodes: M, a prefix of the farthest-point order; for ``coarse``.
-        skinning_nodes, offset_nodes, visibility_nodes: of these M, at how many that network is evaluated.
         window_poses: d; fewer poses span the same seconds.
         visibility_degree: 0 to 3; higher SH coefficients are left out.
     """
@@ -41,9 +37,6 @@ class Variant:
     encoder: EncoderKind = "full"
     precision: Precision = "f32"
     nodes: int | None = None
-    skinning_nodes: int | None = None
-    offset_nodes: int | None = None
-    visibility_nodes: int | None = None
     window_poses: int | None = None
     visibility_degree: int = SH_DEGREE
 
@@ -53,33 +46,20 @@ class Variant:
             return config.nodes
         return self.nodes or max(NEIGHBOURS, config.nodes // COARSE_SHARE)
 
-    def rates(self, config: ModelConfig) -> Rates:
-        """Nodes of each network, of the M of the file."""
-        count = self.node_count(config)
-        return Rates(**{network: getattr(self, name) or count for name, network in OWN_NODES.items()})
-
     def check(self, config: ModelConfig) -> None:
         """Raise ``InputError`` for what no file of this checkpoint can be."""
-        low = {
-            **dict.fromkeys(["nodes", *OWN_NODES], NEIGHBOURS),
-            "window_poses": 2 if config.window_poses > 1 else 1,
-            "visibility_degree": 0,
+        limits = {
+            "nodes": (NEIGHBOURS, config.nodes),
+            "window_poses": (min(2, config.window_poses), config.window_poses),
+            "visibility_degree": (0, SH_DEGREE),
         }
-        high = {
-            "nodes": config.nodes,
-            **dict.fromkeys(OWN_NODES, self.node_count(config)),
-            "window_poses": config.window_poses,
-            "visibility_degree": SH_DEGREE,
-        }
-        for name in low:
+        for name, (low, high) in limits.items():
             value = getattr(self, name)
-            if value is not None and not low[name] <= value <= high[name]:
-                raise InputError(flag(name), expected=f"{low[name]} to {high[name]}", got=value)
+            if value is not None and not low <= value <= high:
+                raise InputError(flag(name), expected=f"{low} to {high}", got=value)
         if self.nodes is not None and self.encoder != "coarse":
             raise InputError("--nodes", expected="--encoder coarse", got=f"--encoder {self.encoder}")
         static = self.encoder == "static" or not config.dynamic_skinning
-        if self.skinning_nodes is not None and static:
-            raise InputError("--skinning-nodes", expected="dynamic skinning", got="the template's weights")
         if self.window_poses is not None and static:
             got = "the template's weights, which have no window"
             raise InputError("--window-poses", expected="dynamic skinning", got=got)
@@ -87,14 +67,13 @@ class Variant:
 
 def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:
     """``baked`` without what ``variant`` leaves out."""
-    changes: dict[str, Any] = {"rates": variant.rates(config)}
+    changes: dict[str, Any] = {}
     nodes, skinning = variant.node_count(config), baked.skinning
     if nodes < len(baked.codes):
         neighbours, weights = node_interpolation(baked.all_codes, baked.codes[:nodes], baked.area)
         changes |= {
             "codes": baked.codes[:nodes],
             "node_rows": baked.node_rows[:nodes],
-            "node_ranks": baked.node_ranks[:nodes],
             "neighbours": neighbours,
             "neighbour_weights": weights,
             "dynamic_nodes": nodes if skinning else 0,
@@ -112,11 +91,10 @@ def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedA
 
 def static_where(baked: BakedAvatar, still: NDArray[np.bool_]) -> BakedAvatar:
     """``baked`` with the template's skinning at the nodes ``still`` [M], which become the last ones."""
+    if still.all():
+        return dataclasses.replace(baked, dynamic_nodes=0, skinning=None)
     moved = permute_nodes(baked, np.argsort(still, kind="stable"))
-    moved = dataclasses.replace(moved, dynamic_nodes=int((~still).sum()))
-    if len(moving_sites(moved)):
-        return moved
-    return dataclasses.replace(moved, dynamic_nodes=0, skinning=None)
+    return dataclasses.replace(moved, dynamic_nodes=int((~still).sum()))
 
 
 def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:

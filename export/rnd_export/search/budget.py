@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 import onnx
 
-from rnd_export.reduce.variant import OWN_NODES, Variant
+from rnd_export.reduce.variant import Variant
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.config import ModelConfig
 
@@ -26,15 +26,11 @@ LADDERS: dict[str, tuple[float, ...]] = {
     "cull": (-0.7, -0.5, -0.4, -0.3, -0.2),
     "dynamic_mm": (0.05, 0.2, 0.5, 1.0, 2.0, np.inf),
     "nodes": (0.5, 0.25, 0.125),
-    "skinning_nodes": (0.5, 0.25, 0.125),
-    "offset_nodes": (0.5, 0.25, 0.125),
-    "visibility_nodes": (0.5, 0.25, 0.125),
     "gaussians": (0.85, 0.7, 0.55, 0.4, 0.3, 0.2),
     "visibility_degree": (2, 1, 0),
     "window": (0.5, 0.3, 0.2),
 }
-"""steps of each choice; nodes, Gaussians and window poses as shares of the checkpoint's, nodes of one network as shares
-of the file's"""
+"""steps of each choice; nodes, Gaussians and window poses as shares of the checkpoint's"""
 MARGIN_DB = 0.3
 """above a required PSNR: held-out views are a little worse"""
 MIN_GAIN = 0.01
@@ -62,9 +58,6 @@ class Plan:
     cull: int = 0
     dynamic_mm: int = 0
     nodes: int = 0
-    skinning_nodes: int = 0
-    offset_nodes: int = 0
-    visibility_nodes: int = 0
     gaussians: int = 0
     visibility_degree: int = 0
     window: int = 0
@@ -79,14 +72,10 @@ class Plan:
         nodes, gaussians, window, degree = (rung(n) for n in ("nodes", "gaussians", "window", "visibility_degree"))
         static = rung("dynamic_mm") == np.inf
         node_count = _nodes(nodes, config.nodes) or config.nodes
-        own = {name: _nodes(rung(name), node_count) for name in OWN_NODES}
-        if static:
-            own["skinning_nodes"] = None
         variant = Variant(
             encoder="coarse" if nodes else "full",
             precision=PRECISIONS[self.precision],
             nodes=_nodes(nodes, config.nodes),
-            **own,
             window_poses=max(2, round(window * config.window_poses)) if window and not static else None,
             visibility_degree=3 if degree is None else int(degree),
         )
@@ -244,9 +233,6 @@ def given_up(bench: Workbench, plan: Plan) -> list[str]:
         lines.append(f"{recipe.gaussians} of {config.gaussians} Gaussians, the others merged, colours fitted again")
     if recipe.variant.nodes is not None:
         lines.append(f"networks at {recipe.variant.nodes} of {config.nodes} nodes")
-    for name, network in OWN_NODES.items():
-        if count := getattr(recipe.variant, name):
-            lines.append(f"{network} at {count} of {recipe.variant.node_count(config)} nodes")
     if recipe.dynamic_mm == np.inf:
         lines.append("dynamic skinning nowhere")
     elif recipe.dynamic_mm:

@@ -31,7 +31,6 @@ from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light
 from rnd_trainer.model.checkpoint import Checkpoint
-from rnd_trainer.model.template import node_interpolation
 
 from .timing import PairedTimer, milliseconds
 
@@ -114,7 +113,7 @@ class Workbench:
         """The file of ``recipe``."""
         baked = reduced(self._baked, self.config, recipe.variant)
         if recipe.dynamic_mm and baked.skinning is not None:
-            baked = static_where(baked, self._site_moves(baked) < recipe.dynamic_mm)
+            baked = static_where(baked, self._node_moves(baked) < recipe.dynamic_mm)
         if recipe.gaussians is not None:
             baked = merged(baked, recipe.gaussians, self._shares)
             fewer = _loaded(self._built(baked, recipe.variant))
@@ -143,7 +142,7 @@ class Workbench:
     def still_share(self, recipe: Recipe) -> float:
         """Share of the skinning network's nodes to which ``recipe`` gives the template's weights."""
         baked = reduced(self._baked, self.config, recipe.variant)
-        return float((self._site_moves(baked)[: baked.rates.skinning] < recipe.dynamic_mm).mean())
+        return float((self._node_moves(baked) < recipe.dynamic_mm).mean())
 
     def _built(self, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
         return build(self._checkpoint, baked, variant)
@@ -175,16 +174,11 @@ class Workbench:
         assert self._timer
         return self._timer.ms(self._frames(avatar))
 
-    def _site_moves(self, baked: BakedAvatar) -> Floats:
-        """Largest motion by dynamic skinning [M], mm, of the Gaussians that read each node, directly or not."""
+    def _node_moves(self, baked: BakedAvatar) -> Floats:
+        """Largest motion by dynamic skinning [M], mm, of the Gaussians that read each node."""
         moves: Floats = np.zeros(len(baked.codes))
         np.maximum.at(moves, baked.neighbours, self._moves[:, None])
-        if baked.rates.skinning == len(moves):
-            return moves
-        sites = baked.codes[: baked.rates.skinning]
-        site_moves: Floats = np.zeros(len(moves))
-        np.maximum.at(site_moves, node_interpolation(baked.codes, sites, baked.area)[0], moves[:, None])
-        return site_moves
+        return moves
 
     def _gaussian_moves(self) -> Floats:
         """Largest motion of each Gaussian by dynamic skinning [N], mm, over the poses of the search."""

@@ -34,19 +34,15 @@ STORED = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", 
 
 @dataclass(frozen=True)
 class Encoders:
-    """Options of ``rnd-export``; ``encoder`` may also be "rates": skinning at ¼ of the nodes, offsets at ⅛."""
+    """Options of ``rnd-export``."""
 
     encoder: str = "full"
     precision: str = "f32"
     window: int | None = None
 
-    def words(self, checkpoint: Path) -> list[str]:
-        """As on the command line, for an avatar.ckpt."""
+    def words(self) -> list[str]:
+        """As on the command line."""
         words = ["--encoder", self.encoder, "--precision", self.precision]
-        if self.encoder == "rates":
-            nodes = checkpoint_model(checkpoint)["nodes"]
-            words[1] = "full"
-            words += ["--skinning-nodes", str(nodes // 4), "--offset-nodes", str(nodes // 8)]
         return words + (["--window-poses", str(self.window)] if self.window is not None else [])
 
 
@@ -69,7 +65,7 @@ def forget(folder: Path) -> None:
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
     """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless it is there."""
     key = content_key(checkpoint, *sources("rnd_export"))
-    words = encoders.words(checkpoint)
+    words = encoders.words()
     name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
     out = folder / f"{name}.onnx"
     if not out.exists():

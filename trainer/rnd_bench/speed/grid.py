@@ -27,7 +27,7 @@ FACTORS: dict[str, tuple[Any, ...]] = {
     "n": (4_000, 8_000, 15_000, FULL_N, 60_000),
     "size": (256, 512, 1024),
     "shade": ("ao", "table", "table+sun", "lights:32", "brute"),
-    "encoder": ("full", "rates", "coarse", "static"),
+    "encoder": ("full", "coarse", "static"),
     "precision": ("f32", "f16", "int8"),
     "window": (None, 2, 5),
     "raster": ("cpu", "gl-egl", "gl-osmesa"),
