@@ -13,7 +13,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import to_bytes, write_image
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
-from rnd_trainer.checking.silhouette import DrawnMesh, draw
+from rnd_trainer.checking.silhouette import RenderedMesh, render_mesh
 from support.tiny import body as embedded_body
 
 WIDTH, HEIGHT, FRAMES, FPS = 48, 64, 4, 30.0
@@ -24,7 +24,7 @@ GREY = 90  # of the background that importers must remove
 
 @cache
 def coarse_body() -> Body:
-    """The embedded body with the vertices of every 3 cm cell merged: small files, quick pictures."""
+    """The embedded body with the vertices of every 3 cm cell merged: small files, fast rendering."""
     fine = embedded_body()
     cells, member = np.unique(np.floor(fine.vertices / CELL), axis=0, return_inverse=True)
     member = member.reshape(-1)
@@ -46,7 +46,6 @@ def smpl_arrays() -> dict[str, np.ndarray]:
     """The members of an SMPL file whose mean shape is the coarse body."""
     body = coarse_body()
     vertices = body.vertices
-    rng = np.random.default_rng(5)
     x, y, z = vertices.T
     waves = np.stack([np.sin((k + 1) * 2 * y + 0.3 * k) for k in range(10)], 1)  # [V, 10]
     shape_dirs = 0.01 * np.stack([x[:, None] * (1 + waves), y[:, None] * waves[:, ::-1], z[:, None] * (1 - waves)], 1)
@@ -62,7 +61,6 @@ def smpl_arrays() -> dict[str, np.ndarray]:
         "kintree_table": tree,
         "J_regressor": regressor,
         "shapedirs": shape_dirs,
-        "posedirs": 1e-3 * rng.normal(size=(len(vertices), 3, 207)),
         "J": body.skeleton.rest_joints,
     }
 
@@ -80,7 +78,7 @@ def shaped_body() -> Body:
 
 @cache
 def axis_angles() -> np.ndarray:
-    """[F, 24, 3] rad: the person leans, turns and moves the arms, so that no rotation is about one axis only."""
+    """[F, 24, 3] rad: the person leans, rotates and moves the arms, so that no rotation is about one axis only."""
     names = coarse_body().skeleton.names
     angles = np.zeros((FRAMES, 24, 3))
     phase = np.arange(FRAMES) / FRAMES
@@ -124,15 +122,15 @@ class Truth:
 
 @cache
 def see(camera: str, frame: int, k1: float = 0.0) -> Truth:
-    """The picture of ``camera`` in ``frame`` through a lens of distortion ``k1``, on grey."""
+    """The view of ``camera`` in ``frame`` through a lens of distortion ``k1``, on grey."""
     view = view_of(cameras()[camera], frame, k1)
     colours = to_bytes(0.2 + 0.35 * (view.normals + 1))
     return Truth(np.where(view.mask[..., None], colours, GREY).astype(np.uint8), view.mask, view.normals)
 
 
-def view_of(camera: Camera, frame: int, k1: float = 0.0) -> DrawnMesh:
+def view_of(camera: Camera, frame: int, k1: float = 0.0) -> RenderedMesh:
     vertices = posed_vertices(shaped_body(), motion().rotations[frame], motion().translations[frame])
-    return draw(vertices, shaped_body().faces, camera, k1)
+    return render_mesh(vertices, shaped_body().faces, camera, k1)
 
 
 def write_true_capture(folder, *, k1: float = 0.0) -> Capture:

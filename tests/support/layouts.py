@@ -54,22 +54,22 @@ def smplx_body_file(folder: Path) -> Path:
 
 
 class World:
-    """The scene in a source's world x' = s (turn x + shift): cameras' R, t; root rotations and places."""
+    """The scene in a source's world x' = s (rotation x + shift): cameras' R, t; root rotations and positions."""
 
-    def __init__(self, turn: np.ndarray, shift=(0, 0, 0)) -> None:
-        self.turn, shift = np.asarray(turn), np.asarray(shift, float)
+    def __init__(self, rotation: np.ndarray, shift=(0, 0, 0)) -> None:
+        self.rotation, shift = np.asarray(rotation), np.asarray(shift, float)
         self.cameras: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for name, camera in cameras().items():
-            R = camera.world_to_camera[:3, :3] @ self.turn.T
+            R = camera.world_to_camera[:3, :3] @ self.rotation.T
             self.cameras[name] = (camera.K, R, camera.world_to_camera[:3, 3] - R @ shift)
         self.rest = shaped_body().skeleton.rest_joints[0]
-        self.roots = self.turn @ motion().rotations[:, 0]  # [F, 3, 3]
-        self.places = (motion().translations + self.rest) @ self.turn.T + shift  # of the pelvis [F, 3]
+        self.roots = self.rotation @ motion().rotations[:, 0]  # [F, 3, 3]
+        self.positions = (motion().translations + self.rest) @ self.rotation.T + shift  # of the pelvis [F, 3]
 
     @property
     def trans(self) -> np.ndarray:
         """SMPL: v = R (v0 − J0) + J0 + trans."""
-        return self.places - self.rest
+        return self.positions - self.rest
 
     @property
     def Rh(self) -> np.ndarray:
@@ -78,7 +78,7 @@ class World:
     @property
     def Th(self) -> np.ndarray:
         """EasyMocap: v = R(Rh) v0 + Th, so that the pelvis lies at R J0 + Th."""
-        return self.places - self.roots @ self.rest
+        return self.positions - self.roots @ self.rest
 
     @property
     def thetas(self) -> np.ndarray:
@@ -103,12 +103,12 @@ def _jpeg(path: Path, image: np.ndarray) -> None:
     assert cv2.imwrite(str(path), image[..., ::-1], flags)
 
 
-def _save_object(path: Path, content: object) -> None:
+def save_object(path: Path, content: object) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, content, allow_pickle=True)
 
 
-def _pickle(path: Path, content: object) -> None:
+def write_pickle(path: Path, content: object) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pickle.dumps(content, protocol=2))
 
@@ -151,11 +151,11 @@ def write_zju(folder: Path, *, refined: bool = False, early: bool = False) -> No
         rows.append({"ims": row})
         poses = np.concatenate([np.zeros(3), axis_angles()[k, 1:].ravel()])
         record = {"poses": poses[None], "Rh": world.Rh[k][None], "Th": world.Th[k][None], "shapes": BETAS[None]}
-        _save_object(
+        save_object(
             folder / ("params" if refined else "new_params") / f"{k + early}.npy",
             {key: value.astype(np.float32) for key, value in record.items()},
         )
-    _save_object(folder / "annots.npy", {"cams": cams, "ims": rows})
+    save_object(folder / "annots.npy", {"cams": cams, "ims": rows})
 
 
 def write_arah(folder: Path) -> None:
@@ -190,7 +190,7 @@ def write_arah(folder: Path) -> None:
 
 
 def write_humannerf(folder: Path) -> None:
-    """HumanNeRF: one static camera, EasyMocap's root, pickles by picture name."""
+    """HumanNeRF: one static camera, EasyMocap's root, pickles by image name."""
     world = World(Z_UP)
     K, R, t = world.cameras["0"]
     extrinsic = np.eye(4)
@@ -203,8 +203,8 @@ def write_humannerf(folder: Path) -> None:
         lens[name] = {"intrinsics": opencv_K(K), "extrinsics": extrinsic, "distortions": np.array([K1, 0, 0, 0, 0])}
         poses = np.concatenate([np.zeros(3), axis_angles()[k, 1:].ravel()])
         meshes[name] = {"Rh": world.Rh[k], "Th": world.Th[k], "poses": poses, "joints": np.zeros((24, 3))}
-    _pickle(folder / "cameras.pkl", lens)
-    _pickle(folder / "mesh_infos.pkl", meshes)
+    write_pickle(folder / "cameras.pkl", lens)
+    write_pickle(folder / "mesh_infos.pkl", meshes)
     np.save(folder / "avg_betas.npy", BETAS)
 
 
@@ -236,7 +236,7 @@ def write_snapshot(folder: Path) -> None:
         "width": WIDTH,
         "height": HEIGHT,
     }
-    _pickle(folder / "camera.pkl", lens)
+    write_pickle(folder / "camera.pkl", lens)
     write_video(folder / "me.mp4", [see("0", k, K1).image for k in range(FRAMES)])
     with h5py.File(folder / "masks.hdf5", "w") as file:
         file["masks"] = np.stack([_mask("0", k, K1) for k in range(FRAMES)])
@@ -262,7 +262,7 @@ def write_instant_avatar(folder: Path) -> None:
 
 
 def write_snapshot_split(folder: Path, train: range, test: range) -> None:
-    """A subject of InstantAvatar's: every picture of the video, frame k in the scene's pose k % 4, and poses that were
+    """A subject of InstantAvatar's: every image of the video, frame k in the scene's pose k % 4, and poses that were
     optimised for the frames of its splits alone; the first poses beside them are worthless."""
     write_instant_avatar(folder)
     count = test.stop
@@ -338,7 +338,7 @@ def write_rana(folder: Path) -> None:
             "pose": world.thetas[k, 3:].tolist(),
             "betas": BETAS.tolist(),
             "global_orient": world.Rh[k].tolist(),
-            "global_trans": (scale * world.places[k]).tolist(),
+            "global_trans": (scale * world.positions[k]).tolist(),
             "scale": scale,
         }
         (folder / f"{stem}.json").write_text(json.dumps({"skeleton_0": {"smpl_data": data}}))
@@ -372,7 +372,7 @@ def write_neuman(folder: Path, *, hugs: bool = False) -> None:
     (folder / "sparse" / "images.txt").write_text("\n".join(views[:1] + views[1:]) + "\n")
     if hugs:
         # x = s · smpl(pose, root about its pelvis) + transl
-        transl = NEUMAN_SCALE * (world.places - world.rest)
+        transl = NEUMAN_SCALE * (world.positions - world.rest)
         (folder / "4d_humans" / "sam_segmentations").mkdir(parents=True)
         for k in range(FRAMES):
             write_image(folder / "4d_humans" / "sam_segmentations" / f"{k:05d}.png", 255 * _mask(neuman_camera(k), k))
@@ -392,12 +392,12 @@ def write_neuman(folder: Path, *, hugs: bool = False) -> None:
         scale = NEUMAN_SCALE * (1 + 0.02 * (k - 1.5))  # fits scatter; the median is not quite the true scale
         seen = matrix_to_axis_angle(R @ world.roots[k])
         poses.append(np.concatenate([seen, world.thetas[k, 3:]]))
-        place = R @ world.places[k] + t  # metres before the camera
+        position = R @ world.positions[k] + t  # metres before the camera
         linear = scale * R.T
         center = -R.T @ t
-        shift = NEUMAN_SCALE * center + scale * R.T @ place - linear @ world.rest
+        shift = NEUMAN_SCALE * center + scale * R.T @ position - linear @ world.rest
         alignments[f"{k:05d}.png"] = np.concatenate([linear.T, shift[None]], 0)
-    _save_object(folder / "alignments.npy", alignments)
+    save_object(folder / "alignments.npy", alignments)
     person = {
         "pose": np.stack(poses).astype(np.float32),
         "betas": np.tile(BETAS, (FRAMES, 1)),

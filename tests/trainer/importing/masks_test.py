@@ -22,7 +22,7 @@ CAPTURE = ASSETS / "capture"
 SHARED_DATA = SHARED / "data"
 FRAMES = 6
 
-HALF_SIZE = 0.95  # IoU through a network that sees the picture at half its size: its border is uncertain by a pixel
+HALF_SIZE = 0.95  # IoU through a network that sees the image at half its size: its border is uncertain by a pixel
 
 # Mean IoU over six of the embedded capture's frames before a texture. Measured: 0.938 with exact poses, 0.886 with 3°
 # of noise in every joint (whose template alone is at 0.70), 0.900 where the background moves, 0.748 without any pose.
@@ -61,7 +61,7 @@ def _template(capture: Capture, camera: Camera, frame: int, noise: np.ndarray) -
 
 @pytest.fixture(scope="module")
 def video():
-    """Function of (pose noise in rad, camera moves) to pictures, templates and true masks."""
+    """Function of (pose noise in rad, camera moves) to images, templates and true masks."""
     capture = load_capture(CAPTURE)
     frames = capture.split("train")[:: len(capture.split("train")) // FRAMES][:FRAMES]
     camera = capture.cameras[frames[0].camera]
@@ -71,14 +71,16 @@ def video():
     @functools.cache
     def make(noise: float = 0.0, moving: bool = False):
         rng = np.random.default_rng(0)
-        pictures, templates = [], []
+        composites, templates = [], []
         for k, (frame, image) in enumerate(zip(frames, images)):
             behind = np.roll(background, 37 * k, 1) if moving else background
-            picture = 255 * image.image_srgb + (1 - image.mask[..., None]) * behind + rng.normal(size=behind.shape) * 3
-            pictures.append(np.clip(np.round(picture), 0, 255).astype(np.uint8))
+            composite = (
+                255 * image.image_srgb + (1 - image.mask[..., None]) * behind + rng.normal(size=behind.shape) * 3
+            )
+            composites.append(np.clip(np.round(composite), 0, 255).astype(np.uint8))
             joints = rng.normal(size=(len(capture.body.skeleton), 3)) * noise
             templates.append(_template(capture, camera, frame.frame, joints))
-        return pictures, templates, [image.mask > 0.5 for image in images]
+        return composites, templates, [image.mask > 0.5 for image in images]
 
     return make
 
@@ -92,21 +94,21 @@ def _mean_iou(masks, truth) -> float:
     ("noise", "moving", "floor"), [(0.0, False, WITH_POSES), (0.05, False, WITH_BAD_POSES), (0.0, True, MOVING_CAMERA)]
 )
 def test_masks_from_poses(video, noise, moving, floor):
-    pictures, templates, truth = video(noise, moving)
-    masks = list(make_masks(pictures, templates))
+    composites, templates, truth = video(noise, moving)
+    masks = list(make_masks(composites, templates))
     assert all(mask.dtype == np.uint8 and mask.shape == templates[0].shape for mask in masks)
     assert _mean_iou(masks, truth) > floor
     assert _mean_iou(masks, truth) > _mean_iou([np.uint8(255) * t for t in templates], truth)
 
 
 def test_masks_from_movement_alone(video):
-    pictures, _, truth = video()
-    assert _mean_iou(make_masks(pictures), truth) > WITHOUT_POSES
+    composites, _, truth = video()
+    assert _mean_iou(make_masks(composites), truth) > WITHOUT_POSES
 
 
 def test_equal_pictures_give_equal_masks(video):
-    pictures, templates, _ = video()
-    runs = [np.stack(list(make_masks(pictures[:4], templates[:4]))) for _ in range(2)]
+    composites, templates, _ = video()
+    runs = [np.stack(list(make_masks(composites[:4], templates[:4]))) for _ in range(2)]
     assert (runs[0] == runs[1]).all()
 
 
@@ -117,8 +119,8 @@ def test_nothing_to_go_by_is_refused(video):
 
 
 def test_a_frame_whose_template_is_out_of_view_has_an_empty_mask(video):
-    pictures, templates, _ = video()
-    masks = list(make_masks(pictures[:3], [templates[0], np.zeros_like(templates[0]), templates[2]]))
+    composites, templates, _ = video()
+    masks = list(make_masks(composites[:3], [templates[0], np.zeros_like(templates[0]), templates[2]]))
     assert masks[1].max() == 0 and masks[0].max() == masks[2].max() == 255
 
 
@@ -162,7 +164,7 @@ def _red_network(
 
 
 def _red_on_green(columns: slice) -> tuple[np.ndarray, np.ndarray]:
-    """A noisy picture [90, 120, 3] with something red in 50 rows of ``columns``, and where that is."""
+    """A noisy image [90, 120, 3] with something red in 50 rows of ``columns``, and where that is."""
     truth = np.zeros((90, 120), bool)
     truth[20:70, columns] = True
     colours = np.where(truth[..., None], (200, 40, 40), (60, 160, 60))
@@ -184,18 +186,18 @@ def _red_on_green(columns: slice) -> tuple[np.ndarray, np.ndarray]:
     ],
 )
 def test_networks_of_every_layout(tmp_path, layout):
-    picture, truth = _red_on_green(slice(40, 80))
-    mask = next(make_masks([picture], net=_red_network(tmp_path / "net.onnx", **layout)))
+    composite, truth = _red_on_green(slice(40, 80))
+    mask = next(make_masks([composite], net=_red_network(tmp_path / "net.onnx", **layout)))
     assert _mean_iou([mask], [truth]) > HALF_SIZE
 
 
 def test_the_network_looks_at_the_templates_surroundings(tmp_path):
     """Something as red, far from the person, is none of it."""
-    picture, truth = _red_on_green(slice(20, 40))
-    picture[20:70, 100:118] = picture[20:70, 20:38]
+    composite, truth = _red_on_green(slice(20, 40))
+    composite[20:70, 100:118] = composite[20:70, 20:38]
     template = np.zeros_like(truth)
     template[22:68, 22:38] = True
-    mask = next(make_masks([picture], [template], net=_red_network(tmp_path / "net.onnx")))
+    mask = next(make_masks([composite], [template], net=_red_network(tmp_path / "net.onnx")))
     assert _mean_iou([mask], [truth]) > HALF_SIZE
 
 
@@ -215,6 +217,6 @@ def test_what_is_no_such_network_is_refused(tmp_path):
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data is not here; all else here is self-made")
 def test_a_real_network_with_poses(video):
-    pictures, templates, truth = video(0.05)
+    composites, templates, truth = video(0.05)
     net = SHARED_DATA / "segmentation" / "prisma_nchw.onnx"
-    assert _mean_iou(make_masks(pictures, templates, net=net), truth) > REAL_NETWORK
+    assert _mean_iou(make_masks(composites, templates, net=net), truth) > REAL_NETWORK

@@ -10,11 +10,11 @@ from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.importing.surfaces.normals import (
+    fill_holes,
     find_axes,
     normal_map,
     normal_network,
     read_normals,
-    smoothed,
     to_opencv,
 )
 from support.paths import SHARED
@@ -91,10 +91,10 @@ def test_files_of_another_kind_are_refused(tmp_path):
 
 @pytest.mark.parametrize("as_picture", [True, False])
 def test_a_network_sees_the_person_on_grey(tmp_path, as_picture):
-    """The network gives back its picture (as n in 0…1, or −1…1): the picture of a normal map comes out as that map."""
+    """The network gives back its image (as n in 0…1, or −1…1): the image of a normal map comes out as that map."""
     normals, inside = _sphere()
-    picture = np.round(255 * (normals * np.float32([1, -1, -1]) + 1) / 2).astype(np.uint8)
-    picture[~inside] = (10, 200, 90)
+    image = np.round(255 * (normals * np.float32([1, -1, -1]) + 1) / 2).astype(np.uint8)
+    image[~inside] = (10, 200, 90)
     mask = np.where(inside, 255, 0).astype(np.uint8)
     scale, shift = (1.0, 0.0) if as_picture else (2.0, -1.0)
     weights = scale * np.eye(3, dtype=np.float32)
@@ -109,7 +109,7 @@ def test_a_network_sees_the_person_on_grey(tmp_path, as_picture):
         ],
     )
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), tmp_path / "n.onnx")
-    found = normal_map(normal_network(tmp_path / "n.onnx"), picture, mask)
+    found = normal_map(normal_network(tmp_path / "n.onnx"), image, mask)
     axes = find_axes([found], [normals])
     assert axes.signs == (1, -1, -1)
     turned = to_opencv(found, axes)
@@ -131,7 +131,7 @@ def test_holes_are_filled_from_next_to_them():
     normals, inside = _sphere()
     holed = normals.copy()
     holed[30:33, 30:33] = 0
-    filled = smoothed(holed, np.where(inside, 255, 0).astype(np.uint8))
+    filled = fill_holes(holed, np.where(inside, 255, 0).astype(np.uint8))
     assert_allclose((filled * normals).sum(-1)[30:33, 30:33], 1, atol=0.01)
     assert (filled[~inside] == 0).all()
 

@@ -7,7 +7,8 @@ import pytest
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, smpl_skeleton
+from rnd_runtime.motion.skeleton import smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_trainer.importing.select import select_frames, sharpness
 
 
@@ -57,15 +58,15 @@ def test_nonsense_is_refused():
 
 def test_blur_lowers_sharpness_and_brightness_does_not():
     rng = np.random.default_rng(0)
-    picture = cv2.GaussianBlur(rng.integers(0, 255, (96, 96, 3), np.uint8), (0, 0), 1.0)
-    blurred = [cv2.GaussianBlur(picture, (0, 0), sigma) for sigma in (0.7, 1.0, 1.5)]
-    values = [sharpness(one) for one in (picture, *blurred)]
+    image = cv2.GaussianBlur(rng.integers(0, 255, (96, 96, 3), np.uint8), (0, 0), 1.0)
+    blurred = [cv2.GaussianBlur(image, (0, 0), sigma) for sigma in (0.7, 1.0, 1.5)]
+    values = [sharpness(one) for one in (image, *blurred)]
     assert (np.diff(values) < 0).all() and values[0] > 1.5 * values[1]
-    darker = (picture // 2).astype(np.uint8)
-    assert abs(sharpness(darker) / sharpness(picture) - 1) < 0.1  # rounding to half as many levels
+    darker = (image // 2).astype(np.uint8)
+    assert abs(sharpness(darker) / sharpness(image) - 1) < 0.1  # rounding to half as many levels
     mask = np.zeros((96, 96), np.uint8)
-    assert sharpness(picture, mask) == 0
+    assert sharpness(image, mask) == 0
     mask[20:70, 20:70] = 255
     half_sharp = blurred[2].copy()
-    half_sharp[15:75, 15:75] = picture[15:75, 15:75]
-    np.testing.assert_allclose(sharpness(half_sharp, mask), sharpness(picture, mask), rtol=1e-6)
+    half_sharp[15:75, 15:75] = image[15:75, 15:75]
+    np.testing.assert_allclose(sharpness(half_sharp, mask), sharpness(image, mask), rtol=1e-6)

@@ -1,4 +1,4 @@
-"""What is imported under the wrong name is told its right one, by the command, and what it tells mends it."""
+"""rnd-data import: a source of another convention is named with the option that corrects it, and the option does."""
 
 from __future__ import annotations
 
@@ -11,116 +11,87 @@ import numpy as np
 import pytest
 
 from rnd_runtime.capture.capture import load_capture
-from rnd_runtime.core.images import to_bytes, write_image
-from rnd_trainer.checking.check import GOOD_OVERLAP
+from rnd_trainer.checking.check import MIN_IOU
 from rnd_trainer.checking.normals import parse_axes
 from rnd_trainer.commands import data as data_cli
 from support import layouts
-from support.known_scene import BETAS, FRAMES, HEIGHT, WIDTH, view_of
-from trainer.importing.importing_test import LAYOUTS, ONE_A_MOMENT, assert_the_scene
-
-ALIGNED = 0.999  # cosine of stored normals with the scene's: 8 bits
+from support.imported import LAYOUTS, assert_the_scene
+from support.known_scene import FRAMES, view_of
+from support.pose_programs import INTRINSICS, LENS, write_frames, write_poses
 
 
 @pytest.fixture
-def import_it(tmp_path, monkeypatch, capsys) -> Callable[..., tuple[int, str, Path]]:
-    """Run ``rnd-data import`` on a source: exit code, what was printed, the capture's folder."""
+def import_it(tmp_path, capsys) -> Callable[..., tuple[int, str, Path]]:
+    """Run ``rnd-data import`` on a source: exit code, output, the capture's folder."""
     body = layouts.body_file(tmp_path)
 
     def run(source: Path, *options: object) -> tuple[int, str, Path]:
         out = tmp_path / f"capture{len(list(tmp_path.glob('capture*')))}"
-        words = ["import", source, out, "--body", body, *options]
-        monkeypatch.setattr("sys.argv", ["rnd-data", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
-            data_cli.main()
+            data_cli.main([str(word) for word in ("import", source, out, "--body", body, *options)])
         printed = capsys.readouterr()
         return int(ended.value.code or 0), printed.out + printed.err, out
 
     return run
 
 
-SMPL_ROOTS = ("ARAH", "PeopleSnapshot", "InstantAvatar", "RANA prepared", "SyntheticHuman", "nerfstudio")
-EASYMOCAP_ROOTS = ("ZJU-MoCap", "ZJU-MoCap refined", "HumanNeRF", "EasyMocap", "EasyVolcap")
-
-
-@pytest.mark.parametrize("name", [*SMPL_ROOTS, *EASYMOCAP_ROOTS])
-def test_a_root_of_the_other_convention_is_named_and_mended(tmp_path, monkeypatch, import_it, name) -> None:
+@pytest.mark.parametrize("name", ["ARAH", "PeopleSnapshot", "nerfstudio", "ZJU-MoCap", "HumanNeRF", "EasyVolcap"])
+def test_a_root_of_the_other_convention_is_named_and_corrected(tmp_path, monkeypatch, import_it, name) -> None:
     """The layout's own files, but Th where SMPL's trans belongs, or trans where Th belongs."""
-    if name == "PeopleSnapshot":
-        pytest.importorskip("h5py")
-    smpl = name in SMPL_ROOTS
+    smpl = name in ("ARAH", "PeopleSnapshot", "nerfstudio")
     ours, other = ("trans", "Th") if smpl else ("Th", "trans")
     monkeypatch.setattr(layouts.World, ours, getattr(layouts.World, other))
-    source = tmp_path / "source"
-    source.mkdir()
-    _, write, camera_of, bent, fps = LAYOUTS[name]
-    write(source)
-    every = () if camera_of in ONE_A_MOMENT else ("--held-out-every", 1)
+    layout = LAYOUTS[name]
+    source = layout.write_into(tmp_path / "source")
+    every = ("--held-out-every", layout.selection.held_out_every) if layout.camera_of else ()
     code, printed, _ = import_it(source, *every)
     assert code == 1
-    told = "EasyMocap's Rh/Th; try --as easymocap" if smpl else "read as EasyMocap's Rh/Th; try --as smpl"
+    option = f"--root {'easymocap' if smpl else 'smpl'}"
     found = re.search(r"wrong silhouette: mean IoU (0\.\d\d): the root rotation looks like (.+?) \(mean", printed)
-    assert found and found[2].endswith(told), printed
-    assert float(found[1]) < GOOD_OVERLAP
-    code, printed, out = import_it(source, *every, "--as", told.split()[-1])
+    assert found and found[2].endswith(f"try {option}"), printed
+    assert float(found[1]) < MIN_IOU
+    code, printed, out = import_it(source, *every, *option.split())
     assert code == 0, printed
-    assert_the_scene(load_capture(out), camera_of, bent=bent, fps=fps)
-
-
-def test_a_layout_that_places_the_pelvis_has_no_root_to_misread(tmp_path, import_it) -> None:
-    layouts.write_rana(tmp_path)
-    code, printed, _ = import_it(tmp_path, "--as", "smpl")
-    assert code == 2 and "this layout says where the pelvis is" in printed
-
-
-# Normals
+    assert_the_scene(load_capture(out), layout)
 
 
 @pytest.fixture
 def frames(tmp_path) -> Path:
-    """A folder with the scene's frames, masks and poses before the camera."""
-    camera, world = layouts.video_camera(77.0), layouts.camera_world()
-    for k in range(FRAMES):
-        view = view_of(camera, k)
-        image = np.where(view.mask[..., None], to_bytes(0.2 + 0.35 * (view.normals + 1)), 90)
-        write_image(tmp_path / "frames" / f"{k:05d}.png", image.astype(np.uint8))
-        write_image(tmp_path / "masks" / f"{k:05d}.png", (255 * view.mask).astype(np.uint8))
-    np.savez(tmp_path / "poses.npz", thetas=world.thetas, trans=world.trans, betas=BETAS)
+    """A folder with the scene's frames, masks and poses in camera axes."""
+    write_frames(tmp_path)
+    write_poses(tmp_path)
     return tmp_path
 
 
 def _of_frames(folder: Path) -> list[object]:
-    lens = ("--intrinsics", 77, 77, WIDTH / 2, HEIGHT / 2)
-    return ["--poses", folder / "poses.npz", "--masks", folder / "masks", *lens]
+    return ["--poses", folder / "poses.npz", "--masks", folder / "masks", "--intrinsics", *INTRINSICS]
 
 
-def _assert_normals(out: Path) -> None:
-    capture = load_capture(out)
-    for frame in capture.frames:
-        normals, truth = capture.load_frame(frame).normal, view_of(layouts.video_camera(77.0), frame.frame)
-        assert (normals * truth.normals).sum(-1)[truth.mask].min() > ALIGNED
-
-
-@pytest.mark.parametrize("said", ["x,y,z", "x,-y,z", "-x,-y,-z", "y,x,-z", "z,x,y"])
-@pytest.mark.parametrize("written", ["x,-y,-z", "-x,y,z", "y,-z,-x"])
-def test_axes_told_wrongly_are_named_as_the_flag_wants_them(frames, import_it, written, said) -> None:
-    """``--normal-axes=SAID`` for maps in the axes ``written``: the check names ``written``, whatever was said."""
+@pytest.mark.parametrize(
+    ("written", "given"),
+    [("x,-y,-z", "x,y,z"), ("x,-y,-z", "y,x,-z"), ("-x,y,z", "-x,-y,-z"), ("y,-z,-x", "x,y,z"), ("y,-z,-x", "z,x,y")],
+)
+def test_wrong_axes_are_named_as_the_option_takes_them(frames, import_it, written, given) -> None:
+    """``--normal-axes=given`` for maps in the axes ``written``: the check names ``written``."""
     to_theirs = np.linalg.inv(parse_axes(written))
     (frames / "normals").mkdir()
     for k in range(FRAMES):
-        normals = view_of(layouts.video_camera(77.0), k).normals @ to_theirs.T
+        normals = view_of(LENS, k).normals @ to_theirs.T
         np.save(frames / "normals" / f"{k:05d}.npy", normals.astype(np.float32))
-    given = [*_of_frames(frames), "--normals", frames / "normals"]
-    code, printed, _ = import_it(frames / "frames", *given, f"--normal-axes={said}")
+    options = [*_of_frames(frames), "--normals", frames / "normals"]
+    code, printed, _ = import_it(frames / "frames", *options, f"--normal-axes={given}")
     named = re.search(r"wrong normals: mean cosine .* with --normal-axes=(\S+) it would be 1\.00", printed)
     assert code == 1 and named and named[1] == written, printed
-    code, printed, out = import_it(frames / "frames", *given, f"--normal-axes={named[1]}")
+    code, printed, out = import_it(frames / "frames", *options, f"--normal-axes={named[1]}")
     assert code == 0, printed
-    _assert_normals(out)
+    capture = load_capture(out)
+    for frame in capture.frames:
+        normals, truth = capture.load_frame(frame).normal, view_of(LENS, frame.frame)
+        assert (normals * truth.normals).sum(-1)[truth.mask].min() > 0.999
 
 
 @pytest.mark.parametrize("write", [layouts.write_rana, partial(layouts.write_intrinsic_avatar, many=False)])
-def test_a_layouts_own_normals_can_be_turned(tmp_path, monkeypatch, import_it, write) -> None:
+def test_axes_of_a_layouts_own_normals_can_be_given(tmp_path, monkeypatch, import_it, write) -> None:
     """OpenCV's axes where RANA promises OpenGL's."""
     monkeypatch.setattr(layouts, "FLIP", np.eye(3))
     (tmp_path / "source").mkdir()
@@ -131,30 +102,29 @@ def test_a_layouts_own_normals_can_be_turned(tmp_path, monkeypatch, import_it, w
     assert code == 0 and "ok normals: in 4 frames, 0° from the template" in printed, printed
 
 
-# What cannot be meant
+UNUSED = [
+    # source, options, words of the refusal
+    ("rana", ("--poses", "poses.npz"), "--poses: expected none, as rana has its own"),
+    ("rana", ("--person", 1), "--person: expected none, as rana has its own"),
+    ("rana", ("--distortion", 0.1, 0, 0, 0), "--distortion: expected none, as rana has its own"),
+    ("rana", ("--normal-axes=x,y",), "such as x,-y,-z"),
+    ("rana", ("--root", "smpl"), "--root: expected none, as this layout stores the pelvis position"),
+    ("rana", ("--count", 5), "--count: expected the default, got 5"),
+    ("rana", ("--as", "rama"), "--as: expected zju or"),
+    ("rana", ("--as", "zju"), "layout: expected zju"),
+    ("frames", ("--normal-axes=x,y,z",), "--normal-axes: expected normals to permute"),
+    ("frames", ("--mask-net", "net.onnx"), "--masks and --mask-net: expected one of them"),
+    ("frames", ("--held-out-every", 2), "--held-out-every: expected the default, got 2"),
+    ("frames", ("--train-camera", 1), "--train-camera: expected the default, got 1"),
+]
 
 
-def test_options_that_would_change_nothing_are_refused(frames, import_it) -> None:
-    def refusal(source: Path, *options: object) -> str:
-        code, printed, _ = import_it(source, *options)
-        assert code == 2
-        return printed.strip().splitlines()[-1]
-
-    (frames / "rana").mkdir()
-    layouts.write_rana(frames / "rana")
-    folder = frames / "frames"
-    for option in ("--poses", frames / "poses.npz"), ("--person", 1), ("--distortion", 0.1, 0, 0, 0):
-        assert f"{option[0]}: expected none, as rana has its own" in refusal(frames / "rana", *option)
-    assert "--normal-axes: expected normals to turn" in refusal(folder, *_of_frames(frames), "--normal-axes=x,y,z")
-    assert "such as x,-y,-z" in refusal(frames / "rana", "--normal-axes=x,y")
-    both = ("--mask-net", frames / "net.onnx")
-    assert "--masks and --mask-net: expected one of them" in refusal(folder, *_of_frames(frames), *both)
-    for option in ("--held-out-every", 2), ("--train-camera", 1):
-        said = f"{option[0]}: expected the default, got {option[1]} (a video has one camera, and its last 1/5 are"
-        assert said in refusal(folder, *_of_frames(frames), *option)
-    assert import_it(folder, *_of_frames(frames), "--train-camera", 0)[0] == 0  # the only one there is
-    assert "--count: expected the default, got 5 (of a video the sharpest pictures" in refusal(
-        frames / "rana", "--count", 5
-    )
-    assert "--as: expected zju or" in refusal(frames / "rana", "--as", "rama")
-    assert "layout: expected zju" in refusal(frames / "rana", "--as", "zju")
+@pytest.mark.parametrize(("source", "options", "words"), UNUSED)
+def test_options_that_would_change_nothing_are_refused(frames, import_it, source, options, words) -> None:
+    if source == "rana":
+        layouts.write_rana(frames / "rana")
+    else:
+        options = (*_of_frames(frames), *options)
+    code, printed, _ = import_it(frames / source, *options)
+    line = printed.strip().splitlines()[-1]
+    assert code == 2 and line.startswith("rnd-data: ") and words in line

@@ -1,4 +1,4 @@
-"""Which axes a capture's normal maps have, by the template's own normals."""
+"""Axes of normal maps, compared with the template's own normals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .silhouette import DrawnMesh
+from .silhouette import RenderedMesh
 
 Floats = NDArray[np.float64]
 
@@ -17,13 +17,13 @@ GAIN = 0.15
 _AXES = "xyz"
 
 
-class NormalAxes(NamedTuple):
-    """How normal maps agree with the template.
+class AxesAgreement(NamedTuple):
+    """Agreement of normal maps with the template.
 
     Attributes:
         cosine: mean cosine to the template's normals, as they are.
         facing: share of normals that face the camera (z < 0).
-        best_cosine, best_axes: the best reading, as "x,-y,-z": our x is their x, our y their −y, …
+        best_cosine, best_axes: of the best signed permutation, as "x,-y,-z": our x is their x, our y their −y, …
     """
 
     cosine: float
@@ -37,7 +37,7 @@ class NormalAxes(NamedTuple):
 
 
 def parse_axes(text: str) -> Floats:
-    """The signed permutation [3, 3] that "x,-y,-z" means. ValueError for anything else."""
+    """The signed permutation [3, 3] of "x,-y,-z". ValueError for anything else."""
     matrix = np.zeros((3, 3))
     for row, part in enumerate(text.replace(" ", "").split(",")):
         sign, axis = part[:-1], part[-1:]
@@ -49,44 +49,45 @@ def parse_axes(text: str) -> Floats:
     return matrix
 
 
-def axes_in_words(matrix: Floats) -> str:
-    """What ``parse_axes`` turns into the signed permutation ``matrix`` [3, 3]."""
+def format_axes(matrix: Floats) -> str:
+    """The inverse of ``parse_axes``."""
     columns = np.abs(matrix).argmax(1)
     return ",".join(("" if row[column] > 0 else "-") + _AXES[column] for row, column in zip(matrix, columns))
 
 
-def judge(pairs: list[tuple[Floats, Floats]], turned: Floats | None = None) -> NormalAxes:
-    """Judge (map's normals [n, 3], template's normals [n, 3]) at the same pixels, both in OpenCV camera axes.
+def compare_axes(pairs: list[tuple[Floats, Floats]], applied: Floats | None = None) -> AxesAgreement:
+    """Agreement of (map's normals [n, 3], template's normals [n, 3]) at the same pixels, in OpenCV camera axes.
 
-    ``turned`` [3, 3] is how an import turned the maps; what is best is told of the maps as they were before.
+    ``applied`` [3, 3] is the permutation that an import applied to the maps; ``best_axes`` is relative to the
+    source's maps.
     """
     ours = np.concatenate([a for a, _ in pairs])
     template = np.concatenate([b for _, b in pairs])
     products = template.T @ ours / len(ours)
-    best, cosine = best_reading(products)
-    axes = axes_in_words(best @ (np.eye(3) if turned is None else turned))
-    return NormalAxes(float(np.trace(products)), float((ours[:, 2] < 0).mean()), cosine, axes)
+    best, cosine = best_permutation(products)
+    axes = format_axes(best @ (np.eye(3) if applied is None else applied))
+    return AxesAgreement(float(np.trace(products)), float((ours[:, 2] < 0).mean()), cosine, axes)
 
 
-def best_reading(products: Floats) -> tuple[Floats, float]:
+def best_permutation(products: Floats) -> tuple[Floats, float]:
     """The signed permutation [3, 3] of a map's axes that agrees best with the template, and its mean cosine.
 
-    ``products`` [3, 3] is the mean of template_i · map_j over the pixels; equals go to the least changed.
+    ``products`` [3, 3] is the mean of template_i · map_j over the pixels; of equals the least changed wins.
     """
-    readings = [
+    candidates = [
         np.array(signs)[:, None] * np.eye(3)[list(order)]
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
-    best = max(readings, key=lambda reading: round(float((reading * products).sum()), 9))
+    best = max(candidates, key=lambda candidate: round(float((candidate * products).sum()), 9))
     return best, float((best * products).sum())
 
 
-def pixels(normals: NDArray[np.float32], view: DrawnMesh) -> tuple[Floats, Floats]:
-    """Pairs of normals [n, 3] where the map ``normals`` [H, W, 3] and the template's ``view`` [h, w] both have one."""
-    height, width = view.mask.shape
+def paired_normals(normals: NDArray[np.float32], template: RenderedMesh) -> tuple[Floats, Floats]:
+    """Pairs of normals [n, 3] where the map ``normals`` [H, W, 3] and ``template`` [h, w] both have one."""
+    height, width = template.mask.shape
     rows = ((np.arange(height) + 0.5) * normals.shape[0] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * normals.shape[1] / width).astype(int)
     small = normals[rows][:, columns].astype(np.float64)
-    both = view.mask & (np.abs(small).max(-1) > 0)
-    return small[both], view.normals[both]
+    both = template.mask & (np.abs(small).max(-1) > 0)
+    return small[both], template.normals[both]

@@ -1,4 +1,4 @@
-"""The overlay picture: what is the person's only, what is the template's only, frame by frame."""
+"""Overlay image of mask and template, frame by frame."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ from numpy.typing import NDArray
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import write_image
 
-from .check import Report
-from .silhouette import draw
-from .views import Sight
+from .check import CheckReport
+from .silhouette import render_mesh
+from .views import MaskView
 
-TILE, COLUMNS, MOST = 256, 4, 12
+TILE, COLUMNS, MAX_TILES = 256, 4, 12
 MARGIN = 0.05
-"""of what is seen of mask and template, left around them"""
+"""share of the extent of mask and template that is left around them"""
 MASK_ONLY, TEMPLATE_ONLY = (255, 80, 60), (60, 140, 255)
 CAPTION = 18
 
 
-def save_overlay(path: str | Path, report: Report) -> None:
-    """Write a sheet of up to 12 pictures: the four that fit worst, then evenly spaced ones.
+def save_overlay(path: str | Path, report: CheckReport) -> None:
+    """Write a sheet of up to 12 crops: the four frames that fit worst, then evenly spaced ones.
 
-    Each shows the surroundings of mask and template. Red: the mask's only. Blue: the template's only. White line: the
-    template's outline.
+    Red: mask only. Blue: template only. White line: the template's outline.
     """
-    worst = np.argsort([entry.iou for entry in report.overlaps])[:COLUMNS].tolist()
-    evenly = np.linspace(0, len(report.overlaps) - 1, MOST - COLUMNS).round().astype(int).tolist()
-    chosen = list(dict.fromkeys(worst + evenly)) if report.overlaps else []
+    worst = np.argsort([entry.iou for entry in report.ious])[:COLUMNS].tolist()
+    evenly = np.linspace(0, len(report.ious) - 1, MAX_TILES - COLUMNS).round().astype(int).tolist()
+    chosen = list(dict.fromkeys(worst + evenly)) if report.ious else []
     tiles = [_tile(report, k) for k in chosen]
     columns = min(COLUMNS, max(len(tiles), 1))
     tiles += [np.zeros((TILE + CAPTION, TILE, 3), np.uint8)] * (-len(tiles) % columns)
@@ -38,28 +37,28 @@ def save_overlay(path: str | Path, report: Report) -> None:
     write_image(path, np.concatenate(rows) if rows else np.zeros((TILE, TILE, 3), np.uint8))
 
 
-def _tile(report: Report, index: int) -> NDArray[np.uint8]:
-    entry, small = report.overlaps[index], report.sights[index]
-    images = report.capture.load_frame(small.frame)
-    camera, rows, columns = _close_up(small, report.capture.cameras[small.frame.camera])
-    template = draw(small.vertices, small.faces, camera).mask
+def _tile(report: CheckReport, index: int) -> NDArray[np.uint8]:
+    entry, view = report.ious[index], report.views[index]
+    loaded = report.capture.load_frame(view.frame)
+    camera, rows, columns = _close_up(view, report.capture.cameras[view.frame.camera])
+    template = render_mesh(view.vertices, view.faces, camera).mask
     height, width = template.shape
-    mask = cv2.resize(images.mask[rows, columns], (width, height), interpolation=cv2.INTER_AREA) > 0.5
-    picture = cv2.resize(images.image_srgb[rows, columns], (width, height), interpolation=cv2.INTER_AREA) * 255
+    mask = cv2.resize(loaded.mask[rows, columns], (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    image = cv2.resize(loaded.image_srgb[rows, columns], (width, height), interpolation=cv2.INTER_AREA) * 255
     for where, colour in ((mask & ~template, MASK_ONLY), (template & ~mask, TEMPLATE_ONLY)):
-        picture[where] = 0.35 * picture[where] + 0.65 * np.array(colour, np.float32)
+        image[where] = 0.35 * image[where] + 0.65 * np.array(colour, np.float32)
     outline = template & ~cv2.erode(template.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
-    picture[outline] = 255
+    image[outline] = 255
     tile = np.zeros((TILE + CAPTION, TILE, 3), np.uint8)
-    tile[CAPTION : CAPTION + height, :width] = np.clip(picture, 0, 255).astype(np.uint8)
+    tile[CAPTION : CAPTION + height, :width] = np.clip(image, 0, 255).astype(np.uint8)
     text = f"{entry.camera} {entry.frame}  IoU {entry.iou:.2f}"
     cv2.putText(tile, text, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
     return tile
 
 
-def _close_up(small: Sight, camera: Camera) -> tuple[Camera, slice, slice]:
-    """The part of ``camera``'s picture around mask and template that fills a tile, and its rows and columns."""
-    either = small.mask | small.view().mask
+def _close_up(view: MaskView, camera: Camera) -> tuple[Camera, slice, slice]:
+    """``camera`` cropped to mask and template and scaled to a tile, and the rows and columns of the crop."""
+    either = view.mask | view.template().mask
     if not either.any():
         either[:] = True
     spans = []

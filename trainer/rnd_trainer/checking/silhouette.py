@@ -1,4 +1,4 @@
-"""The template as a camera sees it: a z-buffer of a posed mesh, for checks against masks and normal maps."""
+"""Z-buffer of a posed mesh, for checks against masks and normal maps."""
 
 from __future__ import annotations
 
@@ -13,55 +13,58 @@ from rnd_runtime.core.camera import Camera
 Floats = NDArray[np.float64]
 
 NEAR = 0.05
-"""metres: triangles with a corner nearer than this (or behind the camera) are left out"""
+"""m: triangles with a corner nearer than this, or behind the camera, are left out"""
 
 
-class DrawnMesh(NamedTuple):
-    """A mesh drawn into a camera's pixels.
+class RenderedMesh(NamedTuple):
+    """A mesh rasterized at the pixel centres of a camera.
 
     Attributes:
         mask: [H, W] True where the mesh covers the pixel's centre.
-        normals: [H, W, 3] unit face normals in the camera's axes, towards the viewer (z < 0); zero outside.
+        normals: [H, W, 3] unit face normals in OpenCV camera axes, towards the viewer (z < 0); zero outside.
     """
 
     mask: NDArray[np.bool_]
     normals: Floats
 
 
-def draw(vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float = 0.0) -> DrawnMesh:
-    """The mesh ``vertices`` [V, 3] (world, m), ``faces`` [F, 3] through ``camera``.
+def render_mesh(vertices: Floats, faces: NDArray[np.int32], camera: Camera, k1: float = 0.0) -> RenderedMesh:
+    """Mask and normals of the mesh ``vertices`` [V, 3] (world, m), ``faces`` [F, 3].
 
-    ``distortion`` is a radial coefficient k1 in normalised coordinates (x (1 + k1 r²)): for asking whether
-    pictures are still, or twice, undistorted.
+    ``k1`` is a radial distortion in normalised coordinates: x (1 + k1 r²).
     """
-    local, kept, nearest = _nearest_faces(vertices, faces, camera, distortion)
+    local, kept, nearest = _nearest_faces(vertices, faces, camera, k1)
     mask = nearest >= 0
     corners = local[kept]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cross /= np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-15)
-    cross *= np.where((cross * corners[:, 0]).sum(1, keepdims=True) > 0, -1, 1)  # meshes wound the other way too
+    cross *= np.where((cross * corners[:, 0]).sum(1, keepdims=True) > 0, -1, 1)  # either winding order
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = cross[nearest[mask]]
-    return DrawnMesh(mask, normals)
+    return RenderedMesh(mask, normals)
 
 
-def silhouette(
-    vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float = 0.0
-) -> NDArray[np.bool_]:
-    """The mask [H, W] of ``draw`` alone."""
-    mask: NDArray[np.bool_] = _nearest_faces(vertices, faces, camera, distortion)[2] >= 0
+def silhouette(vertices: Floats, faces: NDArray[np.int32], camera: Camera, k1: float = 0.0) -> NDArray[np.bool_]:
+    """The mask [H, W] of ``render_mesh`` alone."""
+    mask: NDArray[np.bool_] = _nearest_faces(vertices, faces, camera, k1)[2] >= 0
     return mask
 
 
+def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Intersection over union of two masks; 1 when both are empty."""
+    union = int((a | b).sum())
+    return 1.0 if union == 0 else int((a & b).sum()) / union
+
+
 def _nearest_faces(
-    vertices: Floats, faces: NDArray[np.int32], camera: Camera, distortion: float
+    vertices: Floats, faces: NDArray[np.int32], camera: Camera, k1: float
 ) -> tuple[Floats, NDArray[np.int32], NDArray[np.int64]]:
-    """Vertices in the camera's axes, the faces wholly before it, and the index [H, W] of the nearest of those."""
+    """Vertices in camera axes, the faces in front of the camera, and the index [H, W] of the nearest of those."""
     local = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     depth = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         flat = local[:, :2] / depth[:, None]
-        flat = flat * (1 + distortion * (flat**2).sum(1, keepdims=True))
+        flat = flat * (1 + k1 * (flat**2).sum(1, keepdims=True))
         pixels = flat @ camera.K[:2, :2].T + camera.K[:2, 2]
     usable = (depth > NEAR) & np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e6).all(1)
     kept = faces[usable[faces].all(1)]
@@ -69,17 +72,11 @@ def _nearest_faces(
     return local, kept, nearest
 
 
-def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Intersection over union of two masks; 1 when both are empty."""
-    union = int((a | b).sum())
-    return 1.0 if union == 0 else int((a & b).sum()) / union
-
-
 @numba.njit(cache=True)
 def _z_buffer(pixels, inverse_depth, faces, width, height):
-    """Index [H, W] of the nearest of ``faces`` at every pixel centre, −1 where there is none."""
+    """Index [H, W] of the nearest of ``faces`` at every pixel centre; −1 where there is none."""
     nearest = np.full((height, width), -1, np.int64)
-    depth = np.zeros((height, width))  # 1/z is linear over the picture: larger is nearer
+    depth = np.zeros((height, width))  # 1/z is linear in the image: larger is nearer
     for f in range(faces.shape[0]):
         a, b, c = faces[f]
         ax, ay = pixels[a]

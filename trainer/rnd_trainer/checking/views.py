@@ -1,4 +1,4 @@
-"""The pictures a check looks at, made small, and the template drawn into them."""
+"""Small views of a capture's frames: the mask, and the template in front of the same camera."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.capture.capture import Capture, Frame
 from rnd_runtime.core.camera import Camera
 
-from .silhouette import DrawnMesh, draw, overlap, silhouette
+from .silhouette import RenderedMesh, mask_iou, render_mesh, silhouette
 
 Floats = NDArray[np.float64]
 
 SIZE = 192
-"""pixels, the longer side of what is compared: IoU changes by less than 0.005 above it, time quadruples"""
+"""pixels, the longer side of a view: IoU changes by less than 0.005 above it, time quadruples"""
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """One frame as a check sees it.
+class MaskView:
+    """One frame's mask and template.
 
     Attributes:
-        frame, camera: the frame, and its camera scaled to ``mask``.
+        camera: the frame's camera, scaled to ``mask``.
         mask: [h, w] True for the person.
         faces: [F, 3] of the template.
-        vertices: [V, 3] m, world: the template in the pose that the capture gives it.
-        turn, joint: [3, 3] and [3] m: rotation and place of its root.
+        vertices: [V, 3] m, world: the posed template.
+        root_rotation, root_position: [3, 3] and [3] m, world.
     """
 
     frame: Frame
@@ -37,65 +37,60 @@ class Sight:
     mask: NDArray[np.bool_]
     faces: NDArray[np.int32]
     vertices: Floats
-    turn: Floats
-    joint: Floats
+    root_rotation: Floats
+    root_position: Floats
 
-    def view(self) -> DrawnMesh:
+    def template(self) -> RenderedMesh:
         """The template as the camera sees it."""
-        return draw(self.vertices, self.faces, self.camera)
+        return render_mesh(self.vertices, self.faces, self.camera)
 
-    def moved(self, turn: Floats, joint: Floats) -> Sight:
-        """The same pose with another root rotation [3, 3] and place [3] m."""
-        vertices = (self.vertices - self.joint) @ (turn @ self.turn.T).T + joint
-        return replace(self, vertices=vertices, turn=turn, joint=joint)
+    def with_root(self, rotation: Floats, position: Floats) -> MaskView:
+        """The same pose with another root rotation [3, 3] and position [3] m."""
+        vertices = (self.vertices - self.root_position) @ (rotation @ self.root_rotation.T).T + position
+        return replace(self, vertices=vertices, root_rotation=rotation, root_position=position)
 
-    def seen_by(self, K: Floats | None = None, world_to_camera: Floats | None = None) -> Sight:
-        """The same person before another camera."""
+    def with_camera(self, K: Floats | None = None, world_to_camera: Floats | None = None) -> MaskView:
+        """The same person in front of another camera."""
         pose = self.camera.world_to_camera if world_to_camera is None else world_to_camera
         K = self.camera.K if K is None else K
         return replace(self, camera=Camera(self.camera.width, self.camera.height, K, pose))
 
-    def zoomed(self, factor: float) -> Sight:
-        """The same sight with its focal lengths times ``factor``."""
+    def zoomed(self, factor: float) -> MaskView:
+        """The same view with its focal lengths times ``factor``."""
         K = self.camera.K.copy()
         K[:2, :2] *= factor
-        return self.seen_by(K=K)
+        return self.with_camera(K=K)
 
 
-def sight(
-    capture: Capture, frame: Frame, mask: NDArray[np.float32], *, size: int = SIZE, index: int | None = None
-) -> Sight:
-    """``frame`` with its ``mask`` [H, W], shrunk to at most ``size`` pixels a side.
-
-    ``index`` is another motion frame to pose the template by.
-    """
-    camera = capture.cameras[frame.camera]
-    factor = min(1.0, size / max(camera.width, camera.height))
-    small = camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+def mask_view(capture: Capture, frame: Frame, mask: NDArray[np.float32]) -> MaskView:
+    """``frame`` with its ``mask`` [H, W], shrunk to at most ``SIZE`` pixels a side."""
+    small = shrunk_camera(capture.cameras[frame.camera], SIZE)
     shrunk = cv2.resize(mask, (small.width, small.height), interpolation=cv2.INTER_AREA) > 0.5
-    return posed(capture, Sight(frame, small, shrunk, capture.body.faces, *_NO_POSE), index)
+    no_pose = (np.zeros((1, 3)), np.eye(3), np.zeros(3))
+    return with_pose(capture, MaskView(frame, small, shrunk, capture.body.faces, *no_pose), frame.frame)
 
 
-_NO_POSE = (np.zeros((1, 3)), np.eye(3), np.zeros(3))
-
-
-def posed(capture: Capture, seen: Sight, index: int | None = None) -> Sight:
-    """``seen`` with the template in the pose of motion frame ``index``, its own when None."""
-    k = seen.frame.frame if index is None else index
+def with_pose(capture: Capture, view: MaskView, k: int) -> MaskView:
+    """``view`` with the template in the pose of motion frame ``k``."""
     rotations, translation = capture.motion.rotations[k], capture.motion.translations[k]
     vertices = posed_vertices(capture.body, rotations, translation)
-    joint = capture.body.skeleton.rest_joints[0] + translation
-    return replace(seen, vertices=vertices, turn=rotations[0], joint=joint)
+    position = capture.body.skeleton.rest_joints[0] + translation
+    return replace(view, vertices=vertices, root_rotation=rotations[0], root_position=position)
 
 
-def mean_overlap(sights: list[Sight], *, distortion: float = 0.0) -> float:
-    """Mean IoU of the template's silhouette with the masks of ``sights``, through a lens of ``distortion``."""
-    drawn = [silhouette(seen.vertices, seen.faces, seen.camera, distortion) for seen in sights]
-    return float(np.mean([overlap(template, seen.mask) for template, seen in zip(drawn, sights)]))
+def shrunk_camera(camera: Camera, side: int) -> Camera:
+    """``camera`` with at most ``side`` pixels along its longer side."""
+    factor = min(1.0, side / max(camera.width, camera.height))
+    return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
 
 
-def spread(sights: list[Sight], count: int) -> list[Sight]:
-    """At most ``count`` of ``sights``, evenly spaced."""
-    if len(sights) <= count:
-        return sights
-    return [sights[round(k)] for k in np.linspace(0, len(sights) - 1, count)]
+def mean_iou(views: list[MaskView], k1: float = 0.0) -> float:
+    """Mean IoU of the template's silhouettes with the masks, through a lens of radial distortion ``k1``."""
+    return float(np.mean([mask_iou(silhouette(v.vertices, v.faces, v.camera, k1), v.mask) for v in views]))
+
+
+def evenly_spaced(views: list[MaskView], count: int) -> list[MaskView]:
+    """At most ``count`` of ``views``, evenly spaced."""
+    if len(views) <= count:
+        return views
+    return [views[round(k)] for k in np.linspace(0, len(views) - 1, count)]

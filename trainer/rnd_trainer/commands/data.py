@@ -1,102 +1,95 @@
-"""rnd-data: captures from what people have, and checks of what came out."""
+"""rnd-data: captures from data sets and videos, and checks of captures."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from functools import partial, wraps
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from rnd_runtime.core.errors import parse_options, run_command
+from rnd_runtime.core.command import OptionalFolder, finish, option, parse_subcommand, run_command
 from rnd_runtime.core.files import is_folder
 from rnd_trainer.importing.options import ImportOptions
 
 from .eval import need_extra
-from .motion import motion
 
 
-def import_source(
-    source: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
-    reading: Annotated[ImportOptions, tyro.conf.arg(name="")] = ImportOptions(),  # noqa: B008  # frozen
-) -> int:
-    """Turn what you have into a capture: a data set, or a video with body poses. What it is is found out, and told.
+@dataclass(frozen=True)
+class ImportCommand:
+    """Turn a data set, or a video with body poses, into a capture. The layout of SOURCE is found out.
 
-    Args:
-        source: a data set's folder for one subject, a video, or a folder of frames
-        out: folder for the capture
-        reading: how it is to be understood
+    rnd-data import me.mp4 me --body SMPL_NEUTRAL.npz --poses wham_output.pkl
     """
-    need_extra()
-    from rnd_trainer.importing.report import import_and_report
 
-    return import_and_report(source, out, reading)
+    source: Annotated[tyro.conf.Positional[Path], option("SOURCE")]
+    """a data set's folder for one subject, a video, or a folder of frames"""
+    out: Annotated[tyro.conf.Positional[Path], option("FOLDER")]
+    """folder for the capture"""
+    reading: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
+
+    def run(self) -> int:
+        from rnd_trainer.importing.report import import_and_report
+
+        return import_and_report(self.source, self.out, self.reading)
 
 
-def check(capture: Annotated[Path, tyro.conf.Positional], out: Path | None = None) -> int:
-    """Check a capture against itself: units, cameras, masks, silhouettes, normals, timing. Exit 1: something is wrong.
+@dataclass(frozen=True)
+class CheckCommand:
+    """Check units, cameras, masks, silhouettes, normals and timing of a capture. Exit code 1: something is wrong.
 
-    Args:
-        capture: folder with capture.json, or that file
-        out: folder for check.json (IoU of every frame) and check.png (overlay); CAPTURE/check when not given
+    rnd-data check me
     """
-    need_extra()
-    from rnd_trainer.checking.report import check_and_report
 
-    folder = capture if is_folder(capture) else capture.parent
-    return check_and_report(capture, folder / "check" if out is None else out)
+    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE")]
+    """folder with capture.json, or that file"""
+    out: OptionalFolder = None
+    """folder for check.json (IoU of every frame) and check.png (overlay). Default: CAPTURE/check"""
+
+    def run(self) -> int:
+        from rnd_trainer.checking.report import check_and_report
+
+        folder = self.capture if is_folder(self.capture) else self.capture.parent
+        return check_and_report(self.capture, folder / "check" if self.out is None else self.out)
 
 
-def convert_body(
-    model: Annotated[str, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.Positional],
-    betas: tuple[float, ...] = (),
-    license: str | None = None,
-) -> None:
-    """Turn a body model (SMPL, SMPL-H, SMPL-X as .npz or .pkl, or the word anny) into a body.npz.
+@dataclass(frozen=True)
+class ConvertBodyCommand:
+    """Turn a body model (SMPL, SMPL-H or SMPL-X as .npz or .pkl, or the word anny) into a body.npz.
 
-    Args:
-        model: the file; a pickle is read without executing anything
-        out: the body.npz to write
-        betas: shape parameters, the first of them; the rest are 0
-        license: what to write into the file about who may pass it on
+    rnd-data convert-body SMPL_NEUTRAL.npz body.npz --betas 0.5 -0.2
     """
-    need_extra()
-    from rnd_trainer.importing.body_models import convert_body_model
 
-    print(convert_body_model(model, out, betas, license))  # noqa: T201
+    model: Annotated[tyro.conf.Positional[str], option("FILE|anny")]
+    """the model; a pickle is read without executing anything"""
+    out: Annotated[tyro.conf.Positional[Path], option("FILE")]
+    """the body.npz to write"""
+    betas: Annotated[tuple[float, ...], option("N ...")] = ()
+    """shape parameters, the first of them; the rest are 0"""
+    license: Annotated[str | None, option("TEXT")] = None
+    """licence to write into the file"""
 
+    def run(self) -> int:
+        from rnd_trainer.importing.body_models import convert_body_model
 
-COMMANDS: dict[str, Callable[..., Any]] = {
-    "import": import_source,
-    "check": check,
-    "convert-body": convert_body,
-    "motion": motion,
-}
-
-
-def _not_yet(command: Callable[..., Any]) -> Callable[..., Any]:
-    """``command`` as tyro sees it, but what it does when called is left to the call of what it returns."""
-
-    @wraps(command)
-    def chosen(*args: Any, **options: Any) -> Callable[[], Any]:
-        return partial(command, *args, **options)
-
-    return chosen
+        finish(self.out, convert_body_model(self.model, self.out, self.betas, self.license))
+        return 0
 
 
-def main() -> None:
+COMMANDS = {"import": ImportCommand, "check": CheckCommand, "convert-body": ConvertBodyCommand}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of ``rnd-data``."""
 
-    later = {name: _not_yet(function) for name, function in COMMANDS.items()}
-
-    def command() -> int | None:
-        chosen = parse_options(lambda: tyro.extras.subcommand_cli_from_dict(later, prog="rnd-data"))
-        result: int | None = chosen()
-        return result
+    def command() -> int:
+        description = "Captures from data sets and videos, and checks of captures."
+        chosen = parse_subcommand(COMMANDS, "rnd-data", arguments, description=description)
+        need_extra()
+        code: int = chosen.run()
+        return code
 
     sys.exit(run_command("rnd-data", command))
 
