@@ -17,7 +17,7 @@ COLUMNS = 6
 
 
 def main(run: Path, out: Path) -> None:
-    """Tile six evenly spaced frames of RUN/play/frames under the newest picture of RUN/previews."""
+    """Tile six evenly spaced frames of RUN/play/frames under the newest image of RUN/previews."""
     frames = sorted((run / "play" / "frames").glob("*.png"))
     chosen = [frames[k * len(frames) // COLUMNS] for k in range(COLUMNS)]
     played = np.concatenate([_on_grey(read_image(path)) for path in chosen], axis=1)
@@ -28,12 +28,12 @@ def main(run: Path, out: Path) -> None:
     write_image(out, np.concatenate([preview, shrunk]))
 
 
-def _on_grey(picture: np.ndarray) -> np.ndarray:
+def _on_grey(image: np.ndarray) -> np.ndarray:
     """[H, W, 3 or 4] uint8 → [H, W, 3]; straight alpha goes over dark grey."""
-    if picture.shape[2] == 3:
-        return picture
-    alpha = picture[..., 3:] / 255
-    return np.round(picture[..., :3] * alpha + 40 * (1 - alpha)).astype(np.uint8)
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:] / 255
+    return np.round(image[..., :3] * alpha + 40 * (1 - alpha)).astype(np.uint8)
 
 
 if __name__ == "__main__":

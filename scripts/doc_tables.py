@@ -26,12 +26,12 @@ PAGES = {
 """pages with tables, and the folder of their charts as seen from them"""
 
 
-def filled(text: str, bench: Path, pictures: str = "../assets/bench") -> str:
-    """``text`` with every table and chart as the files in ``bench`` have it; ``pictures`` is the folder in links."""
+def filled(text: str, bench: Path, images: str = "../assets/bench") -> str:
+    """``text`` with every table and chart as the files in ``bench`` have it; ``images`` is the folder in links."""
 
     def chart(found: re.Match[str]) -> str:
-        picture = f"![{Path(found[2]).stem}]({pictures}/{found[2]})\n"
-        return found[1] + (picture if (bench / found[2]).is_file() else "") + found[3]
+        image = f"![{Path(found[2]).stem}]({images}/{found[2]})\n"
+        return found[1] + (image if (bench / found[2]).is_file() else "") + found[3]
 
     def table(found: re.Match[str]) -> str:
         files, _, key = found[2].partition("#")
@@ -66,6 +66,6 @@ def _cell(value: object, form: str) -> str:
 
 
 if __name__ == "__main__":
-    for page, pictures in PAGES.items():
-        text = filled(page.read_text(encoding="utf-8"), ROOT / "assets" / "bench", pictures)
+    for page, images in PAGES.items():
+        text = filled(page.read_text(encoding="utf-8"), ROOT / "assets" / "bench", images)
         page.write_text(text, encoding="utf-8")

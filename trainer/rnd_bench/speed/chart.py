@@ -26,7 +26,7 @@ HARD = "X"
 """marks a frame of one of the hardest scenes"""
 EDGES = {"ao": "#aaaaaa", "table": "#000000", "table+sun": "#f4d03f", "lights": "#ff4fa3", "brute": "#00c8ff"}
 """of a mark: its shading"""
-MARKERS = {"full": "o", "rates": "D", "coarse": "s", "static": "^"}
+MARKERS = {"full": "o", "coarse": "s", "static": "^"}
 EDGE = 0.9
 """points wide"""
 CEILING_DB = 60.0

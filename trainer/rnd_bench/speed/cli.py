@@ -46,7 +46,7 @@ def run_frame(options: Frame) -> None:
     check_mode(options.shade)
     values = {name: getattr(options, name) for name in Setting.__dataclass_fields__}
     setting = Setting(**values | {"threads": _threads(options.threads)})
-    inputs, rows = _inputs(options.files), []
+    inputs, rows = _inputs(options.files), list[dict[str, Any]]()
     for _ in range(options.runs):
         row = measured(setting, inputs, seconds=6.0, compare=not options.no_compare, file=options.avatar)
         rows.append(row)
@@ -55,8 +55,8 @@ def run_frame(options: Frame) -> None:
         for name, milliseconds in row["stages"].items():
             show(f"  {name:16} {milliseconds:6.2f} ms")
     if options.runs > 1:
-        for name, what in {"ms_median": "median", "ms_p95": "p95", "cold_start_ms": "cold start"}.items():
-            values = sorted(row[name] for row in rows)
+        for column, what in {"ms_median": "median", "ms_p95": "p95", "cold_start_ms": "cold start"}.items():
+            values = sorted(float(each[column]) for each in rows)
             middle = statistics.median(values)
             show(f"{what} of {len(rows)} runs: {values[0]:.1f} to {values[-1]:.1f} ms, median {middle:.1f}")
 
@@ -122,11 +122,11 @@ def run_compare(options: Compare) -> None:
             checkouts.append(Checkout(folder, files, options.shade, options.size, threads))
         with Progress() as progress:
             progress.phase("pairs of frames", options.pairs)
-            rows = compare(*checkouts, options.pairs, progress.update)
+            rows = compare(checkouts, options.pairs, progress.update)
     finally:
         for checkout in checkouts:
             checkout.close()
-    about = {name: checkout.commit for name, checkout in zip(("before", "after"), checkouts)}
+    about: dict[str, Any] = {name: checkout.commit for name, checkout in zip(("before", "after"), checkouts)}
     about |= {"avatar_sha256": sha256_of(options.avatar), "machine": machine(), "frames": FRAMES, "threads": threads}
     about |= {name: getattr(options, name) for name in ("size", "shade", "pairs")}
     _write(options.json, [row | about for row in rows])
@@ -170,8 +170,8 @@ def _check(options: Any, *counts: str) -> None:
 def _inputs(files: Files) -> Any:
     from .point import Inputs
 
-    named = (files.assets / name for name in ("body.npz", "walk.npz", "sky.exr"))
-    return Inputs(*named, files.work, files.checkpoint).checked()
+    body, motion, hdr = (files.assets / name for name in ("body.npz", "walk.npz", "sky.exr"))
+    return Inputs(body, motion, hdr, files.work, files.checkpoint).checked()
 
 
 def _write(file: Path | None, value: Sequence[Any] | dict[str, Any]) -> None:

@@ -88,9 +88,8 @@ class Checkout:
         return subprocess.run(line, capture_output=True, text=True, check=False).stdout.strip()
 
 
-def compare(before: Checkout, after: Checkout, pairs: int, on_pair: Callable[[int], None]) -> list[dict[str, Any]]:
-    """Rows by stage: medians and 95th percentiles in ms of both, and the ratio with its standard error."""
-    checkouts = (before, after)
+def compare(checkouts: Sequence[Checkout], pairs: int, on_pair: Callable[[int], None]) -> list[dict[str, Any]]:
+    """Rows by stage: medians and 95th percentiles in ms of both checkouts, and the ratio with its standard error."""
     for checkout in checkouts:
         checkout.render(WARM_UP)
     taken: tuple[list[Any], list[Any]] = ([], [])

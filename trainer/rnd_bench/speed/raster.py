@@ -77,11 +77,9 @@ def measure(splats: Splats, camera: Camera, *, repeats: int, threads: int | None
                 _Case("torch tiles", raster_reference.rasterize, 1, few, wanted),
             )
         ]
-        alone = (
-            ("numba, as played", partial(_as_arrays, partial(raster_cpu.rasterize, depth=False))),
-            *_gl_rasterizers(),
-        )
-        cases += [_Case(name, rasterize, WARMUP, repeats) for name, rasterize in alone]
+        played = partial(_as_arrays, partial(raster_cpu.rasterize, depth=False))
+        alone: dict[str, Callable[..., Any]] = {"numba, as played": played, **dict(_gl_rasterizers())}
+        cases += [_Case(name, rasterize, WARMUP, repeats) for name, rasterize in alone.items()]
         taken: list[list[float]] = [[] for _ in cases]
         results = [Rendering(torch.empty(0), torch.empty(0))] * len(cases)
         for number in range(max(case.warmup + case.repeats for case in cases)):
@@ -125,7 +123,7 @@ def _gl_rasterizers() -> Iterator[tuple[str, Callable[..., Any]]]:
     """OpenGL on every backend that this machine has; it has no backward pass."""
     for backend in ("egl", "osmesa"):
         try:
-            rasterizer = GlRasterizer(backend)  # type: ignore[arg-type]
+            rasterizer = GlRasterizer(backend)
         except InputError:
             continue
         yield f"gl-{backend}", partial(_as_arrays, partial(rasterizer, depth=False))

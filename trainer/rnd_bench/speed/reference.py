@@ -22,12 +22,12 @@ from rnd_runtime.core.files import atomic_path
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.posing.forearm import skinning_bones
-from rnd_runtime.posing.rest import RestPose
 from rnd_runtime.posing.reference import pose_reference
+from rnd_runtime.posing.rest import RestPose
 from rnd_runtime.posing.window import motion_window
 from rnd_runtime.raster import oracle as raster_oracle
 from rnd_runtime.shading.light import load_light
-from rnd_runtime.shading.reference import shade_reference, shade_reference_with_suns
+from rnd_runtime.shading.reference import shade_reference, shade_reference_with_directional
 
 from .frame import COMPARED, STEP_S, STEP_YAW, Measured
 
@@ -90,12 +90,12 @@ def posed_reference(avatar: Avatar, motion: Any, time: float) -> Gaussians:
     *rest, limits = avatar.run(inputs, REST_OUTPUTS)
     posed = pose_reference(RestPose(*rest, *limits.tolist()), logits, offsets, visibility, bones)  # type: ignore[arg-type]
     static = avatar.pose(motion, time)
-    means, covariances, normals, harmonics = (np.asarray(value) for value in posed)
-    return replace(static, means=means, covariances=covariances, normals=normals, visibility=harmonics)  # type: ignore[arg-type]
+    means, covariances, normals, seen = (np.asarray(value) for value in posed)
+    return replace(static, means=means, covariances=covariances, normals=normals, visibility=seen)  # type: ignore[arg-type]
 
 
 def _lit(avatar_file: Path, scene: BenchScene, with_suns: bool) -> dict[str, Any]:
-    shade = shade_reference_with_suns if with_suns else shade_reference
+    shade = shade_reference_with_directional if with_suns else shade_reference
     avatar = Avatar.load(avatar_file)
     motion = load_motion(scene.motion, avatar.skeleton)
     light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position

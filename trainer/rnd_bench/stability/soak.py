@@ -59,7 +59,7 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
     """
     config = tiny_config(steps=3 * steps, gaussians=subject.few(400, 4000))
     training = Training(studio(subject), replace(config, stage1_fraction=1 / 3, full_light_fraction=1 / 3))
-    training.rehearse()
+    training.warm_up()
 
     def step(number: int) -> str:
         training.step()

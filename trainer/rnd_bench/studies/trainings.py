@@ -24,7 +24,7 @@ from rnd_trainer.training.data import check_true_normals, training_light
 from rnd_trainer.training.pose_refinement import joint_error_degrees
 from rnd_trainer.training.run import run
 from rnd_trainer.training.state import STATE_FILE, read_state
-from rnd_trainer.training.training import Step, Training
+from rnd_trainer.training.training import StepResult, Training
 
 from .variants import StudyRow
 
@@ -191,10 +191,10 @@ def _train(
     training = Training(seen, config, perceptual, consistency=consistency)
     if (folder / STATE_FILE).exists():
         training.resume(folder / STATE_FILE)
-    effort = training.schedule.effort
+    cost = training.schedule.cost
 
-    def on_step(step: Step) -> None:
-        on_share(effort(step.index + 1) / effort(training.schedule.total))
+    def on_step(step: StepResult) -> None:
+        on_share(cost(step.index + 1) / cost(training.schedule.total))
 
     if run(training, folder, on_step=on_step, on_preview=lambda: None):
         raise KeyboardInterrupt

@@ -16,10 +16,10 @@ from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import srgb_to_linear, to_bytes
 from rnd_runtime.core.sh import sh_basis
 from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.shading.directional import DirectionalLight, extract_directional
 from rnd_runtime.shading.light import Light, texel_directions, texel_solid_angles
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.shadow import directional_visibility
-from rnd_runtime.shading.directional import DirectionalLight, extract_directional
 from rnd_trainer.evaluation.evaluate import Judge, albedo_scale, evaluate
 from rnd_trainer.losses.metrics import mask_box
 from rnd_trainer.model.checkpoint import load_checkpoint

@@ -136,7 +136,8 @@ def fly_through(subject: Subject) -> Result:
     chest = np.median(posed.means, axis=0).astype(np.float64)
     eyes = [chest + np.array([0.02, 0.05, z]) for z in np.linspace(2.5, -2.5, subject.few(21, 101))]
     eyes += [posed.means[k].astype(np.float64) - [0, 0, step] for k in (0, 11) for step in (0.0, 0.011, 0.03)]
-    finite, filling, seconds, worst = True, -1.0, [], np.zeros(0)
+    finite, filling, seconds = True, -1.0, []
+    worst = np.zeros((0, 0, 4), np.float32)
     for eye in eyes:
         camera = Camera.look_at(eye, eye - [0, 0, 1.0], width=subject.size, height=subject.size, fov_y=0.6)
         times = []
@@ -269,7 +270,8 @@ def rasters_agree(subject: Subject) -> Result:
     images: dict[str, Floats] = {}
     with _Rasters() as rasters, torch.no_grad():
         images |= {name: srgb(raster(*splats, camera).image) for name, raster in rasters.all.items()}
-        by_torch = rasterize_by_torch(*(torch.from_numpy(array) for array in splats), camera)[0]
+        means, covariances, opacities, features = (torch.from_numpy(array) for array in splats)
+        by_torch = rasterize_by_torch(means, covariances, opacities, features, camera)[0]
         images["torch"] = srgb(by_torch.numpy())
     worst = min(images, key=lambda name: np.nan_to_num(decibels(images[name], truth), nan=-np.inf))
     largest = max(float(np.abs(image - truth).max()) for image in images.values())

@@ -22,6 +22,7 @@ from rnd_runtime.core.npz import save_npz
 from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 from rnd_stage.people import characters
 
+pytestmark = pytest.mark.slow
 MIXAMO = dict(
     zip(
         SMPL_NAMES,
@@ -80,11 +81,8 @@ def write_glb(path: Path, body: Body, above: dict | None = None) -> None:
         "meshes": [
             {
                 "primitives": [
-                    {
-                        "attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "TEXCOORD_0": 4},
-                        "indices": 1,
-                        "material": 0,
-                    }
+                    {"indices": 1, "material": 0}
+                    | {"attributes": {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3, "TEXCOORD_0": 4}}
                 ]
             }
         ],
@@ -146,8 +144,8 @@ def test_a_node_above_the_skeleton_brings_it_to_metres_and_upright(body: Body, t
     plain, dressed = (characters.load_character(tmp_path / f"{name}.glb") for name in ("plain", "theirs"))
     moved = np.array([0.3, 0, 0.5]) if "moved" in stored else np.zeros(3)  # they stand on the floor
     np.testing.assert_allclose(np.sort(dressed.vertices, 0), np.sort(plain.vertices + moved, 0), atol=1e-4)
-    places = dressed.body.skeleton.rest_joints
-    np.testing.assert_allclose(places, plain.body.skeleton.rest_joints + moved, atol=1e-4)
+    positions = dressed.body.skeleton.rest_joints
+    np.testing.assert_allclose(positions, plain.body.skeleton.rest_joints + moved, atol=1e-4)
 
 
 def test_who_is_as_tall_as_a_house_is_refused(body: Body, tmp_path: Path) -> None:
@@ -182,13 +180,13 @@ def test_bent_arms_are_straightened(body: Body, tmp_path: Path) -> None:
     from rnd_runtime.core.rotations import axis_angle_to_matrix
     from rnd_runtime.motion.skeleton import bone_transforms
 
-    turns = np.tile(np.eye(3), (24, 1, 1))
-    turns[SMPL_NAMES.index("left_shoulder")] = axis_angle_to_matrix([0, 0, -0.9])
-    turns[SMPL_NAMES.index("right_shoulder")] = axis_angle_to_matrix([0, 0, 0.9])
-    bones = bone_transforms(body.skeleton, turns, np.zeros(3))
+    rotations = np.tile(np.eye(3), (24, 1, 1))
+    rotations[SMPL_NAMES.index("left_shoulder")] = axis_angle_to_matrix([0, 0, -0.9])
+    rotations[SMPL_NAMES.index("right_shoulder")] = axis_angle_to_matrix([0, 0, 0.9])
+    bones = bone_transforms(body.skeleton, rotations, np.zeros(3))
     blend = np.tensordot(body.skinning_weights, bones, axes=1)
     posed = np.einsum("vij,vj->vi", blend[:, :, :3], body.vertices) + blend[:, :, 3]
-    joints = body.skeleton.joint_transforms(turns, np.zeros(3))[:, :3, 3]
+    joints = body.skeleton.joint_transforms(rotations, np.zeros(3))[:, :3, 3]
     lowered = Body(posed, body.faces, body.skinning_weights, replace(body.skeleton, rest_joints=joints))
     write_glb(tmp_path / "lowered.glb", lowered)
     dressed = characters.load_character(tmp_path / "lowered.glb")

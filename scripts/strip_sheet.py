@@ -1,7 +1,7 @@
-"""Sheets for the README from the strips of rnd-eval: python scripts/strip_pictures.py STRIPS OUT.png NAME NAME …
+"""Sheets for the README from the strips of rnd-eval: python scripts/strip_sheet.py STRIPS OUT.png NAME NAME …
 
-STRIPS is a folder that ``rnd-eval --pictures`` wrote (truth, render, normals, albedo, error side by side); the named
-strips are cut to the person and laid out two to a row; of an odd number, the last has black beside it.
+STRIPS is a folder that ``rnd-eval --strips`` wrote (truth, render, normals, albedo, error side by side). The named
+strips are cropped to the person, two to a row; an odd last one has black beside it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def main(folder: Path, out: Path, names: list[str]) -> None:
 
 
 def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The tiles of a strip, each cut to the person in the first, whose middle is the tile's."""
+    """The tiles of a strip, each cropped to the person in the first."""
     tiles = np.split(strip, len(TILES), axis=1)
     rows, columns = np.nonzero(tiles[0].any(axis=2))
     high = (np.ptp(rows) + 1) * (1 + 2 * MARGIN)
@@ -48,5 +48,5 @@ def _cut(strip: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 if __name__ == "__main__":
     if len(sys.argv) < 4:
-        sys.exit("usage: strip_pictures.py FOLDER OUT NAME ...")
+        sys.exit("usage: strip_sheet.py FOLDER OUT NAME ...")
     main(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:])

@@ -1,4 +1,4 @@
-"""Our renderer with true attributes against Mitsuba, in small: what ``rnd-stage agreement`` measures in full."""
+"""Our renderer with true attributes against Mitsuba, in small: what ``rnd-bench study agreement`` measures in full."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from rnd_runtime.shading.shadow import directional_visibility  # noqa: E402
 
 mi.set_variant("scalar_rgb")
 
-from rnd_bench.studies.agreement import AgreementOptions, ball, compare, fitted_visibility, true_gaussians  # noqa: E402
-from rnd_stage import cli  # noqa: E402
+from rnd_bench.cli import main  # noqa: E402
+from rnd_bench.studies.agreement import ball, compare, fitted_visibility, true_gaussians  # noqa: E402
 from rnd_stage.film.cameras import ring_cameras  # noqa: E402
 from rnd_stage.people import dressing  # noqa: E402
 
+pytestmark = pytest.mark.slow
 SIZE = 64  # pixels
 
 
 @pytest.fixture(scope="module")
 def compared():
-    matt = replace(ball(rings=64), roughness=np.full(2 * 64 * 64, 0.8))
+    rough = replace(ball(rings=64), roughness=np.full(2 * 64 * 64, 0.8))
     camera = ring_cameras(1, SIZE)["cam00"]
-    options = AgreementOptions(size=SIZE, samples=64, lights=("white", "red"))
-    return {result.row["light"]: result for result in compare("ball", matt, camera, options)}
+    return {result.row["light"]: result for result in compare("ball", rough, camera, 64, ("white", "red"))}
 
 
 @pytest.mark.parametrize("mode", ["brute", "table+sun"])
@@ -62,13 +62,13 @@ def test_the_strip_shows_the_difference(compared) -> None:
 
 def test_an_unknown_light_is_refused() -> None:
     with pytest.raises(InputError, match="--lights"):
-        next(compare("ball", ball(rings=8), ring_cameras(1, 16)["cam00"], AgreementOptions(lights=("mauve",))))
+        next(compare("ball", ball(rings=8), ring_cameras(1, 16)["cam00"], 2, ("mauve",)))
 
 
-def test_a_picture_too_small_for_the_body_is_refused() -> None:
+def test_an_image_too_small_for_the_body_is_refused() -> None:
     thin = ball(radius=0.05, rings=8)
     with pytest.raises(InputError, match="--size"):
-        next(compare("ball", thin, ring_cameras(1, 16)["cam00"], AgreementOptions(size=16, samples=2)))
+        next(compare("ball", thin, ring_cameras(1, 16)["cam00"], 2))
 
 
 def test_fitted_visibility_keeps_the_light_that_arrives() -> None:
@@ -88,28 +88,17 @@ def test_fitted_visibility_keeps_the_light_that_arrives() -> None:
     assert abs(np.mean(kept - arriving)) < 0.001
 
 
-def test_the_command_writes_rows_and_a_picture(monkeypatch, tmp_path: Path) -> None:
+def test_the_command_writes_rows_and_a_sheet(monkeypatch, tmp_path: Path) -> None:
     template, made = Body.load(ASSETS / "body.npz"), dressing.dress
     monkeypatch.setattr(dressing, "dress", lambda who, step: made(who, 0.02, template))
-    options = cli.Agreement(
-        tmp_path / "rows.json",
-        frame=1,
-        size=64,
-        samples=4,
-        lights=("white", "rim"),
-        picture=tmp_path / "sheet.png",
-        variant="scalar_rgb",
-    )
-    cli._agreement(options)
-    rows = json.loads((tmp_path / "rows.json").read_text())
-    assert [(row["body"], row["light"]) for row in rows] == [
-        ("ball", "white"),
-        ("ball", "rim"),
-        ("person", "white"),
-        ("person", "rim"),
-    ]
+    out, sheet = tmp_path / "rows.json", tmp_path / "sheet.png"
+    options = ["--frame", "1", "--size", "64", "--samples", "4", "--variant", "scalar_rgb", "--lights", "white", "rim"]
+    assert main(["study", "agreement", str(out), "--sheet", str(sheet), *options]) == 0
+    rows = json.loads(out.read_text())
+    bodies = [(row["body"], row["light"]) for row in rows]
+    assert bodies == [(body, light) for body in ("ball", "person") for light in ("white", "rim")]
     for row in rows:
         assert row["machine"] and row["variant"] == "scalar_rgb"
         assert (row["size"], row["samples"]) == (64, 4) and row["gaussians"] > 1000
         assert 10 < row["brute"]["psnr_inside"] < 60
-    assert read_image(tmp_path / "sheet.png").shape == (2 * 64, 8 * 64, 3)
+    assert read_image(sheet).shape == (2 * 64, 8 * 64, 3)

@@ -1,4 +1,4 @@
-"""Renders README's first picture and those of docs/method.md: python scripts/doc_pictures.py"""
+"""Renders README's first image and those of docs/method.md: python scripts/doc_images.py"""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from rnd_viewer.play.player import Player
 
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
@@ -17,11 +18,10 @@ from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light, load_light
 from rnd_viewer.inputs.background import Background
-from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path, orbit_path
-from rnd_viewer.play.player import Player
 
 ROOT = Path(__file__).parent.parent
 SIDE, TIME_S = 400, 0.55

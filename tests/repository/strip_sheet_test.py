@@ -1,4 +1,4 @@
-"""scripts/strip_pictures.py: sheets of any number of strips."""
+"""scripts/strip_sheet.py: sheets of any number of strips."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from rnd_runtime.core.images import read_image, write_image
 from rnd_trainer.evaluation.preview import CAPTION
 from support.paths import ROOT
 
-SCRIPT = runpy.run_path(str(ROOT / "scripts/strip_pictures.py"))
+SCRIPT = runpy.run_path(str(ROOT / "scripts/strip_sheet.py"))
 SIDE = 54
 QUARTER = 4  # of a pixel of the strip, which is 15 of the sheet
 
 
 @pytest.mark.parametrize(("count", "rows", "columns"), [(1, 1, 1), (2, 1, 2), (3, 2, 2), (5, 3, 2)])
-def test_strips_are_laid_out_two_to_a_row_and_cut_to_the_person(tmp_path, count, rows, columns) -> None:
-    """A person who is 20 pixels high and 6 wide, somewhere in each tile, fills the middle of his tile of the sheet."""
+def test_strips_are_two_to_a_row_and_cropped_to_the_person(tmp_path, count, rows, columns) -> None:
+    """A person 20 pixels high and 6 wide, somewhere in each tile, fills the middle of a tile of the sheet."""
     names = [f"strip{k}" for k in range(count)]
     for k, name in enumerate(names):
         strip = np.zeros((SIDE, 5 * SIDE, 3), np.uint8)
