@@ -11,7 +11,8 @@ from rnd_runtime.avatar.file import PlayerAdvice
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton, smpl_skeleton
+from rnd_runtime.motion.skeleton import Skeleton, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_runtime.shading.light import Light
 
 BALL_RADIUS = 0.1  # m
@@ -36,7 +37,7 @@ class Encoded(NamedTuple):
     motion: Motion
     time: float
     root: np.ndarray  # it is posed in the world
-    seconds: dict[str, float] = {}
+    seconds: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class FakeAvatar:
     advice: PlayerAdvice = field(default_factory=PlayerAdvice)
 
     def encode(self, motion: Motion, time: float) -> Encoded:
-        return Encoded(motion, time, np.eye(4))
+        return Encoded(motion, time, np.eye(4), {})
 
     def posed(self, encoded: Encoded) -> Gaussians:
         return self.pose(encoded.motion, encoded.time)

@@ -14,7 +14,8 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.posing.posing import Posed, RestPose
+from rnd_runtime.posing.rest import RestPose
+from rnd_runtime.posing.skinning import PosedArrays
 
 Image = NDArray[np.uint8]
 
@@ -35,7 +36,7 @@ def assert_only_ties(got: Image, expected: Image, again: Callable[[], Image], to
     rng = np.random.default_rng(0)
     pose = RestPose.pose
 
-    def wobbling(rest: RestPose, *fields: Any) -> Posed:
+    def wobbling(rest: RestPose, *fields: Any) -> PosedArrays:
         posed = pose(rest, *fields)
         return posed._replace(means=posed.means + rng.normal(0, LAST_BITS, posed.means.shape).astype(np.float32))
 

@@ -5,7 +5,7 @@ while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NE
 machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``);
 no other liberty is taken, so a NaN fails every comparison.
 
-numba's cache looks only at the file of the kernel it stored; after an edit of this one, ``._kernel_cache`` does.
+numba's cache looks only at the file of the kernel it stored; after an edit of this one, ``.kernels`` does.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _call(builder: Any, name: str, result: Any, *args: Any, flags: tuple[str, ..
 
 
 @intrinsic
-def larger(context, a, b):  # type: ignore[no-untyped-def]
+def maximum(context, a, b):  # type: ignore[no-untyped-def]
     """The larger of two lanes, neither of them NaN.
 
     Written as ``select`` and stored where one of the two came from, it becomes a masked store, which some
@@ -194,19 +194,19 @@ def magnitude(context, values):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def root(context, values):  # type: ignore[no-untyped-def]
+def sqrt(context, values):  # type: ignore[no-untyped-def]
     """√values."""
     return LANES(values), lambda ctx, builder, sig, args: _call(builder, "llvm.sqrt.v16f32", _FLOATS, args[0])
 
 
 @intrinsic
-def whole(context, values):  # type: ignore[no-untyped-def]
+def floor(context, values):  # type: ignore[no-untyped-def]
     """The greatest whole numbers that are not above ``values``."""
     return LANES(values), lambda ctx, builder, sig, args: _call(builder, "llvm.floor.v16f32", _FLOATS, args[0])
 
 
 @intrinsic
-def total(context, values):  # type: ignore[no-untyped-def]
+def reduce_add(context, values):  # type: ignore[no-untyped-def]
     """Sum over the lanes, as a tree that is the same every time."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -274,7 +274,7 @@ prefetch_to_write = intrinsic(_prefetched(1))  # or written; past the end does n
 
 
 @intrinsic
-def spread(context, array, index):  # type: ignore[no-untyped-def]
+def broadcast(context, array, index):  # type: ignore[no-untyped-def]
     """Sixteen times ``array[index]`` of a flat contiguous float32 array; no bounds are checked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -378,8 +378,14 @@ def fetch_add(context, counter):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
+def at_least(x, low):  # type: ignore[no-untyped-def]
+    """The larger of the lanes ``x`` and ``low``; ``low`` for NaN too."""
+    return select(x > low, x, low)
+
+
+@njit(inline="always")
 def aligned_floats(count: int) -> np.ndarray[Any, Any]:
     """An uninitialised flat float32 array on a cache line's border: no load of lanes straddles two lines."""
-    room = np.empty(count + WIDTH, np.float32)
-    skip = (-(room.ctypes.data // 4)) % WIDTH
-    return room[skip : skip + count]
+    scratch = np.empty(count + WIDTH, np.float32)
+    skip = (-(scratch.ctypes.data // 4)) % WIDTH
+    return scratch[skip : skip + count]

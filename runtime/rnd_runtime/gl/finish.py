@@ -1,4 +1,4 @@
-"""What is done to a blended picture on an OpenGL device before it comes back: outlines, tone mapping, packing.
+"""What is done to a blended image on an OpenGL device before it comes back: outlines, tone mapping, packing.
 
 The device writes arrays as the CPU wants them: red, green and blue of pixel after pixel, without gaps, so that nothing
 has to be moved once it has arrived.
@@ -31,11 +31,11 @@ class Finished(NamedTuple):
 
 
 class GlFinish:
-    """Finishes pictures of three channels; the context must be current whenever it is used.
+    """Finishes images of three channels; the context must be current whenever it is used.
 
     Args:
         context: where.
-        tone: make 8-bit pictures too, to the bit those of ``raster.tone.tone_map``; by default where a
+        tone: make 8-bit images too, to the bit those of ``raster.tone.tone_map``; by default where a
             graphics card does it, as the CPU is faster at it than OpenGL that runs there.
     """
 

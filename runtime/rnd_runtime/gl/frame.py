@@ -1,7 +1,6 @@
 """Frames on an OpenGL device: posed, projected, shaded, splatted and tone mapped there.
 
-What the networks say goes up and the picture comes back. In between nothing crosses where the device can sort (see
-``projection_gl``).
+The networks' outputs go up and the image comes back; where the device can sort, nothing else crosses.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians, Raster
-from rnd_runtime.posing.posing import Unposed
+from rnd_runtime.posing.rest import Unposed
 from rnd_runtime.shading.shader import Shader
 
 from .finish import GlFinish
@@ -31,7 +30,7 @@ class GlRenderer:
     """Draws an avatar under a light; keeps programs, tables and textures between calls.
 
     Args:
-        rasterizer: whose context and targets are drawn with; to be closed after this.
+        rasterizer: whose context and targets are rendered with; to be closed after this.
         sorting: see ``gl.projection.GlProjection``.
     """
 
@@ -40,7 +39,7 @@ class GlRenderer:
         self._passes: _Passes | None = None
 
     def draw(self, body: Gaussians | Unposed, shader: Shader, camera: Camera, *, cull: float | None = None) -> Raster:
-        """The picture's linear radiance [H, W, 3], outlines sharpened, without depth.
+        """The image's linear radiance [H, W, 3], outlines sharpened, without depth.
 
         Only Gaussians that reach it are shaded.
 
@@ -61,9 +60,9 @@ class GlRenderer:
                 self._passes = _Passes(context, self._sorting)
             seconds = self._draw(context, self._passes, body, shader, camera, cull)
             started = perf_counter()
-            picture = self._passes.finish.read(camera)
+            result = self._passes.finish.read(camera)
             seconds["read-back"] = perf_counter() - started
-        return Raster(picture.image, picture.alpha, np.zeros_like(picture.alpha), seconds, picture.srgb)
+        return Raster(result.image, result.alpha, np.zeros_like(result.alpha), seconds, result.srgb)
 
     def close(self) -> None:
         """Release everything but the rasteriser."""

@@ -14,6 +14,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from .constants import shared_constants
 from .context import GL_VERSION
 
 ROW_GAUSSIANS = 1024  # Gaussians in a row of a texture
@@ -57,11 +58,11 @@ class GaussianTexture:
     def write(self, values: NDArray[Any]) -> moderngl.Texture:
         """Upload ``values`` [N, texels · components], contiguous and of the texture's type."""
         texture = self.reserve(len(values))
-        whole, rest = divmod(len(values), self._row)
-        if whole:
-            texture.write(values[: whole * self._row], viewport=(0, 0, self._row * self._texels, whole))
+        full_rows, rest = divmod(len(values), self._row)
+        if full_rows:
+            texture.write(values[: full_rows * self._row], viewport=(0, 0, self._row * self._texels, full_rows))
         if rest:
-            texture.write(values[whole * self._row :], viewport=(0, whole, rest * self._texels, 1))
+            texture.write(values[full_rows * self._row :], viewport=(0, full_rows, rest * self._texels, 1))
         return texture
 
     def release(self) -> None:
@@ -170,8 +171,9 @@ class Pass:
 
 
 def shader_head(macros: Mapping[str, object], *, version: int = GL_VERSION) -> str:
-    """GLSL's version and the macros that the shaders ask for."""
-    return f"#version {version} core\n" + "".join(f"#define {name} {value}\n" for name, value in macros.items())
+    """GLSL's version, the constants shared with Python, and ``macros``."""
+    defined = {**shared_constants(), **macros}
+    return f"#version {version} core\n" + "".join(f"#define {name} {value}\n" for name, value in defined.items())
 
 
 def shader_source(names: tuple[str, ...]) -> str:

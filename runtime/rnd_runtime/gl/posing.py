@@ -1,4 +1,4 @@
-"""Posing by OpenGL: ``posing.py``'s formulas in a fragment for each Gaussian.
+"""Posing by OpenGL: ``posing.skinning``'s formulas in a fragment for each Gaussian.
 
 Only what the networks say at the nodes and the bones go up for a frame; what does not depend on the pose lies on the
 device since the first one.
@@ -12,15 +12,15 @@ import numpy as np
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Floats32
 from rnd_runtime.core.simd import WIDTH
-from rnd_runtime.posing.posing import NEVER, TWIST_STEPS, RestPose, Unposed
-from rnd_runtime.shading.shader import CASTING_OPACITY, DISC_SIGMAS
+from rnd_runtime.posing.rest import RestPose, Unposed
+from rnd_runtime.posing.skinning import NEVER
 
 from .passes import ROW_WIDE, GaussianTargets, GaussianTexture, Pass
 from .surfaces import Surfaces
 
 _REST_TEXELS = 6  # points 3, factors 9, normals 3, limbs 7, opacity, floor of the template
-_HARMONIC_TEXELS = 4
-_FIELD_TEXELS = 12  # of a node before its joints': four for the floor's blend, four for offsets, four for harmonics
+_SH_TEXELS = 4
+_FIELD_TEXELS = 12  # of a node before its joints': four for the floor's blend, four each for offsets and SH
 
 
 class GlPosing:
@@ -30,7 +30,7 @@ class GlPosing:
         self._context = context
         self._avatar: _OnDevice | None = None
         self._posed = GaussianTargets(context, (4, 4, 4, 2))
-        self._harmonics = GaussianTargets(context, (4,), texels=_HARMONIC_TEXELS)
+        self._visibility = GaussianTargets(context, (4,), texels=_SH_TEXELS)
 
     def pose(self, unposed: Unposed) -> Surfaces:
         """All Gaussians of ``unposed``, posed."""
@@ -44,7 +44,7 @@ class GlPosing:
         self._context.enable_only(moderngl.NOTHING)
         (points, normals, covariances, covariances_z), _ = self._posed.reserve(count)
         avatar.pose.fill()
-        (visibility,), _ = self._harmonics.reserve(count)
+        (visibility,), _ = self._visibility.reserve(count)
         avatar.interpolate.fill()
         return Surfaces(points, normals, covariances, covariances_z, visibility, avatar.materials, gaussians=count)
 
@@ -53,7 +53,7 @@ class GlPosing:
             self._avatar.release()
             self._avatar = None
         self._posed.release()
-        self._harmonics.release()
+        self._visibility.release()
 
 
 class _OnDevice:
@@ -72,9 +72,6 @@ class _OnDevice:
             "BEFORE_JOINTS": _FIELD_TEXELS,
             "JOINT_QUADS": -(-len(unposed.bones) // 4),
             "FIELD_TEXELS": quads + _FIELD_TEXELS,
-            "TWIST_STEPS": TWIST_STEPS,
-            "CASTING_OPACITY": float(CASTING_OPACITY),
-            "DISC_SIGMAS": float(DISC_SIGMAS),
         }
         self.pose = Pass(context, ("fill.vert",), ("nodes.glsl", "pose.frag"), macros)
         self.interpolate = Pass(context, ("fill.vert",), ("nodes.glsl", "visibility.frag"), macros)
@@ -130,7 +127,7 @@ class _OnDevice:
 
 
 def _padded_template(rest: RestPose) -> Floats32:
-    """Log weights above the floor [N, C] with both up to whole numbers of sixteen."""
+    """Log weights above the floor [N, C] with both up to multiples of sixteen."""
     count, joints = rest.log_template.shape
     padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), NEVER, np.float32)
     padded[rest.template.gaussians, rest.template.joints] = rest.template.logs
@@ -138,9 +135,9 @@ def _padded_template(rest: RestPose) -> Floats32:
 
 
 def _check_limits(context: moderngl.Context, count: int, joints: int) -> None:
-    most = context.info["GL_MAX_TEXTURE_SIZE"]
-    most_joints = (most // ROW_WIDE - _FIELD_TEXELS) * 4 // WIDTH * WIDTH
-    if joints > most_joints:
-        raise InputError("joints", expected=f"at most {most_joints} with this OpenGL", got=joints)
-    if count > most * ROW_WIDE:
-        raise InputError("Gaussians", expected=f"at most {most * ROW_WIDE} with this OpenGL", got=count)
+    max_size = context.info["GL_MAX_TEXTURE_SIZE"]
+    max_joints = (max_size // ROW_WIDE - _FIELD_TEXELS) * 4 // WIDTH * WIDTH
+    if joints > max_joints:
+        raise InputError("joints", expected=f"at most {max_joints} with this OpenGL", got=joints)
+    if count > max_size * ROW_WIDE:
+        raise InputError("Gaussians", expected=f"at most {max_size * ROW_WIDE} with this OpenGL", got=count)

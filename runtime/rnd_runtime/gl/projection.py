@@ -1,9 +1,8 @@
 """Projection, culling and depth order of Gaussians that lie on an OpenGL device.
 
-A fragment for each Gaussian projects it, in float32. Their order is that of depths in float64 (in float32 neighbours
-change places): compute shaders sort them where they lie (``sort_gl``). Where there are none (OpenGL before 4.3, so all
-of macOS), and where OpenGL runs on the CPU anyway, the CPU's radix sort does it: 16 bytes of each Gaussian come back, 4
-go up again, and the device waits for them. Both give the same order.
+A fragment for each Gaussian projects it, in float32. Their order is that of depths in float64, by compute shaders
+(``gl.sort``). Without them (OpenGL before 4.3, so all of macOS), and where OpenGL runs on the CPU, the CPU's radix sort
+does it. Both give the same order.
 """
 
 from __future__ import annotations
@@ -16,9 +15,8 @@ from numba import njit
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.raster.oracle import DILATION, NEAR
 from rnd_runtime.raster.project import pinhole
-from rnd_runtime.raster.tiles import _front_to_back
+from rnd_runtime.raster.tiles import front_to_back
 
 from .context import is_software
 from .passes import GaussianTargets, GaussianTexture, Pass
@@ -34,13 +32,13 @@ class Projected(NamedTuple):
     """What splat.vert reads of N Gaussians."""
 
     order: moderngl.Texture  # of each rank, back to front; −1 where there is none
-    places: moderngl.Texture  # by Gaussian
+    positions: moderngl.Texture  # by Gaussian
     shapes: moderngl.Texture
-    ranks: int  # at least as many as are drawn
+    ranks: int  # at least as many as are rendered
 
     def textures(self) -> dict[str, moderngl.Texture]:
         """By the names of their samplers."""
-        return {"order": self.order, "places": self.places, "shapes": self.shapes}
+        return {"order": self.order, "places": self.positions, "shapes": self.shapes}
 
 
 class GlProjection:
@@ -60,14 +58,14 @@ class GlProjection:
             raise InputError("sorting", expected=" | ".join(get_args(Sorting)), got=repr(sorting))
         self._context = context
         self._targets = GaussianTargets(context, (4, 4, 4))
-        self._pass = Pass(context, ("fill.vert",), ("project.frag",), {"NEAR": NEAR, "DILATION": DILATION})
+        self._pass = Pass(context, ("fill.vert",), ("project.frag",))
         self._sort = _device_sort(context, sorting)
         self._order = GaussianTexture(context, 1, dtype="i4") if self._sort is None else None
 
     def project(self, surfaces: Surfaces, camera: Camera, cull: float | None) -> Projected:
         """All of ``surfaces`` that can be seen, but those whose n·v is below ``cull``."""
         count = surfaces.gaussians
-        (places, shapes, drawn), target = self._targets.reserve(count)
+        (positions, shapes, drawn), target = self._targets.reserve(count)
         view = pinhole(camera)
         self._pass.bind(
             surfaces.textures(),
@@ -83,12 +81,12 @@ class GlProjection:
         self._context.enable_only(moderngl.NOTHING)
         self._pass.fill()
         if self._sort is not None:
-            return Projected(self._sort.order(drawn, count, view.rotation[2]), places, shapes, count)
+            return Projected(self._sort.order(drawn, count, view.rotation[2]), positions, shapes, count)
         assert self._order is not None
         means = np.empty((*target.viewport[2:][::-1], 4), np.float32)
         target.read_into(means, viewport=target.viewport, components=4, attachment=2, dtype="f4")
         order = _back_to_front(means.reshape(-1, 4)[:count], view.rotation[2])
-        return Projected(self._order.write(order), places, shapes, len(order))
+        return Projected(self._order.write(order), positions, shapes, len(order))
 
     def release(self) -> None:
         for part in (self._targets, self._pass, self._sort, self._order):
@@ -117,5 +115,5 @@ def _back_to_front(drawn, forward):  # type: ignore[no-untyped-def]
     for i in range(count):
         depths[i] = forward[0] * drawn[i, 0] + forward[1] * drawn[i, 1] + forward[2] * drawn[i, 2]
         starts[i + 1] = starts[i] + (1 if drawn[i, 3] > 0 else 0)
-    order = _front_to_back(depths, starts)
+    order = front_to_back(depths, starts)
     return order[::-1].copy()

@@ -24,14 +24,14 @@ from rnd_runtime.core.arrays import checked
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Floats32, Raster
-from rnd_runtime.raster.project import Pinhole, _project_range, pinhole
-from rnd_runtime.raster.tiles import _front_to_back
+from rnd_runtime.raster.project import Pinhole, pinhole, project_range
+from rnd_runtime.raster.tiles import front_to_back
 
 from .context import Backend, create_context
 from .passes import ROW_GAUSSIANS, Pass, Targets
 
 LOG2_255 = float(np.log2(255.0))
-GEOMETRY_TEXELS = 2  # centre from the picture's middle, reach, peak; √fall_x, √fall_y, shear, –
+GEOMETRY_TEXELS = 2  # centre from the image's middle, reach, peak; √fall_x, √fall_y, shear, –
 PER_TARGET = 3  # attributes of a target; its fourth component is α
 FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
 
@@ -45,7 +45,7 @@ class GlRasterizer:
             ``close`` all the same.
 
     Raises:
-        InputError: no context; arrays of the wrong shape; a picture or a number of Gaussians above GL's limits.
+        InputError: no context; arrays of the wrong shape; an image or a number of Gaussians above GL's limits.
     """
 
     def __init__(self, backend: Backend = "auto", *, context: moderngl.Context | None = None) -> None:
@@ -77,7 +77,7 @@ class GlRasterizer:
         started = perf_counter()
         splats = sorted_ellipses(means, covariances, opacities, features, pinhole(camera))
         seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
-        pictures: list[Floats32] = []  # [H, W, ≤ 4] of every target
+        target_images: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
             total = channels + 1 if depth or channels == 0 else channels  # something must carry α
             for first in range(0, total, self._max_attributes):
@@ -86,10 +86,10 @@ class GlRasterizer:
                 self._draw(splats, first, attributes, camera)
                 self.context.finish()  # else the read-back would be charged with the drawing
                 drawn = perf_counter()
-                pictures += self.read(attributes, camera)
+                target_images += self.read(attributes, camera)
                 seconds["raster"] += drawn - started
                 seconds["read-back"] += perf_counter() - drawn
-        return _assembled(pictures, channels, depth, seconds)
+        return _assembled(target_images, channels, depth, seconds)
 
     def close(self) -> None:
         """Release everything, the context too."""
@@ -112,10 +112,10 @@ class GlRasterizer:
         self.close()
 
     def check_limits(self, count: int, camera: Camera) -> None:
-        """Raise an ``InputError`` where the picture or the number of Gaussians is above GL's limits."""
+        """Raise an ``InputError`` where the image or the number of Gaussians is above GL's limits."""
         size = f"{camera.width} x {camera.height}"
         if max(camera.width, camera.height) > self._max_size:
-            raise InputError("picture size", expected=f"at most {self._max_size} x {self._max_size}", got=size)
+            raise InputError("image size", expected=f"at most {self._max_size} x {self._max_size}", got=size)
         if count > self._max_size * ROW_GAUSSIANS:
             raise InputError("Gaussians", expected=f"at most {self._max_size * ROW_GAUSSIANS}", got=count)
 
@@ -156,16 +156,16 @@ class GlRasterizer:
         return texture
 
     def read(self, attributes: int, camera: Camera) -> list[Floats32]:
-        """What was drawn: a picture [H, W, ≤ 4] for each target; the first one's fourth channel is alpha."""
+        """What was drawn: an image [H, W, ≤ 4] for each target; the first one's fourth channel is alpha."""
         targets = self.targets_for(attributes, camera)
-        pictures = []
+        target_images = []
         for index, texture in enumerate(targets.textures):
-            picture = np.empty((camera.height, camera.width, texture.components), np.float32)
+            target_image = np.empty((camera.height, camera.width, texture.components), np.float32)
             targets.framebuffer.read_into(
-                picture, components=texture.components, attachment=index, dtype="f4", alignment=1
+                target_image, components=texture.components, attachment=index, dtype="f4", alignment=1
             )
-            pictures.append(picture)
-        return pictures
+            target_images.append(target_image)
+        return target_images
 
     def targets_for(self, attributes: int, camera: Camera) -> Targets:
         """Float32 targets for ``attributes`` at the camera's size; those of other sizes are released."""
@@ -228,10 +228,10 @@ def _project_and_sort(means, covariances, opacities, features, view):  # type: i
     starts[0] = 0
     outputs = (centers, shapes, boxes, attributes, depths, starts[1:])
     everything = np.empty(0, np.bool_)
-    _project_range(0, count, means, covariances, opacities, features, everything, view, outputs)
+    project_range(0, count, means, covariances, opacities, features, everything, view, outputs)
     for i in range(count):
         starts[i + 1] += starts[i]
-    return _front_to_back(depths, starts), centers, shapes, attributes
+    return front_to_back(depths, starts), centers, shapes, attributes
 
 
 def _records(splats: Ellipses, first: int, attributes: int, camera: Camera) -> Floats32:
@@ -258,24 +258,24 @@ def _fill_records(records, order, centers, shapes, values, middle, first, attrib
             records[k, 8 + c] = values[i, first + c]
 
 
-def _assembled(pictures: list[Floats32], channels: int, depth: bool, seconds: dict[str, float]) -> Raster:
+def _assembled(target_images: list[Floats32], channels: int, depth: bool, seconds: dict[str, float]) -> Raster:
     """Targets [H, W, ≤ 4] → the raster; what needs no copy is a view."""
     if channels <= PER_TARGET:
-        image = pictures[0][..., :channels]
+        image = target_images[0][..., :channels]
     else:
-        image = np.empty((*pictures[0].shape[:2], channels), np.float32)
-        for index, picture in enumerate(pictures):
-            _copy_channels(image, PER_TARGET * index, picture)
-    alpha = pictures[0][..., 3]
-    far = pictures[channels // PER_TARGET][..., channels % PER_TARGET] if depth else np.zeros_like(alpha)
+        image = np.empty((*target_images[0].shape[:2], channels), np.float32)
+        for index, target_image in enumerate(target_images):
+            _copy_channels(image, PER_TARGET * index, target_image)
+    alpha = target_images[0][..., 3]
+    far = target_images[channels // PER_TARGET][..., channels % PER_TARGET] if depth else np.zeros_like(alpha)
     return Raster(image, alpha, far, seconds)
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _copy_channels(image, first, picture):  # type: ignore[no-untyped-def]
+def _copy_channels(image, first, target_image):  # type: ignore[no-untyped-def]
     """Three times as fast as numpy, which calls memcpy for every pixel."""
-    count = min(PER_TARGET, picture.shape[2], image.shape[2] - first)
+    count = min(PER_TARGET, target_image.shape[2], image.shape[2] - first)
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
             for c in range(count):
-                image[y, x, first + c] = picture[y, x, c]
+                image[y, x, first + c] = target_image[y, x, c]

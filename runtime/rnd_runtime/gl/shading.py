@@ -1,9 +1,8 @@
-"""Shading by OpenGL: a fragment for each Gaussian that is drawn writes its radiance into a float32 texture.
+"""Shading on an OpenGL device: radiance of each Gaussian by one fragment.
 
-The formulas are the kernels' of ``shading_ambient``, ``shading_tables``, ``shading_sum`` and ``shading``, in GLSL. All
-is computed in the light probe's frame, to which each fragment turns the visibility's harmonics: the light's tables are
-uploaded once, and turning light or body costs a few uniforms. The suns' depth maps are drawn here too (``shadow_gl``).
-Nothing is read back.
+GLSL versions of ``shading.ambient``, ``shading.tables``, ``shading.sum`` and ``shading.direct``, evaluated in the light
+probe's frame: the light's tables are uploaded once, and turning light or body costs a few uniforms. Depth maps of
+directional lights are rendered here too (``gl.shadow``). Nothing is read back.
 """
 
 from __future__ import annotations
@@ -17,15 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.sh import SH_COUNT, sh_basis, sh_rotation
 from rnd_runtime.shading.ambient import AmbientLight
 from rnd_runtime.shading.lookup import DIFFUSE_SIZE, SPECULAR_SIZE
-from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader
-from rnd_runtime.shading.shadow import CLEARANCE, CLEARANCE_TEXELS, SLOPE_FLOOR, SOFTNESS, axes_towards
+from rnd_runtime.shading.shader import Shader
+from rnd_runtime.shading.shadow import axes_towards
 from rnd_runtime.shading.specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table
 from rnd_runtime.shading.sum import DistantLights
-from rnd_runtime.shading.sunlight import AT_SILHOUETTE, TURNED_AWAY
 from rnd_runtime.shading.tables import SkyTables
 
 from .passes import GaussianTargets, Pass
-from .shadow import SunMaps
+from .shadow import ShadowMaps
 from .surfaces import Surfaces
 
 Floats32 = NDArray[np.float32]
@@ -33,8 +31,8 @@ Floats32 = NDArray[np.float32]
 _ROW_LIGHTS = 128  # lights in a row of their texture: 8192 fit into 768 × 64 texels
 _LIGHT_TEXELS = 6
 _DIFFUSE_TEXELS = 12  # of a node: sixteen numbers of each colour
-# The blocks of 4 × 4 of a rotation of harmonics that are not all zero, as surface.glsl multiplies them.
-_TURN_BLOCKS = ((0, 0), (1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 2), (3, 3))
+# The blocks of 4 × 4 of a rotation of SH coefficients that are not all zero, as surface.glsl multiplies them.
+_ROTATION_BLOCKS = ((0, 0), (1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 2), (3, 3))
 
 
 class GlShading:
@@ -42,8 +40,8 @@ class GlShading:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._suns = SunMaps(context)
-        self._passes: dict[tuple[type, int], Pass] = {}  # by the kind of sky and the number of suns
+        self._shadows = ShadowMaps(context)
+        self._passes: dict[tuple[type, int], Pass] = {}  # by the kind of sky and the number of directional lights
         self._sky: tuple[Any, dict[str, moderngl.Texture], dict[str, Any]] | None = None
         self._lobes: moderngl.Texture | None = None
         self._radiance = GaussianTargets(context, (4,))
@@ -66,16 +64,16 @@ class GlShading:
         light_to_world = shader.light_to_world
         textures, uniforms = self._sky_of(shader.sky)
         textures = {**textures, **surfaces.textures(), "order": order}
-        if shader.suns:
-            suns = shader.sun_arrays()
-            axes = np.stack([axes_towards(direction) for direction in suns.directions])
-            maps = self._suns.draw(surfaces.points, surfaces.normals, surfaces.gaussians, axes)
+        if shader.directional:
+            lights = shader.directional_arrays()
+            axes = np.stack([axes_towards(direction) for direction in lights.directions])
+            maps = self._shadows.draw(surfaces.points, surfaces.normals, surfaces.gaussians, axes)
             textures |= {"depths": maps.depths, "bounds": maps.bounds}
             uniforms = uniforms | {
-                "sun_axes": maps.axes,
-                "sun_directions": np.array([sun.direction for sun in shader.suns]),
-                "sun_irradiances": suns.irradiance,
-                "sun_blurs": suns.spread_squared,
+                "light_axes": maps.axes,
+                "light_directions": np.array([light.direction for light in shader.directional]),
+                "light_irradiances": lights.irradiance,
+                "light_blurs": lights.spread_squared,
             }
         program = self._pass_of(shader)
         (radiance,), _ = self._radiance.reserve(ranks)
@@ -84,7 +82,7 @@ class GlShading:
             count=ranks,
             eye=np.asarray(eye, np.float32),
             world_to_light=light_to_world,  # by column it is the transpose
-            turn=_turn(sh_rotation(light_to_world.T @ np.asarray(root_rotation, np.float64))),
+            turn=_rotation_blocks(sh_rotation(light_to_world.T @ np.asarray(root_rotation, np.float64))),
             **uniforms,
         )
         self._context.enable_only(moderngl.NOTHING)
@@ -92,7 +90,7 @@ class GlShading:
         return radiance
 
     def release(self) -> None:
-        self._suns.release()
+        self._shadows.release()
         for program in self._passes.values():
             program.release()
         self._passes = {}
@@ -141,41 +139,30 @@ class GlShading:
         return texture
 
     def _pass_of(self, shader: Shader) -> Pass:
-        key = type(shader.sky), len(shader.suns)
+        key = type(shader.sky), len(shader.directional)
         if key not in self._passes:
             parts = {
                 AmbientLight: ("lobe.glsl", "sky_ambient.glsl"),
                 SkyTables: ("lobe.glsl", "sky_table.glsl"),
                 DistantLights: ("sky_lights.glsl",),
             }[key[0]]
-            macros: dict[str, float] = {
-                "LOBE_ROWS": ROUGHNESS_COUNT,
-                "LOBE_COLUMNS": COSINE_COUNT,
-                "DIFFUSE_SIZE": DIFFUSE_SIZE,
-                "SPECULAR_SIZE": SPECULAR_SIZE,
-                "LEVELS": len(LOBE_WIDTHS),
-                "ROW_LIGHTS": _ROW_LIGHTS,
-                "MAP_SIZE": SHADOW_RESOLUTION,
-            }
-            if shader.suns:
-                macros["SUNS"] = len(shader.suns)
-                macros |= {"TURNED_AWAY": float(TURNED_AWAY), "AT_SILHOUETTE": float(AT_SILHOUETTE)}
-                macros |= {"CLEARANCE": float(CLEARANCE), "CLEARANCE_TEXELS": float(CLEARANCE_TEXELS)}
-                macros |= {"SLOPE_FLOOR": float(SLOPE_FLOOR), "SOFTNESS": float(SOFTNESS)}
-                parts = (*parts, "shadow_map.glsl", "suns.glsl")
+            macros = {"ROW_LIGHTS": _ROW_LIGHTS}
+            if shader.directional:
+                macros["LIGHTS"] = len(shader.directional)
+                parts = (*parts, "shadow_map.glsl", "direct.glsl")
             fragment = ("sh.glsl", "ggx.glsl", "surface.glsl", *parts, "shade.frag")
             self._passes[key] = Pass(self._context, ("fill.vert",), fragment, macros)
         return self._passes[key]
 
 
-def _turn(rotation: NDArray[np.float64]) -> Floats32:
-    """The blocks [8, 4, 4] of a rotation [16, 16] of harmonics, by column."""
+def _rotation_blocks(rotation: NDArray[np.float64]) -> Floats32:
+    """The blocks [8, 4, 4] of a rotation [16, 16] of SH coefficients, by column."""
     blocks = rotation.reshape(4, 4, 4, 4).swapaxes(1, 2)  # row of blocks, column of blocks, row, column
-    return np.asarray(np.stack([blocks[at].T for at in _TURN_BLOCKS]), np.float32)
+    return np.asarray(np.stack([blocks[at].T for at in _ROTATION_BLOCKS]), np.float32)
 
 
 def _light_rows(lights: DistantLights) -> Floats32:
-    """[rows, _ROW_LIGHTS · 6, 4]: direction and flux.r; flux.g, flux.b; sixteen harmonics at the direction."""
+    """[rows, _ROW_LIGHTS · 6, 4]: direction and flux.r; flux.g, flux.b; sixteen SH coefficients at the direction."""
     rows = max(-(-len(lights.directions) // _ROW_LIGHTS), 1)
     packed = np.zeros((rows * _ROW_LIGHTS, _LIGHT_TEXELS, 4), np.float32)
     used = packed[: len(lights.directions)].reshape(-1, 4 * _LIGHT_TEXELS)

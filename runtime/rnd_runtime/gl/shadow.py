@@ -1,7 +1,7 @@
-"""Depth maps of suns drawn by OpenGL: ``shadow.py``'s discs and bounds, read by ``shaders/suns.glsl``.
+"""Depth maps of directional lights on an OpenGL device, as ``shading.shadow`` makes them; read by ``direct.glsl``.
 
 The maps keep the nearest depth by blending with the maximum, in float32 as the CPU's, and nothing is read back: the
-bounds that the maps are cut to are themselves found on the device, as points blended by maximum onto one texel a sun.
+bounds that the maps are cut to are themselves found on the device, as points blended by maximum onto one texel a light.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.shading.shader import SHADOW_RESOLUTION
-from rnd_runtime.shading.shadow import DROP, EDGE_ON, RIM_TEXELS, SLOPE_FLOOR
 
 from .passes import Pass
 
@@ -24,19 +23,19 @@ _FARTHEST = -1e30  # m; nothing
 
 
 class DepthMaps(NamedTuple):
-    """What the shading pass needs of S suns."""
+    """What the shading pass needs of S lights."""
 
-    depths: moderngl.Texture  # [S · SHADOW_RESOLUTION, SHADOW_RESOLUTION] m towards the sun
+    depths: moderngl.Texture  # [S · SHADOW_RESOLUTION, SHADOW_RESOLUTION] m towards the light
     bounds: moderngl.Texture  # [1, S, 4]
     axes: Floats32  # [S, 3, 3] world → map, transposed as uniforms are
 
 
-class SunMaps:
-    """Draws the depth maps of up to a few suns; the context must be current."""
+class ShadowMaps:
+    """Draws the depth maps of up to a few lights; the context must be current."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._made: dict[int, _Made] = {}  # by the number of suns
+        self._made: dict[int, _Made] = {}  # by the number of lights
 
     def draw(self, points: moderngl.Texture, normals: moderngl.Texture, count: int, axes: Floats32) -> DepthMaps:
         """Maps of all ``count`` Gaussians of two ``gl.passes.GaussianTexture``.
@@ -44,27 +43,27 @@ class SunMaps:
         Args:
             points: mean m, world, and the radius m of its disc; a Gaussian of radius 0 casts no shadow.
             normals: unit, world.
-            axes: [S, 3, 3] of ``shading.shadow.axes_towards`` each sun, world.
+            axes: [S, 3, 3] of ``shading.shadow.axes_towards`` each light, world.
         """
-        suns = len(axes)
-        if suns not in self._made:
-            self._made[suns] = _Made(self._context, suns)
-        made = self._made[suns]
-        turned = np.ascontiguousarray(axes.swapaxes(1, 2), np.float32)
+        lights = len(axes)
+        if lights not in self._made:
+            self._made[lights] = _Made(self._context, lights)
+        made = self._made[lights]
+        axes_by_column = np.ascontiguousarray(axes.swapaxes(1, 2), np.float32)
         self._context.enable_only(moderngl.BLEND)
         self._context.blend_func = moderngl.ONE, moderngl.ONE
         self._context.blend_equation = moderngl.MAX, moderngl.MAX
         textures = {"points": points, "normals": normals, "bounds": made.bounds}
         made.bounds_target.use()
         made.bounds_target.clear(_FARTHEST, _FARTHEST, _FARTHEST, _FARTHEST)
-        made.surround.bind(textures, sun_axes=turned, count=count)
-        made.surround.render(moderngl.POINTS, suns * -(-count // _BLOCK))
+        made.surround.bind(textures, light_axes=axes_by_column, count=count)
+        made.surround.render(moderngl.POINTS, lights * -(-count // _BLOCK))
         made.depths_target.use()
         made.depths_target.clear(_FARTHEST)
-        made.discs.bind(textures, sun_axes=turned, count=count)
-        made.discs.render(moderngl.TRIANGLES, 6 * suns * count)
+        made.discs.bind(textures, light_axes=axes_by_column, count=count)
+        made.discs.render(moderngl.TRIANGLES, 6 * lights * count)
         self._context.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
-        return DepthMaps(made.depths, made.bounds, turned)
+        return DepthMaps(made.depths, made.bounds, axes_by_column)
 
     def release(self) -> None:
         for made in self._made.values():
@@ -73,22 +72,14 @@ class SunMaps:
 
 
 class _Made:
-    """Programs and targets for a number of suns."""
+    """Programs and targets for a number of lights."""
 
-    def __init__(self, context: moderngl.Context, suns: int) -> None:
-        macros = {
-            "SUNS": suns,
-            "MAP_SIZE": SHADOW_RESOLUTION,
-            "BLOCK": _BLOCK,
-            "SLOPE_FLOOR": float(SLOPE_FLOOR),
-            "DROP": float(DROP),
-            "EDGE_ON": float(EDGE_ON),
-            "RIM_TEXELS": float(RIM_TEXELS),
-        }
-        self.surround = Pass(context, ("sun_bounds.vert",), ("sun_bounds.frag",), macros)
-        self.discs = Pass(context, ("shadow_map.glsl", "sun_discs.vert"), ("sun_discs.frag",), macros)
-        size = (SHADOW_RESOLUTION, suns * SHADOW_RESOLUTION)
-        self.bounds = context.texture((suns, 1), 4, dtype="f4")
+    def __init__(self, context: moderngl.Context, lights: int) -> None:
+        macros = {"LIGHTS": lights, "BLOCK": _BLOCK}
+        self.surround = Pass(context, ("shadow_bounds.vert",), ("shadow_bounds.frag",), macros)
+        self.discs = Pass(context, ("shadow_map.glsl", "shadow_discs.vert"), ("shadow_discs.frag",), macros)
+        size = (SHADOW_RESOLUTION, lights * SHADOW_RESOLUTION)
+        self.bounds = context.texture((lights, 1), 4, dtype="f4")
         self.depths = context.texture(size, 1, dtype="f4")
         self.bounds_target = context.framebuffer([self.bounds])
         self.depths_target = context.framebuffer([self.depths])

@@ -1,7 +1,7 @@
 """Depth order of Gaussians by compute shaders: nothing of them leaves the device.
 
-A stable radix sort (least digit first, eight bits at a time) of the very keys of ``_raster_tiles``, made of float64
-depths: the order is the CPU's, so the pictures are. Blocks of keys count their digits, one group turns counts into
+A stable radix sort (least digit first, eight bits at a time) of the very keys of ``raster.tiles``, made of float64
+depths: the order is the CPU's, so the images are. Blocks of keys count their digits, one group turns counts into
 places, blocks scatter: Satish, Harris and Garland, "Designing efficient sorting algorithms for manycore GPUs" (2009).
 """
 
@@ -50,14 +50,14 @@ class DepthSort:
         }
         self._order = GaussianTexture(context, 1, dtype="i4")
         self._extremes = context.buffer(reserve=16)
-        self._room = 0  # blocks that the buffers below hold
+        self._capacity = 0  # blocks that the buffers below hold
         self._buffers: dict[int, moderngl.Buffer] = {}
 
     def order(self, drawn: moderngl.Texture, count: int, forward: NDArray[np.float64]) -> moderngl.Texture:
         """Of each of ``count`` ranks the Gaussian, back to front; then −1 for each that is not drawn.
 
         Args:
-            drawn: a texel for each Gaussian: mean m, and a positive number where it is drawn.
+            drawn: a texel for each Gaussian: mean m, and a positive number where it is rendered.
             forward: [3] the direction along which depth is measured, in the means' frame.
         """
         blocks = -(-count // _BLOCK)
@@ -89,14 +89,14 @@ class DepthSort:
         self._order.release()
 
     def _reserve(self, blocks: int) -> None:
-        if blocks <= self._room:
+        if blocks <= self._capacity:
             return
         for buffer in self._buffers.values():
             buffer.release()
         sizes = dict.fromkeys((_KEYS, _GAUSSIANS, _NEW_KEYS, _NEW_GAUSSIANS), 4 * _BLOCK * blocks)
         sizes[_COUNTS] = 4 * 256 * blocks
         self._buffers = {name: self._context.buffer(reserve=size) for name, size in sizes.items()}
-        self._room = blocks
+        self._capacity = blocks
 
     def _bind(self, *names: int) -> None:
         """Bind buffers, the first to the first binding of a pass, and so on."""

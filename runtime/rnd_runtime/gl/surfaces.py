@@ -26,7 +26,7 @@ class Surfaces(NamedTuple):
     normals: moderngl.Texture  # unit; opacity
     covariances: moderngl.Texture  # xx, xy, xz, yy m²
     covariances_z: moderngl.Texture  # yz, zz
-    visibility: moderngl.Texture  # four texels: harmonics in the root's frame
+    visibility: moderngl.Texture  # four texels: SH coefficients in the root's frame
     materials: moderngl.Texture  # albedo, roughness
     gaussians: int  # N
 
@@ -40,7 +40,7 @@ class SurfaceUpload:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._four = [GaussianTexture(context, 4) for _ in range(4)]
-        self._two, self._harmonics = GaussianTexture(context, 2), GaussianTexture(context, 4, texels=4)
+        self._two, self._visibility = GaussianTexture(context, 2), GaussianTexture(context, 4, texels=4)
 
     def write(self, gaussians: Gaussians) -> Surfaces:
         """Raises ``InputError`` where an array has the wrong shape."""
@@ -63,11 +63,11 @@ class SurfaceUpload:
             outward,
             first,
             self._two.write(np.ascontiguousarray(covariances[:, 4:])),
-            self._harmonics.write(floats(gaussians.visibility)),
+            self._visibility.write(floats(gaussians.visibility)),
             materials,
             count,
         )
 
     def release(self) -> None:
-        for texture in (*self._four, self._two, self._harmonics):
+        for texture in (*self._four, self._two, self._visibility):
             texture.release()

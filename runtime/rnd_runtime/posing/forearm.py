@@ -1,9 +1,7 @@
 """How a forearm shares a twist between its two ends before it is skinned, as skin and the two bones beneath it do.
 
-Blend skinning turns a limb within the few centimetres in which two bones share the skin. A hand that is turned by 120°
-pinches the wrist ("candy wrapper"), and what is left of the limb there is a screw that no normal follows. Riggers hand
-part of such a twist on along the bone; we turn the forearm about its own axis, which moves neither elbow nor wrist and
-leaves the hand as it was::
+A hand that is rotated by 120° pinches the wrist ("candy wrapper") where two bones share the skin. The forearm is
+therefore rotated about its own axis, which moves neither elbow nor wrist and leaves the hand as it was::
 
     τ = atan2(a · u, tr R − uᵀRu)              twist of R about u, a = (R₃₂ − R₂₃, R₁₃ − R₃₁, R₂₁ − R₁₂)
     s = min(1, 2 (1 + uᵀRu))                   1 but where R bends by more than 120°, 0 at 180°, where τ is nobody's
@@ -11,7 +9,7 @@ leaves the hand as it was::
     δ = h(elbow) − h(wrist),   R_elbow ← R_elbow exp(−δ u),   R_wrist ← exp(δ u) R_wrist
 
 Up to 60° nothing changes, to the bit; a twist of 120° comes to 60° at each end. h falls back to 0 at 180°, where τ
-jumps to −180°: a forearm that untwists in one picture would be worse than one that is pinched where no arm can turn.
+jumps to −180°.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ Floats = NDArray[np.float64]
 
 FREE = np.pi / 3
 """radians that an end is twisted by before it hands anything on; dancers' forearms in AIST++ keep to a fifth of it"""
-MOST = np.pi / 3
+MAX_SHARE = np.pi / 3
 """radians that an end hands on at most, of a twist of (π + FREE)/2"""
 
 
@@ -45,20 +43,20 @@ def share_twists(skeleton: Skeleton, rotations: ArrayLike) -> Floats:
     The same array where no forearm is twisted by more than FREE, or the skeleton has none by SMPL's names.
     """
     rotations = shared = np.asarray(rotations, np.float64)
-    for elbow, wrist, axis, turns in twist_turns(skeleton, rotations):
+    for elbow, wrist, axis, angles in twist_angles(skeleton, rotations):
         if shared is rotations:
             shared = np.array(rotations, order="C")
-        _turn_all(shared.reshape(-1, *shared.shape[-3:]), elbow, wrist, axis, turns.reshape(-1))
+        _rotate_all(shared.reshape(-1, *shared.shape[-3:]), elbow, wrist, axis, angles.reshape(-1))
     return shared
 
 
-def twist_turns(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, int, Floats, Floats]]:
+def twist_angles(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, int, Floats, Floats]]:
     """Of each forearm that shares a twist its elbow, its wrist, u [3] and δ [...] radians; rotations [..., J, 3, 3]."""
     for elbow, wrist, axis in forearms(skeleton):
-        turns = np.empty(rotations.shape[:-3])
-        _shares(rotations.reshape(-1, *rotations.shape[-3:]), elbow, wrist, axis, turns.reshape(-1))
-        if turns.any():
-            yield elbow, wrist, axis, turns
+        angles = np.empty(rotations.shape[:-3])
+        _shares(rotations.reshape(-1, *rotations.shape[-3:]), elbow, wrist, axis, angles.reshape(-1))
+        if angles.any():
+            yield elbow, wrist, axis, angles
 
 
 @lru_cache(maxsize=16)
@@ -93,15 +91,15 @@ def _handed_on(rotation, axis):  # type: ignore[no-untyped-def]
     beyond = (abs(twist) - FREE) / (np.pi - FREE)
     if beyond <= 0:
         return 0.0
-    share = MOST * np.sin(np.pi * beyond) ** 2 * max(min(1.0, 2 * (1 + along)), 0.0)
+    share = MAX_SHARE * np.sin(np.pi * beyond) ** 2 * max(min(1.0, 2 * (1 + along)), 0.0)
     return share if twist > 0 else -share
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _shares(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-def]
-    """Fill ``turns`` [B] with δ of ``rotations`` [B, J, 3, 3]."""
+def _shares(rotations, elbow, wrist, axis, angles):  # type: ignore[no-untyped-def]
+    """Fill ``angles`` [B] with δ of ``rotations`` [B, J, 3, 3]."""
     for pose in range(len(rotations)):
-        turns[pose] = share(rotations[pose], elbow, wrist, axis)
+        angles[pose] = share(rotations[pose], elbow, wrist, axis)
 
 
 @njit(error_model="numpy")
@@ -111,15 +109,15 @@ def share(rotations, elbow, wrist, axis):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _turn_all(rotations, elbow, wrist, axis, turns):  # type: ignore[no-untyped-def]
+def _rotate_all(rotations, elbow, wrist, axis, angles):  # type: ignore[no-untyped-def]
     for pose in range(len(rotations)):
-        hand_on(rotations[pose], elbow, wrist, axis, turns[pose])
+        hand_on(rotations[pose], elbow, wrist, axis, angles[pose])
 
 
 @njit(error_model="numpy")
-def hand_on(rotations, elbow, wrist, axis, turn):  # type: ignore[no-untyped-def]
+def hand_on(rotations, elbow, wrist, axis, angle):  # type: ignore[no-untyped-def]
     """Turn the forearm of one pose [J, 3, 3] by δ, and the hand back."""
-    back = -turn * axis[0], -turn * axis[1], -turn * axis[2]
+    back = -angle * axis[0], -angle * axis[1], -angle * axis[2]
     before, after = rotations[elbow].copy(), np.empty((3, 3))
     turned(before, back, rotations[elbow])
     for row in range(3):

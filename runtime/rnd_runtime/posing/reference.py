@@ -1,4 +1,4 @@
-"""Posing as it is defined, in plain float64: what the compiled pass of ``posing`` is measured against."""
+"""Posing as it is defined, in plain float64: what the compiled pass of ``skinning`` is measured against."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.sh import SH_COUNT
 
-from .posing import SMALLEST_SQUARE, TWIST_STEPS, RestPose
+from .rest import RestPose
+from .skinning import SMALLEST_SQUARE, TWIST_STEPS
 
 Floats = NDArray[np.float64]
 
@@ -31,11 +32,11 @@ def pose_reference(
     axes, levers = limbs[:, :3], limbs[:, 3:6]
     length = np.linalg.norm((linear @ axes[..., None])[..., 0], axis=1)
     area = np.linalg.norm((cofactors @ axes[..., None])[..., 0], axis=1)
-    kept = np.minimum(area / np.maximum(length**2, SMALLEST_SQUARE), 1)
-    factor = np.ones(len(kept))
+    twist_left = np.minimum(area / np.maximum(length**2, SMALLEST_SQUARE), 1)
+    factor = np.ones(len(twist_left))
     for _ in range(TWIST_STEPS):
-        step = 0.5 * (3 - kept)
-        factor, kept = factor * step, kept * step**2
+        step = 0.5 * (3 - twist_left)
+        factor, twist_left = factor * step, twist_left * step**2
     kappa = (limbs[:, 6] * (factor - 1))[:, None]
     points = rest.points + rest.max_offset * moved[:, :3] + kappa * levers
     means = (linear @ points[..., None])[..., 0] + blend[:, :, 3]
@@ -56,6 +57,6 @@ def pose_reference(
     normals = normals + kappa * axes * (axes * normals).sum(1, keepdims=True)
     normals = (mixed @ normals[..., None])[..., 0]
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    harmonics = np.zeros((len(points), SH_COUNT))
-    harmonics[:, : visibility.shape[1]] = (visibility[rest.neighbours] * weights).sum(1)
-    return means, full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], normals, harmonics
+    visibility_posed = np.zeros((len(points), SH_COUNT))
+    visibility_posed[:, : visibility.shape[1]] = (visibility[rest.neighbours] * weights).sum(1)
+    return means, full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], normals, visibility_posed

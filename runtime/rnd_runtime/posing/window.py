@@ -50,8 +50,8 @@ def moment(motion: Motion, time_s: float, skeleton: Skeleton, *, poses: int, sec
 
 def motion_window(motion: Motion, time_s: float, *, poses: int, seconds: float) -> tuple[Floats32, Floats32]:
     """``window`` and ``velocity`` of the ``moment``."""
-    (rotations, _, place), spacing = _recent(motion, time_s, poses, seconds)
-    window, velocity = _window(interpolate_rotations(rotations, place), spacing, poses)
+    (rotations, _, position), spacing = _recent(motion, time_s, poses, seconds)
+    window, velocity = _window(interpolate_rotations(rotations, position), spacing, poses)
     return window, velocity
 
 
@@ -83,8 +83,8 @@ def _tree(skeleton: Skeleton) -> _Tree:
 @njit(nogil=True, cache=True, error_model="numpy")
 def _moment(path, spacing, poses, tree):  # type: ignore[no-untyped-def]
     """In numba: forty small steps of numpy's take 0.4 ms of a frame."""
-    rotations, translations, place = path
-    recent, moved = interpolate_rotations(rotations, place), interpolate_points(translations, place)
+    rotations, translations, position = path
+    recent, moved = interpolate_rotations(rotations, position), interpolate_points(translations, position)
     window, velocity = _window(recent, spacing, poses)
     root = np.zeros((4, 4))
     bones = _bones(recent[-1], moved[-1], tree, root)
@@ -110,18 +110,18 @@ def _window(recent, spacing, poses):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")
 def _bones(rotations, translation, tree, root):  # type: ignore[no-untyped-def]
     """Bones of a pose [J, 3, 3], which is changed, and its translation [3]; fills ``root``."""
-    place = tree.rest_joints[0]
+    position = tree.rest_joints[0]
     root[3, 3] = 1.0
     for row in range(3):
-        root[row, 3] = place[row] + translation[row]
+        root[row, 3] = position[row] + translation[row]
         for k in range(3):
             root[row, k] = rotations[0, row, k]
-            root[row, 3] -= rotations[0, row, k] * place[k]
+            root[row, 3] -= rotations[0, row, k] * position[k]
             rotations[0, row, k] = 1.0 if row == k else 0.0
     for arm in range(len(tree.ends)):
         elbow, wrist, axis = tree.ends[arm, 0], tree.ends[arm, 1], tree.axes[arm]
-        turn = share(rotations, elbow, wrist, axis)
-        if turn != 0.0:
-            hand_on(rotations, elbow, wrist, axis, turn)
+        angle = share(rotations, elbow, wrist, axis)
+        if angle != 0.0:
+            hand_on(rotations, elbow, wrist, axis, angle)
     posed = chain(np.expand_dims(rotations, 0), np.zeros((1, 3)), tree.parents, tree.rest_joints)
     return bones_of(posed, tree.rest_joints)[0]

@@ -25,12 +25,12 @@ from rnd_runtime.core.simd import (
     lowest_bit,
     magnitude,
     prefetch,
+    reduce_add,
     select,
     store,
-    total,
 )
 
-from .outline import steepening
+from .outline import sharpening
 from .project import TILE
 
 BLOCK = 4
@@ -41,7 +41,7 @@ ALL_BLOCKS = (1 << (BLOCKS * BLOCKS)) - 1
 LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
 LOG2_ALPHA_NEARLY_MIN = LOG2_ALPHA_MIN - np.float32(1e-3)  # no block is lost to rounding
 LOG2_ALPHA_MAX = np.float32(math.log2(0.99))
-TRANSMITTANCE_MIN = np.float32(0.9999e-4)  # see raster_oracle
+TRANSMITTANCE_MIN = np.float32(0.9999e-4)  # see raster.oracle
 LN2 = np.float32(math.log(2.0))
 ZERO = np.float32(0)
 ONE = np.float32(1)
@@ -61,7 +61,7 @@ def _centers(block):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _start_tile(tile_x, tile_y, width, height, transmittance):  # type: ignore[no-untyped-def]
-    """Transmittance 1 inside the picture, 0 (as if saturated) outside."""
+    """Transmittance 1 inside the image, 0 (as if saturated) outside."""
     for block in range(BLOCKS * BLOCKS):
         x, y = _centers(block)
         inside = (x < np.float32(width - tile_x)) & (y < np.float32(height - tile_y))
@@ -205,7 +205,7 @@ def _fullest_first(starts):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
 def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-def]
-    """Pictures [H, W, K] of the attributes and [H, W] of alpha; with ``outlines`` as ``.outline`` sharpens them."""
+    """Images [H, W, K] of the attributes and [H, W] of alpha; with ``outlines`` as ``.outline`` sharpens them."""
     channels = splats.attributes.shape[1]
     columns = channels // 4 * 4 + 4  # and alpha, up to whole fours
     image, coverage = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
@@ -238,7 +238,7 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
                     block, lane = y // BLOCK * BLOCKS + x // BLOCK, y % BLOCK * BLOCK + x % BLOCK
                     at = block * columns * WIDTH + lane
                     covered = sums[at + channels * WIDTH]
-                    factor = steepening(covered) if outlines else ONE
+                    factor = sharpening(covered) if outlines else ONE
                     for c in range(channels):
                         image[tile_y + y, tile_x + x, c] = sums[at + c * WIDTH] * factor
                     coverage[tile_y + y, tile_x + x] = covered * factor
@@ -252,7 +252,7 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
 
     ``wanted`` holds, for each block, the incoming gradients of K attributes, then of alpha.
     """
-    transmittance, behind, wanted, gathered = buffers
+    transmittance, remaining, wanted, gathered = buffers
     centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
     pair_gaussians, pair_slots = splats.pair_gaussians, splats.pair_slots
     channels = attributes.shape[1]
@@ -295,8 +295,8 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
                 value += gradient * attributes[g, c]
                 store(gathered, c * WIDTH, load(gathered, c * WIDTH) + weight * gradient)
                 at += WIDTH
-            rest = load(behind, block * WIDTH) - weight * value
-            store(behind, block * WIDTH, rest)
+            rest = load(remaining, block * WIDTH) - weight * value
+            store(remaining, block * WIDTH, rest)
             # ∂L/∂log2 α = ln2·(w·value − rest·α/(1 − α)): all that lies behind shrinks by 1 − α
             gradient = LN2 * (weight * value - rest * (alpha / (ONE - alpha)))
             gradient = select(hit & unfinished & (power < LOG2_ALPHA_MAX), gradient, ZERO)
@@ -307,10 +307,10 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
             sy += gy
             syy += gy * dy
             sdy += gd * dy
-        slots[slot, 0], slots[slot, 1], slots[slot, 2] = total(s), total(sd), total(sdd)
-        slots[slot, 3], slots[slot, 4], slots[slot, 5] = total(sy), total(syy), total(sdy)
+        slots[slot, 0], slots[slot, 1], slots[slot, 2] = reduce_add(s), reduce_add(sd), reduce_add(sdd)
+        slots[slot, 3], slots[slot, 4], slots[slot, 5] = reduce_add(sy), reduce_add(syy), reduce_add(sdy)
         for c in range(channels):
-            slots[slot, MOMENTS + c] = total(load(gathered, c * WIDTH))
+            slots[slot, MOMENTS + c] = reduce_add(load(gathered, c * WIDTH))
 
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
@@ -327,9 +327,9 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
     tiles = _fullest_first(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
-        transmittance, behind = aligned_floats(PIXELS), aligned_floats(PIXELS)
+        transmittance, remaining = aligned_floats(PIXELS), aligned_floats(PIXELS)
         wanted, gathered = aligned_floats((channels + 1) * PIXELS), aligned_floats(channels * WIDTH)
-        buffers = (transmittance, behind, wanted, gathered)
+        buffers = (transmittance, remaining, wanted, gathered)
         while True:
             n = fetch_add(counter)
             if n >= tiles.size or starts[tiles[n]] == starts[tiles[n] + 1]:
@@ -338,7 +338,7 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
             tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
             _start_tile(tile_x, tile_y, width, height, transmittance)
             wanted[:] = ZERO
-            behind[:] = ZERO
+            remaining[:] = ZERO
             for y in range(min(TILE, height - tile_y)):
                 for x in range(min(TILE, width - tile_x)):
                     block, lane = y // BLOCK * BLOCKS + x // BLOCK, y % BLOCK * BLOCK + x % BLOCK
@@ -349,6 +349,6 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
                         wanted[at + c * WIDTH] = grad_image[row, column, c]
                         value += grad_image[row, column, c] * image[row, column, c]
                     wanted[at + channels * WIDTH] = grad_coverage[row, column]
-                    behind[block * WIDTH + lane] = value
+                    remaining[block * WIDTH + lane] = value
             _blend_tile_backward(tile_x, tile_y, starts[tile], starts[tile + 1], splats, buffers, slots)
     return slots

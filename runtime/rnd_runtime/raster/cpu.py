@@ -60,7 +60,7 @@ def rasterize(
         opacities: [N].
         features: [N, C], any C.
         camera: the view.
-        depth: False leaves the depth picture all zero and saves its time.
+        depth: False leaves the depth image all zero and saves its time.
         outlines: they are sharp, see ``.outline``.
         seen: [N] the Gaussians to be drawn, as ``raster.in_view.in_view`` tells them; by default all.
 
@@ -83,7 +83,7 @@ def forward(
 ) -> tuple[Raster, State]:
     """``rasterize`` that also returns what ``backward`` needs.
 
-    Without ``depth`` the depth picture is all zero and costs nothing.
+    Without ``depth`` the depth image is all zero and costs nothing.
     """
     arrays = checked(means, covariances, opacities, features)
     view = pinhole(camera)
@@ -99,7 +99,7 @@ def _splat(
     differentiable: bool,
     outlines: bool,
 ) -> tuple[Raster, Splats, Floats32]:
-    """The pictures, what ``backward`` needs of their making, and features and depth in one picture [H, W, K]."""
+    """The images, what ``backward`` needs of their making, and features and depth in one image [H, W, K]."""
     started = perf_counter()
     threads, channels = get_num_threads(), arrays[3].shape[1]
     centers, shapes, boxes, attributes, depths, slot_starts = project(*arrays, seen, view, depth)
@@ -121,13 +121,13 @@ def backward(
 
     Args:
         state: of ``forward``.
-        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's pictures, [H, W, C], [H, W] and [H, W]; the
+        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's images, [H, W, C], [H, W] and [H, W]; the
             last is ignored where the forward pass was run without depth.
 
     Zero where α is clamped at 0.99 and for what was not drawn.
     """
     wanted, wanted_alpha = floats(grad_image), floats(grad_alpha)
-    check_shape("gradient of the picture", wanted, (*state.coverage.shape, state.channels))
+    check_shape("gradient of the image", wanted, (*state.coverage.shape, state.channels))
     check_shape("gradient of alpha", wanted_alpha, state.coverage.shape)
     if state.image.shape[2] > state.channels:
         height, width = state.coverage.shape

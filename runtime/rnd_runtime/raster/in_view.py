@@ -1,4 +1,4 @@
-"""Which Gaussians a camera may see: what has to be shaded before anything is drawn (numba)."""
+"""Which Gaussians a camera may see: what has to be shaded before anything is rendered (numba)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.arrays import check_shape, floats
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.simd import WIDTH, load, load_points, root, store_mask
+from rnd_runtime.core.simd import WIDTH, load, load_points, sqrt, store_mask
 
 from .oracle import ALPHA_MIN, DILATION, NEAR
 from .project import Pinhole, pinhole
 
 # Of α = 1/255 at opacity 1, in standard deviations, and a hundredth for a camera's rotation that is one to 1e-4 only
 REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
-LEAST_OPACITY = np.float32(ALPHA_MIN)
+MIN_OPACITY = np.float32(ALPHA_MIN)
 ZERO = np.float32(0)
 EVERYTHING = np.float32(-1)  # no cosine is below it
 CHUNK = 128 * WIDTH  # Gaussians looked at by a thread at a time
@@ -33,15 +33,14 @@ def in_view(
     normals: ArrayLike | None = None,
     cull: float | None = None,
 ) -> NDArray[np.bool_]:
-    """[N] all that reach the picture of ``raster.cpu.rasterize``, and few others.
+    """[N] all that reach the image of ``raster.cpu.rasterize``, and few others.
 
     Cheaper than projecting them, since a Gaussian counts as the ball that holds it: one whose σ is √‖Σ‖, Frobenius'
     norm, which no direction exceeds. Arguments as of ``rasterize``.
 
     With ``cull`` those are left out that face away, where the cosine n·v of ``normals`` [N, 3] (unit) and the direction
-    to the camera is below it: they lie behind what faces the camera, if the body is closed and opaque. A little below 0
-    the silhouette's own Gaussians are kept, which are seen from their edge. No trained avatar is quite that; what it
-    costs one of 30 000 stands in docs/performance.md (``rnd-bench frame --cull``).
+    to the camera is below it: a closed, opaque body hides them. A little below 0 the silhouette's Gaussians stay. What
+    it costs: docs/performance.md (``rnd-bench frame --cull``).
 
     Raises:
         InputError: an array has the wrong shape.
@@ -52,12 +51,12 @@ def in_view(
     check_shape("covariances", covariances, (count, 6))
     check_shape("opacities", opacities, (count,))
     if normals is None or cull is None:
-        facing, least = means, EVERYTHING
+        facing, min_cosine = means, EVERYTHING
     else:
-        facing, least = floats(normals), np.float32(cull)
+        facing, min_cosine = floats(normals), np.float32(cull)
     check_shape("normals", facing, (count, 3))
-    seen: NDArray[np.bool_] = look(
-        means, covariances, opacities, facing, floats(camera.position), least, pinhole(camera)
+    seen: NDArray[np.bool_] = find_in_view(
+        means, covariances, opacities, facing, floats(camera.position), min_cosine, pinhole(camera)
     )
     return seen
 
@@ -75,7 +74,7 @@ def opacities_of(gaussians: Gaussians, seen: NDArray[np.bool_]) -> NDArray[np.fl
 
 @njit(inline="always")
 def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, high: float):  # type: ignore[no-untyped-def]
-    """A picture's side as a plane: x, y, z, constant, and how far a ball of σ = 1 m reaches beyond it.
+    """An image's side as a plane: x, y, z, constant, and how far a ball of σ = 1 m reaches beyond it.
 
     A point of the camera's frame is projected to u = f x/z + c, and its ball reaches REACH·√(|m|² σ² + DILATION) px
     from there, where |m|² = (f/z)² (1 + s²) and s is the slope that ``Pinhole`` bounds. It may touch the pixels
@@ -126,8 +125,8 @@ def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def look(means, covariances, opacities, normals, eye, least, view):  # type: ignore[no-untyped-def]
-    """``in_view`` from ``eye`` [3], where n·v is ``least`` or more; EVERYTHING looks at no normal."""
+def find_in_view(means, covariances, opacities, normals, eye, min_cosine, view):  # type: ignore[no-untyped-def]
+    """``in_view`` from ``eye`` [3], where n·v is ``min_cosine`` or more; EVERYTHING looks at no normal."""
     seen = np.empty(len(means), np.bool_)
     sides = np.empty((5, 5), np.float64)
     sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
@@ -138,35 +137,35 @@ def look(means, covariances, opacities, normals, eye, least, view):  # type: ign
     arrays = (means, covariances, opacities, normals)
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
         last = min((chunk + 1) * CHUNK, len(seen))
-        _look_at(chunk * CHUNK, last, arrays, sides, (eye, least), seen)
+        _find_in_view(chunk * CHUNK, last, arrays, sides, (eye, min_cosine), seen)
     return seen
 
 
 @njit(error_model="numpy")
-def _look_at(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyped-def]
-    """Fill ``seen`` from ``first``, a whole number of sixteen, up to ``last``."""
+def _find_in_view(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyped-def]
+    """Fill ``seen`` from ``first``, a multiple of sixteen, up to ``last``."""
     means, covariances, opacities, normals = arrays
-    eye, least = limits
-    culling = least > EVERYTHING
-    # Of most the middle is in the picture: seen sixteen at a time, and rounding may err, for the others are looked at
+    eye, min_cosine = limits
+    culling = min_cosine > EVERYTHING
+    # Of most the middle is in the image: seen sixteen at a time, and rounding may err, for the others are looked at
     a, b, c, d, e = (_rounded(sides[0]), _rounded(sides[1]), _rounded(sides[2]), _rounded(sides[3]), _rounded(sides[4]))
     sixteens = last // WIDTH * WIDTH
     for i in range(first, sixteens, WIDTH):
         x, y, z = load_points(means, 3 * i)
         inside = (_distance(a, x, y, z, ZERO) >= ZERO) & (_distance(b, x, y, z, ZERO) >= ZERO)
         inside = inside & (_distance(c, x, y, z, ZERO) >= ZERO) & (_distance(d, x, y, z, ZERO) >= ZERO)
-        inside = inside & (_distance(e, x, y, z, ZERO) >= ZERO) & (load(opacities, i) >= LEAST_OPACITY)
+        inside = inside & (_distance(e, x, y, z, ZERO) >= ZERO) & (load(opacities, i) >= MIN_OPACITY)
         if culling:
             along, squared = _along(eye, x, y, z, load_points(normals, 3 * i))
-            inside = inside & (along - least * root(squared) >= ZERO)
+            inside = inside & (along - min_cosine * sqrt(squared) >= ZERO)
         store_mask(seen, i, inside)
     seen[sixteens:last] = False
     for i in range(first, last):
-        if seen[i] or not opacities[i] >= LEAST_OPACITY:
+        if seen[i] or not opacities[i] >= MIN_OPACITY:
             continue
         if culling:
             along, squared = _along(eye, means[i, 0], means[i, 1], means[i, 2], normals[i])
-            if not along >= least * np.sqrt(squared):
+            if not along >= min_cosine * np.sqrt(squared):
                 continue
         x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         sigma = _sigma(covariances, i)

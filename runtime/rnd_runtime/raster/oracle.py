@@ -15,18 +15,18 @@ from rnd_runtime.core.gaussians import Floats32, Raster
 
 Floats = NDArray[np.float64]
 
-# m: what lies nearer is not drawn. At 1 cm a Gaussian of 8 mm filled the picture; at 5 cm one of a sparse avatar still
+# m: what lies nearer is not drawn. At 1 cm a Gaussian of 8 mm filled the image; at 5 cm one of a sparse avatar still
 # covered half of it (the stability suite's G3); 3DGS draws nothing within 20 cm
 NEAR = 0.1
 # px² added to both variances, so that little falls between pixels' centres. 3DGS has 0.3, Mip-Splatting (Yu et al.
-# 2024) 0.1, a pixel's box 1/12. It makes an opaque body wider, the more the smaller the picture is, whatever was
+# 2024) 0.1, a pixel's box 1/12. It makes an opaque body wider, the more the smaller the image is, whatever was
 # learned: docs/tried.md
 DILATION = 0.05
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 # 1e-4, less a hair: two Gaussians clamped at 0.99 leave 1e-4 exactly, which rounding must not decide
 TRANSMITTANCE_MIN = 0.9999e-4
-FIELD_OF_VIEW_MARGIN = 0.3  # gsplat's 1.3 × field of view, the margin measured from each border of the picture
+FIELD_OF_VIEW_MARGIN = 0.3  # gsplat's 1.3 × field of view, the margin measured from each border of the image
 
 
 def symmetric(triangles: ArrayLike) -> Floats:
@@ -47,9 +47,9 @@ def image_points(points: Floats, camera: Camera) -> Floats:
 
 
 def clamped_slopes(points: Floats, camera: Camera) -> Floats:
-    """x/z and y/z [N, 2], held within the picture widened by 0.3 half fields of view on each side.
+    """x/z and y/z [N, 2], held within the image widened by 0.3 half fields of view on each side.
 
-    The affine approximation of the projection explodes far outside the picture; 3DGS and gsplat evaluate it
+    The affine approximation of the projection explodes far outside the image; 3DGS and gsplat evaluate it
     at the clamped direction. The limits follow the principal point.
     """
     size, focal = np.array([camera.width, camera.height]), camera.K[[0, 1], [0, 1]]
@@ -75,8 +75,8 @@ def alphas(offsets: Floats, covariance: Floats, opacity: float) -> Floats:
     """min(0.99, o·exp(−½ dᵀ Σ'⁻¹ d)) at pixel offsets d [..., 2] from the mean; 0 below 1/255."""
     distance = np.einsum("...i,ij,...j", offsets, np.linalg.inv(covariance), offsets)
     alpha = np.minimum(ALPHA_MAX, opacity * np.exp(-0.5 * distance))
-    kept: Floats = np.where(alpha >= ALPHA_MIN, alpha, 0.0)
-    return kept
+    indices: Floats = np.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    return indices
 
 
 def reach(covariance: Floats, opacity: float) -> Floats:
@@ -88,7 +88,7 @@ def reach(covariance: Floats, opacity: float) -> Floats:
 def drawn(
     means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, features: ArrayLike, camera: Camera
 ) -> NDArray[np.bool_]:
-    """Which Gaussians are drawn at all [N].
+    """Which Gaussians are rendered at all [N].
 
     All numbers finite, at least NEAR in front of the camera, opacity at least 1/255, a covariance that is
     not zero and whose projection is positive definite.
@@ -101,8 +101,8 @@ def drawn(
         in_front = camera_points(means, camera)[:, 2] >= NEAR
         flat = image_covariances(means, covariances, camera)
         definite = (flat[:, 0, 0] > 0) & (flat[:, 1, 1] > 0) & (np.linalg.det(flat) > 0)
-    kept: NDArray[np.bool_] = finite & in_front & definite
-    return kept
+    indices: NDArray[np.bool_] = finite & in_front & definite
+    return indices
 
 
 def front_to_back(depths: Floats) -> NDArray[np.intp]:
@@ -134,13 +134,13 @@ def rasterize(
 
     Each Gaussian meets every pixel of the box outside of which its α is below 1/255.
     """
-    kept = drawn(means, covariances, opacities, features, camera)
-    points = camera_points(means[kept], camera)
-    pixels, shapes = image_points(points, camera), image_covariances(means[kept], covariances[kept], camera)
-    peaks = opacities[kept].astype(np.float64)
-    attributes = np.concatenate([features[kept], np.ones((len(points), 1)), points[:, 2:]], axis=1)
+    indices = drawn(means, covariances, opacities, features, camera)
+    points = camera_points(means[indices], camera)
+    pixels, shapes = image_points(points, camera), image_covariances(means[indices], covariances[indices], camera)
+    peaks = opacities[indices].astype(np.float64)
+    attributes = np.concatenate([features[indices], np.ones((len(points), 1)), points[:, 2:]], axis=1)
     size = np.array([camera.width, camera.height])
-    picture = np.zeros((camera.height, camera.width, attributes.shape[1]))
+    image = np.zeros((camera.height, camera.width, attributes.shape[1]))
     transmittance = np.ones((camera.height, camera.width))
     for i in front_to_back(points[:, 2]):
         half = reach(shapes[i], peaks[i])
@@ -152,6 +152,6 @@ def rasterize(
         centres = np.stack(np.meshgrid(np.arange(x0, x1) + 0.5, np.arange(y0, y1) + 0.5), axis=-1)
         alpha = alphas(centres - pixels[i], shapes[i], peaks[i])
         weights, transmittance[box] = blend(transmittance[box], alpha)
-        picture[box] += weights[..., None] * attributes[i]
-    far = picture[..., -1] if depth else np.zeros_like(picture[..., -1])
-    return Raster(picture[..., :-2], picture[..., -2], far)  # type: ignore[arg-type]
+        image[box] += weights[..., None] * attributes[i]
+    far = image[..., -1] if depth else np.zeros_like(image[..., -1])
+    return Raster(image[..., :-2], image[..., -2], far)  # type: ignore[arg-type]

@@ -1,12 +1,11 @@
-"""Outlines as sharp as a body's: what is done to a picture of an avatar after its Gaussians are blended.
+"""Outlines as sharp as a body's: what is done to an image of an avatar after its Gaussians are blended.
 
-An opaque surface covers a pixel at its outline by the part that lies inside; overlapping discs reach out, and fade over
-three pixels or four. The coverage α of a blended picture is therefore steepened, the same on both sides of one half:
+Overlapping discs fade over three pixels or four at an outline. The coverage α of a blended image is therefore
+sharpened, symmetrically about one half:
 
     α' = α² (3 − 2 α)        features' = features · α (3 − 2 α)
 
-so that means over what covers a pixel, features / α, stay. What it is worth on held-out pictures stands in
-docs/tried.md. Training and files of splats know nothing of it: they blend as every renderer of splats does.
+so that means over what covers a pixel, features / α, stay. Training and files of splats blend without it.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def sharpened(raster: Raster) -> Raster:
 
 
 @njit(inline="always")
-def steepening(covered):  # type: ignore[no-untyped-def]
+def sharpening(covered):  # type: ignore[no-untyped-def]
     """What the coverage and the features of a pixel are multiplied with, of which ``covered`` is covered."""
     return covered * (_THREE - _TWO * covered) if _ZERO < covered < _ONE else _ONE
 
@@ -46,7 +45,7 @@ def _sharpen(image: Floats32, alpha: Floats32, depth: Floats32) -> None:
             covered = alpha[y, x]
             if not _ZERO < covered < _ONE:
                 continue
-            factor = steepening(covered)
+            factor = sharpening(covered)
             alpha[y, x] = covered * factor
             depth[y, x] *= factor
             for c in range(channels):

@@ -1,4 +1,4 @@
-"""From Gaussians in the world to ellipses in the picture, and the way back for gradients (numba, float64).
+"""From Gaussians in the world to ellipses in the image, and the way back for gradients (numba, float64).
 
 An ellipse is kept as the conditional form of its log-density, which no float32 rounding can make indefinite:
 
@@ -113,7 +113,7 @@ def tile_range(boxes, i):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def _project_range(first, last, means, covariances, opacities, features, seen, view, outputs):  # type: ignore[no-untyped-def]
+def project_range(first, last, means, covariances, opacities, features, seen, view, outputs):  # type: ignore[no-untyped-def]
     """Fill rows first … last − 1; ``tiles`` counts the tiles each reaches, 0 if it is not drawn.
 
     ``seen`` are those to look at, all where it is empty. NaN fails every guard.
@@ -194,7 +194,7 @@ def project(means, covariances, opacities, features, seen, view, with_depth):  #
     outputs = (centers, shapes, boxes, attributes, depths, slot_starts[1:])
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         last = min((chunk + 1) * CHUNK, count)
-        _project_range(chunk * CHUNK, last, means, covariances, opacities, features, seen, view, outputs)
+        project_range(chunk * CHUNK, last, means, covariances, opacities, features, seen, view, outputs)
     for i in range(count):
         slot_starts[i + 1] += slot_starts[i]
     return centers, shapes, boxes, attributes, depths, slot_starts
@@ -202,7 +202,7 @@ def project(means, covariances, opacities, features, seen, view, with_depth):  #
 
 @njit(error_model="numpy")
 def _project_range_backward(first, last, arrays, channels, view, slot_starts, slots, grads):  # type: ignore[no-untyped-def]
-    """Chain rule from the summed slots (see ``_raster_blend.blend_backward``) of Gaussians first … last − 1 to
+    """Chain rule from the summed slots (see ``.blend.blend_backward``) of Gaussians first … last − 1 to
     their world parameters."""
     means, covariances, opacities = arrays
     grad_means, grad_covariances, grad_opacities, grad_features = grads
@@ -270,7 +270,7 @@ def _project_range_backward(first, last, arrays, channels, view, slot_starts, sl
 def project_backward(means, covariances, opacities, channels, view, slot_starts, slots):  # type: ignore[no-untyped-def]
     """Sum each Gaussian's slots in their fixed order and take the sums back to the world.
 
-    ``slots`` [P, 6 + K] as ``_raster_blend.blend_backward`` fills them. Returns gradients of means [N, 3],
+    ``slots`` [P, 6 + K] as ``.blend.blend_backward`` fills them. Returns gradients of means [N, 3],
     covariances [N, 6], opacities [N] and features [N, C], zero where a Gaussian was not drawn.
     """
     count = means.shape[0]

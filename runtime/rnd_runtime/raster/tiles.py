@@ -26,7 +26,7 @@ class Splats(NamedTuple):
 
 
 @njit(error_model="numpy")
-def _front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
+def front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
     """Indices of the drawn Gaussians by depth, equal depths by index.
 
     A stable radix sort of 32-bit keys that span just the visible range: 1 m of depth is cut into 0.2 nm,
@@ -59,9 +59,9 @@ def _front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
         shift = np.uint32(p * RADIX_BITS)
         for k in range(count):
             digit = (keys[k] >> shift) & mask
-            place = counts[p, digit]
-            counts[p, digit] = place + 1
-            other_keys[place], other_order[place] = keys[k], order[k]
+            slot_at = counts[p, digit]
+            counts[p, digit] = slot_at + 1
+            other_keys[slot_at], other_order[slot_at] = keys[k], order[k]
         keys, other_keys = other_keys, keys
         order, other_order = other_order, order
     return order
@@ -78,48 +78,48 @@ def _next_tile(tile, x, x0, x1, tiles_x):  # type: ignore[no-untyped-def]
 def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # type: ignore[no-untyped-def]
     """Counting sort of the (Gaussian, tile) pairs into tiles, front to back within each.
 
-    Takes what ``._raster_project.project`` returns and the picture's ``size`` (width, height). Returns tile_starts,
+    Takes what ``.project.project`` returns and the image's ``size`` (width, height). Returns tile_starts,
     pair_gaussians and pair_slots of ``Splats``, the last one empty unless ``with_slots``. Each thread counts and
     places a stretch of the Gaussians, near ones first, so their number changes nothing.
     """
     tiles_x, tiles_y = (size[0] + TILE - 1) // TILE, (size[1] + TILE - 1) // TILE
-    order = _front_to_back(depths, slot_starts)
+    order = front_to_back(depths, slot_starts)
     stretch = (order.size + threads - 1) // threads
-    places = np.zeros((threads, tiles_x * tiles_y), np.int32)
+    offsets = np.zeros((threads, tiles_x * tiles_y), np.int32)
     for part in prange(threads):
-        own = places[part]
+        own = offsets[part]
         for g in order[part * stretch : (part + 1) * stretch]:
             x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
             for _ in range(slot_starts[g], slot_starts[g + 1]):
                 own[tile] += 1
                 tile, x = _next_tile(tile, x, x0, x1, tiles_x)
-    starts = _starts(places)
+    starts = _starts(offsets)
     pair_gaussians = np.empty(starts[-1], np.int32)
     pair_slots = np.empty(starts[-1] if with_slots else 0, np.int32)
     for part in prange(threads):
-        own = places[part]
+        own = offsets[part]
         for g in order[part * stretch : (part + 1) * stretch]:
             x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
             for slot in range(slot_starts[g], slot_starts[g + 1]):
-                place = own[tile]
-                own[tile] = place + 1
-                pair_gaussians[place] = g
+                slot_at = own[tile]
+                own[tile] = slot_at + 1
+                pair_gaussians[slot_at] = g
                 if with_slots:
-                    pair_slots[place] = slot
+                    pair_slots[slot_at] = slot
                 tile, x = _next_tile(tile, x, x0, x1, tiles_x)
     return starts, pair_gaussians, pair_slots
 
 
 @njit(error_model="numpy")
-def _starts(places):  # type: ignore[no-untyped-def]
+def _starts(offsets):  # type: ignore[no-untyped-def]
     """Where each tile's pairs begin [tiles + 1]; the counts [threads, tiles] become where each thread's begin."""
-    starts = np.empty(places.shape[1] + 1, np.int64)
-    total = 0
-    for tile in range(places.shape[1]):
-        starts[tile] = total
-        for part in range(len(places)):
-            total, places[part, tile] = total + places[part, tile], total
-    starts[-1] = total
+    starts = np.empty(offsets.shape[1] + 1, np.int64)
+    running = 0
+    for tile in range(offsets.shape[1]):
+        starts[tile] = running
+        for part in range(len(offsets)):
+            running, offsets[part, tile] = running + offsets[part, tile], running
+    starts[-1] = running
     return starts

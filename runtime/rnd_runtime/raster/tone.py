@@ -26,18 +26,18 @@ _LOWEST = np.float32(2.0**-14)  # below it the code is 0: the first step is at 1
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-def tone_map(radiance: ArrayLike, alpha: ArrayLike, behind: ArrayLike | None = None) -> Bytes:
+def tone_map(radiance: ArrayLike, alpha: ArrayLike, background: ArrayLike | None = None) -> Bytes:
     """8-bit sRGB [H, W, 3] of premultiplied ``radiance`` [H, W, 3] and ``alpha`` [H, W] over a background.
 
     Args:
-        behind: linear radiance of the background, [3] or [H, W, 3]; black when None.
+        background: linear radiance of the background, [3] or [H, W, 3]; black when None.
     """
     radiance, alpha = _checked(radiance, alpha)
-    background = floats(np.zeros(3) if behind is None else behind)
-    if background.shape not in ((3,), radiance.shape):
-        raise InputError("background", expected=f"[3] or {radiance.shape}", got=background.shape)
+    backdrop = floats(np.zeros(3) if background is None else background)
+    if backdrop.shape not in ((3,), radiance.shape):
+        raise InputError("background", expected=f"[3] or {radiance.shape}", got=backdrop.shape)
     image = np.empty(radiance.shape, np.uint8)
-    _tone_map(radiance, alpha, background.reshape(-1, 3), *tone_tables(), image)
+    _tone_map(radiance, alpha, backdrop.reshape(-1, 3), *tone_tables(), image)
     return image
 
 
@@ -57,7 +57,7 @@ def code_steps() -> Floats32:
 def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]:
     radiance, alpha = floats(radiance), floats(alpha)
     if alpha.ndim != 2 or radiance.shape != (*alpha.shape, 3):
-        raise InputError("picture", expected="[H, W, 3] and [H, W]", got=f"{radiance.shape}, {alpha.shape}")
+        raise InputError("image", expected="[H, W, 3] and [H, W]", got=f"{radiance.shape}, {alpha.shape}")
     return radiance, alpha
 
 
@@ -95,12 +95,12 @@ _START = int(_LOWEST.view(np.int32)) >> _SHIFT
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-untyped-def]
+def _tone_map(radiance, alpha, background, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape
-    one_colour = len(behind) == 1
+    one_colour = len(background) == 1
     empty = np.empty(3 * width, np.uint8)  # a row of nothing but the one colour
     for c in range(3):
-        empty[c::3] = _code(behind[0, c], steps, first)
+        empty[c::3] = _code(background[0, c], steps, first)
     rows = image.reshape(height, 3 * width)
     for y in prange(height):
         if one_colour:
@@ -112,7 +112,7 @@ def _tone_map(radiance, alpha, behind, steps, first, image):  # type: ignore[no-
             if one_colour and left == _ONE:
                 continue
             for c in range(3):
-                image[y, x, c] = _code(radiance[y, x, c] + left * behind[at, c], steps, first)
+                image[y, x, c] = _code(radiance[y, x, c] + left * background[at, c], steps, first)
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""The cheapest shading: a light of sixteen harmonics and one number of occlusion per Gaussian."""
+"""The cheapest shading: a light of sixteen SH coefficients and one number of occlusion per Gaussian."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
-from rnd_runtime.core.simd import WIDTH, aligned_floats, lanes, load, store
+from rnd_runtime.core.simd import WIDTH, aligned_floats, at_least, lanes, load, store
 
 from .lanes import (
     ALBEDO,
@@ -21,13 +21,12 @@ from .lanes import (
     RADIANCE,
     VIEW,
     ZERO,
-    at_least,
-    enter,
-    leave,
+    gather,
+    load3,
+    lobe_direction,
     lobes_in_lanes,
-    mean_direction,
-    no_number,
-    three,
+    nan_lanes,
+    scatter,
     transposed,
     unit,
     visibility_in_lanes,
@@ -81,43 +80,43 @@ class AmbientLight:
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: ignore[no-untyped-def]
-    """As ``.shading_lookup.look_up``, with ``tables`` the light [16, 3] in the root's frame and the lobes."""
+    """As ``.lookup.shade_from_tables``, with ``tables`` the light [16, 3] in the root's frame and the lobes."""
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
-        members, room = np.empty(WIDTH, np.int64), aligned_floats(FREE)
+        indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(FREE)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
         while i < last:
-            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            i, count = gather(i, last, seen, surfaces, camera, indices, scratch)
             if count > 0:
-                _shade_sixteen(members, surfaces[4], root_rotation, tables, room, rows, columns)
-                leave(count, members, room, radiance)
+                _shade_sixteen(indices, surfaces[4], root_rotation, tables, scratch, rows, columns)
+                scatter(count, indices, scratch, radiance)
 
 
 @njit(error_model="numpy")
-def _shade_sixteen(members, visibility, root_rotation, tables, room, rows, columns):  # type: ignore[no-untyped-def]
-    """Radiance over the albedo in ``room``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+def _shade_sixteen(indices, visibility, root_rotation, tables, scratch, rows, columns):  # type: ignore[no-untyped-def]
+    """Radiance over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
     light, lobes = tables
-    normal = transposed(root_rotation, three(room, NORMAL))
-    view = unit(transposed(root_rotation, three(room, VIEW)))
+    normal = transposed(root_rotation, load3(scratch, NORMAL))
+    view = unit(transposed(root_rotation, load3(scratch, VIEW)))
     n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
-    lobes_in_lanes(lobes, n_dot_v, room, rows, columns)
-    energy, shrink = load(columns, 0), three(columns, 4 * WIDTH)
-    at_lobe = compiled_sh_columns(*mean_direction(columns, normal, view, n_dot_v))
+    lobes_in_lanes(lobes, n_dot_v, scratch, rows, columns)
+    energy, shrink = load(columns, 0), load3(columns, 4 * WIDTH)
+    at_lobe = compiled_sh_columns(*lobe_direction(columns, normal, view, n_dot_v))
     at_normal = compiled_sh_columns(*normal)
-    visibility_in_lanes(members, visibility, rows, columns)
-    broken = no_number(room, columns)
+    visibility_in_lanes(indices, visibility, rows, columns)
+    broken = nan_lanes(scratch, columns)
 
     occlusion = lanes(ZERO)
     for j in range(9):
         occlusion += COSINE_LOBE[j] * (at_normal[j] * load(columns, j * WIDTH))
     occlusion = at_least(occlusion, ZERO)
     for channel in range(3):
-        diffuse, shine = lanes(ZERO), at_lobe[0] * light[0, channel]
+        diffuse, specular = lanes(ZERO), at_lobe[0] * light[0, channel]
         for j in range(9):
             diffuse += COSINE_LOBE[j] * light[j, channel] * at_normal[j]
         for j in range(1, 16):
             left = shrink[0] if j < 4 else (shrink[1] if j < 9 else shrink[2])
-            shine += left * (at_lobe[j] * light[j, channel])
+            specular += left * (at_lobe[j] * light[j, channel])
         at = channel * WIDTH
-        matt = load(room, ALBEDO + at) * at_least(diffuse, ZERO)
-        store(room, RADIANCE + at, occlusion * (matt + energy * at_least(shine, ZERO)) + broken)
+        diffuse_part = load(scratch, ALBEDO + at) * at_least(diffuse, ZERO)
+        store(scratch, RADIANCE + at, occlusion * (diffuse_part + energy * at_least(specular, ZERO)) + broken)

@@ -20,11 +20,14 @@ Directions l (to the light), v (to the camera) and n are unit vectors in one fra
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import pi
 from typing import Any
 
 import numba
 import numpy as np
+
+from rnd_runtime.core import simd
 
 F0 = 0.04
 ROUGHNESS_RANGE = (0.09, 0.99)  # GGX's D overflows half floats below 0.089
@@ -45,7 +48,7 @@ def specular(roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
     half_squared = (2 + 2 * l_dot_v).clip(min=_HALF_FLOOR)  # |l + v|²
     n_dot_h = n_dot_l + n_dot_v
     sine_squared = (1 - n_dot_h * n_dot_h / half_squared).clip(min=0)
-    return ggx(roughness_to_alpha(roughness), n_dot_l, n_dot_v, sine_squared, half_squared)
+    return ggx(roughness_to_alpha(roughness) ** 2, n_dot_l, n_dot_v, sine_squared, half_squared)
 
 
 def roughness_to_alpha(roughness: Any) -> Any:
@@ -53,31 +56,24 @@ def roughness_to_alpha(roughness: Any) -> Any:
     return roughness.clip(*ROUGHNESS_RANGE) ** 2
 
 
-def ggx(alpha: Any, n_dot_l: Any, n_dot_v: Any, sine_squared: Any, half_squared: Any) -> Any:
-    """The specular term from sin²θ_h and |l + v|², for callers that know them better than cosines tell."""
-    alpha_squared = alpha * alpha
-    lobe = sine_squared + alpha_squared * (1 - sine_squared)
-    n_dot_l, n_dot_v = n_dot_l.clip(min=COSINE_FLOOR), n_dot_v.clip(min=COSINE_FLOOR)
-    shadowing = n_dot_l + (alpha_squared + (1 - alpha_squared) * n_dot_l * n_dot_l) ** 0.5
-    masking = n_dot_v + (alpha_squared + (1 - alpha_squared) * n_dot_v * n_dot_v) ** 0.5
-    grazing = (1 - 0.5 * half_squared**0.5).clip(min=0)  # 1 − v·h = 1 − |l + v|/2
-    grazing_squared = grazing * grazing  # numpy's x**5 costs more than all the rest
-    fresnel = F0 + (1 - F0) * grazing_squared * grazing_squared * grazing
-    return (1 / pi) * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
+def _ggx(sqrt: Callable[[Any], Any], at_least: Callable[[Any, Any], Any], number: Callable[[float], Any]) -> Any:
+    """The specular term for values that ``sqrt``, ``at_least`` and constants of type ``number`` compute with."""
+    zero, half, one, f0, floor, one_over_pi = (number(x) for x in (0, 0.5, 1, F0, COSINE_FLOOR, 1 / pi))
+
+    def ggx(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type: ignore[no-untyped-def]
+        """D·F·G / (4 n·l n·v) in 1/sr from α², two cosines, sin²θ_h and |l + v|²."""
+        lobe = sine_squared + alpha_squared * (one - sine_squared)
+        n_dot_l, n_dot_v = at_least(n_dot_l, floor), at_least(n_dot_v, floor)
+        shadowing = n_dot_l + sqrt(alpha_squared + (one - alpha_squared) * n_dot_l * n_dot_l)
+        masking = n_dot_v + sqrt(alpha_squared + (one - alpha_squared) * n_dot_v * n_dot_v)
+        grazing = at_least(one - half * sqrt(half_squared), zero)  # 1 − v·h = 1 − |l + v|/2
+        grazing_squared = grazing * grazing  # numpy's x**5 costs more than all the rest
+        fresnel = f0 + (one - f0) * grazing_squared * grazing_squared * grazing
+        return one_over_pi * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
+
+    return ggx
 
 
-_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
-_F0, _COSINE_FLOOR, _ONE_OVER_PI = np.float32(F0), np.float32(COSINE_FLOOR), np.float32(1 / pi)
-
-
-@numba.njit(inline="always", error_model="numpy")
-def ggx32(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type: ignore[no-untyped-def]
-    """``ggx`` for float32 scalars inside kernels; Python's own constants would make float64 of it there."""
-    lobe = sine_squared + alpha_squared * (_ONE - sine_squared)
-    n_dot_l, n_dot_v = max(n_dot_l, _COSINE_FLOOR), max(n_dot_v, _COSINE_FLOOR)
-    shadowing = n_dot_l + np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_l * n_dot_l)
-    masking = n_dot_v + np.sqrt(alpha_squared + (_ONE - alpha_squared) * n_dot_v * n_dot_v)
-    grazing = max(_ONE - _HALF * np.sqrt(half_squared), _ZERO)
-    grazing_squared = grazing * grazing
-    fresnel = _F0 + (_ONE - _F0) * grazing_squared * grazing_squared * grazing
-    return _ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
+ggx = _ggx(lambda x: x**0.5, lambda x, low: x.clip(min=low), float)  # numpy or torch
+ggx_scalar = numba.njit(_ggx(np.sqrt, max, np.float32), fastmath=True, error_model="numpy")
+ggx_lanes = numba.njit(_ggx(simd.sqrt, simd.at_least, np.float32), error_model="numpy")

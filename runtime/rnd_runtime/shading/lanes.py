@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rnd_runtime.core.simd import WIDTH, load, magnitude, root, select, spread, store, transpose, whole
+from rnd_runtime.core.simd import WIDTH, at_least, broadcast, floor, load, magnitude, select, sqrt, store, transpose
 
-from .brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
+from .brdf import ROUGHNESS_RANGE
 from .specular_lobe import COSINE_COUNT, ROUGHNESS_COUNT
 
 CHUNK = 512  # Gaussians that a thread shades at a time
@@ -19,20 +19,19 @@ ZERO, ONE = np.float32(0), np.float32(1)
 TINY = np.float32(1e-12)
 ROUGHNESS_LOW = np.float32(ROUGHNESS_RANGE[0])
 ROUGHNESS_SPAN = np.float32(ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
-_HALF, _F0, _COSINE_FLOOR = np.float32(0.5), np.float32(F0), np.float32(COSINE_FLOOR)
 ONE_OVER_PI = np.float32(1 / np.pi)
 
 # Rows of sixteen in the working memory of a thread: what goes in, what comes out in place of the albedo, where to look
 (NORMAL, VIEW, ALBEDO) = (0, 3 * WIDTH, 6 * WIDTH)  # three each, one after the other
 RADIANCE = ALBEDO
 ROUGHNESS = 9 * WIDTH
-_ENTERED = 10 * WIDTH
+_GATHERED = 10 * WIDTH
 (ROW, COLUMN, S, T, _W00, _W01, _W10, _W11) = (WIDTH * k for k in range(10, 18))  # a cell of a table, see store_cell
 FREE = 18 * WIDTH
 
 
 @njit(error_model="numpy")
-def enter(first, last, seen, surfaces, camera, members, room):  # type: ignore[no-untyped-def]
+def gather(first, last, seen, surfaces, camera, indices, scratch):  # type: ignore[no-untyped-def]
     """The next sixteen of the Gaussians ``seen`` [N] from ``first`` on: where the search goes on, and how many.
 
     ``surfaces``: means, normals, albedo, roughness, visibility. Of fewer than sixteen the first stands in for the rest.
@@ -42,84 +41,84 @@ def enter(first, last, seen, surfaces, camera, members, room):  # type: ignore[n
     while i < last and k < WIDTH:
         if seen[i]:
             for axis in range(3):
-                room[NORMAL + axis * WIDTH + k] = normals[i, axis]
-                room[VIEW + axis * WIDTH + k] = camera[axis] - means[i, axis]
-                room[ALBEDO + axis * WIDTH + k] = albedo[i, axis]
-            room[ROUGHNESS + k] = roughness[i]
-            members[k] = i
+                scratch[NORMAL + axis * WIDTH + k] = normals[i, axis]
+                scratch[VIEW + axis * WIDTH + k] = camera[axis] - means[i, axis]
+                scratch[ALBEDO + axis * WIDTH + k] = albedo[i, axis]
+            scratch[ROUGHNESS + k] = roughness[i]
+            indices[k] = i
             k += 1
         i += 1
     count = k
     for k in range(count, WIDTH):
-        members[k] = members[0]
-        for at in range(0, _ENTERED, WIDTH):
-            room[at + k] = room[at]
+        indices[k] = indices[0]
+        for at in range(0, _GATHERED, WIDTH):
+            scratch[at + k] = scratch[at]
     return i, count
 
 
 @njit(inline="always")
-def leave(count, members, room, radiance):  # type: ignore[no-untyped-def]
-    """Radiance [N, 3] of the Gaussians that entered."""
+def scatter(count, indices, scratch, radiance):  # type: ignore[no-untyped-def]
+    """Radiance [N, 3] of the Gaussians that were gathered."""
     for k in range(count):
         for channel in range(3):
-            radiance[members[k], channel] = room[RADIANCE + channel * WIDTH + k]
+            radiance[indices[k], channel] = scratch[RADIANCE + channel * WIDTH + k]
 
 
 @njit(inline="always")
-def three(room, at):  # type: ignore[no-untyped-def]
+def load3(scratch, at):  # type: ignore[no-untyped-def]
     """Three rows from ``at`` on."""
-    return load(room, at), load(room, at + WIDTH), load(room, at + 2 * WIDTH)
+    return load(scratch, at), load(scratch, at + WIDTH), load(scratch, at + 2 * WIDTH)
 
 
 @njit(inline="always")
 def unit(v):  # type: ignore[no-untyped-def]
     x, y, z = v
-    scale = ONE / at_least(root(x * x + y * y + z * z), TINY)
+    scale = ONE / at_least(sqrt(x * x + y * y + z * z), TINY)
     return x * scale, y * scale, z * scale
 
 
 @njit(inline="always")
-def visibility_in_lanes(members, visibility, rows, columns):  # type: ignore[no-untyped-def]
+def visibility_in_lanes(indices, visibility, rows, columns):  # type: ignore[no-untyped-def]
     """Coefficients [N, 16] of sixteen Gaussians as [16, lanes] in ``columns``."""
     for k in range(WIDTH):
-        store(rows, k * WIDTH, load(visibility, members[k] * WIDTH))
+        store(rows, k * WIDTH, load(visibility, indices[k] * WIDTH))
     transpose(rows, columns)
 
 
 @njit(inline="always")
-def no_number(room, visibility):  # type: ignore[no-untyped-def]
+def nan_lanes(scratch, visibility):  # type: ignore[no-untyped-def]
     """NaN in the lanes of Gaussians that have a number that is not finite, else 0: ``at_least`` may lose that.
 
-    Asks for all that entered in ``room``, and for the visibility as [16, lanes].
+    Asks for all that were gathered in ``scratch``, and for the visibility as [16, lanes].
     """
-    sum_of_all = load(room, 0)
-    for at in range(WIDTH, _ENTERED, WIDTH):
-        sum_of_all += load(room, at)
+    sum_of_all = load(scratch, 0)
+    for at in range(WIDTH, _GATHERED, WIDTH):
+        sum_of_all += load(scratch, at)
     for at in range(0, WIDTH * WIDTH, WIDTH):
         sum_of_all += load(visibility, at)
     return sum_of_all - sum_of_all
 
 
 @njit(inline="always")
-def lobes_in_lanes(lobes, n_dot_v, room, rows, columns):  # type: ignore[no-untyped-def]
+def lobes_in_lanes(lobes, n_dot_v, scratch, rows, columns):  # type: ignore[no-untyped-def]
     """The sixteen columns of ``lobes`` [16, 49, 16] at each Gaussian's roughness and n·v, in ``columns``."""
-    a = (load(room, ROUGHNESS) - ROUGHNESS_LOW) / ROUGHNESS_SPAN * np.float32(ROUGHNESS_COUNT - 1)
-    b = root(clamped(magnitude(n_dot_v), ONE))
+    a = (load(scratch, ROUGHNESS) - ROUGHNESS_LOW) / ROUGHNESS_SPAN * np.float32(ROUGHNESS_COUNT - 1)
+    b = sqrt(clamped(magnitude(n_dot_v), ONE))
     b = (select(n_dot_v < ZERO, ZERO - b, b) + ONE) * np.float32(0.5 * (COSINE_COUNT - 1))
-    store_cell(a, b, ROUGHNESS_COUNT, COSINE_COUNT, room)
+    store_cell(a, b, ROUGHNESS_COUNT, COSINE_COUNT, scratch)
     for k in range(WIDTH):
-        at = (int(room[ROW + k]) * COSINE_COUNT + int(room[COLUMN + k])) * WIDTH
-        store(rows, k * WIDTH, four_corners(lobes, at, WIDTH, COSINE_COUNT * WIDTH, room, k))
+        at = (int(scratch[ROW + k]) * COSINE_COUNT + int(scratch[COLUMN + k])) * WIDTH
+        store(rows, k * WIDTH, four_corners(lobes, at, WIDTH, COSINE_COUNT * WIDTH, scratch, k))
     transpose(rows, columns)
 
 
 @njit(inline="always")
-def mean_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
+def lobe_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
     """Unit directions of the lobes, whose shares along mirrored tangent and normal stand in ``lobe``."""
     (nx, ny, nz), (vx, vy, vz) = normal, view
     # the tangent away from the camera; in a view along the normal there is none, and none is needed
     tx, ty, tz = n_dot_v * nx - vx, n_dot_v * ny - vy, n_dot_v * nz - vz
-    along_tangent = load(lobe, WIDTH) / at_least(root(tx * tx + ty * ty + tz * tz), TINY)
+    along_tangent = load(lobe, WIDTH) / at_least(sqrt(tx * tx + ty * ty + tz * tz), TINY)
     along_normal = load(lobe, 2 * WIDTH)
     x, y, z = (
         along_normal * nx + along_tangent * tx,
@@ -130,25 +129,6 @@ def mean_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def ggx_in_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type: ignore[no-untyped-def]
-    """``.brdf.ggx``."""
-    lobe = sine_squared + alpha_squared * (ONE - sine_squared)
-    n_dot_l, n_dot_v = at_least(n_dot_l, _COSINE_FLOOR), at_least(n_dot_v, _COSINE_FLOOR)
-    shadowing = n_dot_l + root(alpha_squared + (ONE - alpha_squared) * n_dot_l * n_dot_l)
-    masking = n_dot_v + root(alpha_squared + (ONE - alpha_squared) * n_dot_v * n_dot_v)
-    grazing = at_least(ONE - _HALF * root(half_squared), ZERO)
-    grazing_squared = grazing * grazing
-    fresnel = _F0 + (ONE - _F0) * grazing_squared * grazing_squared * grazing
-    return ONE_OVER_PI * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
-
-
-@njit(inline="always")
-def at_least(x, low):  # type: ignore[no-untyped-def]
-    """``low`` for NaN too."""
-    return select(x > low, x, low)
-
-
-@njit(inline="always")
 def clamped(x, high):  # type: ignore[no-untyped-def]
     """x within 0 and ``high``; 0 for NaN."""
     x = at_least(x, ZERO)
@@ -156,27 +136,29 @@ def clamped(x, high):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def store_cell(a, b, rows, columns, room):  # type: ignore[no-untyped-def]
+def store_cell(a, b, rows, columns, scratch):  # type: ignore[no-untyped-def]
     """Where (a, b) lies among so many rows and columns of nodes: the cell's first corner and all corners' shares."""
     a, b = clamped(a, np.float32(rows - 1)), clamped(b, np.float32(columns - 1))
-    row, column = whole(clamped(a, np.float32(rows - 2))), whole(clamped(b, np.float32(columns - 2)))
+    row, column = floor(clamped(a, np.float32(rows - 2))), floor(clamped(b, np.float32(columns - 2)))
     t, s = a - row, b - column
-    store(room, ROW, row)
-    store(room, COLUMN, column)
-    store(room, S, s)
-    store(room, T, t)
-    store(room, _W00, (ONE - t) * (ONE - s))
-    store(room, _W01, (ONE - t) * s)
-    store(room, _W10, t * (ONE - s))
-    store(room, _W11, t * s)
+    store(scratch, ROW, row)
+    store(scratch, COLUMN, column)
+    store(scratch, S, s)
+    store(scratch, T, t)
+    store(scratch, _W00, (ONE - t) * (ONE - s))
+    store(scratch, _W01, (ONE - t) * s)
+    store(scratch, _W10, t * (ONE - s))
+    store(scratch, _W11, t * s)
 
 
 @njit(inline="always")
-def four_corners(table, at, right, down, room, k):  # type: ignore[no-untyped-def]
+def four_corners(table, at, right, down, scratch, k):  # type: ignore[no-untyped-def]
     """Gaussian k's mean of the four rows of sixteen at its cell's corners."""
-    upper = spread(room, _W00 + k) * load(table, at) + spread(room, _W01 + k) * load(table, at + right)
+    upper = broadcast(scratch, _W00 + k) * load(table, at) + broadcast(scratch, _W01 + k) * load(table, at + right)
     at += down
-    return upper + (spread(room, _W10 + k) * load(table, at) + spread(room, _W11 + k) * load(table, at + right))
+    return upper + (
+        broadcast(scratch, _W10 + k) * load(table, at) + broadcast(scratch, _W11 + k) * load(table, at + right)
+    )
 
 
 @njit(inline="always")

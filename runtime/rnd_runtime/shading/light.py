@@ -11,10 +11,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.copies import twin
+from rnd_runtime.core.copies import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_header, read_image
+from rnd_runtime.core.kinds import explained
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -25,7 +26,7 @@ REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 _SAME_COLOUR = 2e-3  # by which x and y may miss them: D65 has more digits
 
 _MAX_STOPS = 64  # beyond it radiance leaves float32
-_MOST_EXPOSED = 1e30  # a .hdr file's EXPOSURE, or one over it
+_MAX_EXPOSURE = 1e30  # a .hdr file's EXPOSURE, or one over it
 _LONGEST_LINE = 4096  # bytes of its header
 _DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
@@ -90,7 +91,7 @@ class Light:
     def turned(self, yaw: float) -> Light:
         """The same light at another ``yaw``; no texel is looked at, so it may be turned in every frame."""
         _check_yaw(yaw)
-        return twin(self, yaw=yaw, rotation=_rotation(yaw, self.up))
+        return shallow_copy(self, yaw=yaw, rotation=_rotation(yaw, self.up))
 
     def resized(self, height: int, width: int) -> Light:
         """The same light on another grid, by ``downsize``."""
@@ -134,7 +135,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     """Read a lat-long .exr or .hdr as a ``Light``.
 
     NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them. Pixels of a
-    Radiance file are divided by each EXPOSURE that its header states ("Radiance picture format", Ward).
+    Radiance file are divided by each EXPOSURE that its header states ("Radiance image format", Ward).
 
     Args:
         up: the axis that points up in the world the map was made for: "y"; "z" for a Z-up world; "-y" for
@@ -148,7 +149,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     suffix = existing_file(path, what="light probe").suffix.lower()
     if suffix not in (".exr", ".hdr"):
         got = suffix or "no suffix"
-        raise InputError("light probe", expected="an .exr or .hdr file", got=got, file=path)
+        raise explained(InputError("light probe", expected="an .exr or .hdr file", got=got), path, "light")
     if not abs(exposure) <= _MAX_STOPS:
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
     header = read_header(path)
@@ -198,8 +199,8 @@ def _radiance_header(path: str | Path) -> tuple[float, tuple[float, ...] | None]
                 exposure *= numbers[0] if len(numbers) == 1 else np.nan
             elif len(numbers) == 8 and np.isfinite(numbers).all() and any(numbers):  # zeros state nothing
                 primaries = numbers
-    if not 1 / _MOST_EXPOSED <= exposure <= _MOST_EXPOSED:
-        expected = f"numbers whose product is {1 / _MOST_EXPOSED:g} to {_MOST_EXPOSED:g}"
+    if not 1 / _MAX_EXPOSURE <= exposure <= _MAX_EXPOSURE:
+        expected = f"numbers whose product is {1 / _MAX_EXPOSURE:g} to {_MAX_EXPOSURE:g}"
         raise InputError("EXPOSURE of the light probe", expected=expected, got=f"{exposure:g}", file=path)
     return exposure, primaries
 
@@ -213,11 +214,11 @@ def _exposure_notes(stated: float) -> tuple[str, ...]:
 def _colour_channels(names: tuple[str, ...], path: str | Path) -> list[int]:
     """Where R, G and B are: those of no layer, or else of the only layer ("view.R") that has all three."""
     layers = dict.fromkeys(name.removesuffix("R") for name in names if name.split(".")[-1] == "R")
-    whole = [layer for layer in layers if {f"{layer}{colour}" for colour in "RGB"} <= set(names)]
-    if "" not in whole and len(whole) != 1:
-        expected = "channels R, G and B" + (" of one layer" if whole else "")
+    complete = [layer for layer in layers if {f"{layer}{colour}" for colour in "RGB"} <= set(names)]
+    if "" not in complete and len(complete) != 1:
+        expected = "channels R, G and B" + (" of one layer" if complete else "")
         raise InputError("light probe", expected=expected, got=", ".join(names), file=path)
-    layer = "" if "" in whole else whole[0]
+    layer = "" if "" in complete else complete[0]
     return [names.index(f"{layer}{colour}") for colour in "RGB"]
 
 
@@ -260,9 +261,9 @@ def repair(radiance: Floats32) -> tuple[Floats32, int]:
     return values.astype(np.float32).reshape(shape), repaired
 
 
-def _around(places: NDArray[np.int64], shape: tuple[int, ...]) -> list[NDArray[np.int64]]:
-    """Of flat ``places`` in [H, W, C] the neighbours within a texel, themselves too: nine arrays as long."""
-    row, column, channel = np.unravel_index(places, shape)
+def _around(texels: NDArray[np.int64], shape: tuple[int, ...]) -> list[NDArray[np.int64]]:
+    """Of flat ``texels`` in [H, W, C] the neighbours within a texel, themselves too: nine arrays as long."""
+    row, column, channel = np.unravel_index(texels, shape)
     rows = [np.clip(row + down, 0, shape[0] - 1) for down in (-1, 0, 1)]
     columns = [(column + right) % shape[1] for right in (-1, 0, 1)]
     return [np.ravel_multi_index((r, c, channel), shape) for r in rows for c in columns]

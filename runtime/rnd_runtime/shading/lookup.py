@@ -1,4 +1,4 @@
-"""Shading from tables, sixteen Gaussians at a time (numba over sixteen lanes); the tables: ``.shading_tables``."""
+"""Shading from tables, sixteen Gaussians at a time (numba over sixteen lanes); the tables: ``.tables``."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from rnd_runtime.core.sh import compiled_sh_columns
 from rnd_runtime.core.simd import (
     WIDTH,
     aligned_floats,
+    at_least,
+    broadcast,
+    floor,
     lanes,
     load,
     magnitude,
+    reduce_add,
     select,
-    spread,
     store,
-    total,
     transpose,
-    whole,
 )
 
 from .lanes import (
@@ -35,16 +36,15 @@ from .lanes import (
     ZERO,
     S,
     T,
-    at_least,
     clamped,
-    enter,
     four_corners,
-    leave,
+    gather,
+    load3,
+    lobe_direction,
     lobes_in_lanes,
-    mean_direction,
-    no_number,
+    nan_lanes,
+    scatter,
     store_cell,
-    three,
     transposed,
     unit,
     visibility_in_lanes,
@@ -62,11 +62,11 @@ _S_CONSTANT, _T_CONSTANT = np.maximum(-_S_SLOPE, 0), np.maximum(-_T_SLOPE, 0)
 
 (_LEVEL, _UP) = (FREE, FREE + WIDTH)  # rows of a thread's working memory
 _IRRADIANCE = FREE + 2 * WIDTH  # three
-_ROOM = FREE + 5 * WIDTH
+_SCRATCH = FREE + 5 * WIDTH
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def look_up(surfaces, camera, rotations, tables, seen, radiance):  # type: ignore[no-untyped-def]
+def shade_from_tables(surfaces, camera, rotations, tables, seen, radiance):  # type: ignore[no-untyped-def]
     """Fill ``radiance`` [N, 3] of the Gaussians ``seen`` [N].
 
     Args:
@@ -76,68 +76,68 @@ def look_up(surfaces, camera, rotations, tables, seen, radiance):  # type: ignor
             [16, 49, 16].
     """
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
-        members, room = np.empty(WIDTH, np.int64), aligned_floats(_ROOM)
+        indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(_SCRATCH)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
         while i < last:
-            i, count = enter(i, last, seen, surfaces, camera, members, room)
+            i, count = gather(i, last, seen, surfaces, camera, indices, scratch)
             if count > 0:
-                _shade_sixteen(members, surfaces[4], rotations, tables, room, rows, columns)
-                leave(count, members, room, radiance)
+                _shade_sixteen(indices, surfaces[4], rotations, tables, scratch, rows, columns)
+                scatter(count, indices, scratch, radiance)
 
 
 @njit(error_model="numpy")
-def _shade_sixteen(members, visibility, rotations, tables, room, rows, columns):  # type: ignore[no-untyped-def]
-    """Radiance over the albedo in ``room``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+def _shade_sixteen(indices, visibility, rotations, tables, scratch, rows, columns):  # type: ignore[no-untyped-def]
+    """Radiance over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
     light_to_world, root_to_light = rotations
     diffuse, specular, lobes = tables
-    normal = transposed(light_to_world, three(room, NORMAL))
-    view = unit(transposed(light_to_world, three(room, VIEW)))
+    normal = transposed(light_to_world, load3(scratch, NORMAL))
+    view = unit(transposed(light_to_world, load3(scratch, VIEW)))
     n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
 
-    lobes_in_lanes(lobes, n_dot_v, room, rows, columns)
-    energy, place = load(columns, 0), load(columns, 3 * WIDTH)
-    mean = mean_direction(columns, normal, view, n_dot_v)
-    shrink = three(columns, 4 * WIDTH)
-    visibility_in_lanes(members, visibility, rows, columns)
-    broken = no_number(room, columns)
-    energy = energy * at_least(_open_share(root_to_light, mean, shrink, columns), ZERO)
+    lobes_in_lanes(lobes, n_dot_v, scratch, rows, columns)
+    energy, level_position = load(columns, 0), load(columns, 3 * WIDTH)
+    mean = lobe_direction(columns, normal, view, n_dot_v)
+    shrink = load3(columns, 4 * WIDTH)
+    visibility_in_lanes(indices, visibility, rows, columns)
+    broken = nan_lanes(scratch, columns)
+    energy = energy * at_least(_mean_visibility(root_to_light, mean, shrink, columns), ZERO)
 
-    _place_in_square(mean[0], mean[1], mean[2], SPECULAR_SIZE, room)
+    _octahedral_cell(mean[0], mean[1], mean[2], SPECULAR_SIZE, scratch)
     levels = specular.shape[1]
-    level = whole(clamped(place, np.float32(levels - 2)))
-    store(room, _LEVEL, level)
-    store(room, _UP, place - level)
+    level = floor(clamped(level_position, np.float32(levels - 2)))
+    store(scratch, _LEVEL, level)
+    store(scratch, _UP, level_position - level)
     s_slope, s_constant = load(_S_SLOPE, 0), load(_S_CONSTANT, 0)
     t_slope, t_constant = load(_T_SLOPE, 0), load(_T_CONSTANT, 0)
     for k in range(WIDTH):
-        cell = int(room[ROW + k]) * SPECULAR_SIZE + int(room[COLUMN + k])
-        at = (cell * levels + int(room[_LEVEL + k])) * WIDTH
+        cell = int(scratch[ROW + k]) * SPECULAR_SIZE + int(scratch[COLUMN + k])
+        at = (cell * levels + int(scratch[_LEVEL + k])) * WIDTH
         lower, upper = load(specular, at), load(specular, at + WIDTH)
-        share = (s_constant + s_slope * room[S + k]) * (t_constant + t_slope * room[T + k])
-        store(rows, k * WIDTH, share * (lower + room[_UP + k] * (upper - lower)))
+        share = (s_constant + s_slope * scratch[S + k]) * (t_constant + t_slope * scratch[T + k])
+        store(rows, k * WIDTH, share * (lower + scratch[_UP + k] * (upper - lower)))
     transpose(rows, columns)
 
-    _place_in_square(normal[0], normal[1], normal[2], DIFFUSE_SIZE, room)
+    _octahedral_cell(normal[0], normal[1], normal[2], DIFFUSE_SIZE, scratch)
     row = 3 * WIDTH  # of one node
     for k in range(WIDTH):
-        at = (int(room[ROW + k]) * DIFFUSE_SIZE + int(room[COLUMN + k])) * row
-        coefficients = load(visibility, members[k] * WIDTH)
+        at = (int(scratch[ROW + k]) * DIFFUSE_SIZE + int(scratch[COLUMN + k])) * row
+        coefficients = load(visibility, indices[k] * WIDTH)
         for channel in range(3):
-            met = four_corners(diffuse, at + channel * WIDTH, row, DIFFUSE_SIZE * row, room, k)
-            room[_IRRADIANCE + channel * WIDTH + k] = total(coefficients * met)
+            met = four_corners(diffuse, at + channel * WIDTH, row, DIFFUSE_SIZE * row, scratch, k)
+            scratch[_IRRADIANCE + channel * WIDTH + k] = reduce_add(coefficients * met)
 
     for channel in range(3):
         at = channel * WIDTH
-        shine = load(columns, at) + load(columns, at + 4 * WIDTH)
-        shine += load(columns, at + 8 * WIDTH) + load(columns, at + 12 * WIDTH)
-        matt = load(room, ALBEDO + at) * ONE_OVER_PI * load(room, _IRRADIANCE + at)
-        store(room, RADIANCE + at, at_least(matt + energy * shine, ZERO) + broken)
+        specular_part = load(columns, at) + load(columns, at + 4 * WIDTH)
+        specular_part += load(columns, at + 8 * WIDTH) + load(columns, at + 12 * WIDTH)
+        diffuse_part = load(scratch, ALBEDO + at) * ONE_OVER_PI * load(scratch, _IRRADIANCE + at)
+        store(scratch, RADIANCE + at, at_least(diffuse_part + energy * specular_part, ZERO) + broken)
 
 
 @njit(inline="always")
-def _place_in_square(x, y, z, size, room):  # type: ignore[no-untyped-def]
-    """See ``.shading_tables.octahedral_nodes``."""
+def _octahedral_cell(x, y, z, size, scratch):  # type: ignore[no-untyped-def]
+    """See ``.tables.octahedral_nodes``."""
     scale = ONE / at_least(magnitude(x) + magnitude(y) + magnitude(z), TINY)
     a, b = x * scale, y * scale
     below = z < ZERO
@@ -146,11 +146,11 @@ def _place_in_square(x, y, z, size, room):  # type: ignore[no-untyped-def]
     folded_b = select(b < ZERO, ZERO - folded_b, folded_b)
     a, b = select(below, folded_a, a), select(below, folded_b, b)
     half = np.float32(0.5 * (size - 1))
-    store_cell((b + ONE) * half, (a + ONE) * half, size, size, room)
+    store_cell((b + ONE) * half, (a + ONE) * half, size, size, scratch)
 
 
 @njit(inline="always")
-def _open_share(root_to_light, mean, shrink, visibility):  # type: ignore[no-untyped-def]
+def _mean_visibility(root_to_light, mean, shrink, visibility):  # type: ignore[no-untyped-def]
     """Visibility averaged over the lobe, from its coefficients [16, lanes]."""
     basis = compiled_sh_columns(*transposed(root_to_light, mean))
     first = load(visibility, WIDTH) * basis[1] + load(visibility, 2 * WIDTH) * basis[2]
@@ -166,8 +166,8 @@ def _open_share(root_to_light, mean, shrink, visibility):  # type: ignore[no-unt
 
 
 @njit(parallel=True, nogil=True, cache=True)
-def turned(diffuse, turn):  # type: ignore[no-untyped-def]
-    """Diffuse tables [33·33, 3·16] that take coefficients before ``turn`` [16, 16]: 3 267 rows instead of N.
+def rotated(diffuse, rotation):  # type: ignore[no-untyped-def]
+    """Diffuse tables [33·33, 3·16] that take coefficients before ``rotation`` [16, 16]: 3 267 rows instead of N.
 
     In numba, since a BLAS product would leave threads spinning that slow the look-up threefold.
     """
@@ -176,6 +176,6 @@ def turned(diffuse, turn):  # type: ignore[no-untyped-def]
         for at in range(i * 3 * WIDTH, (i + 1) * 3 * WIDTH, WIDTH):
             row = lanes(ZERO)
             for source in range(WIDTH):
-                row += spread(diffuse, at + source) * load(turn, source * WIDTH)
+                row += broadcast(diffuse, at + source) * load(rotation, source * WIDTH)
             store(result, at, row)
     return result

@@ -11,11 +11,11 @@ from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.sh import sh_basis
 
 from .brdf import specular
+from .direct import AT_SILHOUETTE, TURNED_AWAY
+from .directional import extract_directional
 from .light import Light, texel_directions, texel_solid_angles
 from .shader import SHADOW_RESOLUTION, shadow_radii
 from .shadow import directional_visibility
-from .sun import extract_suns
-from .sunlight import AT_SILHOUETTE, TURNED_AWAY
 
 Floats = NDArray[np.float64]
 
@@ -40,44 +40,43 @@ def shade_reference(
     flux = (probe.radiance.astype(np.float64) * texel_solid_angles(*texels)[..., None]).reshape(-1, 3)
     # rows times R: the root's frame
     basis = sh_basis(directions @ np.asarray(gaussians.root_rotation, np.float64))
-    harmonics = np.asarray(gaussians.visibility, np.float64)
-    summed = _sum_over_texels(gaussians, directions, flux, lambda part: harmonics[part] @ basis.T, camera_position)
+    coefficients = np.asarray(gaussians.visibility, np.float64)
+    summed = _sum_over_texels(gaussians, directions, flux, lambda part: coefficients[part] @ basis.T, camera_position)
     return np.maximum(summed, 0)
 
 
-def shade_reference_with_suns(
+def shade_reference_with_directional(
     gaussians: Gaussians, light: Light, camera_position: ArrayLike, *, texels: tuple[int, int] = (32, 64)
 ) -> Floats:
-    """What ``table+sun`` stands for: the sky as ``shade_reference``, and every texel of the suns in the whole map.
+    """What ``table+sun`` stands for: the sky as ``shade_reference``, and every texel of the directional lights.
 
         L_o = sky + Σ_s V_s Σ_{k in s} ΔL_k Δω_k f(ω_k, ω_o) max(n·ω_k, 0)
 
-    with ΔL what ``shading.sun.extract_suns`` takes out of the map, by the sun that lies nearest, and V_s how
-    much of a sun's middle ``shading.shader.Shader`` lets reach a Gaussian: its depth maps are no
-    approximation of the sum's, but another visibility. Arguments as of ``shade_reference``.
+    with ΔL what ``directional.extract_directional`` takes out of the map for the nearest light s, and V_s the
+    visibility of its centre by ``Shader``'s own depth maps. Arguments as of ``shade_reference``.
     """
-    sky, suns = extract_suns(light)
+    sky, lights = extract_directional(light)
     radiance = shade_reference(gaussians, sky, camera_position, texels=texels)
-    if not suns:
+    if not lights:
         return radiance
     height, width = sky.radiance.shape[:2]
-    whole = light.resized(height, width).radiance.astype(np.float64) - sky.radiance
-    taken = np.abs(whole).max(axis=-1) > 0
+    full = light.resized(height, width).radiance.astype(np.float64) - sky.radiance
+    taken = np.abs(full).max(axis=-1) > 0
     local = texel_directions(height, width)[taken]
-    flux = whole[taken] * np.broadcast_to(texel_solid_angles(height, width), taken.shape)[taken][:, None]
-    middles = np.array([sun.direction for sun in suns])
+    flux = full[taken] * np.broadcast_to(texel_solid_angles(height, width), taken.shape)[taken][:, None]
+    middles = np.array([k.direction for k in lights])
     nearest = np.argmax(local @ middles.T, axis=1)
-    reached = _reached_by_suns(gaussians, middles @ light.rotation.T, camera_position)
-    for sun in range(len(suns)):
-        own = nearest == sun
-        visibility = reached[:, sun : sun + 1].__getitem__
+    reached = _reached_by_lights(gaussians, middles @ light.rotation.T, camera_position)
+    for k in range(len(lights)):
+        own = nearest == k
+        visibility = reached[:, k : k + 1].__getitem__
         directions = local[own] @ light.rotation.T
         radiance += _sum_over_texels(gaussians, directions, flux[own], visibility, camera_position)
     return radiance
 
 
-def _reached_by_suns(gaussians: Gaussians, directions: Floats, camera_position: ArrayLike) -> Floats:
-    """How much of suns in world ``directions`` [S, 3] the shader lets reach each Gaussian: [N, S]."""
+def _reached_by_lights(gaussians: Gaussians, directions: Floats, camera_position: ArrayLike) -> Floats:
+    """How much of directional lights in world ``directions`` [S, 3] the shader lets reach each Gaussian: [N, S]."""
     shadows = directional_visibility(
         gaussians.means, gaussians.normals, directions, radii=shadow_radii(gaussians), resolution=SHADOW_RESOLUTION
     )
@@ -113,6 +112,6 @@ def _sum_over_texels(
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
         arriving = visibility(part) * np.maximum(n_dot_l, 0)
         # f is albedo/π and the specular term, which three channels share
-        shine = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
-        radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + shine @ flux
+        specular_sum = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
+        radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + specular_sum @ flux
     return radiance

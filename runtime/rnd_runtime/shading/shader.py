@@ -1,7 +1,7 @@
 """Relighting posed Gaussians, at whatever price per frame one is willing to pay.
 
 ============  =====================================================================================
-ao            sixteen harmonics of light times ambient occlusion
+ao            sixteen SH coefficients of light times ambient occlusion
 table         the whole map through tables over the normal; soft shadows from the visibility
 table+sun     the same, with the sun taken out, its own highlight and a hard shadow from a depth map
 lights:K      K lights of equal luminance (median cut), each with the whole BRDF
@@ -21,23 +21,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
-from rnd_runtime.core.copies import twin
+from rnd_runtime.core.copies import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 
 from .ambient import AmbientLight
+from .direct import DirectionalArrays, add_directional
+from .directional import DirectionalLight, extract_directional
 from .light import Light
 from .shadow import directional_visibility
 from .sum import DistantLights
-from .sun import Sun, extract_suns
-from .sunlight import SunArrays, add_suns
 from .tables import SkyTables
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
 SHADE_MODES = ("ao", "table", "table+sun", "lights:K", "brute")
-_MOST_LIGHTS = 8192
+_MAX_LIGHTS = 8192
 SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
 # A Gaussian's disc in the depth map, in standard deviations: neighbours of a trained avatar stand 1.4 σ apart. Discs
 # of 2 σ hide nothing more, but rise above their neighbours where normals disagree: speckled thighs.
@@ -51,13 +51,13 @@ class Shader:
     Args:
         light: the probe. Its yaw can change later by ``turned`` at no cost.
         mode: one of SHADE_MODES, with a number for K.
-        texels: (height, width) the probe is downsized to, suns excepted. An avatar's visibility has degree 3
+        texels: (height, width) the probe is downsized to; an avatar's visibility has degree 3
             and was trained on 32 × 64; more changes highlights below roughness 0.4 only.
 
     Attributes:
         light_to_world: [3, 3], the probe's frame → that of the Gaussians that are shaded, see ``in_frame``.
-        sky: all the light but the suns, as the mode has it.
-        suns: what ``table+sun`` took out of the map; empty when nothing in it is bright and compact enough.
+        sky: all the light but the directional lights, as the mode has it.
+        directional: lights that ``table+sun`` took out of the map, if any are bright and compact enough.
 
     Raises:
         InputError: the mode is none of SHADE_MODES.
@@ -66,75 +66,70 @@ class Shader:
     def __init__(self, light: Light, mode: str = "table+sun", *, texels: tuple[int, int] = (32, 64)) -> None:
         self.light, self.mode = light, mode
         self.light_to_world = light.rotation
-        self.suns: tuple[Sun, ...] = ()
+        self.directional: tuple[DirectionalLight, ...] = ()
         self.sky: AmbientLight | SkyTables | DistantLights
         if mode == "ao":
             self.sky = AmbientLight.project(light, texels)
         elif mode == "table":
             self.sky = SkyTables.build(light, texels)
         elif mode == "table+sun":
-            sky, self.suns = extract_suns(light)
+            sky, self.directional = extract_directional(light)
             self.sky = SkyTables.build(sky, texels)
         elif mode == "brute":
             self.sky = DistantLights.all_texels(light, texels)
         else:
             self.sky = DistantLights.median_cut(light, _light_count(mode))
-        self._in_probe = (  # what sun_arrays returns, with directions in the light probe's frame
-            np.array([sun.direction for sun in self.suns]).reshape(-1, 3),
-            np.array([sun.irradiance for sun in self.suns], np.float32).reshape(-1, 3),
-            np.array([sun.spread**2 for sun in self.suns], np.float32),
+        self._in_probe = (  # what directional_arrays returns, with directions in the light probe's frame
+            np.array([light_.direction for light_ in self.directional]).reshape(-1, 3),
+            np.array([light_.irradiance for light_ in self.directional], np.float32).reshape(-1, 3),
+            np.array([light_.spread**2 for light_ in self.directional], np.float32),
         )
 
     def turned(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as ``Light``); shares all tables."""
         light = self.light.turned(yaw)
-        return twin(self, light=light, light_to_world=light.rotation)
+        return shallow_copy(self, light=light, light_to_world=light.rotation)
 
     def in_frame(self, frame_to_world: ArrayLike) -> Shader:
         """The same light for Gaussians in a frame that ``frame_to_world`` [3, 3] turns to the world's axes."""
-        return twin(self, light_to_world=np.asarray(frame_to_world, np.float64).T @ self.light.rotation)
+        return shallow_copy(self, light_to_world=np.asarray(frame_to_world, np.float64).T @ self.light.rotation)
 
     def shade(
-        self,
-        gaussians: Gaussians,
-        camera_position: ArrayLike,
-        seen: ArrayLike | None = None,
-        *,
-        sun_shadows: bool = True,
+        self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None, *, shadows: bool = True
     ) -> Floats32:
         """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m.
 
         Gaussians that face away from the camera are shaded too: at a silhouette they are seen. Those that are
         not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same. Without
-        ``sun_shadows`` nothing stands in the way of the suns, as for models that know of no shadows.
+        ``shadows`` nothing stands in the way of the directional lights, as for models that know of no shadows.
         """
         light_to_world = self.light_to_world
         seen = mask(seen, len(gaussians.means))
         radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
-        if self.suns and len(radiance):
-            suns = self.sun_arrays()
-            visibility = np.ones((len(radiance), len(suns.directions)), np.float32)
-            if sun_shadows:
+        if self.directional and len(radiance):
+            lights = self.directional_arrays()
+            visibility = np.ones((len(radiance), len(lights.directions)), np.float32)
+            if shadows:
                 visibility = directional_visibility(
                     gaussians.means,
                     gaussians.normals,
-                    suns.directions,
+                    lights.directions,
                     radii=shadow_radii(gaussians),
                     resolution=SHADOW_RESOLUTION,
                     receivers=seen,
                 )
             surfaces = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
             eye = np.array(camera_position, np.float32)
-            add_suns(tuple(floats(a) for a in surfaces), floats(visibility), eye, suns, seen, radiance)
+            add_directional(tuple(floats(a) for a in surfaces), floats(visibility), eye, lights, seen, radiance)
         return radiance
 
-    def sun_arrays(self) -> SunArrays:
-        """The suns as kernels want them, in the frame of the Gaussians."""
+    def directional_arrays(self) -> DirectionalArrays:
+        """The directional lights as kernels want them, in the frame of the Gaussians."""
         directions, irradiance, spreads = self._in_probe
-        if not self.suns:
-            return SunArrays(irradiance, irradiance, spreads)
+        if not self.directional:
+            return DirectionalArrays(irradiance, irradiance, spreads)
         turned = directions @ self.light_to_world.T
-        return SunArrays(np.array(turned, np.float32, order="C"), irradiance, spreads)
+        return DirectionalArrays(np.array(turned, np.float32, order="C"), irradiance, spreads)
 
 
 def check_mode(mode: str) -> None:
@@ -146,9 +141,9 @@ def check_mode(mode: str) -> None:
 def _light_count(mode: str) -> int:
     match = re.fullmatch(r"lights:(\d{1,6})", mode)
     count = int(match[1]) if match else 0
-    if not 1 <= count <= _MOST_LIGHTS:
+    if not 1 <= count <= _MAX_LIGHTS:
         raise InputError(
-            "shading mode", expected=f"one of {', '.join(SHADE_MODES)} (K from 1 to {_MOST_LIGHTS})", got=mode
+            "shading mode", expected=f"one of {', '.join(SHADE_MODES)} (K from 1 to {_MAX_LIGHTS})", got=mode
         )
     return count
 

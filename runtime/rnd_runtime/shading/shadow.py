@@ -1,14 +1,12 @@
 """Which points of a body a distant light reaches: depth maps splatted from the points themselves.
 
-No mesh and no capsules: any cloud of points with normals on closed surfaces will do, so clothing and other
-skeletons need nothing of their own. Per direction, every point that faces the light is drawn as a small disc
-in its tangent plane into an orthographic map that keeps what lies nearest to the light; then every point
-looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its
-own tangent plane, so that a slope casts no shadow on itself. Visibility is a continuous function of the places, if a
-steep one.
+Any cloud of points with normals on closed surfaces will do. Per direction, every point that faces the light is rendered
+as a small disc in its tangent plane into an orthographic map that keeps what is nearest to the light. Every point then
+looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its own tangent
+plane, so that a slope casts no shadow on itself. Visibility is a continuous function of the positions.
 
-Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). Threads share the work of
-each direction; their number changes no bit.
+Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). The number of threads
+changes no bit.
 """
 
 from __future__ import annotations
@@ -19,13 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.simd import WIDTH, aligned_floats, block_x, block_y, lanes, larger, load, store
+from rnd_runtime.core.simd import WIDTH, aligned_floats, block_x, block_y, lanes, load, maximum, store
 
 Floats32 = NDArray[np.float32]
 
 # How far a blocker must rise above a point's tangent plane, in disc radii: a disc of radius r beside it on a
 # surface of curvature 1/R rises r²/2R. 0.5 is enough for exact normals; those of a trained avatar disagree by some
-# 10° and speckled its limbs (28.9 dB instead of 29.0 on relit pictures). More loses shadows where limbs touch.
+# 10° and speckled its limbs (28.9 dB instead of 29.0 on relit images). More loses shadows where limbs touch.
 CLEARANCE = np.float32(1.0)
 # ... and no less than this many texels, which is what rounding to the map's grid costs on curved surfaces.
 CLEARANCE_TEXELS = np.float32(0.35)
@@ -104,7 +102,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
     bounds = np.empty((chunks, 4), np.float32)
     for chunk in numba.prange(chunks):
         first, last = chunk * _CHUNK, min((chunk + 1) * _CHUNK, count)
-        _turn(arrays, frame, first, last, position, normal, bounds[chunk])
+        _to_map(arrays, frame, first, last, position, normal, bounds[chunk])
     left, bottom, right, top = _NOWHERE
     for chunk in range(chunks):
         left, bottom = min(left, bounds[chunk, 0]), min(bottom, bounds[chunk, 1])
@@ -132,11 +130,11 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
                 _draw_disc(depth, across, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
     for i in numba.prange(count):
         if normal[i, 2] > 0 and receivers[i]:
-            visibility[i] = _look_up(depth, across, position, normal, i, radii[i], texel)
+            visibility[i] = _lit_share(depth, across, position, normal, i, radii[i], texel)
 
 
 @numba.njit(error_model="numpy")
-def _turn(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
+def _to_map(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
     """Rows first … last − 1 in the axes of ``frame``, and the least and greatest x and y among them."""
     points, normals, radii, _ = arrays
     left, bottom, right, top = _NOWHERE
@@ -177,10 +175,10 @@ def axes_towards(direction):  # type: ignore[no-untyped-def]
     frame = np.zeros((3, 3), np.float32)
     x, y, z = frame[0], frame[1], frame[2]
     _normalized(direction, z)
-    least = 0
+    smallest = 0
     for axis in range(1, 3):
-        least = axis if abs(z[axis]) < abs(z[least]) else least
-    y[least] = 1
+        smallest = axis if abs(z[axis]) < abs(z[smallest]) else smallest
+    y[smallest] = 1
     _cross(y, z, x)
     _normalized(x, x)
     _cross(z, x, y)
@@ -226,21 +224,21 @@ def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  #
             rise = slope_x * dx + slope_y * dy
             # beyond the circle, and beyond the ellipse that one sees of it
             beyond = (dx * dx + dy * dy) * (texel * texel) - square
-            outside = larger(beyond, lanes(_ZERO)) + cosine * larger(beyond + rise * rise, lanes(_ZERO))
+            outside = maximum(beyond, lanes(_ZERO)) + cosine * maximum(beyond + rise * rise, lanes(_ZERO))
             plane = z + rise - fall * outside
             at = (row * across + column) * WIDTH
-            store(depth, at, larger(plane, load(depth, at)))
+            store(depth, at, maximum(plane, load(depth, at)))
 
 
 @numba.njit(inline="always")
-def _place(row, column, across):  # type: ignore[no-untyped-def]
+def _texel_index(row, column, across):  # type: ignore[no-untyped-def]
     """Of a texel in a map that is kept as rows of ``across`` blocks of 4×4."""
     block = (row >> BLOCK_SHIFT) * across + (column >> BLOCK_SHIFT)
     return block * WIDTH + (row & BLOCK - 1) * BLOCK + (column & BLOCK - 1)
 
 
 @numba.njit(error_model="numpy")
-def _look_up(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
+def _lit_share(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
     """Bilinear share of the four texels around a point that lies open: what rises above its plane hides it."""
     x, y, z = position[i, 0], position[i, 1], position[i, 2]
     slope_x, slope_y = _slopes(normal, i, texel)
@@ -251,6 +249,6 @@ def _look_up(depth, across, position, normal, i, radius, texel):  # type: ignore
     for corner in range(4):
         c, r = column + (corner & 1), row + (corner >> 1)
         dx, dy = np.float32(c) - x, np.float32(r) - y
-        open_share = (z + slope_x * dx + slope_y * dy + top - depth[_place(r, c, across)]) * span
+        open_share = (z + slope_x * dx + slope_y * dy + top - depth[_texel_index(r, c, across)]) * span
         lit += (1 - abs(dx)) * (1 - abs(dy)) * min(max(open_share, _ZERO), _ONE)
     return min(lit, np.float32(1))

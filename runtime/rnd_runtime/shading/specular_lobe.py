@@ -62,9 +62,9 @@ def make_table() -> Floats32:
     energy, tangent, normal = (np.stack(column) for column in zip(*rows))
     length = np.hypot(tangent, normal)
     width = width_of_mean(length)
-    place = np.log(width / LOBE_WIDTHS[0]) / np.log(LOBE_WIDTHS[1] / LOBE_WIDTHS[0])
-    place = np.clip(place, 0, len(LOBE_WIDTHS) - 1)
-    columns = [energy, tangent / length, normal / length, place, *attenuation(width)]
+    level = np.log(width / LOBE_WIDTHS[0]) / np.log(LOBE_WIDTHS[1] / LOBE_WIDTHS[0])
+    level = np.clip(level, 0, len(LOBE_WIDTHS) - 1)
+    columns = [energy, tangent / length, normal / length, level, *attenuation(width)]
     return np.ascontiguousarray(np.stack(columns, axis=-1), np.float32)
 
 

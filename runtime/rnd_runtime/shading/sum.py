@@ -17,7 +17,7 @@ from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.sh import sh_basis
 
-from .brdf import ggx32, roughness_to_alpha
+from .brdf import ggx_scalar, roughness_to_alpha
 from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles
 
 Floats = NDArray[np.float64]
@@ -26,7 +26,7 @@ Floats32 = NDArray[np.float32]
 _EXPONENT = np.int32(0x7F800000)  # of a float32: all ones in what is infinite or no number
 _ZERO, _NAN = np.float32(0), np.float32(np.nan)
 _ONE_OVER_PI = np.float32(1 / np.pi)
-_HALF_FLOOR = np.float32(1e-8)  # |l + v|² where light and camera are opposite
+HALF_FLOOR = np.float32(1e-8)  # |l + v|² where light and camera are opposite
 _CUT_TEXELS = (128, 256)  # the grid a median cut works on
 
 
@@ -165,7 +165,7 @@ def _sum_lights(  # type: ignore[no-untyped-def]
             continue
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         vx, vy, vz = camera[0] - means[i, 0], camera[1] - means[i, 1], camera[2] - means[i, 2]
-        distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), _HALF_FLOOR)
+        distance = max(np.sqrt(vx * vx + vy * vy + vz * vz), HALF_FLOOR)
         vx, vy, vz = vx / distance, vy / distance, vz / distance
         n_dot_v = nx * vx + ny * vy + nz * vz
         alpha_squared = alpha[i] * alpha[i]
@@ -182,13 +182,13 @@ def _sum_lights(  # type: ignore[no-untyped-def]
             v += c8 * basis[8, k] + c9 * basis[9, k] + c10 * basis[10, k] + c11 * basis[11, k]
             v += c12 * basis[12, k] + c13 * basis[13, k] + c14 * basis[14, k] + c15 * basis[15, k]
             hx, hy, hz = lx + vx, ly + vy, lz + vz
-            half_squared = max(hx * hx + hy * hy + hz * hz, _HALF_FLOOR)
+            half_squared = max(hx * hx + hy * hy + hz * hz, HALF_FLOOR)
             # sin²θ_h by the cross product: 1 − (n·h)² would lose the highlights of α ≈ 0.01 to rounding
             cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
             sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
             n_dot_l = nx * lx + ny * ly + nz * lz
             arriving = v * max(n_dot_l, _ZERO)
-            reflected = arriving * ggx32(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
+            reflected = arriving * ggx_scalar(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
             diffuse_r += arriving * flux[0, k]
             diffuse_g += arriving * flux[1, k]
             diffuse_b += arriving * flux[2, k]

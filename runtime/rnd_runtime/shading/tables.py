@@ -23,10 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.sh import SH_COUNT, rotation_matrix, sh_basis, sh_quadrature
-from rnd_runtime.core.simd import WIDTH, lanes, load, store, total
+from rnd_runtime.core.simd import WIDTH, lanes, load, reduce_add, store
 
 from .light import Light, texel_directions, texel_solid_angles
-from .lookup import DIFFUSE_SIZE, SPECULAR_SIZE, look_up, turned
+from .lookup import DIFFUSE_SIZE, SPECULAR_SIZE, rotated, shade_from_tables
 from .specular_lobe import LOBE_WIDTHS, lobe_rows
 
 Floats = NDArray[np.float64]
@@ -66,11 +66,11 @@ class SkyTables:
         weighted = (radiance * solid_angles)[:, :, None] * sh_basis(directions)[:, None, :]  # [K, 3, 16]
         diffuse = np.empty((DIFFUSE_SIZE * DIFFUSE_SIZE, 3 * SH_COUNT), np.float32)
         weighted = weighted.reshape(len(directions), 3 * SH_COUNT).astype(np.float32)
-        _gather(octahedral_nodes(DIFFUSE_SIZE), directions, weighted, diffuse)
+        _sum_diffuse(octahedral_nodes(DIFFUSE_SIZE), directions, weighted, diffuse)
         nodes = octahedral_nodes(SPECULAR_SIZE)
         specular = np.empty((len(LOBE_WIDTHS), len(nodes), 3), np.float32)
-        whole = -(-len(directions) // WIDTH) * WIDTH
-        texel_columns = np.zeros((7, whole), np.float32)
+        padded = -(-len(directions) // WIDTH) * WIDTH
+        texel_columns = np.zeros((7, padded), np.float32)
         texel_columns[:, : len(directions)] = np.concatenate(
             [directions, solid_angles, radiance * solid_angles], axis=1
         ).T
@@ -120,11 +120,11 @@ def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, see
         for column in range(3):
             for k in range(3):
                 root_to_light[row, column] += light_to_world[k, row] * root_rotation[k, column]
-    turn = rotation_matrix(tables.directions, tables.weighted, root_to_light).astype(np.float32)
+    rotation = rotation_matrix(tables.directions, tables.weighted, root_to_light).astype(np.float32)
     rotations = light_to_world.astype(np.float32), root_to_light.astype(np.float32)
     radiance = np.zeros((len(seen), 3), np.float32)
-    diffuse = turned(tables.diffuse, turn)
-    look_up(surfaces, camera, rotations, (diffuse, tables.specular, tables.lobes), seen, radiance)
+    diffuse = rotated(tables.diffuse, rotation)
+    shade_from_tables(surfaces, camera, rotations, (diffuse, tables.specular, tables.lobes), seen, radiance)
     return radiance
 
 
@@ -144,7 +144,7 @@ def octahedral_nodes(size: int) -> Floats32:
 
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _gather(nodes, directions, weighted, sums):  # type: ignore[no-untyped-def]
+def _sum_diffuse(nodes, directions, weighted, sums):  # type: ignore[no-untyped-def]
     """Σ_k weighted [K, 48] max(n·ω_k, 0) at every node, texel by texel: a product of matrices would add in an order of
     its threads."""
     for i in numba.prange(len(nodes)):
@@ -178,7 +178,7 @@ def _prefilter(nodes, texels, widths, specular):  # type: ignore[no-untyped-def]
                 red += weight * load(texels, 4 * count + k)
                 green += weight * load(texels, 5 * count + k)
                 blue += weight * load(texels, 6 * count + k)
-            whole = total(weights)
-            specular[level, i, 0] = total(red) / whole
-            specular[level, i, 1] = total(green) / whole
-            specular[level, i, 2] = total(blue) / whole
+            padded = reduce_add(weights)
+            specular[level, i, 0] = reduce_add(red) / padded
+            specular[level, i, 1] = reduce_add(green) / padded
+            specular[level, i, 2] = reduce_add(blue) / padded

@@ -16,8 +16,8 @@ from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.light import load_light
 from rnd_runtime.shading.shader import Shader
-from runtime.shading.shading_test import ball
 from support.paths import ASSETS
+from support.shading_scenes import ball
 from support.ties import assert_only_ties
 
 BACKENDS = ("gl-egl", "gl-osmesa")
@@ -141,12 +141,6 @@ _BROKEN = (
 @pytest.mark.parametrize("mode", MODES)
 def test_broken_gaussians_leave_no_trace(sky, rasterizer, mode):
     _assert_no_trace_of_broken_ones(sky, rasterizer, mode)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_broken_gaussians_leave_no_trace_on_the_cpu(sky, mode):
-    with make_rasterizer("cpu") as cpu:
-        _assert_no_trace_of_broken_ones(sky, cpu, mode)
 
 
 def _assert_no_trace_of_broken_ones(sky, rasterizer, mode):

@@ -14,14 +14,14 @@ from rnd_runtime.gl.posing import GlPosing
 from rnd_runtime.gl.projection import GlProjection
 from rnd_runtime.gl.raster import sorted_ellipses
 from rnd_runtime.gl.surfaces import SurfaceUpload
-from rnd_runtime.posing.posing import Unposed
 from rnd_runtime.posing.reference import pose_reference
+from rnd_runtime.posing.rest import Unposed
 from rnd_runtime.raster.cpu import forward
 from rnd_runtime.raster.project import pinhole
 from rnd_runtime.shading.shader import shadow_radii
-from runtime.posing.posing_test import BROKEN, broken_scene, posing_scene
 from support import gl_devices
 from support.gl_devices import BACKENDS
+from support.posing_scenes import BROKEN, broken_scene, posing_scene
 from support.raster_scenes import off_centre_camera, random_scene
 
 ROUNDING = 1e-5  # float32 against float64, relative to the largest entry: products of three 3×3 matrices, GPU's exp

@@ -159,23 +159,6 @@ def _counted_reads(patch):
     return reads
 
 
-def test_gpus_sort_and_llvmpipe_leaves_it_to_the_cpu(context, monkeypatch):
-    made = []
-    monkeypatch.setattr(projection_gl, "DepthSort", lambda context: made.append(context) or DepthSort(context))
-
-    def sorts(sorting="auto"):
-        made.clear()
-        with context:
-            GlProjection(context, sorting).release()
-        return bool(made)
-
-    assert (sorts(), sorts("device"), sorts("cpu")) == (not is_software(context), True, False)
-    monkeypatch.setattr(projection_gl, "is_software", lambda _: False)  # as on a GPU
-    assert (sorts(), sorts("cpu")) == (True, False)
-    monkeypatch.setattr(projection_gl, "can_sort", lambda _: False)  # as on macOS
-    assert not sorts()
-
-
 def test_what_cannot_sort_says_so(context, monkeypatch):
     monkeypatch.setattr(sort_gl, "can_sort", lambda _: False)
     with context, pytest.raises(InputError, match=r"sorting on the device: expected OpenGL 4\.3, got "):

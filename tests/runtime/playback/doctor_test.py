@@ -46,19 +46,3 @@ def test_without_opengl_it_says_what_to_install(monkeypatch, probe, reason):
     assert ill["OpenGL, OSMesa"].advice.startswith("apt-get install libosmesa6: ")
     assert reason in ill["OpenGL, EGL"].advice
     assert ill["rasteriser"].value == "cpu" and reason in ill["rasteriser"].advice
-
-
-def test_a_driver_that_hangs_is_given_up(monkeypatch):
-    monkeypatch.setattr(doctor, "PROBE_SECONDS", 0.2)
-    assert doctor._outcome(doctor._start("import time; time.sleep(60)")) == (False, "no answer within 0 s")
-
-
-def test_osmesa_is_optional_beside_egl():
-    assert doctor._gl_finding("", "osmesa", False, "why", needed=False).advice == (
-        "apt-get install libosmesa6 (optional: EGL works): why"
-    )
-
-
-@pytest.mark.parametrize("line", ["gl (egl, NVIDIA H200/PCIe/SSE2)", "gl (window, Apple M3)", "cpu"])
-def test_it_tells_the_rasteriser_that_auto_takes(line):
-    assert doctor._rasterizer(True, line) == (line, None)

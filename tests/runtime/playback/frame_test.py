@@ -88,14 +88,6 @@ def test_encoded_and_posed_bodies_give_one_frame(avatar, motion, sky, mode, cull
     assert list(frame.stage_seconds) == stages
 
 
-def test_codes_are_made_where_they_are_asked_for(avatar, motion, sky):
-    encoded, renderer = avatar.encode(motion, 0.3), FrameRenderer(avatar, sky, CAMERA, shade="table")
-    coded, plain = (renderer.draw(encoded, srgb=yes) for yes in (True, False))
-    np.testing.assert_array_equal(coded.radiance, plain.radiance)
-    np.testing.assert_array_equal(coded.srgb, plain.srgb)
-    assert "tone map" in coded.stage_seconds and "tone map" not in plain.stage_seconds
-
-
 def test_turning_the_light_equals_another_light(avatar, motion, sky):
     turned, fresh = FrameRenderer(avatar, sky, CAMERA), FrameRenderer(avatar, sky, CAMERA)
     still = turned.render(motion, 0.3).srgb

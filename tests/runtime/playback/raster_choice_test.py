@@ -57,8 +57,3 @@ def test_all_draw_the_same():
         cpu, gl = (getattr(picture, name) for picture in pictures)
         assert cpu.shape == gl.shape
         np.testing.assert_allclose(cpu, gl, atol=1e-5)  # one float32 exp2 against another, at α up to 0.5
-
-
-def test_an_unknown_kind_is_refused():
-    with pytest.raises(InputError, match=r"expected auto \| gl \| gl-egl \| gl-osmesa \| cpu, got 'optix'"):
-        make_rasterizer("optix")

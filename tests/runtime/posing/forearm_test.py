@@ -15,7 +15,7 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import bone_transforms
-from rnd_runtime.posing.forearm import FREE, MOST, share_twists, skinning_bones
+from rnd_runtime.posing.forearm import FREE, MAX_SHARE, share_twists, skinning_bones
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.training.data import pose_input
 from support.paths import ROOT
@@ -50,7 +50,7 @@ def _handed_on(rotation: np.ndarray, axis: np.ndarray) -> float:
     along = np.array([x, y, z]) @ axis
     twist = (2 * np.arctan2(along, w) + np.pi) % (2 * np.pi) - np.pi
     beyond = max(abs(twist) - FREE, 0) / (np.pi - FREE)
-    return float(np.sign(twist) * MOST * np.sin(np.pi * beyond) ** 2 * min(1, 4 * (w * w + along * along)))
+    return float(np.sign(twist) * MAX_SHARE * np.sin(np.pi * beyond) ** 2 * min(1, 4 * (w * w + along * along)))
 
 
 def test_it_turns_by_what_quaternions_say() -> None:

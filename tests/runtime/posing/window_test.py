@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix, rotation_6d
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.motion.skeleton import SMPL_NAMES, Skeleton, smpl_skeleton
+from rnd_runtime.motion.skeleton import Skeleton, smpl_skeleton
+from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_runtime.posing.forearm import skinning_bones
 from rnd_runtime.posing.window import moment, motion_window
 

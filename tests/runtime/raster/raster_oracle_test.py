@@ -76,12 +76,6 @@ def test_image_covariance_is_that_of_projected_samples():
     np.testing.assert_allclose(np.cov(pixels.T), projected, atol=0.01 * np.trace(projected))
 
 
-def test_dilation_alone_is_left_of_a_point():
-    np.testing.assert_allclose(
-        oracle.image_covariances([[0, 0, 2]], isotropic(0.0), straight(8, 8))[0], 0.05 * np.eye(2), rtol=EXACT
-    )
-
-
 def test_alpha_falls_with_the_mahalanobis_distance():
     covariance = np.array([[9.0, 3.0], [3.0, 5.0]])
     root = np.linalg.cholesky(covariance)
@@ -196,14 +190,3 @@ def test_what_is_not_drawn(mean, upper, opacity, feature):
     rows = np.array([mean, (0, 0, 3)], float), np.array([upper, (0.01, 0, 0, 0.01, 0, 0.01)], float)
     arrays = (*rows, np.array([opacity, 0.5]), np.array([[feature], [1.0]]))
     assert oracle.drawn(*arrays, straight(8, 8)).tolist() == [False, True]
-
-
-def test_drawing_begins_ten_centimetres_away():
-    means, upper = np.array([(0, 0, 0.0999), (0, 0, 0.1001)]), isotropic(0.01, 0.01)
-    assert oracle.drawn(means, upper, np.full(2, 0.5), np.ones((2, 1)), straight(8, 8)).tolist() == [False, True]
-
-
-def test_no_gaussians_give_an_empty_picture():
-    raster = oracle.rasterize(np.zeros((0, 3)), np.zeros((0, 6)), np.zeros(0), np.zeros((0, 4)), straight(5, 3))
-    assert raster.image.shape == (3, 5, 4) and raster.alpha.shape == raster.depth.shape == (3, 5)
-    assert not raster.image.any() and not raster.alpha.any() and not raster.depth.any()

@@ -55,7 +55,7 @@ def test_straight_alpha():
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(InputError, match="picture"):
+    with pytest.raises(InputError, match="image"):
         tone_map(np.zeros((4, 5, 3)), np.zeros((5, 4)))
     with pytest.raises(InputError, match="background"):
         tone_map(np.zeros((4, 5, 3)), np.zeros((4, 5)), np.zeros((5, 4, 3)))

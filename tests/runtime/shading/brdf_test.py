@@ -2,7 +2,16 @@ import numba
 import numpy as np
 import pytest
 
-from rnd_runtime.shading.brdf import F0, LARGEST_ALBEDO, ROUGHNESS_RANGE, brdf, ggx, ggx32, roughness_to_alpha, specular
+from rnd_runtime.shading.brdf import (
+    F0,
+    LARGEST_ALBEDO,
+    ROUGHNESS_RANGE,
+    brdf,
+    ggx,
+    ggx_scalar,
+    roughness_to_alpha,
+    specular,
+)
 
 ROUGHNESSES = [0.0, 0.09, 0.2, 0.4, 0.6, 0.8, 0.99, 1.0]
 COSINES = [1.0, 0.9, 0.5, 0.2, 0.05, 0.01, 1e-3]
@@ -67,21 +76,6 @@ def test_it_is_the_formula_of_the_papers():
     np.testing.assert_allclose(brdf(0.3, roughness, *cosines), 0.3 / np.pi + np.array(expected), rtol=1e-9)
 
 
-@pytest.mark.parametrize("roughness", [0.09, 0.3, 0.6, 0.99])
-def test_normal_distribution_projects_to_one(roughness):
-    # D alone, out of the whole formula: where l = v = h, F is F0 and G/(4 n·l n·v) is known
-    alpha = roughness**2
-    edges = np.linspace(0, 1, 200001)
-    tangent = alpha * np.sqrt(((edges[1:] + edges[:-1]) / 2) / (1 - (edges[1:] + edges[:-1]) / 2))
-    cosine = np.cos(np.arctan(tangent))
-    value = specular(np.float64(roughness), cosine, cosine, np.ones_like(cosine))
-    smith = 1 / (cosine + np.sqrt(alpha**2 + (1 - alpha**2) * cosine**2)) ** 2
-    d = value / (F0 * smith)
-    area = np.diff(np.cos(np.arctan(alpha * np.sqrt(edges[:-1] / (1 - edges[:-1])))) ** 2)
-    integral = np.sum(d[:-1] * np.pi * -area)  # ∫ D cosθ dω = π ∫ D d(sin²θ)
-    np.testing.assert_allclose(integral, 1, atol=2e-5)  # the last cell, the horizon, holds 5e-6
-
-
 @pytest.mark.parametrize("cosine", COSINES)
 @pytest.mark.parametrize("roughness", ROUGHNESSES)
 def test_white_furnace_of_the_specular_term(roughness, cosine):
@@ -95,13 +89,6 @@ def test_smooth_specular_reflects_at_least_f0(roughness, cosine):
     assert specular_reflectance(roughness, cosine) >= F0 * (1 - QUADRATURE)
 
 
-def test_rough_specular_reflects_less_than_f0():
-    # What GGX scatters twice is lost: of F0 = 0.04 remain 0.0387 at γ 0.4, 0.0223 at 0.8, 0.0127 at 0.99.
-    # The formula is the paper's, so FAILURES L8 (F0 ≤ reflectance) holds for albedo 0 only up to γ ≈ 0.2.
-    measured = [specular_reflectance(roughness, 1.0) for roughness in (0.4, 0.8, 0.99)]
-    np.testing.assert_allclose(measured, [0.0387, 0.0223, 0.0127], rtol=5e-3)
-
-
 @pytest.mark.parametrize("albedo", [0.0, LARGEST_ALBEDO, pytest.param(1.0, marks=pytest.mark.xfail(strict=True))])
 def test_white_furnace_from_all_sides(albedo):
     # Lambert and GGX are added uncoupled as in the paper: white gives back more than it gets (1.02 to 1.09,
@@ -113,13 +100,6 @@ def test_white_furnace_from_all_sides(albedo):
         assert albedo + np.sum(weights * cosines * specular_part) <= 1  # ∫ R(μ) 2μ dμ
 
 
-def test_reciprocal():
-    lights, views = upper_directions(300, 3), upper_directions(300, 4)
-    roughness, l_dot_v = np.full(300, 0.35), (lights * views).sum(-1)
-    forth, back = (specular(roughness, a[:, 2], b[:, 2], l_dot_v) for a, b in [(lights, views), (views, lights)])
-    np.testing.assert_allclose(forth, back, rtol=1e-12)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_finite_where_cosines_vanish(dtype):
     cosines = np.array([-1, -1e-3, -1e-30, 0, 1e-30, 1e-8, 1e-4, 0.5, 1], dtype)
@@ -128,14 +108,6 @@ def test_finite_where_cosines_vanish(dtype):
     assert value.dtype == dtype
     assert np.isfinite(value).all()
     assert (value >= 0).all()
-
-
-def test_the_silhouette_is_continuous():
-    # a normal that tips over the horizon as seen from the camera: nothing jumps where n·v changes sign
-    tilt = np.linspace(-1e-3, 1e-3, 201)
-    light, view = direction(0.7), np.stack([-np.cos(tilt), 0 * tilt, np.sin(tilt)], -1)
-    value = specular(np.full(201, 0.3), np.full(201, light[2]), view[:, 2], view @ light)
-    assert np.abs(np.diff(value)).max() < 2e-2 * value.max()
 
 
 def test_torch_computes_the_same_with_finite_gradients():
@@ -150,14 +122,16 @@ def test_torch_computes_the_same_with_finite_gradients():
     assert all(torch.isfinite(tensor.grad).all() for tensor in [*tensors, *corner])
 
 
-def test_the_kernel_twin_agrees():
-    twin = numba.vectorize(["f4(f4,f4,f4,f4,f4)"])(
-        lambda alpha_squared, l, v, sine_squared, half_squared: ggx32(alpha_squared, l, v, sine_squared, half_squared)
+def test_the_kernel_computes_the_same():
+    kernel = numba.vectorize(["f4(f4,f4,f4,f4,f4)"])(
+        lambda alpha_squared, l, v, sine_squared, half_squared: ggx_scalar(
+            alpha_squared, l, v, sine_squared, half_squared
+        )
     )
     rng = np.random.default_rng(7)
     n_dot_l, n_dot_v = rng.uniform(-0.1, 1, size=(2, 1000)).astype(np.float32)
     sine_squared, half_squared = rng.uniform(0, 1, 1000) ** 4, rng.uniform(0, 4, 1000)
     alpha = roughness_to_alpha(rng.uniform(0, 1, 1000))
-    exact = ggx(alpha, n_dot_l.astype(float), n_dot_v.astype(float), sine_squared, half_squared)
-    fast = twin((alpha**2).astype("f4"), n_dot_l, n_dot_v, sine_squared.astype("f4"), half_squared.astype("f4"))
+    exact = ggx(alpha**2, n_dot_l.astype(float), n_dot_v.astype(float), sine_squared, half_squared)
+    fast = kernel((alpha**2).astype("f4"), n_dot_l, n_dot_v, sine_squared.astype("f4"), half_squared.astype("f4"))
     np.testing.assert_allclose(fast, exact, rtol=2e-5)  # some ten roundings of 6e-8, (1 − v·h)⁵ the worst

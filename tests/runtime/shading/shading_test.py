@@ -5,16 +5,16 @@ import pytest
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import SH_COUNT, sh_basis, sh_rotation, sphere_quadrature
+from rnd_runtime.core.sh import sh_rotation
+from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.light import Light, texel_directions, texel_solid_angles
-from rnd_runtime.shading.reference import shade_reference, shade_reference_with_suns
+from rnd_runtime.shading.reference import shade_reference, shade_reference_with_directional
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.sum import DistantLights
-from rnd_runtime.shading.sun import extract_suns
 from rnd_runtime.shading.tables import octahedral_nodes
+from support.shading_scenes import COUNT, ball, fibonacci_sphere, probe, rotation
 
 CAMERA = np.array([0.5, 0.4, 4.0])
-COUNT = 1500
 
 
 def psnr(image, reference):
@@ -22,66 +22,10 @@ def psnr(image, reference):
     return 10 * np.log10(reference.max() ** 2 / error)
 
 
-def fibonacci_sphere(count):
-    i = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    return np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], -1)
-
-
-def rotation(seed):
-    q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
-    q = q * np.sign(np.diag(r))
-    return q * np.sign(np.linalg.det(q))
-
-
-def ball(count=COUNT, seed=0, roughness=(0.35, 0.99), open_sky=False):
-    """A unit ball of Gaussians; visibility is a random smooth mask of some half of the sphere, or one."""
-    rng = np.random.default_rng(seed)
-    normals = fibonacci_sphere(count)
-    visibility = np.zeros((count, SH_COUNT))
-    visibility[:, 0] = np.sqrt(4 * np.pi)
-    root = rotation(seed + 1)
-    if not open_sky:
-        directions, weights = sphere_quadrature(12)
-        tilted = normals + 0.8 * np.sin(3 * normals @ rng.normal(size=(3, 3)))
-        facing = 1 / (1 + np.exp(-4 * (tilted @ root @ directions.T)))  # in the root's frame
-        visibility = facing @ (sh_basis(directions) * weights[:, None])
-    spacing = np.sqrt(4 * np.pi / max(count, 1))
-    covariances = np.zeros((count, 6))
-    covariances[:, [0, 3, 5]] = (0.6 * spacing) ** 2
-    arrays = (
-        normals,
-        covariances,
-        np.full(count, 0.95),
-        normals,
-        rng.uniform(0.03, 0.8, (count, 3)),
-        rng.uniform(*roughness, count),
-        visibility,
-        root,
-    )
-    return Gaussians(*(np.asarray(a, np.float32) for a in arrays))
-
-
-def probe(height=32, sun=0.0, yaw=0.0, up="y"):
-    """A coloured sky with a bright window, and a texel of sun when asked for."""
-    directions = texel_directions(height, 2 * height)
-    window = np.exp(8 * (directions @ [0.6, 0.48, 0.64] - 1))[..., None]
-    radiance = np.array([0.3, 0.5, 0.9]) * (1.2 + directions[..., 1:2]) + window * np.array([6.0, 5, 3])
-    radiance[..., 0] *= 1 + 0.5 * np.sin(4 * directions[..., 0])
-    radiance[height // 4, height // 3] += sun * np.array([1, 0.9, 0.7])
-    return Light(radiance.astype(np.float32), yaw=yaw, up=up)
-
-
 @pytest.mark.parametrize(("yaw", "up"), [(0.0, "y"), (0.9, "y"), (-2.0, "z")])
 def test_brute_is_the_reference(yaw, up):
     gaussians, light = ball(roughness=(0.2, 1.0)), probe(sun=2000, yaw=yaw, up=up)
     assert psnr(Shader(light, "brute").shade(gaussians, CAMERA), shade_reference(gaussians, light, CAMERA)) > 110
-
-
-def test_brute_is_the_reference_in_the_sharpest_highlights():
-    # α = 0.008 of a sun: directions rounded to 6e-8 move the highlight by 1e-5 of its width
-    gaussians, light = ball(roughness=(0.0, 0.2)), probe(sun=2000)
-    assert psnr(Shader(light, "brute").shade(gaussians, CAMERA), shade_reference(gaussians, light, CAMERA)) > 90
 
 
 # Measured at yaw 0 and 0.9: 47.7 and 46.9, 38.9 and 32.5, 30.7 and 29.5 dB; a decibel is left to compilers.
@@ -106,7 +50,7 @@ def test_the_diffuse_table_is_exact_but_for_its_grid():
 def test_without_a_sun_table_and_table_sun_are_the_same():
     gaussians, light = ball(), probe()
     shader = Shader(light, "table+sun")
-    assert shader.suns == ()
+    assert shader.directional == ()
     np.testing.assert_array_equal(shader.shade(gaussians, CAMERA), Shader(light, "table").shade(gaussians, CAMERA))
 
 
@@ -114,7 +58,7 @@ def test_a_sun_is_shaded_by_itself_with_the_whole_brdf():
     gaussians = ball(open_sky=True, roughness=(0.3, 0.99))
     light = probe(height=64, sun=4000, yaw=0.7)
     shader = Shader(light, "table+sun")
-    assert len(shader.suns) == 1
+    assert len(shader.directional) == 1
     fine = DistantLights.all_texels(light, (64, 128)).shade(gaussians, CAMERA, light.rotation)
     # a convex body under an open sky shadows nothing beyond its own horizon, so the sum is the truth
     seen = _facing(gaussians) > 0
@@ -128,25 +72,18 @@ def test_a_sun_by_its_middle_and_spread_comes_near_the_sum_over_its_texels(yaw):
     disc = texel_directions(64, 128) @ rotation(3)[0] > np.cos(np.radians(4))
     light = replace(light, radiance=light.radiance + np.float32(200) * disc[..., None].astype(np.float32))
     shader = Shader(light, "table+sun")
-    assert len(shader.suns) == 1 and shader.suns[0].spread > 0.03
+    assert len(shader.directional) == 1 and shader.directional[0].spread > 0.03
     ours = shader.shade(gaussians, CAMERA)
-    assert psnr(ours, shade_reference_with_suns(gaussians, light, CAMERA)) > 48
+    assert psnr(ours, shade_reference_with_directional(gaussians, light, CAMERA)) > 48
     assert psnr(ours, shade_reference(gaussians, light, CAMERA)) < 28
-
-
-def test_without_a_sun_both_references_are_one():
-    gaussians, light = ball(), probe()
-    np.testing.assert_array_equal(
-        shade_reference_with_suns(gaussians, light, CAMERA), shade_reference(gaussians, light, CAMERA)
-    )
 
 
 def test_suns_fade_out_on_what_faces_away_from_the_camera():
     """What gaps in a front in shade would show of its back is sky alone."""
     gaussians, light = ball(open_sky=True), probe(height=64, sun=4000)
-    sun, sky = Shader(light, "table+sun"), extract_suns(light)[0]
+    sun, sky = Shader(light, "table+sun"), extract_directional(light)[0]
     added = sun.shade(gaussians, CAMERA) - Shader(sky, "table").shade(gaussians, CAMERA)
-    facing, lit = _facing(gaussians), gaussians.normals @ np.float32(sun.suns[0].direction) > 0.05
+    facing, lit = _facing(gaussians), gaussians.normals @ np.float32(sun.directional[0].direction) > 0.05
     away, between, front = facing < -0.2, (facing > -0.2) & (facing < 0), facing > 0
     assert (lit & away).sum() > 20 and (lit & between).sum() > 5 and (lit & front).sum() > 20
     assert np.abs(added[away]).max() < 1e-6
@@ -165,7 +102,7 @@ def test_a_mirror_shows_a_lamp_and_no_pinpoint():
     lamp = np.where((directions @ towards > np.cos(np.radians(4)))[..., None], 300.0, 0.1)
     light = Light(np.repeat(lamp, 3, axis=-1))
     shader = Shader(light, "table+sun")
-    assert len(shader.suns) == 1
+    assert len(shader.directional) == 1
     gaussians = ball(200, open_sky=True, roughness=(0.1, 0.1))
     to_camera = (CAMERA - gaussians.means) / np.linalg.norm(CAMERA - gaussians.means, axis=-1, keepdims=True)
     half = to_camera + towards
@@ -243,11 +180,6 @@ def test_extreme_lights_and_broken_normals_stay_finite(mode, peak):
         assert peak > 0 or (shaded == 0).all()
 
 
-@pytest.mark.parametrize("mode", ["ao", "table", "table+sun", "lights:16", "brute"])
-def test_no_gaussians(mode):
-    assert Shader(probe(height=64, sun=4000), mode).shade(ball(0), CAMERA).shape == (0, 3)
-
-
 @pytest.mark.parametrize(
     "mode",
     ["", "tables", "lights", "lights:", "lights:0", "lights:-3", "lights:1e3", "lights:9999", f"lights:{'9' * 5000}"],
@@ -268,14 +200,6 @@ def test_a_median_cut_keeps_the_energy_and_shares_it_out(count):
     assert luminance.max() < 3 * luminance.mean()
     if count > 1:
         np.testing.assert_allclose(np.linalg.norm(lights.directions, axis=-1), 1)
-
-
-def test_a_single_texel_is_a_single_light():
-    radiance = np.zeros((32, 64, 3), np.float32)
-    radiance[8, 40] = 5
-    lights = DistantLights.median_cut(Light(radiance), 64)
-    assert (lights.directions @ texel_directions(32, 64)[8, 40] > np.cos(np.radians(6))).all()
-    np.testing.assert_allclose(lights.flux.sum(0), 5 * texel_solid_angles(32, 64)[8, 40], rtol=1e-6)
 
 
 def test_octahedral_nodes_cover_the_sphere():

@@ -4,15 +4,10 @@ import pytest
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.shading.shadow import directional_visibility
+from support.shading_scenes import fibonacci_sphere
 
 SPACING = 0.015  # m between sampled points
 HAIR = 0.5e-6  # m; a float32 of half a metre is known to 0.03e-6
-
-
-def fibonacci_sphere(count):
-    i = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
-    return np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], -1)
 
 
 DIRECTIONS = fibonacci_sphere(8)
@@ -130,15 +125,6 @@ def test_a_person_of_capsules_agrees_with_exact_tracing():
     assert agreement.mean() > 0.985  # 0.995 with points every 12 mm; what is left are the shadows' edges
 
 
-def test_turning_all_together_changes_little():
-    points, normals = capsule_person()
-    q, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
-    here, there = (
-        directional_visibility(points @ r.T, normals @ r.T, DIRECTIONS @ r.T, radii=SPACING) for r in (np.eye(3), q)
-    )
-    assert np.abs(here - there).mean() < 0.01  # the map's texels fall elsewhere
-
-
 def test_points_of_no_radius_cast_nothing():
     points, normals = capsule_person()
     visibility = directional_visibility(points, normals, DIRECTIONS, radii=0.0)
@@ -155,12 +141,6 @@ def test_what_is_not_finite_stays_dark_and_harms_nobody(bad):
     visibility = directional_visibility(broken, points, DIRECTIONS, radii=radii)
     assert (visibility[0] == 0).all()
     np.testing.assert_array_equal(visibility[1:], clean)
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_none_and_one_point(count):
-    visibility = directional_visibility(np.zeros((count, 3)), np.tile([0, 1.0, 0], (count, 1)), [[0, 1, 0]], radii=0.1)
-    np.testing.assert_array_equal(visibility, np.ones((count, 1)))
 
 
 def test_wrong_shapes_are_refused():

@@ -99,7 +99,7 @@ def _shade(
         return shader.shade(gaussians, camera.position)
     everywhere = np.zeros_like(gaussians.visibility)
     everywhere[:, 0] = SH_DC_OF_ONE
-    radiance = shader.shade(replace(gaussians, visibility=everywhere), camera.position, sun_shadows=False)
+    radiance = shader.shade(replace(gaussians, visibility=everywhere), camera.position, shadows=False)
     if kind == "paper":
         eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
         view = torch.nn.functional.normalize(eye - posed.means, dim=-1)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rnd_runtime.motion.skeleton import Skeleton
-from rnd_runtime.posing.posing import SMALLEST_SQUARE
-from rnd_runtime.posing.posing import TWIST_STEPS as STEPS
+from rnd_runtime.posing.skinning import SMALLEST_SQUARE
+from rnd_runtime.posing.skinning import TWIST_STEPS as STEPS
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
-from rnd_runtime.posing.forearm import twist_turns
+from rnd_runtime.posing.forearm import twist_angles
 
 ROTATION_BOUND = 0.12
 """radians that a joint may be corrected by about each axis, 7°: estimators err by one to three"""
@@ -87,7 +87,7 @@ class PoseRefinement(nn.Module):
         """Local rotations [J, 3, 3] as ``.forearm.share_twists`` has them; by how much is taken as given."""
         shared = list(local)
         given = local.detach().double().cpu().numpy()
-        for elbow, wrist, axis, angle in twist_turns(self.skeleton, given):
+        for elbow, wrist, axis, angle in twist_angles(self.skeleton, given):
             turn = torch.as_tensor(axis_angle_to_matrix(angle * axis)).to(local)
             shared[elbow], shared[wrist] = shared[elbow] @ turn.T, turn @ shared[wrist]
         return torch.stack(shared)

@@ -1,5 +1,5 @@
 // A key for each Gaussian, least for the farthest, by falling index; what is not drawn has the greatest.
-// The key is _raster_tiles.py's, turned round: 32 bits that span just the visible range.
+// The key is raster/tiles.py's, turned round: 32 bits that span just the visible range.
 
 layout(local_size_x = THREADS) in;
 layout(std430, binding = 0) readonly buffer Range { double nearest, farthest; };

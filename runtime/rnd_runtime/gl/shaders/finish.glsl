@@ -1,4 +1,4 @@
-// The picture as it is handed out: outlines sharpened (outline.py), three numbers a pixel one after the other.
+// The image as it is handed out: outlines sharpened (outline.py), three numbers a pixel one after the other.
 
 uniform sampler2D blended;  // premultiplied radiance; alpha
 

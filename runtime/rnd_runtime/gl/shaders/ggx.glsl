@@ -1,8 +1,4 @@
-// brdf.py's specular term from sin²θ_h and |l + v|².
-
-const float F0 = 0.04;
-const float COSINE_FLOOR = 1e-4;
-const float ONE_OVER_PI = 0.31830988618379067;
+// shading/brdf.py's specular term from sin²θ_h and |l + v|².
 
 float ggx(float alpha_squared, float n_dot_l, float n_dot_v, float sine_squared, float half_squared) {
     float lobe = sine_squared + alpha_squared * (1.0 - sine_squared);

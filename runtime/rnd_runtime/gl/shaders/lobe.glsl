@@ -1,4 +1,4 @@
-// specular_lobe.py's table between its nodes.
+// shading/specular_lobe.py's table between its nodes.
 
 uniform sampler2D lobes;  // two texels a node: energy, along the tangent, along the normal, place; degrees 1 to 3
 
@@ -6,7 +6,7 @@ struct Lobe {
     float energy;
     vec3 mean;     // unit, in the light's frame
     float place;   // among the widths
-    vec4 shrink;   // what it leaves of harmonics of degree 0 to 3
+    vec4 shrink;   // what it leaves of SH coefficients of degree 0 to 3
 };
 
 Lobe lobe_here() {

@@ -1,7 +1,7 @@
-// posing.py's formulas for one Gaussian.
+// posing/skinning.py's formulas for one Gaussian.
 
 uniform sampler2D log_template;  // JOINT_TEXELS texels a Gaussian: what the template has above its floor
-uniform sampler2D rest;          // six texels a Gaussian: see posing_gl.py
+uniform sampler2D rest;          // six texels a Gaussian: see gl/posing.py
 uniform sampler2D bones;         // three texels a joint, a joint a row: rest pose → posed
 uniform float max_offset;        // m
 uniform float variance_floor;    // m²
@@ -11,9 +11,6 @@ layout(location = 0) out vec4 point;         // mean m, world; radius m of the d
 layout(location = 1) out vec4 normal;        // unit, world; opacity
 layout(location = 2) out vec4 covariance;    // xx, xy, xz, yy m²
 layout(location = 3) out vec2 covariance_z;  // yz, zz
-
-const float SMALLEST_SQUARE = 1e-6;  // of |A_R u|
-const float SHORTEST = 1e-9;         // of a normal before it is normalised
 
 vec4 bounded(vec4 x) {
     vec4 tanhs = 1.0 - 2.0 / (exp(2.0 * clamp(x, -9.0, 9.0)) + 1.0);  // 1 in float32 beyond 9

@@ -1,5 +1,5 @@
-// _raster_project.py in float32: the ellipse of one Gaussian in the picture, as splat.vert reads it. NEAR m and
-// DILATION px² come from raster_oracle.py.
+// raster/project.py in float32: the ellipse of one Gaussian in the image, as splat.vert reads it. NEAR m and
+// DILATION px² come from raster/oracle.py.
 
 uniform sampler2D points;         // mean m, world; –
 uniform sampler2D normals;        // unit, world; opacity
@@ -14,12 +14,10 @@ uniform vec4 slopes;        // limits of x/z, y/z where the Jacobian is taken: l
 uniform vec2 size;          // px
 uniform float facing;       // n·v below which nothing is drawn
 
-layout(location = 0) out vec4 place;   // centre from the picture's middle px; reach in units of the ellipse; log2 of the opacity
+layout(location = 0) out vec4 place;   // centre from the image's middle px; reach in units of the ellipse; log2 of the opacity
 layout(location = 1) out vec4 shape;   // √fall_x, √fall_y, shear, –
 layout(location = 2) out vec4 drawn;   // mean m; 1, or −1 where nothing is drawn
 
-const float LOG2_255 = 7.9943534368588578;
-const float HALF_LOG2_E = 0.72134752044448170;
 const float HUGE = 1e30;
 
 // By its bits: drivers may turn comparisons round as if there were no NaN, and NVIDIA's do.
@@ -43,7 +41,7 @@ void main() {
     vec3 to_eye = eye - mean;
     float towards = dot(to_eye, outward.xyz);
     if (!finite(p.x + p.y + p.z) || !finite(opacity) || !finite(trace) || !finite(towards)) return;
-    bool usable = p.z >= NEAR && p.z < HUGE && opacity >= 1.0 / 255.0 && opacity < HUGE && trace > 0.0 && trace < HUGE;
+    bool usable = p.z >= NEAR && p.z < HUGE && opacity >= ALPHA_MIN && opacity < HUGE && trace > 0.0 && trace < HUGE;
     if (!usable || towards < facing * length(to_eye)) return;
 
     vec2 slope = clamp(p.xy / p.z, slopes.xy, slopes.zw);
@@ -61,7 +59,7 @@ void main() {
 
     vec2 along = pinhole.xy * p.xy / p.z, centre = along + pinhole.zw;
     float peak = log2(opacity);
-    float reach = max(peak + LOG2_255, 0.0);
+    float reach = max(peak + (-LOG2_ALPHA_MIN), 0.0);
     vec2 reach_px = sqrt(reach / HALF_LOG2_E * vec2(xx, yy));
     vec2 low = max(centre - reach_px + 0.499, 0.0), high = min(centre + reach_px - 0.499, size - 1.0);
     if (!(all(lessThan(low, size)) && all(greaterThanEqual(high, vec2(0.0))))) return;

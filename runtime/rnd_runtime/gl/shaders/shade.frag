@@ -13,8 +13,8 @@ void main() {
     if (gaussian < 0) return;
     load_surface(gaussian);
     vec3 linear = sky();
-#ifdef SUNS
-    linear += suns();
+#ifdef LIGHTS
+    linear += direct();
 #endif
     bool none = isnan(checksum) || isinf(checksum) || any(isnan(linear)) || any(isinf(linear));
     radiance = none ? vec4(0.0) : vec4(linear, 1.0);

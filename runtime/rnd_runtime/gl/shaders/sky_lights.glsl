@@ -1,9 +1,7 @@
-// shading_sum.py: the sum over distant lights, each with the whole BRDF and the visibility towards it.
+// shading/sum.py: the sum over distant lights, each with the whole BRDF and the visibility towards it.
 
-uniform sampler2D distant;  // six texels a light, ROW_LIGHTS lights a row: direction, flux.r; flux.g, flux.b; harmonics
+uniform sampler2D distant;  // six texels a light, ROW_LIGHTS lights a row: direction, flux.r; flux.g, flux.b; SH coefficients
 uniform int lights;
-
-const float HALF_FLOOR = 1e-8;  // of |l + v|², where light and camera are opposite
 
 vec3 sky() {
     vec3 scattered = vec3(0.0), reflected = vec3(0.0);

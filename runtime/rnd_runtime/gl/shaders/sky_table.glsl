@@ -1,4 +1,4 @@
-// shading_tables.py: irradiance for each harmonic of the visibility over the normal, light prefiltered by lobes.
+// shading/tables.py: irradiance for each harmonic of the visibility over the normal, light prefiltered by lobes.
 
 uniform sampler2D diffuse;   // DIFFUSE_SIZE² nodes of twelve texels: 16 numbers of red, of green, of blue
 uniform sampler2D specular;  // LEVELS maps of SPECULAR_SIZE² nodes, one below the other
@@ -38,11 +38,11 @@ vec3 sky() {
     octahedral_cell(lobe.mean, SPECULAR_SIZE, cell, place);
     int low = clamp(int(lobe.place), 0, LEVELS - 2);
     cell.y += low * SPECULAR_SIZE;
-    vec3 shine = mix(
+    vec3 specular_sum = mix(
         prefiltered(cell, place), prefiltered(cell + ivec2(0, SPECULAR_SIZE), place), lobe.place - float(low)
     );
     octahedral_cell(normal, DIFFUSE_SIZE, cell, place);
     vec3 upper = mix(irradiance_at(cell), irradiance_at(cell + ivec2(1, 0)), place.x);
     vec3 lower = mix(irradiance_at(cell + ivec2(0, 1)), irradiance_at(cell + ivec2(1, 1)), place.x);
-    return max(ONE_OVER_PI * albedo * mix(upper, lower, place.y) + lobe.energy * open * shine, 0.0);
+    return max(ONE_OVER_PI * albedo * mix(upper, lower, place.y) + lobe.energy * open * specular_sum, 0.0);
 }

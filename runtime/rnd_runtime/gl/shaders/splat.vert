@@ -7,11 +7,11 @@ uniform sampler2D places;    // by Gaussian: as below
 uniform sampler2D shapes;
 uniform sampler2D radiance;  // by rank
 #else
-uniform sampler2D records;   // TEXELS texels for each Gaussian, back to front; see raster_gl.py
+uniform sampler2D records;   // TEXELS texels for each Gaussian, back to front; see gl/raster.py
 #endif
 uniform vec2 size;           // px
 
-flat out vec3 centre;   // centre from the picture's middle px; log2 of the opacity
+flat out vec3 centre;   // centre from the image's middle px; log2 of the opacity
 flat out vec3 ellipse;  // u = ellipse.x (dx − ellipse.z dy), v = ellipse.y dy with log2 α = peak − u² − v²
 flat out vec4 attributes[(ATTRIBUTES + 3) / 4];
 
@@ -39,7 +39,7 @@ void main() {
     vec2 uv = place.z * MARGIN * CORNERS[corner];
     float dy = uv.y / shape.y;
     vec2 position = place.xy + vec2(uv.x / shape.x + shape.z * dy, dy);
-    // Around an ellipse much larger than the picture clipping would lose precision: cover the picture instead.
+    // Around an ellipse much larger than the image clipping would lose precision: cover the image instead.
     float extent = 2.0 * place.z * ((1.0 + abs(shape.z)) / shape.y + 1.0 / shape.x);
     if (!(extent < 8.0 * max(size.x, size.y)))
         position = size * (vec2(corner == 1 ? 2.0 : 0.0, corner == 2 ? 2.0 : 0.0) - 0.5);

@@ -3,13 +3,10 @@
 uniform sampler2D points;      // mean m, world; radius of its disc m
 uniform sampler2D normals;     // unit, world
 uniform sampler2D materials;   // albedo, roughness
-uniform sampler2D visibility;  // four texels: 16 harmonics in the root's frame
+uniform sampler2D visibility;  // four texels: 16 SH coefficients in the root's frame
 uniform vec3 eye;              // m, world
 uniform mat3 world_to_light;
-uniform mat4 turn[8];          // root's frame → light's frame, of the harmonics: see below
-
-const float TINY = 1e-12;
-const float ROUGHNESS_LOW = 0.09, ROUGHNESS_HIGH = 0.99;  // brdf.py
+uniform mat4 turn[8];          // root's frame → light's frame, of the SH coefficients: see below
 
 vec3 mean_world, normal_world;
 float disc_radius;
@@ -37,7 +34,7 @@ void load_surface(int index) {
     vec4 c = texelFetch(visibility, first + ivec2(2, 0), 0), d = texelFetch(visibility, first + ivec2(3, 0), 0);
     const vec4 ONES = vec4(1.0);
     checksum = dot(point, ONES) + dot(material, ONES) + dot(normal_world, ONES.xyz) + dot(a + b + c + d, ONES);
-    // a rotation mixes harmonics of one degree only: degrees 0 and 1 are a, 2 is b and c.x, 3 is c.yzw and d
+    // a rotation mixes SH coefficients of one degree only: degrees 0 and 1 are a, 2 is b and c.x, 3 is c.yzw and d
     coefficients = mat4(
         turn[0] * a,
         turn[1] * b + turn[2] * c,

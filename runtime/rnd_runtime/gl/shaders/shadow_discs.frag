@@ -1,4 +1,4 @@
-// Depth of a disc's plane, which falls steeply beyond the disc, inside its own sun's map; blended by maximum.
+// Depth of a disc's plane, which falls steeply beyond the disc, inside its own light's map; blended by maximum.
 
 flat in vec4 disc;
 flat in vec4 plane;

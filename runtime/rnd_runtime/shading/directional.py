@@ -1,9 +1,7 @@
-"""Taking the sun out of a light probe, so that it can cast a hard shadow.
+"""Extracts directional lights from a light probe, so that they can cast hard shadows.
 
-A lat-long map of 64 × 32 texels smears a half-degree sun over five degrees, and visibility of degree 3 blurs its
-shadow over fifty. Compact peaks are therefore split off as directional lights and the rest of the map keeps the
-background that surrounded them: sky + suns = map, per channel, to rounding. How far a sun spreads is measured between
-centres of texels: a texel's own size does not count, as what a sun's texel of a coarse map shows is smaller than it.
+Compact peaks are split off and the rest of the map keeps the background that surrounded them: sky + directional lights
+= map, per channel, to rounding. A light's spread is measured between texel centres, so a single texel spreads by 0.
 """
 
 from __future__ import annotations
@@ -20,14 +18,14 @@ Floats = NDArray[np.float64]
 _CAP = np.radians(6)  # a peak must fit into this radius: a sun with its glare, a softbox two metres away
 _RING = np.radians(10)  # its background is the median between _CAP and here
 _LARGEST = (512, 1024)  # a third of a degree a texel tells the direction; larger maps only cost memory
-_LEAST_SHARE = 0.05  # of the map's luminance; less is not worth a shadow of its own
-_MOST_PEAKS = 16  # that are looked at: lamps too weak for a sun may be brighter than it
+_MIN_SHARE = 0.05  # of the map's luminance; less is not worth a shadow of its own
+_MAX_PEAKS = 16  # that are looked at: lamps too weak for a sun may be brighter than it
 _LAMP = np.radians(2)  # of their spread: what is wider and no sun is a window, whose pieces are none either
 _RING_AREA = 2 * np.pi * (1 - np.cos(_RING))  # sr: more than a peak covers, whatever the texels
 
 
 @dataclass(frozen=True, eq=False)
-class Sun:
+class DirectionalLight:
     """A compact bright light, infinitely far away.
 
     Attributes:
@@ -41,10 +39,10 @@ class Sun:
     spread: float
 
 
-def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...]]:
-    """``light`` without its suns, and the suns, strongest first.
+def extract_directional(light: Light, *, limit: int = 2) -> tuple[Light, tuple[DirectionalLight, ...]]:
+    """``light`` without its directional lights, and these, strongest first.
 
-    A sun is what rises above the median of the ring around the brightest texel, within 6° of its own centre,
+    One is what rises above the median of the ring around the brightest texel, within 6° of its own centre,
     if that is at least 5 % of the map's luminance; a small lamp that is weaker is passed over for the next brightest
     texel more than 6° away. An overcast sky or a wide window has none. Maps of more than 512 rows come back at 512.
     """
@@ -54,34 +52,34 @@ def extract_suns(light: Light, *, limit: int = 2) -> tuple[Light, tuple[Sun, ...
     height, width = radiance.shape[:2]
     solid_angles = texel_solid_angles(height, width)[:, 0]
     luminance = radiance @ REC709_LUMINANCE
-    least = _LEAST_SHARE * float(luminance.sum(1) @ solid_angles)
+    min_luminance = _MIN_SHARE * float(luminance.sum(1) @ solid_angles)
     directions = texel_directions(height, width)
-    suns: list[Sun] = []
-    for _ in range(_MOST_PEAKS):
+    lights: list[DirectionalLight] = []
+    for _ in range(_MAX_PEAKS):
         peak = np.unravel_index(np.argmax(luminance), luminance.shape)
-        if not luminance[peak] * _RING_AREA >= least:  # neither this nor what is darker
+        if not luminance[peak] * _RING_AREA >= min_luminance:  # neither this nor what is darker
             break
         found = _peak_around(radiance, directions, solid_angles, directions[peak])
         if found is None:
             break
-        sun, rows, sky = found
-        if not sun.irradiance @ REC709_LUMINANCE >= max(least, 1e-30):
-            if sun.spread > _LAMP:
+        peak_light, rows, sky = found
+        if not peak_light.irradiance @ REC709_LUMINANCE >= max(min_luminance, 1e-30):
+            if peak_light.spread > _LAMP:
                 break
             luminance[directions @ directions[peak] > np.cos(_CAP)] = -np.inf  # in the search alone
             continue
         radiance[rows] = sky
         luminance[rows] = np.minimum(luminance[rows], sky @ REC709_LUMINANCE)  # what is masked stays so
-        suns.append(sun)
-        if len(suns) == limit:
+        lights.append(peak_light)
+        if len(lights) == limit:
             break
-    suns.sort(key=lambda sun: -float(sun.irradiance @ REC709_LUMINANCE))
-    return replace(light, radiance=radiance.astype(np.float32)), tuple(suns)
+    lights.sort(key=lambda peak_light: -float(peak_light.irradiance @ REC709_LUMINANCE))
+    return replace(light, radiance=radiance.astype(np.float32)), tuple(lights)
 
 
 def _peak_around(
     radiance: Floats, directions: Floats, solid_angles: Floats, centre: Floats
-) -> tuple[Sun, slice, Floats] | None:
+) -> tuple[DirectionalLight, slice, Floats] | None:
     """The excess of ``radiance`` over its surroundings near ``centre``, and the rows of the map without it."""
     for _ in range(3):  # the brightest texel is not the middle of a lamp: move to the mean of what is found
         rows = _rows_within(len(radiance), centre, _RING)
@@ -101,7 +99,7 @@ def _peak_around(
         centre = mean / np.linalg.norm(mean)
     # 1 − cos θ ≈ θ²/2, and the sum of unit vectors is shorter by its mean: no arccos of what is nearly one
     spread = np.sqrt(max(2 * (1 - np.linalg.norm(mean) / weight.sum()), 0))
-    return Sun(centre, flux.sum((0, 1)), float(spread)), rows, sky
+    return DirectionalLight(centre, flux.sum((0, 1)), float(spread)), rows, sky
 
 
 def _rows_within(height: int, centre: Floats, angle: float) -> slice:

@@ -1,37 +1,13 @@
 import numpy as np
 import pytest
 
-from rnd_runtime.shading.light import Light, downsize, texel_directions, texel_solid_angles
-from rnd_runtime.shading.sun import extract_suns
+from rnd_runtime.shading.directional import extract_directional
+from rnd_runtime.shading.light import Light, texel_directions
+from support.sun_scenes import beside_a_lamp, direction_of, energy, sky, with_sun
 
 ENERGY = 1e-6  # relative; the sky is kept in float32, the sun takes what its rounding leaves
 SUN_ENERGY = 1e-2  # FAILURES L1
 HALF_TEXEL = 0.0123  # radians, of a map of 128 rows
-
-
-def sky(height=128, level=(0.3, 0.5, 1.0)):
-    """A blue gradient, brighter at the horizon, with a little noise."""
-    directions = texel_directions(height, 2 * height)
-    gradient = 1.5 - directions[..., 1] ** 2 + 0.3 * directions[..., 0]
-    noise = np.random.default_rng(0).uniform(0.9, 1.1, gradient.shape)
-    return (gradient * noise)[..., None] * np.array(level)
-
-
-def direction_of(elevation, azimuth):
-    return np.array([np.cos(elevation) * np.cos(azimuth), np.sin(elevation), np.cos(elevation) * np.sin(azimuth)])
-
-
-def with_sun(radiance, direction, peak, radius=0.8):
-    """Adds a disc, anti-aliased by averaging down from a grid of twice the size; returns the energy it adds."""
-    height = len(radiance)
-    cosine = texel_directions(2 * height, 4 * height) @ direction
-    disc = np.where(cosine > np.cos(np.radians(radius)), peak, 0.0)[..., None] * np.array([1.0, 0.9, 0.7])
-    disc = downsize(disc, height, 2 * height).astype(float)
-    return radiance + disc, energy(disc)
-
-
-def energy(radiance):
-    return np.einsum("hwc,hw->c", radiance.astype(np.float64), texel_solid_angles(*radiance.shape[:2]))
 
 
 PLACES = {
@@ -50,7 +26,7 @@ def test_a_sun_is_found_whole_and_where_it_is(place, peak):
     direction = direction_of(*PLACES[place])
     radiance, sun_energy = with_sun(sky(), direction, peak)
     light = Light(radiance)
-    rest, suns = extract_suns(light)
+    rest, suns = extract_directional(light)
     assert len(suns) == 1
     np.testing.assert_allclose(suns[0].irradiance, sun_energy, rtol=SUN_ENERGY)
     assert np.linalg.norm(suns[0].direction - direction) < HALF_TEXEL
@@ -62,7 +38,7 @@ def test_a_sun_is_found_whole_and_where_it_is(place, peak):
 
 def test_the_spread_is_that_of_the_disc():
     radiance, _ = with_sun(sky(256), direction_of(0.6, 1.0), 1e5, radius=3)
-    (sun,) = extract_suns(Light(radiance))[1]
+    (sun,) = extract_directional(Light(radiance))[1]
     np.testing.assert_allclose(sun.spread, np.radians(3) / np.sqrt(2), rtol=0.02)
 
 
@@ -71,7 +47,7 @@ def test_two_suns_and_no_third():
     for elevation, azimuth, peak in [(0.7, 1.0, 3e4), (0.3, -2.0, 5e4), (-0.5, 0.0, 2e4)]:
         radiance, _ = with_sun(radiance, direction_of(elevation, azimuth), peak)
     light = Light(radiance)
-    rest, suns = extract_suns(light)
+    rest, suns = extract_directional(light)
     np.testing.assert_allclose(suns[0].direction, direction_of(0.3, -2.0), atol=HALF_TEXEL)  # strongest first
     np.testing.assert_allclose(suns[1].direction, direction_of(0.7, 1.0), atol=HALF_TEXEL)
     total = energy(rest.radiance) + suns[0].irradiance + suns[1].irradiance
@@ -97,33 +73,20 @@ def test_where_there_is_no_sun_none_is_found(kind):
         radiance = np.where(pane[..., None], 20.0 + 0.2 * azimuth[..., None], radiance)
         radiance, _ = with_sun(radiance, direction_of(1.0, 3.0), 500)
     light = Light(radiance)
-    rest, suns = extract_suns(light)
+    rest, suns = extract_directional(light)
     assert suns == ()
     np.testing.assert_array_equal(rest.radiance, light.radiance)
 
 
-def test_yaw_stays_with_the_light_and_the_sun_in_its_frame():
-    radiance, _ = with_sun(sky(), direction_of(0.5, 0.5), 1e5)
-    rest, suns = extract_suns(Light(radiance, yaw=1.0))
-    assert rest.yaw == 1.0
-    np.testing.assert_allclose(suns[0].direction, direction_of(0.5, 0.5), atol=HALF_TEXEL)
-
-
 def test_large_and_tiny_maps():
     radiance, sun_energy = with_sun(sky(600), direction_of(0.5, 0.5), 1e5)
-    rest, suns = extract_suns(Light(radiance))
+    rest, suns = extract_directional(Light(radiance))
     assert rest.radiance.shape == (512, 1024, 3)
     np.testing.assert_allclose(suns[0].irradiance, sun_energy, rtol=SUN_ENERGY)
     spot = np.ones((4, 8, 3))
     spot[1, 3] = 1e6
-    rest, suns = extract_suns(Light(spot))
+    rest, suns = extract_directional(Light(spot))
     assert suns == ()  # a texel of 45° is no sun
-
-
-def beside_a_lamp():
-    """A sun, what it adds, and a lamp of a tenth of its energy whose texels are brighter."""
-    radiance, sun_energy = with_sun(sky(256), direction_of(0.7, 1.0), 400, radius=3)
-    return with_sun(radiance, direction_of(0.2, -2.0), 600, radius=0.8)[0], sun_energy
 
 
 def test_a_brighter_lamp_too_weak_for_a_sun_hides_none():
@@ -131,7 +94,7 @@ def test_a_brighter_lamp_too_weak_for_a_sun_hides_none():
     light = Light(radiance)
     brightest = texel_directions(*radiance.shape[:2]).reshape(-1, 3)[light.radiance[..., 1].argmax()]
     assert brightest @ direction_of(0.2, -2.0) > np.cos(np.radians(1))
-    rest, suns = extract_suns(light)
+    rest, suns = extract_directional(light)
     assert len(suns) == 1
     np.testing.assert_allclose(suns[0].direction, direction_of(0.7, 1.0), atol=HALF_TEXEL)
     np.testing.assert_allclose(suns[0].irradiance, sun_energy, rtol=SUN_ENERGY)

@@ -1,0 +1,188 @@
+"""What of an avatar no pose changes, and what is to be posed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rnd_runtime.core.arrays import floats
+from rnd_runtime.core.simd import WIDTH
+
+from .skinning import (
+    FACTORS,
+    FLOOR,
+    LIMBS,
+    NEVER,
+    NORMALS,
+    OWN,
+    POINTS,
+    PosedArrays,
+    bone_rows,
+    node_fields,
+    pose_kernel,
+)
+
+Floats32 = NDArray[np.float32]
+
+_DEEPEST = 60.0  # logarithm below which a floor is 0 beside the largest weight, and not yet in float32
+
+
+class Template(NamedTuple):
+    """The template relative to a Gaussian's largest weight: its floor, and what some joints have above."""
+
+    floors: Floats32  # [N]
+    gaussians: NDArray[np.intp]  # [L] ascending
+    joints: NDArray[np.intp]  # [L]
+    logs: Floats32  # [L] of the weight less the floor
+
+
+@dataclass(frozen=True, eq=False)
+class RestPose:
+    """What of an avatar does not depend on the pose.
+
+    Attributes:
+        neighbours: [N, K] nodes between which a Gaussian is interpolated.
+        neighbour_weights: [N, K].
+        log_template: [N, J] log of the template's skinning weights, up to a constant for each Gaussian.
+        points: [N, 3] m, x_c.
+        factors: [N, 9] m, R S row by row.
+        normals: [N, 3] unit.
+        limbs: [N, 7] the limb's axis (unit), the lever from it to the point (m, times the share), and the
+            share of a limb (0…1).
+        max_offset: m. floor: m², added to variances. fallback: share of A_R in a normal.
+    """
+
+    neighbours: NDArray[np.int32]
+    neighbour_weights: Floats32
+    log_template: Floats32
+    points: Floats32
+    factors: Floats32
+    normals: Floats32
+    limbs: Floats32
+    max_offset: float
+    floor: float
+    fallback: float
+
+    def pose(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
+    ) -> PosedArrays:
+        """Pose all Gaussians.
+
+        Args:
+            logits: [M, J] Δ logits at the nodes; None where skinning is the template's.
+            offsets: [M, 6] Δx and Δr before tanh.
+            visibility: [M, S] SH coefficients, S ≤ 16; what is missing is 0.
+            bones: [J, 3, 4] m, rest pose → posed.
+        """
+        nodes = self.nodes(logits, offsets, visibility)
+        posed: PosedArrays = pose_kernel(self.arrays, nodes, floats(bones), self.limits, len(self.points))
+        return posed
+
+    def node_fields(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
+    ) -> Floats32:
+        """What is interpolated between the nodes, [M, 48 + C].
+
+        Σ_j e^(Δ_j − c) B_j row by row [12], the same without B, c and two zeros; offsets [6] and zeros up to 16;
+        visibility [16]; Δ logits with zeros up to C, a padded number of 16.
+        """
+        fields: Floats32 = node_fields(*self.nodes(logits, offsets, visibility), bone_rows(floats(bones)))
+        return fields
+
+    def nodes(
+        self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike
+    ) -> tuple[Floats32, Floats32, Floats32]:
+        """The networks' outputs as the kernels want them: Δ logits [M, J], which may be None, offsets, visibility."""
+        offsets = floats(offsets)
+        changes = np.zeros((len(offsets), self.log_template.shape[1])) if logits is None else logits
+        return floats(changes), offsets, floats(visibility)
+
+    @cached_property
+    def limits(self) -> tuple[np.float32, np.float32, np.float32]:
+        """Of offsets, of variances, and a normal's share of A_R."""
+        return np.float32(self.max_offset), np.float32(self.floor), np.float32(self.fallback)
+
+    @cached_property
+    def template(self) -> Template:
+        """The template as it is summed."""
+        given = np.asarray(self.log_template, np.float32)
+        lowest = np.where(given > -np.inf, given, np.float32(np.inf)).min(1)
+        gaussians, joints = np.nonzero(~(given <= lowest[:, None]))  # what is no number stays none
+        heights = given[gaussians, joints].astype(np.float64) - lowest[gaussians]
+        top = np.zeros(len(given))
+        with np.errstate(invalid="ignore"):
+            np.maximum.at(top, gaussians, heights)
+            logs = heights + np.log(-np.expm1(-heights)) - top[gaussians]
+        floors = np.exp(-np.minimum(top, _DEEPEST))
+        return Template(floors.astype(np.float32), gaussians, joints, logs.astype(np.float32))
+
+    @cached_property
+    def arrays(self) -> RestArrays:
+        """As the kernel wants them."""
+        count = len(self.points)
+        padded = -(-count // WIDTH) * WIDTH
+        own = np.zeros((padded, OWN), np.float32)
+        floors = self.template.floors
+        for first, values in (
+            (POINTS, self.points),
+            (FACTORS, self.factors),
+            (NORMALS, self.normals),
+            (LIMBS, self.limbs),
+            (FLOOR, floors[:, None]),
+        ):
+            own[:count, first : first + values.shape[1]] = values
+        neighbours = np.zeros((padded, self.neighbours.shape[1]), np.int32)
+        weights = np.zeros(neighbours.shape, np.float32)
+        neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
+        by_sixteens = own.reshape(-1, WIDTH, OWN).transpose(0, 2, 1)
+        return RestArrays(neighbours, weights, *_slots(self.template, padded), by_sixteens.ravel())
+
+
+def _slots(template: Template, padded: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
+    """``starts``, ``joints`` and ``logs`` of ``RestArrays``."""
+    _, gaussians, joints, logs = template
+    counts = np.bincount(gaussians, minlength=padded)
+    starts = np.concatenate([[0], np.cumsum(counts.reshape(-1, WIDTH).max(1))])
+    slots = starts[gaussians // WIDTH] + np.arange(len(joints)) - (np.cumsum(counts) - counts)[gaussians]
+    of_slots = np.zeros((starts[-1], WIDTH), np.int32)
+    logs_of_slots = np.full(of_slots.shape, NEVER, np.float32)
+    of_slots[slots, gaussians % WIDTH], logs_of_slots[slots, gaussians % WIDTH] = joints, logs
+    return starts.astype(np.int32), of_slots.ravel(), logs_of_slots.ravel()
+
+
+class RestArrays(NamedTuple):
+    """Constants of a ``RestPose`` in the order in which they are read; N is a padded number of registers of 16.
+
+    A frame reads them all, and caches that others share do not keep them: every number less and every stream less of
+    them counts. Sixteen Gaussians have as many slots for joints each, since processors could not predict a number of
+    its own for each; 2.5 of 24 joints in the mean.
+    """
+
+    neighbours: NDArray[np.int32]  # [N, K]
+    weights: Floats32  # [N, K]
+    starts: NDArray[np.int32]  # [N/16 + 1]: the slots of the sixteen i are starts[i] : starts[i + 1]
+    joints: NDArray[np.int32]  # [S · 16], one of each Gaussian's joints a slot: as many as the one with most has
+    logs: Floats32  # [S · 16] of the template's weights less its floor, relative to the greatest
+    own: Floats32  # [N/16 · 23 · 16] points, factors, normals, limbs, floors by component, sixteen by sixteen
+
+
+class Unposed(NamedTuple):
+    """N Gaussians before they are posed: arguments of ``RestPose.pose`` for M nodes, and their material."""
+
+    rest: RestPose
+    logits: Floats32 | None  # [M, J]
+    offsets: Floats32  # [M, 6]
+    visibility: Floats32  # [M, S]
+    bones: Floats32  # [J, 3, 4] m, rest pose → posed
+    opacities: Floats32  # [N]
+    albedo: Floats32  # [N, 3]
+    roughness: Floats32  # [N]
+
+    @property
+    def root_rotation(self) -> Floats32:
+        """[3, 3], root frame → that of the bones."""
+        return self.bones[0, :, :3]

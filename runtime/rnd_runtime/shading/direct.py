@@ -1,0 +1,109 @@
+"""What directional lights lay on Gaussians, sixteen at a time (numba over sixteen lanes): Lambert and GGX.
+
+A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks for
+α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own α². A sun of one
+texel is a point, see ``.directional``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from rnd_runtime.core.simd import WIDTH, aligned_floats, at_least, lanes, load, select, sqrt, store
+
+from .brdf import ROUGHNESS_RANGE, ggx_lanes
+from .lanes import (
+    ALBEDO,
+    CHUNK,
+    FREE,
+    NORMAL,
+    ONE,
+    ONE_OVER_PI,
+    RADIANCE,
+    ROUGHNESS,
+    ROUGHNESS_LOW,
+    TINY,
+    VIEW,
+    ZERO,
+    clamped,
+    gather,
+    load3,
+    unit,
+)
+
+Floats32 = NDArray[np.float32]
+
+# What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
+# shade. Suns fade out over these n·v, chosen on training images of the dancer (36.19 dB without, 36.27 with).
+TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
+
+_ROUGHNESS_HIGH = np.float32(ROUGHNESS_RANGE[1])
+_OPEN = FREE  # a row of a thread's working memory
+_SCRATCH = FREE + WIDTH
+
+
+class DirectionalArrays(NamedTuple):
+    """S directional lights: where they are, what they lay on a surface that faces them, and how wide they are."""
+
+    directions: Floats32  # [S, 3] unit
+    irradiance: Floats32  # [S, 3]
+    spread_squared: Floats32  # [S] rad²
+
+
+@njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+def add_directional(surfaces, visibility, camera, lights, seen, radiance):  # type: ignore[no-untyped-def]
+    """Add direct light on the Gaussians ``seen`` [N] to ``radiance`` [N, 3], where ``visibility`` [N, S] is not 0.
+
+    ``surfaces`` as of ``.lanes.gather``, ``camera`` [3] m.
+    """
+    lit = np.empty(len(seen), np.bool_)
+    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+        indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(_SCRATCH)
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        for k in range(i, last):
+            lit[k] = False
+            for light in range(visibility.shape[1]):
+                lit[k] |= seen[k] and visibility[k, light] > ZERO
+        while i < last:
+            i, count = gather(i, last, lit, surfaces, camera, indices, scratch)
+            if count > 0:
+                _light_sixteen(indices, visibility, lights, scratch)
+                for k in range(count):
+                    for channel in range(3):
+                        radiance[indices[k], channel] += scratch[RADIANCE + channel * WIDTH + k]
+
+
+@njit(error_model="numpy")
+def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-untyped-def]
+    """What the directional lights add, over the albedo in ``scratch``."""
+    normal, view = load3(scratch, NORMAL), unit(load3(scratch, VIEW))
+    n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
+    facing = clamped((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), ONE)
+    alpha = at_least(clamped(load(scratch, ROUGHNESS), _ROUGHNESS_HIGH), ROUGHNESS_LOW)
+    alpha = alpha * alpha
+    albedo = load3(scratch, ALBEDO)
+    red, green, blue = lanes(ZERO), lanes(ZERO), lanes(ZERO)
+    for light in range(len(lights.directions)):
+        for k in range(WIDTH):
+            scratch[_OPEN + k] = visibility[indices[k], light]
+        lx, ly, lz = lights.directions[light, 0], lights.directions[light, 1], lights.directions[light, 2]
+        n_dot_l = normal[0] * lx + normal[1] * ly + normal[2] * lz
+        arriving = at_least(facing * load(scratch, _OPEN) * n_dot_l, ZERO)
+        hx, hy, hz = view[0] + lx, view[1] + ly, view[2] + lz
+        half_squared = at_least(hx * hx + hy * hy + hz * hz, TINY)
+        cx, cy = normal[1] * hz - normal[2] * hy, normal[2] * hx - normal[0] * hz
+        cz = normal[0] * hy - normal[1] * hx
+        sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
+        alpha_squared = alpha * alpha + lights.spread_squared[light] / sqrt(half_squared)
+        alpha_squared = select(alpha_squared < ONE, alpha_squared, ONE)
+        specular = ggx_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
+        red += arriving * (albedo[0] * ONE_OVER_PI + specular) * lights.irradiance[light, 0]
+        green += arriving * (albedo[1] * ONE_OVER_PI + specular) * lights.irradiance[light, 1]
+        blue += arriving * (albedo[2] * ONE_OVER_PI + specular) * lights.irradiance[light, 2]
+    store(scratch, RADIANCE, red)
+    store(scratch, RADIANCE + WIDTH, green)
+    store(scratch, RADIANCE + 2 * WIDTH, blue)
