@@ -1,6 +1,5 @@
-"""The light stage: coded people, path-traced from many sides under many lights, with the truth beside every picture.
+"""The light stage: coded people, path-traced from many sides under many lights, with the truth beside every image.
 
-``.subjects`` describes people, ``.garments`` and ``.fabrics`` dress them, ``.cloth`` moves what they wear,
-``.render`` films them with Mitsuba 3, ``.estimates`` spoils the truth as estimators would, ``.film`` writes
-the capture. The command is ``rnd-stage`` (``.cli``).
+``people`` describes and dresses them, ``render`` path-traces them with Mitsuba 3, ``film`` has cameras, lights, motions
+and writes the capture.
 """

@@ -78,8 +78,8 @@ class RenderSet:
 
     def radiance(self, camera: Camera, light: Floats, *, samples: int, seed: int) -> Floats:
         """Linear radiance [H, W, 3], premultiplied on black, under the lat-long ``light`` [h, 2h, 3]."""
-        kept, scene = self._scenes.get(id(light), (None, None))
-        if kept is not light:
+        known, scene = self._scenes.get(id(light), (None, None))
+        if known is not light:
             integrator = {"type": "path", "max_depth": self.max_depth, "hide_emitters": True}
             scene = mi.load_dict(
                 {"type": "scene", "integrator": integrator, "light": environment(light), "figure": self._mesh}

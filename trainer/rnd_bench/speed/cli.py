@@ -44,8 +44,8 @@ def run_frame(options: Frame) -> None:
     _check(options, "n", "size", "runs")
     check_cull(options.cull)
     check_mode(options.shade)
-    values = {name: getattr(options, name) for name in Setting.__dataclass_fields__}
-    setting = Setting(**values | {"threads": _threads(options.threads)})
+    given = {name: getattr(options, name) for name in Setting.__dataclass_fields__}
+    setting = Setting(**given | {"threads": _threads(options.threads)})
     inputs, rows = _inputs(options.files), list[dict[str, Any]]()
     for _ in range(options.runs):
         row = measured(setting, inputs, seconds=6.0, compare=not options.no_compare, file=options.avatar)

@@ -16,8 +16,8 @@ RINGS = ((4.0, 0.5), (32.0, 0.3), (-12.0, 0.2))  # elevation in degrees, share o
 def ring_cameras(count: int, size: int) -> dict[str, Camera]:
     """``count`` square cameras "cam00" …: the middle ring first, then the upper, then the lower.
 
-    ``cam00`` looks from the front, slightly down; the rings are turned against each other, so that no two cameras share
-    an azimuth where their numbers allow it.
+    ``cam00`` looks from the front, slightly down. The rings are rotated against each other, so that cameras share no
+    azimuth where their numbers allow it.
 
     Raises:
         InputError: fewer than one camera or pixel.

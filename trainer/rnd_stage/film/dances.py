@@ -118,7 +118,7 @@ def walk(skeleton: Skeleton) -> Motion:
 
 
 def dance(skeleton: Skeleton) -> Motion:
-    """The capture's motion: an A-pose, then arms, bends and lifted knees while the person turns on the spot."""
+    """The capture's motion: an A-pose, then arms, bends and lifted knees while the person rotates on the spot."""
     times = np.arange(round(DANCE_SECONDS * FPS)) / FPS
     bend, twist, tilt, crouch, lift_left, lift_right = PchipInterpolator(TRUNK[:, 0], TRUNK[:, 1:])(times).T
     pose = _Pose(len(times))
@@ -150,15 +150,15 @@ def dance(skeleton: Skeleton) -> Motion:
 
 
 class _Pose:
-    """Local rotations [F, 24, 3, 3], set joint by joint from turns about the axes."""
+    """Local rotations [F, 24, 3, 3], set joint by joint from rotations about the axes."""
 
     def __init__(self, frames: int) -> None:
         self.rotations = np.tile(np.eye(3), (frames, len(SMPL_NAMES), 1, 1))
 
-    def set(self, name: str, *turns: tuple[str, Floats | float]) -> None:
-        """The product, left to right, of turns (axis, degrees); right limbs mirror: y and z change sign."""
+    def set(self, name: str, *angles: tuple[str, Floats | float]) -> None:
+        """The product, left to right, of rotations (axis, degrees); right limbs mirror: y and z change sign."""
         total = np.eye(3)
-        for axis, degrees in turns:
+        for axis, degrees in angles:
             vector = np.zeros((len(self.rotations), 3))
             sign = -1 if name.startswith("right_") and axis != "x" else 1
             vector[:, "xyz".index(axis)] = sign * np.radians(degrees)

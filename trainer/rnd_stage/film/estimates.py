@@ -21,7 +21,7 @@ DRIFT_SECONDS = 1.5
 ROOT_JITTER, ROOT_DRIFT = 0.004, 0.015  # m
 NORMAL_BLUR = 1.5  # pixels of an image of 512
 NORMAL_TILT = 0.16  # of the smooth tilt's vector: about 8° on average
-NORMAL_TURN = np.radians(3.0)  # of the whole image, another one in every frame
+NORMAL_ROTATION = np.radians(3.0)  # of the whole image, another one in every frame
 MASK_WANDER = 2.5  # pixels of an image of 512 by which the edge wanders in and out
 MASK_GRAIN = 9.0  # pixels of an image of 512 along the edge over which it does
 
@@ -51,8 +51,8 @@ def estimated_normals(normals: Floats, coverage: Floats, seed: int, strength: fl
     weight = cv2.GaussianBlur(coverage, (0, 0), blur)[..., None]
     smooth = cv2.GaussianBlur(normals * coverage[..., None], (0, 0), blur) / np.maximum(weight, 1e-3)
     tilt = cv2.resize(rng.normal(size=(6, 6, 3)), (width, height), interpolation=cv2.INTER_CUBIC)
-    turn = axis_angle_to_matrix(strength * NORMAL_TURN * rng.normal(size=3) / np.sqrt(3))
-    result = smooth @ turn.T + strength * NORMAL_TILT * tilt
+    rotation = axis_angle_to_matrix(strength * NORMAL_ROTATION * rng.normal(size=3) / np.sqrt(3))
+    result = smooth @ rotation.T + strength * NORMAL_TILT * tilt
     result[..., 2] = np.minimum(result[..., 2], -0.02)
     result /= np.maximum(np.linalg.norm(result, axis=-1, keepdims=True), 1e-9)
     return result * (coverage >= 0.05)[..., None]

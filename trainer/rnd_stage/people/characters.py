@@ -60,7 +60,7 @@ _ALIASES = {
     "left_hand": ("leftfingerbase", "lefthandmiddle1", "lefthandindex1"),
 }
 
-# joints that a file may lack: their place follows from the bone before them, by a share of its length
+# joints that a file may lack: their position follows from the bone before them, by a share of its length
 _SPARE = {
     "left_hand": ("left_wrist", "left_elbow", 0.3),
     "right_hand": ("right_wrist", "right_elbow", 0.3),

@@ -1,12 +1,10 @@
-"""Cloth that hangs, swings and folds: position-based dynamics of points spread over the garments.
+"""Cloth by position-based dynamics of points on the garments.
 
 Müller et al., "Position based dynamics" (2007) with the compliance and small steps of Macklin et al. (XPBD, 2016;
-"Small steps", 2019). Points lie on the garments about a centimetre apart and are joined to their neighbours by springs
-that keep their distance (a little longer than at rest: garments have more cloth than the body asks for, which is what
-folds) and by weak ones across that resist bending. Each point is tied softly to where skinning puts it, may stray from
-there by its own radius at most, and may not enter the body: it stays above the plane of the skin below it and outside
-the legs' capsules. What moves the cloth is gravity and the skinned places' motion, so that folds depend on the pose and
-on what came before. Cloth does not touch cloth.
+"Small steps", 2019). Points are about a centimetre apart. Springs to their neighbours, a little longer than at rest,
+resist stretching; weak ones across resist bending. Each point is tied softly to its skinned position, stays within its
+own radius of it, above the plane of the skin and outside the legs' capsules. Gravity and the skinned motion move the
+cloth, so that folds depend on pose and history. Cloth does not collide with cloth.
 """
 
 from __future__ import annotations
@@ -26,12 +24,12 @@ SUBSTEPS = 10  # a frame at 30 fps
 WARM_UP = 1.0  # s: from the rest pose into the first pose, then hanging still
 GRAVITY = 9.81
 STRETCH, BEND = 2e-8, 2e-5  # compliances, m/N for a unit mass
-TIE = 6e-4  # of the pull towards the skinned place where the radius is 2 cm; grows with the square of the radius
-DRAG = 6.0  # 1/s, towards the skinned place's velocity
+TIE = 6e-4  # of the pull towards the skinned position where the radius is 2 cm; grows with the square of the radius
+DRAG = 6.0  # 1/s, towards the skinned position's velocity
 SKIN_GAP = 0.003  # m that stays between cloth and body
 NEIGHBOURS = 4  # simulated points a vertex follows
 NEAR = 1.75 * SPACING  # m within which points are neighbours in the weave
-LEAST_SPRINGS = 3
+MIN_SPRINGS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Drape:
     """How a garment's vertices may move: all [V].
 
     Attributes:
-        radius: m, the farthest a vertex strays from its skinned place; 0 for skin.
+        radius: m, the farthest a vertex moves from its skinned position; 0 for skin.
         gap: m between the garment and the body below it, at rest.
         slack: share by which its springs are longer than at rest.
         piece: garments of different numbers are not joined.
@@ -74,8 +72,8 @@ class Cloth:
         self, vertices: Floats, normals: Floats, weights: Floats, drape: Drape, capsules: Capsules, seed: int = 0
     ) -> None:
         free = np.flatnonzero((drape.radius > 0) & (drape.gap > SKIN_GAP))
-        chosen = free[_spread(vertices[free], SPACING, seed)]
-        chosen = chosen[_held(vertices[chosen], normals[chosen], drape.piece[chosen])]
+        chosen = free[_sampled(vertices[free], SPACING, seed)]
+        chosen = chosen[_connected(vertices[chosen], normals[chosen], drape.piece[chosen])]
         self.rest, self.normals, self.weights = vertices[chosen], normals[chosen], weights[chosen]
         self.radius, self.gap, self.hangs = drape.radius[chosen], drape.gap[chosen], drape.hangs[chosen]
         self.capsules = capsules
@@ -83,7 +81,7 @@ class Cloth:
         self.follows, self.shares = _interpolation(vertices, drape, self.rest, drape.piece[chosen])
 
     def simulate(self, bones: NDArray[np.float32], fps: float, keep: list[int]) -> dict[int, Floats]:
-        """Displacements [P, 3] m from the skinned places, of the frames ``keep``.
+        """Displacements [P, 3] m from the skinned positions, of the frames ``keep``.
 
         Args:
             bones: [F, J, 3, 4] what skins each frame, from the first on; the person comes out of the rest pose before.
@@ -93,9 +91,9 @@ class Cloth:
         first, first_normals = self._skinned(bones[0])
         start, start_normals = self._skinned(identity)
         start = start + first.mean(axis=0) - start.mean(axis=0)  # moved, not dragged, to where the motion begins
-        turned = _best_rotation(start, first)
+        rotation = _best_rotation(start, first)
         middle = first.mean(axis=0)
-        start, start_normals = (start - middle) @ turned.T + middle, start_normals @ turned.T
+        start, start_normals = (start - middle) @ rotation.T + middle, start_normals @ rotation.T
         points, velocity = start.copy(), np.zeros_like(start)
         before = start, start_normals
         result = {}
@@ -135,7 +133,7 @@ class Cloth:
         return np.einsum("cij,ckj->cki", carried[:, :, :3], self.capsules.ends) + carried[:, None, :, 3]
 
 
-def _spread(points: Floats, spacing: float, seed: int) -> Ints:
+def _sampled(points: Floats, spacing: float, seed: int) -> Ints:
     """Indices of a subset of ``points`` at least ``spacing`` apart that leaves no larger hole (dart throwing)."""
     order = np.random.default_rng(seed).permutation(len(points))
     near = cKDTree(points).query_ball_point(points, spacing)
@@ -162,11 +160,11 @@ def _springs(points: Floats, normals: Floats, slack: Floats, piece: Ints) -> tup
     return pairs[order].astype(np.int64), length[order], np.where(near, STRETCH, BEND)[order]
 
 
-def _held(points: Floats, normals: Floats, piece: Ints) -> NDArray[np.bool_]:
+def _connected(points: Floats, normals: Floats, piece: Ints) -> NDArray[np.bool_]:
     """Which points [P] have enough neighbours to hold them: a rim that faces another way would dangle from its edge."""
     pairs = cKDTree(points).query_pairs(NEAR, output_type="ndarray")
     pairs = pairs[_same_sheet(pairs, normals, piece)]
-    return np.bincount(pairs.ravel(), minlength=len(points)) >= LEAST_SPRINGS
+    return np.bincount(pairs.ravel(), minlength=len(points)) >= MIN_SPRINGS
 
 
 def _same_sheet(pairs: Ints, normals: Floats, piece: Ints) -> NDArray[np.bool_]:
@@ -198,12 +196,12 @@ def _best_rotation(source: Floats, target: Floats) -> Floats:
 
 @njit(cache=True)
 def _advance(x, v, before, now, springs, bounds, body, duration):
-    """One frame of ``SUBSTEPS`` small steps: places ``x`` and velocities ``v`` [P, 3], changed in place.
+    """One frame of ``SUBSTEPS`` small steps: positions ``x`` and velocities ``v`` [P, 3], changed in place.
 
     Args:
-        before, now: skinned places and normals [P, 3] at the frame's start and end.
+        before, now: skinned positions and normals [P, 3] at the frame's start and end.
         springs: pairs [S, 2], lengths [S] m, compliances [S].
-        bounds: how far each point may stray m, its gap to the body m, whether it hangs free of a limb, [P] each.
+        bounds: how far each point may move m, its gap to the body m, whether it hangs free of a limb, [P] each.
         body: axes [C, 2, 3] and radii [C] m of the capsules.
         duration: s.
     """
@@ -215,9 +213,9 @@ def _advance(x, v, before, now, springs, bounds, body, duration):
         _fall(x, v, old, before[0], now[0], duration, dt)
         _pull(x, springs, dt)
         for i in range(len(x)):
-            place, normal = _between(before[0], now[0], i, t), _between(before[1], now[1], i, t)
+            anchor, normal = _between(before[0], now[0], i, t), _between(before[1], now[1], i, t)
             tie = 1.0 / (1.0 + TIE * (radius[i] / 0.02) ** 2 / (dt * dt))
-            dx, dy, dz = x[i, 0] - place[0], x[i, 1] - place[1], x[i, 2] - place[2]
+            dx, dy, dz = x[i, 0] - anchor[0], x[i, 1] - anchor[1], x[i, 2] - anchor[2]
             px, py, pz = x[i, 0] - dx, x[i, 1] - dy, x[i, 2] - dz
             away = dx * (1 - tie), dy * (1 - tie), dz * (1 - tie)
             away = _above_skin(away, normal, gap[i])
@@ -232,7 +230,7 @@ def _advance(x, v, before, now, springs, bounds, body, duration):
 
 @njit(inline="always")
 def _fall(x, v, old, before, now, duration, dt):
-    """Air that moves with the body drags, and weight pulls; the places from which the step began go to ``old``."""
+    """Air that moves with the body drags, and weight pulls; the positions at which the step began go to ``old``."""
     drag = 1.0 - np.exp(-DRAG * dt)
     for i in range(len(x)):
         for c in range(3):
@@ -280,12 +278,12 @@ def _above_skin(away, normal, gap):
 
 
 @njit(inline="always")
-def _out_of(axis, radius, place, away, normal):
-    """A displacement from ``place`` that does not end inside a capsule."""
+def _out_of(axis, radius, anchor, away, normal):
+    """A displacement from ``anchor`` that does not end inside a capsule."""
     dx, dy, dz = away
     ax, ay, az = axis[0, 0], axis[0, 1], axis[0, 2]
     bx, by, bz = axis[1, 0] - ax, axis[1, 1] - ay, axis[1, 2] - az
-    qx, qy, qz = place[0] + dx - ax, place[1] + dy - ay, place[2] + dz - az
+    qx, qy, qz = anchor[0] + dx - ax, anchor[1] + dy - ay, anchor[2] + dz - az
     share = (qx * bx + qy * by + qz * bz) / (bx * bx + by * by + bz * bz)
     share = min(max(share, 0.0), 1.0)
     ex, ey, ez = qx - share * bx, qy - share * by, qz - share * bz
@@ -307,8 +305,8 @@ def _out_of(axis, radius, place, away, normal):
 def _within(away, radius):
     """A displacement no longer than ``radius``."""
     dx, dy, dz = away
-    stray = np.sqrt(dx * dx + dy * dy + dz * dz)
-    if stray > radius:
-        shrink = radius / stray
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    if length > radius:
+        shrink = radius / length
         dx, dy, dz = dx * shrink, dy * shrink, dz * shrink
     return dx, dy, dz
