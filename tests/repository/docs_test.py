@@ -1,7 +1,7 @@
 """The documentation: commands run, options exist, links resolve, tables are those of the files, pages are short.
 
 A fenced ``sh`` block is run line by line (``doc_commands``) in a folder that has ``assets``; blocks of one page share
-it. A ``python`` block runs there too; one that starts with ``# file: NAME`` is written to NAME instead.
+it, and its ``python`` blocks their names. A ``python`` block that starts with ``# file: NAME`` is written to NAME.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def test_commands_run(page, tmp_path, monkeypatch):
     copy_assets(tmp_path)
     write_alexnet(tmp_path / "alexnet.safetensors")
     monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "__main__"}
     for block in blocks(page):
         if block.reason is not None:
             continue
@@ -53,7 +54,7 @@ def test_commands_run(page, tmp_path, monkeypatch):
             name = block.body.splitlines()[0].removeprefix("# file: ")
             Path(name).write_text(block.body, encoding="utf-8")
         elif block.kind == "python":
-            exec(compile(block.body, _name(page), "exec"), {"__name__": "__main__"})
+            exec(compile(block.body, _name(page), "exec"), names)
         elif block.kind == "sh":
             for words in block.commands():
                 run(words, monkeypatch)
