@@ -18,7 +18,7 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 class GlbBuilder:
-    """Collects accessors; ``write`` puts them behind the JSON that names them."""
+    """Accessors, and the file that ``write`` makes of them."""
 
     def __init__(self) -> None:
         self._chunks: list[bytes] = []
@@ -31,8 +31,8 @@ class GlbBuilder:
     ) -> int:
         """Store ``values`` [count, …] of glTF type ``kind`` and return the accessor's index.
 
-        ``bounds`` adds the minimum and maximum that glTF asks of positions and key times; ``target`` is None
-        for what is not a vertex attribute or an index.
+        ``bounds`` adds the minimum and maximum that glTF requires of positions and key times; ``target`` is None
+        except for vertex attributes and indices.
         """
         array = np.ascontiguousarray(values, _DTYPES[component])
         view: dict[str, Any] = {"buffer": 0, "byteOffset": self._length, "byteLength": array.nbytes}

@@ -43,7 +43,7 @@ def write_obj(path: Path, vertices: Floats, faces: NDArray[np.int32]) -> None:
 def write_rigged_glb(path: Path, body: Body, motion: Motion) -> None:
     """The rest mesh with its joints as nodes, all its weights, and ``motion`` as an animation.
 
-    Weights are sorted, so that a reader of one JOINTS set alone gets the four strongest of each vertex.
+    Weights are sorted: a reader of one JOINTS set gets the four strongest of each vertex.
     """
     glb = GlbBuilder()
     skeleton, joints = body.skeleton, len(body.skeleton)
@@ -100,18 +100,16 @@ def _weight_sets(glb: GlbBuilder, weights: NDArray[np.float32]) -> dict[str, int
 
 
 def _animation(glb: GlbBuilder, rest_root: Floats, motion: Motion) -> dict[str, Any]:
-    """Rotations of all joints and the root's place at every frame of ``motion``, and of a closed one at its first
-    frame's return: an animation ends at its last key, and players that repeat it begin again there.
-    """
+    """Rotations of all joints and root positions at every frame of ``motion``, a closed one with its first again."""
     keys = np.arange(motion.frame_count + motion.closed)
     times = glb.accessor(keys / motion.fps, "SCALAR", FLOAT, target=None, bounds=True)
     frames = keys % motion.frame_count
     quaternions = matrix_to_quaternion(motion.rotations[frames])  # [K, J, 4]
     dots = (quaternions[1:] * quaternions[:-1]).sum(axis=-1)
     signs = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
-    quaternions[1:] *= signs[..., None]  # neighbours on one half of the sphere: players may not look
-    places = glb.accessor(rest_root + motion.translations[frames], "VEC3", FLOAT, target=None)
-    samplers = [{"input": times, "output": places, "interpolation": "LINEAR"}]
+    quaternions[1:] *= signs[..., None]  # neighbours on one hemisphere, for players that lerp
+    positions = glb.accessor(rest_root + motion.translations[frames], "VEC3", FLOAT, target=None)
+    samplers = [{"input": times, "output": positions, "interpolation": "LINEAR"}]
     channels: list[dict[str, Any]] = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
     for joint in range(motion.rotations.shape[1]):
         output = glb.accessor(quaternions[:, joint][:, [1, 2, 3, 0]], "VEC4", FLOAT, target=None)

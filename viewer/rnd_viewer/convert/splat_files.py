@@ -15,14 +15,14 @@ from rnd_runtime.core.images import srgb_to_linear
 from .glb import FLOAT, GlbBuilder
 from .splats import SH_0, Coding, Splats
 
-# In the order of the 3DGS authors' writer. All 45 higher coefficients, zero or not: some readers count bytes.
+# The order of the 3DGS authors' writer, with all 45 higher coefficients: some readers count bytes.
 PLY_FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz"),
     *(f"f_dc_{k}" for k in range(3)),
     *(f"f_rest_{k}" for k in range(45)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-OPAQUE = 1 - 1e-6  # largest stored opacity: the logit of 1 is infinite
+MAX_OPACITY = 1 - 1e-6  # the logit of 1 is infinite
 KHR = "KHR_gaussian_splatting"
 KHR_SPACES = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
 TRANSFORM = "splat-transform"
@@ -34,12 +34,12 @@ def write_ply(path: Path, splats: Splats) -> None:
 
     ``f_rest`` holds R's fifteen coefficients, then G's, then B's. Normals are the surface's.
     """
-    opacities = np.clip(splats.opacities, 1 - OPAQUE, OPAQUE)
+    opacities = np.clip(splats.opacities, 1 - MAX_OPACITY, MAX_OPACITY)
     columns = (
         splats.means,
         splats.normals,
-        splats.harmonics[:, 0],
-        np.swapaxes(splats.harmonics[:, 1:], 1, 2).reshape(len(splats.means), -1),
+        splats.sh[:, 0],
+        np.swapaxes(splats.sh[:, 1:], 1, 2).reshape(len(splats.means), -1),
         np.log(opacities / (1 - opacities))[:, None],
         np.log(splats.scales),
         splats.quaternions,
@@ -52,13 +52,12 @@ def write_ply(path: Path, splats: Splats) -> None:
 
 
 def write_splat_glb(path: Path, splats: Splats, coding: Coding) -> None:
-    """glTF binary of one KHR_gaussian_splatting primitive: Y up, scales and opacities as they are, xyzw.
+    """glTF binary of one KHR_gaussian_splatting primitive: Y up, quaternions xyzw; zero degrees are left out.
 
-    Points with COLOR_0, linear as glTF 2.0 (3.7.2.1) has it, for viewers that do not know the extension. Degrees that
-    are all zero are left out.
+    Viewers without the extension show points with COLOR_0, linear by glTF 2.0 (3.7.2.1).
     """
     glb = GlbBuilder()
-    stored = np.clip(0.5 + splats.harmonics[:, 0] * SH_0, 0, 1)
+    stored = np.clip(0.5 + splats.sh[:, 0] * SH_0, 0, 1)
     colour = srgb_to_linear(stored) if coding == "srgb" else stored
     attributes = {
         "POSITION": glb.accessor(splats.means, "VEC3", FLOAT, bounds=True),
@@ -67,10 +66,10 @@ def write_splat_glb(path: Path, splats: Splats, coding: Coding) -> None:
         f"{KHR}:SCALE": glb.accessor(splats.scales, "VEC3", FLOAT),
         f"{KHR}:OPACITY": glb.accessor(splats.opacities, "SCALAR", FLOAT),
     }
-    used = [degree for degree in range(1, 4) if splats.harmonics[:, degree**2 :].any()]
+    used = [degree for degree in range(1, 4) if splats.sh[:, degree**2 :].any()]
     for degree in range(1 + max(used, default=0)):
         for k in range(2 * degree + 1):
-            values = splats.harmonics[:, degree**2 + k]
+            values = splats.sh[:, degree**2 + k]
             attributes[f"{KHR}:SH_DEGREE_{degree}_COEF_{k}"] = glb.accessor(values, "VEC3", FLOAT)
     extension = {"kernel": "ellipse", "colorSpace": KHR_SPACES[coding]}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {KHR: extension}}
@@ -95,7 +94,7 @@ def splat_transform() -> str:
 
 
 def transform_ply(program: str, ply: Path, out: Path) -> None:
-    """Let ``program`` write ``out`` (.spz or .sog) from ``ply``."""
+    """Write ``out`` (.spz or .sog) from ``ply`` by ``program``."""
     with atomic_path(out) as temporary:
         line = [program, "--overwrite", "--quiet", "--gpu", "cpu", str(ply), str(temporary)]
         done = subprocess.run(line, capture_output=True, text=True, check=False)

@@ -1,11 +1,11 @@
-"""A clip as one ONNX file that makes plain Gaussians of a time, for Visionary's WebGPU renderer.
+"""A clip as one ONNX file from time to plain Gaussians, for Visionary's WebGPU renderer.
 
-Its contract (arXiv 2512.08478, sect. 3, and the exporters beside its source): an input ``time`` [1]; outputs
-``gaussian_f32`` [N, 10] (place, opacity, covariance xx xy xz yy yz zz), ``color_rgb`` [N, 4] in the screen's coding and
-``num_points`` [1], int32. Its own avatars come in half floats, of which none is a thin Gaussian's variance of 1e-8 m².
+Input ``time`` [1]; outputs ``gaussian_f32`` [N, 10] (position, opacity, covariance xx xy xz yy yz zz), ``color_rgb``
+[N, 4] in sRGB and ``num_points`` [1], int32. float32, as half floats lose a thin Gaussian's variance of 1e-8 m². The
+file holds the clip's frames and picks floor(time · fps), repeated. It is written field by field (onnx.proto of IR
+version 8), without a package for ONNX.
 
-The file holds the clip's frames and picks one: time · fps, rounded down, around and around. It is written field by
-field (onnx.proto of IR version 8), so that no package for ONNX is needed.
+Source: arXiv 2512.08478, section 3, and the exporters beside its source.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from .splats import SH_0, Splats
 
 Floats32 = NDArray[np.float32]
 
-MOST_BYTES = 1 << 27  # of one table: WebGPU's default limit of a storage buffer
+MAX_BYTES = 1 << 27  # of one table: WebGPU's default limit of a storage buffer
 ROW_BYTES = 40
 _IR_VERSION, _OPSET = 8, 18
 _FLOAT, _INT32, _INT64 = 1, 6, 7  # TensorProto.DataType
 _ATTRIBUTE_INT = 2  # AttributeProto.AttributeType
-_LATE = 1e-3  # of a frame: a time that is one frame's own, less rounding, picks that frame
+_LATE = 1e-3  # of a frame: a rounded frame time picks its own frame
 
 
 def packed(splats: Splats) -> tuple[Floats32, Floats32]:
-    """Rows ``gaussian`` [N, 10] and ``color`` [N, 4] of splats whose colour is one for all views."""
+    """Rows ``gaussian`` [N, 10] and ``color`` [N, 4] of splats with a view-independent colour."""
     w, x, y, z = splats.quaternions.T
     axes = np.stack(
         [
@@ -49,22 +49,22 @@ def packed(splats: Splats) -> tuple[Floats32, Floats32]:
     covariances = factors @ np.swapaxes(factors, 1, 2)
     rows, columns = np.triu_indices(3)
     gaussians = np.concatenate([splats.means, splats.opacities[:, None], covariances[:, rows, columns]], axis=1)
-    colours = 0.5 + SH_0 * splats.harmonics[:, 0]
+    colours = 0.5 + SH_0 * splats.sh[:, 0]
     return gaussians.astype(np.float32), np.pad(colours, ((0, 0), (0, 1)), constant_values=1).astype(np.float32)
 
 
-def check_clip(frames: int, gaussians: int, what: str = "--frames", hint: str | None = None) -> None:
-    """Refuse a clip that no WebGPU buffer holds; ``what`` says where its frames come from, ``hint`` what to do."""
-    most = MOST_BYTES // (gaussians * ROW_BYTES)
-    if frames > most:
-        raise InputError(what, expected=f"at most {most} of this avatar for visionary", got=frames, hint=hint)
+def check_clip(frames: int, gaussians: int) -> None:
+    """Refuse a clip that no WebGPU buffer holds."""
+    limit = MAX_BYTES // (gaussians * ROW_BYTES)
+    if frames > limit:
+        raise InputError("--frames", expected=f"at most {limit} of this avatar for visionary", got=frames)
 
 
 def write_visionary(path: Path, frames: Sequence[tuple[Floats32, Floats32]], fps: float) -> None:
     """Write a clip of ``frames``, each as ``packed``.
 
     Raises:
-        InputError: they have not as many Gaussians each.
+        InputError: the frames have different numbers of Gaussians.
     """
     counts = [len(gaussians) for gaussians, _ in frames]
     if min(counts) < max(counts):
@@ -89,10 +89,10 @@ def _model(gaussians: Floats32, colours: Floats32, fps: float) -> bytes:
         "points": np.array([points], np.int32),
     }
     nodes = [
-        _node("Mul", ["time", "fps"], "place"),
-        _node("Add", ["place", "late"], "late_place"),
-        _node("Floor", ["late_place"], "frame"),
-        _node("Add", ["frame", "half"], "frame_middle"),  # whole frames: what rounding does to the ratio cannot matter
+        _node("Mul", ["time", "fps"], "exact_frame"),
+        _node("Add", ["exact_frame", "late"], "late_frame"),
+        _node("Floor", ["late_frame"], "frame"),
+        _node("Add", ["frame", "half"], "frame_middle"),  # so that rounding of the ratio cannot matter
         _node("Div", ["frame_middle", "frames"], "clips"),
         _node("Floor", ["clips"], "whole_clips"),
         _node("Mul", ["whole_clips", "frames"], "clip_start"),
