@@ -30,7 +30,7 @@ AOVS = ("albedo", "normal", "roughness", "visibility")
 
 
 def main() -> None:
-    """Write assets/bench/demo.png and docs/pictures/*.png."""
+    """Write assets/bench/demo.png and docs/images/*.png."""
     avatar = Avatar.load(ROOT / "assets/avatar.onnx")
     walk = load_motion(ROOT / "assets/walk.npz", avatar.skeleton)
     sky = load_light(ROOT / "assets/sky.exr")
@@ -112,7 +112,7 @@ def _write(name: str, tiles: list[np.ndarray]) -> None:
     columns = np.flatnonzero(stack.max(axis=(0, 1, 3)) > 8)
     rows = np.flatnonzero(stack.max(axis=(0, 2, 3)) > 8)
     cut = stack[:, rows[0] : rows[-1] + 1, max(columns[0] - 12, 0) : columns[-1] + 13]
-    write_image(ROOT / "docs/pictures" / name, np.ascontiguousarray(np.concatenate(list(cut), axis=1)))
+    write_image(ROOT / "docs/images" / name, np.ascontiguousarray(np.concatenate(list(cut), axis=1)))
 
 
 if __name__ == "__main__":
