@@ -55,7 +55,9 @@ def _candidates(rest: Floats, world: Floats) -> list[tuple[str, Callable[[MaskVi
     def scale_K(view: MaskView, factor: float) -> MaskView:
         return view.with_camera(K=np.diag([factor, factor, 1.0]) @ view.camera.K)
 
-    inverse = np.linalg.inv
+    def inverse(matrix: Floats) -> Floats:
+        return np.asarray(np.linalg.inv(matrix), np.float64)
+
     millimetres = np.array([[1, 1, 1, 1e-3]] * 3 + [[1, 1, 1, 1]])
     return [
         (

@@ -40,7 +40,7 @@ def _attach(
     for sample in dataset.samples:
         file = folders[inner[sample.camera]].find(sample.name, sample.frame)
         reader = partial(read_sized, read, file, dataset.lenses[sample.camera].camera, what)
-        samples.append(replace(sample, **{what: reader}))
+        samples.append(replace(sample, mask=reader) if what == "mask" else replace(sample, normals=reader))
     notes = dict.fromkeys(
         f"{folder.name} are numbered from {files.first - files.shift}, frames from {files.first}: taken for the same"
         for files in folders.values()

@@ -47,7 +47,7 @@ def make_masks(
     Args:
         images: [H, W, 3] uint8 sRGB, all of one size; more than one where neither of the others is given.
         silhouettes: [H, W] masks of the posed template.
-        net: a segmentation network in ONNX (layouts: ``networks.ImageNetwork``), used in their place.
+        net: a segmentation network in ONNX (``networks.ImageNetwork``), used instead of them.
 
     Raises:
         InputError: neither poses nor network are given, and nothing moves.

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -96,7 +97,7 @@ def read_normals(path: str | Path) -> Normals:
     """A normal map [H, W, 3] in its own axes, unit or zero, from .npy (n, H×W×3 or 3×H×W) or a image of (n + 1)/2."""
     path = existing_file(path, what="normals")
     if path.suffix.lower() == ".npy":
-        normals = load_array(path, "normals").astype(np.float32)
+        normals: NDArray[Any] = load_array(path, "normals").astype(np.float32)
         if normals.ndim == 3 and normals.shape[0] == 3 and normals.shape[2] != 3:
             normals = normals.transpose(1, 2, 0)
     else:
