@@ -24,9 +24,6 @@ from rnd_runtime.playback.aov import CHANNELS
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.shading.light import Light
 from rnd_trainer.model.checkpoint import load_checkpoint
-from rnd_viewer.view.options import ViewOptions
-from rnd_viewer.view.scene import Scene
-from rnd_viewer.view.state import ViewState
 from support.paths import ASSETS
 
 CULL = -0.3
@@ -115,20 +112,6 @@ def test_players_follow_it_unless_they_are_told_otherwise(advised) -> None:
         whole, culled = frame(plain, None, aovs), frame(plain, CULL, aovs)
         assert whole != culled
         assert frame(own, None, aovs) == culled and frame(own, -1, aovs) == whole
-
-
-@pytest.mark.parametrize("output", ["lit", "light", "albedo", "normal"])
-def test_the_viewer_follows_it(advised, output) -> None:
-    plain, own = (
-        Scene(ViewOptions(file, ASSETS / "walk.npz", size=96, raster="cpu"))
-        for file in (ASSETS / "avatar.onnx", advised)
-    )
-    view = plain.description()["view"]
-    state = ViewState(time=0.4, width=96, height=96, output=output, **view)
-    whole, culled = plain.render(state).srgb, own.render(state).srgb
-    assert (whole != culled).any()
-    plain.renderer.cull = CULL
-    np.testing.assert_array_equal(plain.render(state).srgb, culled)
 
 
 @pytest.mark.parametrize(
