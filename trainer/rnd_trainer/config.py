@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from rnd_runtime.core.errors import InputError, check_option
 
-MOST_NODES = 1_875
+MAX_NODES = 1_875
 """3 cm apart on a body, over which what the networks say is smooth. Twice as many gain less than 0.1 dB in held-out
 pictures, 0.14 at most under other lights, and networks take twice as long (docs/tried.md)"""
 NODE_SHARE = 8
@@ -21,7 +21,7 @@ class ModelConfig:
 
     gaussians: int = 30_000
     """Gaussians on the template's surface; fixed, nothing is densified or pruned"""
-    nodes: int = MOST_NODES
+    nodes: int = MAX_NODES
     """points at which the networks are evaluated; the Gaussians interpolate between them (smooth quantities)"""
     window_poses: int = 10
     """d: poses in the motion window (the paper's ablation: 20 gains little over 10)"""
@@ -83,7 +83,7 @@ class TrainConfig:
     (docs/tried.md)"""
     rate_light: float = 1e-2
     """Adam's step for the logarithms of the probe's texels"""
-    rate_kept: float = 0.5
+    rate_final: float = 0.5
     """share of all rates that is left at the last picture, falling exponentially. A tenth, as it was, ends a training
     before it has learned what it could: half a dB at a quarter of the steps (docs/tried.md)"""
     rate_cooled: float = 0.15
@@ -173,7 +173,7 @@ def preset(name: str) -> TrainConfig:
         return standard
     if name == "full":
         # over so many steps the standard's high rates are worse: 34.67 dB and LPIPS .0156, not 34.77 and .0147
-        return dataclasses.replace(standard, steps=5 * standard.steps, rate_kept=0.1, rate_cooled=1.0)
+        return dataclasses.replace(standard, steps=5 * standard.steps, rate_final=0.1, rate_cooled=1.0)
     if name == "quick":
         quick = resized(standard, 12_000, 2_000)
         return dataclasses.replace(quick, unseen_fraction=0.5, preview_every=250, save_every=250)
@@ -182,7 +182,7 @@ def preset(name: str) -> TrainConfig:
 
 def nodes_for(gaussians: int) -> int:
     """At how many nodes the networks of so many Gaussians are evaluated."""
-    return max(16, min(gaussians // NODE_SHARE, MOST_NODES))
+    return max(16, min(gaussians // NODE_SHARE, MAX_NODES))
 
 
 def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> TrainConfig:
@@ -207,24 +207,12 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
-    """Rebuild a configuration; an unknown field is an error.
-
-    A missing one has the value it has today: a checkpoint from before a switch existed was trained without it. So the
-    third stage, the repulsion and the black backgrounds, which are on today, are off there, and rates fall as they did.
-    """
-    before = {
-        "unseen_fraction": 0.0,
-        "weight_repulsion": 0.0,
-        "black_backgrounds": 0.0,
-        "weight_smooth": 0.0,
-        "rate_kept": 0.1,
-        "rate_cooled": 1.0,
-    }
-    return _build(TrainConfig, {**before, **values, "model": _build(ModelConfig, values.get("model", {}))})
+    """Rebuild a configuration. Raises ``InputError`` for an unknown or a missing field."""
+    return _build(TrainConfig, {**values, "model": _build(ModelConfig, values["model"])})
 
 
 def _build(kind: Any, values: dict[str, Any]) -> Any:
-    unknown = sorted(set(values) - {field.name for field in dataclasses.fields(kind)})
-    if unknown:
-        raise InputError("configuration", expected=f"the fields of {kind.__name__}", got=f"{unknown} too")
+    wrong = sorted(set(values) ^ {field.name for field in dataclasses.fields(kind)})
+    if wrong:
+        raise InputError("configuration", expected=f"the fields of {kind.__name__}", got=f"others: {wrong}")
     return kind(**values)

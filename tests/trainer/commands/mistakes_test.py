@@ -36,8 +36,8 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (f"rnd-train {CAPTURE} --out OUT --seed -1", "--seed: expected at least 0, got -1"),
-        (f"rnd-train {CAPTURE} --out OUT --seed {2**64}", "--seed: expected less than 2^63, got 184467"),
+        (f"rnd-train {CAPTURE} --out OUT --seed -1", "--seed: expected 0 to 2^63 - 1, got -1"),
+        (f"rnd-train {CAPTURE} --out OUT --seed {2**64}", "--seed: expected 0 to 2^63 - 1, got 184467"),
         (
             f"rnd-train {CAPTURE} --out OUT --light none --probe-channels 1",
             "--probe-channels: expected the default, got 1 (--light none learns no light)",

@@ -208,7 +208,7 @@ def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
 
 
 def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_path) -> None:
-    rows = score(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture, method="m", pictures=tmp_path)
+    rows = score(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture, method="m", strips=tmp_path)
     assert [row["split"] for row in rows] == ["novel_view"]
     row = json.loads(json.dumps(rows[0]))
     wanted = {"psnr", "ssim", "psnr_n", "ssim_n", "normal_deg", "psnr_box", "method", "seed", "minutes"}
@@ -335,9 +335,6 @@ def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config
     lights = mine.lights | {name: structs.replace(mine.lights[name], yaw=1.0)}
     assert checkpoint.learned_under(dataclasses.replace(mine, lights=lights)) == set()
     assert checkpoint.learned_under(dataclasses.replace(mine, lights={})) == set()
-    old = dataclasses.replace(checkpoint, info={k: v for k, v in checkpoint.info.items() if k != "lights"})
-    assert old.learned_under(mine) == {name}
-    assert old.learned_under(load_capture(tmp_path / "renamed")) == set()
 
 
 def test_the_albedos_scale_is_fitted_to_training_frames() -> None:
@@ -390,10 +387,10 @@ def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
     checkpoint.write_bytes(tiny_checkpoint.read_bytes() + b"later")
     assert not _is_of(exported, sha256_of(checkpoint))
     said = capsys.readouterr().err
-    assert said == f"{exported}: of another checkpoint: its size and speed are left out\n"
+    assert f"{exported}: of another checkpoint" in said and said.count("\n") == 1
     exported.write_bytes(b"cut")
     assert not _is_of(exported, sha256_of(checkpoint))  # the figures of the checkpoint are there all the same
-    assert capsys.readouterr().err.startswith(f"{exported}: not a readable ONNX model")
+    assert f"{exported}: not a readable ONNX model" in capsys.readouterr().err
 
 
 def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar, tiny_capture) -> None:

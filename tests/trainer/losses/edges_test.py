@@ -24,11 +24,11 @@ from rnd_trainer.training.sampled_poses import (
     TURNED_JOINTS,
     WIDEST_SHAKE,
     WIDEST_TURN,
-    drawn_pose,
-    nudged_pose,
-    shaken_pose,
+    sampled_pose,
+    jittered_pose,
+    perturbed_pose,
 )
-from rnd_trainer.training.unseen import KEPT_NODES, MM2, UnseenPoses
+from rnd_trainer.training.unseen import NODE_STRIDE, MM2, UnseenPoses
 from support.tiny import body
 
 COUNT = 3000
@@ -47,7 +47,7 @@ def model(template) -> AvatarModel:
 
 
 def _poses(count: int, seed: int) -> list[PoseInput]:
-    return [drawn_pose(body().skeleton, CONFIG, np.random.default_rng((seed, k))) for k in range(count)]
+    return [sampled_pose(body().skeleton, CONFIG, np.random.default_rng((seed, k))) for k in range(count)]
 
 
 def _stretch(lengths: EdgeLengths, model: AvatarModel, pose: PoseInput) -> torch.Tensor:
@@ -66,7 +66,7 @@ def _squat() -> PoseInput:
 def test_a_drawn_pose_turns_a_few_joints_within_bounds_and_comes_there_from_less() -> None:
     skeleton = body().skeleton
     for seed in range(8):
-        pose = drawn_pose(skeleton, CONFIG, np.random.default_rng(seed))
+        pose = sampled_pose(skeleton, CONFIG, np.random.default_rng(seed))
         turned = (pose.window[-1] - pose.window.new_tensor([1, 0, 0, 0, 1, 0])).abs().amax(-1) > 1e-4
         assert 1 <= int(turned.sum()) <= TURNED_JOINTS
         assert pose.velocity[~turned].abs().max() < 1e-4
@@ -81,7 +81,7 @@ def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
     motion = Motion(axis_angle_to_matrix(angles), rng.standard_normal((40, 3)), 30.0, skeleton.names)
     filmed = pose_input(motion, skeleton, 0.9, CONFIG)
     for seed in range(8):
-        shaken = shaken_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
+        shaken = perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
         # where the person stands and looks
         assert torch.allclose(shaken.bones[0], filmed.bones[0], atol=1e-5)
         ours, theirs = (pose.velocity.norm(dim=-1) for pose in (shaken, filmed))
@@ -90,13 +90,13 @@ def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
         assert float(moved.abs().max()) > 0
         own = (shaken.window - filmed.window).abs().amax(-1)
         assert float(own.mean()) < 2 * WIDEST_SHAKE
-    twice = [shaken_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(1)).window for _ in range(2)]
+    twice = [perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(1)).window for _ in range(2)]
     assert torch.equal(*twice)
 
 
 def test_a_nudged_pose_is_hardly_another(model) -> None:
     pose = _poses(1, seed=4)[0]
-    nudged = nudged_pose(pose, np.random.default_rng(0))
+    nudged = jittered_pose(pose, np.random.default_rng(0))
     moved, faster = nudged.window - pose.window, nudged.velocity - pose.velocity
     assert torch.allclose(moved, moved[:1].expand_as(moved), atol=1e-6)  # the window as a whole
     assert float(moved[0].std()) == pytest.approx(NUDGE, rel=0.3)
@@ -113,7 +113,7 @@ def test_descending_calms_weights_that_jump(model) -> None:
 
     @torch.no_grad()
     def jump() -> float:
-        pairs = ((pose, nudged_pose(pose, np.random.default_rng(k))) for k, pose in enumerate(far))
+        pairs = ((pose, jittered_pose(pose, np.random.default_rng(k))) for k, pose in enumerate(far))
         return float(
             np.mean(
                 [float((lengths.weights(model, a) - lengths.weights(model, b)).abs().sum(-1).mean()) for a, b in pairs]
@@ -123,7 +123,7 @@ def test_descending_calms_weights_that_jump(model) -> None:
     before = jump()
     optimizer = torch.optim.Adam(model.skinning.parameters(), lr=2e-3)
     for step in range(60):
-        unseen(model, filmed[step % 2], step)["smooth"].backward()
+        unseen(model, filmed[step % 2], step)["smoothness"].backward()
         optimizer.step()
         optimizer.zero_grad()
     assert jump() < 0.5 * before
@@ -165,14 +165,14 @@ def test_the_step_gives_what_is_drawn_and_only_the_skinning_feels_it(model) -> N
     torch.stack(list(first.values())).sum().backward()
     felt = {name.split(".")[0] for name, p in model.named_parameters() if p.grad is not None}
     assert felt == {"skinning"}
-    assert all(p.grad is None for p in unseen.taught.parameters())
+    assert all(p.grad is None for p in unseen.teacher.parameters())
 
 
 def test_what_is_kept_is_where_the_nodes_were(model) -> None:
     """Against skinning node by node in float64."""
     pose = _poses(1, seed=2)[0]
     unseen = UnseenPoses(model, body().skeleton, TrainConfig(model=CONFIG))
-    assert [unseen(model, pose, k)["kept"] for k in range(KEPT_NODES)] == [0] * KEPT_NODES
+    assert [unseen(model, pose, k)["distillation"] for k in range(NODE_STRIDE)] == [0] * NODE_STRIDE
     with torch.no_grad():
         model.skinning.logits.bias += 0.3 * torch.randn(model.skinning.logits.bias.shape)
         logits = model.skinning.logits.bias.double().numpy()
@@ -186,8 +186,10 @@ def test_what_is_kept_is_where_the_nodes_were(model) -> None:
             blend = np.einsum("j,jrc->rc", weights / weights.sum(), bones)
             placed.append(blend[:, :3] @ point + blend[:, 3])
         squares.append(((placed[0] - placed[1]) ** 2).sum())
-    for k in range(KEPT_NODES):
-        assert unseen(model, pose, k)["kept"].item() == pytest.approx(MM2 * np.mean(squares[k::KEPT_NODES]), rel=1e-3)
+    for k in range(NODE_STRIDE):
+        assert unseen(model, pose, k)["distillation"].item() == pytest.approx(
+            MM2 * np.mean(squares[k::NODE_STRIDE]), rel=1e-3
+        )
 
 
 def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_filmed(model) -> None:
@@ -211,6 +213,6 @@ def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_
         optimizer.step()
         optimizer.zero_grad()
     with torch.no_grad():
-        moved = np.mean([float(unseen(model, pose, 0)["kept"]) for pose in filmed])
+        moved = np.mean([float(unseen(model, pose, 0)["distillation"]) for pose in filmed])
     assert torn() < 0.7 * before
     assert moved < 5**2  # mm²

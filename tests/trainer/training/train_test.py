@@ -25,7 +25,7 @@ from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.commands.eval import EvalOptions, evaluate_run
-from rnd_trainer.config import from_dict
+from rnd_trainer.commands.train import Learning
 from rnd_trainer.losses.losses import linear_to_srgb
 from rnd_trainer.losses.perceptual import load_features, load_lpips
 from rnd_trainer.losses.perceptual_nets import BACKBONES
@@ -66,7 +66,6 @@ def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_con
     assert 0.4 < black.float().mean() < 0.6
     deciles = linear_to_srgb(drawn[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
     torch.testing.assert_close(deciles, torch.linspace(0.1, 0.9, 9), atol=0.06, rtol=0)
-    assert from_dict({}).black_backgrounds == 0  # a configuration from before
 
 
 def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
@@ -74,8 +73,23 @@ def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     assert [row["step"] for row in rows] == list(range(14))
     assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
     assert "grey" in rows[11] and "grey" not in rows[0]
-    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "kept", "edges", "smooth"}
+    assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "distillation", "edges", "smoothness"}
     assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
+    status = json.loads((tiny_run / "status.json").read_text())
+    assert (status["step"], status["steps"], status["ended"]) == (14, 14, "finished")
+
+
+def test_a_run_names_its_phases_the_search_of_the_light_too(tiny_capture, tiny_config, tmp_path) -> None:
+    phases: dict[str, int] = {}
+
+    def count(name: str, done: float, total: float) -> None:
+        assert json.loads((tmp_path / "status.json").read_text())["phase"] == name
+        phases[name] = phases.get(name, 0) + 1
+
+    training = Training(tiny_capture, tiny_config)
+    run(training, tmp_path, on_step=_nothing, on_preview=_nothing, on_phase=count)
+    assert list(phases) == ["warming up", "geometry", "searching the light", "albedo and light", "unseen poses"]
+    assert phases["searching the light"] >= 2
 
 
 def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
@@ -93,21 +107,21 @@ def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, t
     assert training.lit and resumed.lit and resumed.step().terms == training.step().terms
 
 
-def test_a_rehearsal_takes_every_term_and_changes_nothing(tiny_capture, tiny_config, one_thread, monkeypatch) -> None:
-    plain, rehearsed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
+def test_warming_up_takes_every_term_and_changes_nothing(tiny_capture, tiny_config, one_thread, monkeypatch) -> None:
+    plain, warmed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
     asked = []
 
     def spy(*given):
-        asked.append(rehearsed_objective(*given))
+        asked.append(original(*given))
         return asked[-1]
 
-    rehearsed_objective = rehearsed.objective
-    monkeypatch.setattr(rehearsed, "objective", spy)
-    rehearsed.rehearse()
+    original = warmed.objective
+    monkeypatch.setattr(warmed, "objective", spy)
+    warmed.warm_up()
     monkeypatch.undo()
     assert {"image", "mask", "visibility", "grey", "sky"} <= set(asked[0])
-    assert rehearsed.step_index == 0 and rehearsed.seconds > 0
-    assert [plain.step().terms for _ in range(8)] == [rehearsed.step().terms for _ in range(8)]
+    assert warmed.step_index == 0 and warmed.seconds > 0
+    assert [plain.step().terms for _ in range(8)] == [warmed.step().terms for _ in range(8)]
 
 
 def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
@@ -173,7 +187,7 @@ def test_resuming_on_other_pictures_or_poses_is_refused(tiny_run, tiny_capture, 
     wider = dataclasses.replace(bodies, vertices=bodies.vertices * [1.01, 1, 1])
     for other in ({"motion": moved}, {"frames": fewer}, {"frames": swapped}, {"body": wider}):
         training = Training(dataclasses.replace(tiny_capture, **other), tiny_config)
-        with pytest.raises(InputError, match="expected the pictures and poses it was started with, got others"):
+        with pytest.raises(InputError, match="expected the images and poses it was started with, got others"):
             training.resume(tiny_run / "training.state")
 
 
@@ -183,7 +197,7 @@ def test_resuming_under_another_light_of_the_capture_is_refused(tiny_capture, ti
     Training(tiny_capture, config).resume(tmp_path / "training.state")
     white = tiny_capture.lights["white"]
     brighter = {"white": replace(white, scale=(2.0, 2.0, 2.0))}
-    with pytest.raises(InputError, match="expected the pictures and poses it was started with, got others"):
+    with pytest.raises(InputError, match="expected the images and poses it was started with, got others"):
         Training(dataclasses.replace(tiny_capture, lights=brighter), config).resume(tmp_path / "training.state")
 
 
@@ -191,15 +205,6 @@ def test_a_last_bit_of_another_machines_sine_is_no_other_motion(tiny_run, tiny_c
     moves = tiny_capture.motion
     near = dataclasses.replace(moves, rotations=np.nextafter(moves.rotations, 2))
     Training(dataclasses.replace(tiny_capture, motion=near), tiny_config).resume(tiny_run / "training.state")
-
-
-def test_states_from_before_the_digest_are_resumed(tiny_run, tiny_capture, tiny_config, tmp_path) -> None:
-    tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
-    del header["learned_from_sha256"]
-    write_tensors(tmp_path / "older.state", tensors, header | {"seen_sha256": "of float64 bits"})
-    training = Training(tiny_capture, tiny_config)
-    training.resume(tmp_path / "older.state")
-    assert training.step_index == 14
 
 
 def test_how_often_a_state_is_saved_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
@@ -252,7 +257,7 @@ def test_a_training_on_shrunk_pictures_is_resumed_where_a_byte_of_them_differs(
     whole.save(tmp_path)
     other = Training(tiny_capture, tiny_config)
     other.views[0].image[0, 0, 0] += 1
-    with pytest.raises(InputError, match="expected the pictures and poses it was started with"):
+    with pytest.raises(InputError, match="expected the images and poses it was started with"):
         other.resume(tmp_path / "training.state")
 
 
@@ -291,21 +296,16 @@ def _half_of(folder: Path) -> Path:
 def test_a_training_is_scored_in_its_own_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
     scored: list[EvalOptions] = []
     monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
-    options = rnd_trainer.commands.train.TrainOptions(Path("capture"), **changes)
+    options = rnd_trainer.commands.train.TrainOptions(Path("capture"), learning=Learning(**changes))
     rnd_trainer.commands.train._score_after_training(SimpleNamespace(capture=tiny_capture), tmp_path, options)
     assert scored[0].motion == (motion and motion.replace("OUT", str(tmp_path)))
 
 
-def test_a_state_from_before_a_switch_existed_is_resumed_and_one_from_after_refused(
-    tiny_run, tiny_capture, tiny_config, tmp_path
-) -> None:
+def test_a_state_with_other_fields_is_refused(tiny_run, tiny_capture, tiny_config, tmp_path) -> None:
     tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
-    older = {key: value for key, value in header["config"].items() if key != "light_search"}
-    write_tensors(tmp_path / "older.state", tensors, header | {"config": older})
     training = Training(tiny_capture, tiny_config)
-    training.resume(tmp_path / "older.state")
-    assert training.step_index == 14
-    for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, [], None):
+    less = {key: value for key, value in header["config"].items() if key != "light_search"}
+    for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, less, [], None):
         write_tensors(tmp_path / "broken.state", tensors, header | {"config": broken})
         with pytest.raises(InputError, match=r"broken\.state: not a training state"):
             training.resume(tmp_path / "broken.state")
@@ -415,10 +415,8 @@ def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(tiny_capture, 
     sizes = ["--preset", "quick", "--gaussians", "200", "--steps", "5", "--save-every", "2"]
     out = tmp_path / "run"
     monkeypatch.setattr(sys, "argv", ["rnd-train", str(tiny_capture.folder), "--out", str(out), *sizes])
-    with pytest.raises(SystemExit) as leaving:
-        rnd_trainer.commands.train.main()
+    assert rnd_trainer.commands.train.main() == 2
     said = capsys.readouterr().err.splitlines()
-    assert leaving.value.code == 2
     assert said[-1].startswith("rnd-train: --device: expected enough memory, got a GPU that is full (fewer")
     assert load_checkpoint(out / "avatar.ckpt").info["step"] == 2
 
@@ -450,7 +448,7 @@ def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, m
         for raw in training.refinement.raw:
             raw += 0.3
     training.step_index, given = tiny_config.steps, []
-    monkeypatch.setattr(rnd_trainer.training.training, "SHAKEN_SHARE", 0)
+    monkeypatch.setattr(rnd_trainer.training.training, "PERTURBED_SHARE", 0)
     monkeypatch.setattr(training, "_unseen", lambda: lambda model, pose, step: given.append(pose) or {})
     training._unseen_terms(training.views[0], training.poses[0])
     expected = training.refinement.bones(training.views[0].frame.frame)

@@ -14,7 +14,7 @@ from rnd_runtime.core.command import OptionalFolder, finish, option, parse_subco
 from rnd_runtime.core.files import is_folder
 from rnd_trainer.importing.options import ImportOptions
 
-from .eval import need_extra
+from .console import need_extra
 
 
 @dataclass(frozen=True)

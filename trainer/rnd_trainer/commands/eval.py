@@ -1,22 +1,21 @@
-"""rnd-eval: what a trained avatar is worth on pictures it was not trained on."""
+"""rnd-eval: figures of a trained avatar on held-out images."""
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rnd_runtime.core.command import parse_options, run_command
+from rnd_runtime.core.command import OptionalFile, OptionalFolder, is_quiet, log, option, parse, run_command, warn
 from rnd_runtime.core.errors import InputError, check_cull
 from rnd_runtime.core.files import is_folder, output_file, output_folder, refuse_input, write_json
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from .console import log_all, need_extra, wide_console
 
+if TYPE_CHECKING:
     from rnd_trainer.model.checkpoint import Checkpoint
 
 COLUMNS = {
@@ -32,58 +31,50 @@ COLUMNS = {
     "psnr_albedo": ("albedo", "{:.2f}"),
     "outline_px": ("outline px", "{:.2f}"),
 }
-"""what the terminal's table shows of a row: heading and format"""
-WIDTH = 140
-"""characters of the widest table"""
+"""columns of the terminal's table: heading and format"""
+UNKNOWN = {
+    "pictures": "--strips FOLDER writes them",
+    "ablate": "rnd-bench study ablations trains them",
+    "study": "rnd-bench study trains and scores variants",
+    "hdr": "the capture names its lights",
+    "light": "the capture names its lights",
+}
 
 
 @dataclass(frozen=True)
 class EvalOptions:
-    """Score a trained avatar on the held-out splits of a capture."""
+    """Score a trained avatar on the held-out splits of a capture.
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """folder of rnd-train, or an avatar.ckpt"""
-    capture: Annotated[Path, tyro.conf.Positional]
-    """folder with capture.json"""
-    json: Path | None = None
-    """write the rows here as JSON"""
-    pictures: Path | None = None
-    """folder for strips: truth, render, normals, albedo, error"""
-    perceptual_weights: Path | None = None
-    """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds the LPIPS column"""
-    shade: str = "table+sun"
-    """shading of rnd-play: ao, table, table+sun, lights:K or brute"""
-    cull: float | None = None
-    """as of rnd-play: leave out what faces away, Gaussians whose n·v is below this cosine (−1 to 1), such as -0.5"""
-    motion: str | None = None
-    """another motion file of the capture to render with: exact poses for an avatar trained on noisy ones. Default: the
-    poses that the training corrected (--refine-poses), else the capture's own."""
-    method: str | None = None
-    """name of the rows in the JSON; the run folder's unless given"""
+    rnd-eval runs/me captures/me --json scores.json
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], option("RUN|CHECKPOINT")]
+    """Folder of rnd-train, or an avatar.ckpt."""
+    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE")]
+    """Folder with capture.json."""
+    json: OptionalFile = None
+    """Write the rows here."""
+    strips: OptionalFolder = None
+    """Write strips here: truth, render, normals, albedo, error."""
+    perceptual_weights: OptionalFile = None
+    """AlexNet, SqueezeNet or VGG16 with LPIPS heads (.safetensors or .pth): adds LPIPS."""
+    shade: Annotated[str, option("MODE")] = "table+sun"
+    """Shading: ao, table, table+sun, lights:K or brute."""
+    cull: Annotated[float | None, option("COSINE")] = None
+    """n·v below which Gaussians are left out, such as -0.5. Default: none are."""
+    motion: Annotated[str | None, option("FILE")] = None
+    """Another motion file of the capture. Default: the poses refined in training, else the capture's own."""
+    method: Annotated[str | None, option("NAME")] = None
+    """Name of the rows. Default: the run folder's."""
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``rnd-eval``."""
-
-    def command() -> None:
-        options = parse_options(lambda: tyro.cli(EvalOptions, prog="rnd-eval"))
-        evaluate_run(options)
-
-    sys.exit(run_command("rnd-eval", command))
-
-
-def need_extra() -> None:
-    """Refuse to go on, naming the extra to install, where torch and its company are missing."""
-    for package in ("torch", "safetensors", "scipy"):
-        if importlib.util.find_spec(package) is None:
-            raise InputError(
-                f"{package} is not installed",
-                hint='needs the extra: pip install "rnd-avatar[train]", in a clone ".[train]"',
-            )
+    return run_command("rnd-eval", lambda: evaluate_run(parse(EvalOptions, "rnd-eval", arguments, unknown=UNKNOWN)))
 
 
 def evaluate_run(options: EvalOptions) -> None:
-    """Score every held-out split that the capture has; print a table, write rows and pictures as asked."""
+    """Score every held-out split that the capture has; print a table, write rows and strips."""
     need_extra()
     from rich.markup import escape
     from rich.table import Table
@@ -94,7 +85,7 @@ def evaluate_run(options: EvalOptions) -> None:
     from rnd_trainer.evaluation.held_out import score
     from rnd_trainer.losses.perceptual import load_lpips
     from rnd_trainer.model.checkpoint import load_checkpoint
-    from rnd_trainer.training.notes import capture_notes, say_notes
+    from rnd_trainer.training.notes import capture_notes
 
     check_mode(options.shade)
     check_cull(options.cull)
@@ -102,22 +93,24 @@ def evaluate_run(options: EvalOptions) -> None:
     path = _checkpoint_file(options)
     checkpoint = load_checkpoint(path)
     if note := checkpoint.note():
-        print(f"rnd-eval: {note}", file=sys.stderr)  # noqa: T201
-    capture = load_capture(options.capture, motion_file=options.motion or _corrected(path, checkpoint, options))
-    say_notes("rnd-eval", capture_notes(capture, HELD_OUT))
+        warn(note)
+    capture = load_capture(options.capture, motion_file=options.motion or _refined_motion(path, checkpoint, options))
+    log_all(capture_notes(capture, HELD_OUT))
     exported = path.with_suffix(".onnx")
     rows = score(
         checkpoint,
         capture,
         method=options.method or path.resolve().parent.name,
         mode=options.shade,
-        pictures=options.pictures,
+        strips=options.strips,
         perceptual=load_lpips(options.perceptual_weights),
         avatar=exported if _is_of(exported, checkpoint.sha256) else None,
         cull=options.cull,
     )
     if options.json is not None:
         write_json(options.json, rows)
+    if is_quiet():
+        return
     names = [name for name in COLUMNS if any(name in row for row in rows)]
     table = Table("split", "frames", *(COLUMNS[name][0] for name in names), title=escape(str(path)))
     for row in rows:
@@ -133,24 +126,24 @@ def evaluate_run(options: EvalOptions) -> None:
 
 
 def check_outputs(options: EvalOptions) -> None:
-    """Raise ``InputError`` for what could not be written once everything is scored, or is read before."""
+    """Raise ``InputError`` for outputs that cannot be written or are inputs."""
     from rnd_runtime.capture.capture import capture_file
 
     checkpoint = _checkpoint_file(options)
     read = (checkpoint, checkpoint.with_suffix(".onnx"), capture_file(options.capture))
-    for file in filter(None, (options.json,)):
-        refuse_input(file, *read, options.perceptual_weights)
-        output_file(file)
-    if options.pictures is not None:
-        output_folder(options.pictures)
+    if options.json is not None:
+        refuse_input(options.json, *read, options.perceptual_weights)
+        output_file(options.json)
+    if options.strips is not None:
+        output_folder(options.strips)
 
 
 def _checkpoint_file(options: EvalOptions) -> Path:
     return options.run / "avatar.ckpt" if is_folder(options.run) else options.run
 
 
-def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
-    """The poses that the training corrected, where it did and on this capture; says so."""
+def _refined_motion(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
+    """The motion refined in this training if it was on this capture; logs it."""
     from rnd_runtime.capture.capture import capture_file
     from rnd_trainer.training.training import REFINED_MOTION
 
@@ -160,12 +153,12 @@ def _corrected(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str 
         return None
     if not checkpoint.learned_from(capture):
         return None
-    print(f"rnd-eval: poses of {file}, corrected in training; --motion takes others", file=sys.stderr)  # noqa: T201
+    log(f"poses of {file}, refined in training; --motion takes others")
     return str(file)
 
 
 def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
-    """Whether ``exported`` is there and was made of that checkpoint; says where only the first holds."""
+    """Whether ``exported`` exists and is of that checkpoint; warns where it is of another."""
     from rnd_runtime.avatar.file import metadata_of
 
     if not exported.is_file():
@@ -173,16 +166,9 @@ def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
     try:
         made_of = metadata_of(exported).checkpoint_sha256
     except InputError as error:
-        print(f"{error}: its size and speed are left out", file=sys.stderr)  # noqa: T201
+        warn(f"{error}: its size and speed are left out")
         return False
     if made_of == checkpoint_sha256:
         return True
-    print(f"{exported}: of another checkpoint: its size and speed are left out", file=sys.stderr)  # noqa: T201
+    warn(f"{exported}: of another checkpoint: its size and speed are left out")
     return False
-
-
-def wide_console() -> Console:
-    """Where a terminal is too narrow, lines go on in the next: figures cut to two digits tell nothing."""
-    from rich.console import Console
-
-    return Console(width=max(Console().width, WIDTH), soft_wrap=True)

@@ -6,83 +6,120 @@ import dataclasses
 import re
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.errors import InputError, check_option, parse_options, refuse_changed, run_command
+from rnd_runtime.core.command import (
+    Count,
+    Flag,
+    Folder,
+    OptionalCount,
+    OptionalFile,
+    OptionalNumber,
+    finish,
+    group,
+    log,
+    option,
+    parse,
+    run_command,
+    show,
+    warn,
+)
+from rnd_runtime.core.errors import InputError, check_option, refuse_changed
 from rnd_runtime.core.files import existing_file, output_folder, write_json
+from rnd_runtime.core.progress import Progress
 
-from .eval import EvalOptions, evaluate_run, need_extra
+from .console import log_all, need_extra
+from .eval import EvalOptions, evaluate_run
 
 if TYPE_CHECKING:
     from rnd_trainer.config import TrainConfig
-    from rnd_trainer.training.training import Training
+    from rnd_trainer.training.training import StepResult, Training
 
 PREVIEWS = 3
-"""rows of a preview picture: views spread over the training frames"""
+"""rows of a preview: views spread over the training frames"""
+UNKNOWN = {
+    "view": "rnd-view RUN shows a training while it runs",
+    "hdr": "the light is learned; --light capture takes the capture's own, rnd-play relights with --hdr",
+}
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long, and on what."""
+
+    preset: Literal["quick", "standard", "full"] = "standard"
+    """Some seven minutes, half an hour, or hours on two cores."""
+    steps: OptionalCount = None
+    """Steps with an image. Default: 6000 (quick: 2000). The third stage adds 3/8 as many short steps (quick: 1/2)."""
+    gaussians: OptionalCount = None
+    """Number of Gaussians. Default: 30000 (quick: 12000)."""
+    image_scale: OptionalNumber = None
+    """Shrink the training images by this factor."""
+    save_every: OptionalCount = None
+    """Steps between saved states, from which --resume continues. Default: the preset's."""
+    seed: Count = 0
+    """Of all random numbers."""
+    device: Annotated[str, option("cpu|cuda[:N]")] = "cpu"
+    """cuda trains on a GPU with gsplat as the rasteriser (extra [cuda])."""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """What is learned, and from what."""
+
+    perceptual_weights: OptionalFile = None
+    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses."""
+    consistency_weights: OptionalFile = None
+    """Another of them, or its first blocks, for the consistency loss."""
+    unseen_poses: bool = True
+    """Teach the skinning out-of-distribution poses after the images."""
+    refine_poses: Flag = False
+    """Correct the capture's body poses while training; writes refined_motion.npz."""
+    motion: Annotated[str | None, option("FILE")] = None
+    """Another motion file of the capture."""
+
+
+@dataclass(frozen=True)
+class Ablations:
+    """Oracles and ablations, for studies."""
+
+    light: Literal["learn", "capture", "none"] = "learn"
+    """capture: under the capture's own light map; none: plain colours, an avatar that cannot be relit."""
+    normals: Literal["estimated", "true"] = "estimated"
+    """true: the capture's exact normals."""
+    probe_channels: Literal[1, 3] = 3
+    """1: a grey light."""
+    visibility: Literal["pose", "paper", "none"] = "pose"
+    """paper: visibility towards the camera, as printed; none: no shadows. Not exported."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Learn an avatar from one monocular capture."""
+    """Learn an avatar from one monocular capture.
 
-    capture: Annotated[Path, tyro.conf.Positional]
-    """folder with capture.json"""
-    out: Path = Path("runs/avatar")
-    """folder for avatar.ckpt, previews/, metrics.jsonl and config.json"""
-    preset: Literal["quick", "standard", "full"] = "standard"
-    """schedule: some seven minutes, half an hour, hours on two cores"""
-    resume: bool = False
-    """continue a stopped training in OUT"""
-    steps: int | None = None
-    """with pictures, instead of the preset's 6000 (quick: 2000); the third stage, of unseen poses, adds three eighths
-    as many (quick: half), which are short"""
-    gaussians: int | None = None
-    """instead of the preset's; an eighth of them, 1875 at most, are nodes"""
-    save_every: int | None = None
-    """steps between saved states, instead of the preset's; --resume goes on from the last one"""
-    image_scale: float | None = None
-    """shrink the pictures by this factor"""
-    seed: int = 0
-    """of every random draw"""
-    perceptual_weights: Path | None = None
-    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses (with --light none the
-    first alone)"""
-    consistency_weights: Path | None = None
-    """another of them, or its first few blocks, for the consistency loss"""
-    unseen_poses: bool = True
-    """when the pictures are done, teach the skinning poses that nobody filmed: a squat then tears less, and what was
-    filmed hardly changes"""
-    refine_poses: bool = False
-    """correct the capture's body poses while training; writes refined_motion.npz"""
-    light: Literal["learn", "capture", "none"] = "learn"
-    """'capture': train under the capture's own light map (an oracle, for studies); 'none': plain colours"""
-    normals: Literal["estimated", "true"] = "estimated"
-    """'true': the capture's exact normals (an oracle, for studies)"""
-    probe_channels: Literal[1, 3] = 3
-    """1: a grey light"""
-    visibility: Literal["pose", "paper", "none"] = "pose"
-    """'paper': visibility towards the camera, as printed; 'none': no shadows (ablations, not exported)"""
-    motion: str | None = None
-    """another motion file of the capture, such as motion_noisy.npz"""
-    device: str = "cpu"
-    """'cuda' trains on a GPU: the same code, gsplat as its rasteriser (extra [cuda])"""
-    view: bool = False
-    """show the training on a page of this machine: previews, losses, time left"""
+    rnd-train captures/me --out runs/me --preset quick
+    """
+
+    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE")]
+    """Folder with capture.json."""
+    out: Folder = Path("runs/avatar")
+    """Folder for avatar.ckpt, previews/, metrics.jsonl, status.json and config.json."""
+    resume: Flag = False
+    """Continue a stopped training in OUT."""
+    schedule: Annotated[Schedule, *group("schedule")] = field(default_factory=Schedule)
+    learning: Annotated[Learning, *group("learning")] = field(default_factory=Learning)
+    ablations: Annotated[Ablations, *group("oracles and ablations")] = field(default_factory=Ablations)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``rnd-train``."""
-
-    def command() -> None:
-        _train(parse_options(lambda: tyro.cli(TrainOptions, prog="rnd-train")))
-
-    sys.exit(run_command("rnd-train", command))
+    return run_command("rnd-train", lambda: _train(parse(TrainOptions, "rnd-train", arguments, unknown=UNKNOWN)))
 
 
 def _train(options: TrainOptions) -> None:
@@ -90,14 +127,13 @@ def _train(options: TrainOptions) -> None:
     from rnd_runtime.capture.capture import load_capture
     from rnd_trainer.config import to_dict
     from rnd_trainer.losses.perceptual import load_features, load_lpips
-    from rnd_trainer.training.live_view import live_view
-    from rnd_trainer.training.notes import capture_notes, say_notes
+    from rnd_trainer.training.notes import capture_notes
     from rnd_trainer.training.state import STATE_FILE
     from rnd_trainer.training.training import Training
 
-    config, device = _config(options), _device(options.device)
-    capture = load_capture(options.capture, motion_file=options.motion)
-    say_notes("rnd-train", capture_notes(capture, ["train"] if options.light == "capture" else []))
+    config, device, learning = _config(options), _device(options.schedule.device), options.learning
+    capture = load_capture(options.capture, motion_file=learning.motion)
+    log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
     folder = options.out
     state = folder / STATE_FILE
     if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
@@ -105,68 +141,63 @@ def _train(options: TrainOptions) -> None:
         raise InputError("holds a training already", file=folder, hint=hint)
     if options.resume:
         existing_file(state, what="state of a training to resume")
-    perceptual = load_lpips(options.perceptual_weights)
-    features = load_features(options.consistency_weights)
-    with _memory_runs_out():
+    perceptual, features = load_lpips(learning.perceptual_weights), load_features(learning.consistency_weights)
+    with _memory_error_in_one_line():
         training = Training(capture, config, perceptual, device, consistency=features)
     if options.resume:
         training.resume(state)
     write_json(output_folder(folder) / "config.json", to_dict(config))
     if perceptual is None:
         without = "" if features is not None else ", and no consistency loss"
-        _say(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
+        log(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
     for frame in training.bad_masks:
-        _say(f"frame {frame}: mask empty or full, skipped")
-    _say(f"{folder}: {training.schedule.total} steps in all")
-    with live_view(folder, training.schedule) if options.view else nullcontext() as page:
-        if page:
-            _say(page)
-        with _memory_runs_out():
-            interrupted = _run_with_progress(training, folder)
-        print(f"{folder / 'avatar.ckpt'}: {training.step_index} steps, {training.seconds / 60:.1f} min")  # noqa: T201
-        if interrupted:
-            words = [word for word in sys.argv[1:] if word != "--resume"]
-            _say(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
-            raise KeyboardInterrupt
-        _score_after_training(training, folder, options)
-
-
-def _say(what: str) -> None:
-    print(f"rnd-train: {what}", file=sys.stderr)  # noqa: T201
+        warn(f"frame {frame}: mask empty or full, skipped")
+    log(f"{folder}: {training.schedule.total} steps; rnd-view {shlex.quote(str(folder))} shows them")
+    with _memory_error_in_one_line():
+        stopped = _run_with_progress(training, folder)
+    checkpoint = folder / "avatar.ckpt"
+    summary = f"{training.step_index} steps, {training.seconds / 60:.1f} min"
+    if stopped:
+        show(f"{checkpoint}: {summary}")
+        words = [word for word in sys.argv[1:] if word != "--resume"]
+        log(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
+        raise KeyboardInterrupt
+    _score_after_training(training, folder, options)
+    finish(checkpoint, summary, then=f"rnd-export {shlex.quote(str(checkpoint))}")
 
 
 def _config(options: TrainOptions) -> TrainConfig:
-    """The preset with what ``options`` change; raises ``InputError`` for what no training can do."""
+    """The preset with the changes in ``options``; raises ``InputError`` for what cannot be trained."""
     from rnd_trainer.config import check_sizes, preset, resized
 
-    config = resized(preset(options.preset), options.gaussians, options.steps)
+    schedule, ablations = options.schedule, options.ablations
+    config = resized(preset(schedule.preset), schedule.gaussians, schedule.steps)
     config = dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, visibility=options.visibility),
-        seed=options.seed,
-        light=options.light,
-        normals=options.normals,
-        probe_channels=options.probe_channels,
-        unseen_fraction=config.unseen_fraction if options.unseen_poses else 0.0,
-        refine_poses=options.refine_poses,
-        image_scale=config.image_scale if options.image_scale is None else options.image_scale,
-        save_every=config.save_every if options.save_every is None else options.save_every,
+        model=dataclasses.replace(config.model, visibility=ablations.visibility),
+        seed=schedule.seed,
+        light=ablations.light,
+        normals=ablations.normals,
+        probe_channels=ablations.probe_channels,
+        unseen_fraction=config.unseen_fraction if options.learning.unseen_poses else 0.0,
+        refine_poses=options.learning.refine_poses,
+        image_scale=config.image_scale if schedule.image_scale is None else schedule.image_scale,
+        save_every=config.save_every if schedule.save_every is None else schedule.save_every,
     )
-    check_option(options.seed >= 0, "--seed", "at least 0", options.seed)
-    check_option(options.seed < 2**63, "--seed", "less than 2^63", options.seed)
-    if options.light != "learn":
-        refuse_changed(options, ["probe_channels"], f"--light {options.light} learns no light")
-    if options.light == "none":
-        refuse_changed(options, ["visibility"], "--light none has plain colours, which no shadow falls on")
-        refuse_changed(options, ["consistency_weights"], "--light none has no consistency loss")
+    check_option(0 <= schedule.seed < 2**63, "--seed", "0 to 2^63 - 1", schedule.seed)
+    if ablations.light != "learn":
+        refuse_changed(ablations, ["probe_channels"], f"--light {ablations.light} learns no light")
+    if ablations.light == "none":
+        refuse_changed(ablations, ["visibility"], "--light none has plain colours without shadows")
+        refuse_changed(options.learning, ["consistency_weights"], "--light none has no consistency loss")
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     return config
 
 
 @contextmanager
-def _memory_runs_out() -> Iterator[None]:
-    """Say in one line that the GPU has too little memory; the last saved state stands."""
+def _memory_error_in_one_line() -> Iterator[None]:
+    """Turn torch's error of a full GPU into an ``InputError``; the last saved state stays."""
     import torch
 
     try:
@@ -177,7 +208,7 @@ def _memory_runs_out() -> Iterator[None]:
 
 
 def _device(name: str) -> str:
-    """``name`` if torch can compute there; the CUDA path is refused where its parts are missing."""
+    """``name`` if torch can compute there; raises ``InputError`` otherwise."""
     import torch
 
     from rnd_trainer.render.raster import gsplat_rasterization
@@ -195,74 +226,63 @@ def _device(name: str) -> str:
 
 
 def _run_with_progress(training: Training, folder: Path) -> bool:
-    """Train with a progress bar; True when Ctrl-C ended it."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
+    """Train, report progress and write previews; True when Ctrl-C left steps to do."""
     from rnd_trainer.evaluation.preview import save_preview
     from rnd_trainer.training.run import run
 
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
     shown = [training.views[k] for k in dict.fromkeys(chosen)]
-    columns = (
-        TextColumn("stage {task.fields[stage]}"),
-        BarColumn(),
-        TextColumn("{task.fields[told]}"),
-        TimeElapsedColumn(),
-        TextColumn("gone,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=60) as progress:
-        schedule, begun = training.schedule, training.step_index
-        task = progress.add_task(
-            "training",
-            total=schedule.effort(schedule.total),
-            completed=int(schedule.effort(begun)),
-            stage=training.stage,
-            told=f"{begun}/{schedule.total}",
-        )
-        smooth: list[float] = []  # of the image loss
+    schedule = training.schedule
+    phase, smooth, warned = "", 0.0, False
 
-        def on_step(step: Any) -> None:
-            done = step.index + 1
-            if done == max(schedule.first_stage, 1) and training.light_found is False:
-                progress.console.print(
-                    "no sky and sun could be told from these pictures (too little is seen of the person, or always "
-                    "from one side): the light is learned from white, which costs several dB"
-                )
-            told = f"{done}/{schedule.total}"
-            if "image" in step.terms:  # the third stage has no pictures
-                loss = step.terms["image"]
-                smooth[:] = [0.98 * smooth[0] + 0.02 * loss if smooth else loss]
-                told += f" image loss {smooth[0]:.4f}"
-            progress.update(task, completed=schedule.effort(done), stage=step.stage, told=told)
-            if step.skipped:
-                progress.console.print(f"step {step.index}: not finite, skipped")
+    def on_phase(name: str, done: float, total: float) -> None:
+        nonlocal phase
+        if name != phase:
+            phase = name
+            progress.phase(name, total, done=done)
+        else:
+            progress.update(done)
 
-        def on_preview() -> None:
-            name = f"step_{training.step_index:06d}.png"
-            lit = training.stage > 1 and training.config.light != "none"
-            light = training.light() if lit else None
-            motion = training.motion()  # as it is corrected by now
-            posed = [(view, training.pose(view, motion)) for view in shown]
-            save_preview(folder / "previews" / name, training.model, light, posed)
+    def on_step(step: StepResult) -> None:
+        nonlocal smooth, warned
+        done = step.index + 1
+        image = step.terms.get("image")  # the third stage has no images
+        if image is not None:
+            smooth = 0.98 * smooth + 0.02 * image if smooth else image
+        progress.update(schedule.cost(done), step=f"{done}/{schedule.total}", loss=None if image is None else smooth)
+        if training.light_found is False and not warned:
+            warned = True
+            warn(
+                "no sky and sun found in these images (too little is seen of the person, or from one side only): "
+                "the light is learned from white, which costs several dB"
+            )
+        if step.skipped:
+            warn(f"step {step.index}: not finite, skipped")
 
-        return run(training, folder, on_step=on_step, on_preview=on_preview)
+    def on_preview() -> None:
+        lit = training.stage > 1 and training.config.light != "none"
+        motion = training.motion()  # as refined so far
+        posed = [(view, training.pose(view, motion)) for view in shown]
+        file = folder / "previews" / f"step_{training.step_index:06d}.png"
+        save_preview(file, training.model, training.light() if lit else None, posed)
+
+    with Progress() as progress:
+        return run(training, folder, on_step=on_step, on_preview=on_preview, on_phase=on_phase)
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
-    """In the poses that it was trained with, corrected ones where they were."""
+    """Score the held-out splits in the poses of the training, refined ones if they were."""
     from rnd_trainer.evaluation.evaluate import HELD_OUT
     from rnd_trainer.training.training import REFINED_MOTION
 
+    learning = options.learning
     if any(training.capture.split(split) for split in HELD_OUT):
         scoring = EvalOptions(
             folder,
             options.capture,
             json=folder / "eval.json",
-            pictures=folder / "eval",
-            perceptual_weights=options.perceptual_weights,
-            motion=str((folder / REFINED_MOTION).resolve()) if options.refine_poses else options.motion,
+            strips=folder / "eval",
+            perceptual_weights=learning.perceptual_weights,
+            motion=str((folder / REFINED_MOTION).resolve()) if learning.refine_poses else learning.motion,
         )
         evaluate_run(scoring)

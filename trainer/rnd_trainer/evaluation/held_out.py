@@ -37,7 +37,7 @@ def score(
     *,
     method: str,
     mode: str = "table+sun",
-    pictures: Path | None = None,
+    strips: Path | None = None,
     perceptual: Perceptual | None = None,
     avatar: Path | None = None,
     cull: float | None = None,
@@ -47,7 +47,7 @@ def score(
     Args:
         method: name of the rows.
         mode: shading of the runtime.
-        pictures: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
+        strips: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
         perceptual: adds LPIPS.
         avatar: the exported file; adds its size and its frames a second.
         cull: as of the player.
@@ -81,10 +81,10 @@ def score(
     rows = []
     for split, factor in jobs:
         name = split if factor is None else f"{split}, albedo scaled"
-        folder = None if pictures is None else pictures / name.replace(", ", "_").replace(" ", "_")
-        strips: list[Any] = []
+        folder = None if strips is None else strips / name.replace(", ", "_").replace(" ", "_")
+        shown: list[Any] = []
 
-        def keep(frame: Any, rendered: Any, target: Any, folder: Path | None = folder, kept: Any = strips) -> None:
+        def keep(frame: Any, rendered: Any, target: Any, folder: Path | None = folder, kept: Any = shown) -> None:
             if folder is not None:
                 kept.append(strip(rendered, target.numpy()))
                 write_image(folder / f"{names[frame.image]}.png", kept[-1])
@@ -93,7 +93,7 @@ def score(
         if not lit:
             result.scores.pop("psnr_albedo", None)
         if folder is not None:
-            contact_sheet(folder.with_name(f"{folder.name}.png"), strips)
+            contact_sheet(folder.with_name(f"{folder.name}.png"), shown)
         exact = all(frame.normal_gt is not None for frame in capture.split(split))
         rows.append(
             {

@@ -48,23 +48,12 @@ class Checkpoint:
 
     def learned_from(self, capture: Path) -> bool:
         """Whether this is the capture.json that the avatar was trained on."""
-        digest = self.info.get("capture_sha256")
-        if digest is None:  # checkpoints of before have none
-            return self._learned_in(capture.parent)
-        return bool(digest == sha256_of(capture))
+        return bool(self.info.get("capture_sha256") == sha256_of(capture))
 
     def learned_under(self, capture: Capture) -> set[str | None]:
-        """Which lights of ``capture`` the avatar was trained under, by their maps; where there is none by their names.
-
-        A capture may have been renamed or edited since.
-        """
-        lights = self.info.get("lights")
-        if lights is None:  # in checkpoints of before: a capture whose folder has the name is taken for theirs
-            return {f.light for f in capture.split("train")} if self._learned_in(capture.folder) else set()
+        """Names of the lights of ``capture`` whose maps the avatar was trained under."""
+        lights = self.info.get("lights", {})
         return {name for name, digest in lights.items() if capture.light_sha256(name) == digest}
-
-    def _learned_in(self, folder: Path) -> bool:
-        return bool(self.info.get("capture") == folder.resolve().name)
 
     def note(self) -> str | None:
         """What a user should know of an avatar whose training was stopped before there was a light; else None."""

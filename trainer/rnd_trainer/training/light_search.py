@@ -20,7 +20,7 @@ reweighted: Holland & Welsch 1977).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +49,7 @@ SKY_FLOOR = 0.02
 """of the mean radiance: no texel of a logarithmic probe may start black"""
 MAX_SUNS = 3
 """bright directions at most"""
-LEAST_GAIN = 0.01
+MIN_GAIN = 0.01
 """of the squared error that is left: what explains less is not a sun"""
 NOISE_FLOOR = 2e-3
 """of the energy: an error below it needs no sun (that of real captures is ten times as large)"""
@@ -73,7 +73,7 @@ FRAMES = 40
 """pictures that are looked at, spread evenly over the capture"""
 FACING = 0.3
 """cosine between normal and view below which a point's colour is not trusted"""
-LEAST_SIGHTINGS = 3
+MIN_SIGHTINGS = 3
 """of a point before it has a say in where suns are: a sun that shines only on what is seen once or twice, its albedo
 unknown, contradicts nothing, and the search would give it all the light"""
 OCCLUSION = 0.03
@@ -104,19 +104,32 @@ class Sightings:
     spacing: float
 
 
-def start_light(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> FirstLight | None:
-    """The light that best explains the pictures; None where too little is seen, or always the same.
+def start_light(
+    model: AvatarModel,
+    views: Sequence[TrainingView],
+    poses: Sequence[PoseInput],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> FirstLight | None:
+    """The light that best explains the images; None where the body is hardly seen, or always from one side.
 
-    Its scale is such that what is seen gives back ``REFLECTANCE`` of what arrives.
+    Its scale makes the visible body reflect ``REFLECTANCE`` of the incident light.
 
     Args:
         model: with the geometry of the first stage.
-        views, poses: of the training pictures, in the same order.
+        views, poses: of the training images, in the same order.
+        on_progress: called with done and total.
     """
-    seen = _sight(model, views, poses)
+    parts = iter(range(1, 6))
+
+    def advance() -> None:
+        on_progress(next(parts), 5)
+
+    on_progress(0, 5)
+    seen = _sightings(model, views, poses)
+    advance()
     if len(seen.who) == 0:
         return None
-    often = np.bincount(seen.who)[seen.who] >= LEAST_SIGHTINGS
+    often = np.bincount(seen.who)[seen.who] >= MIN_SIGHTINGS
     if np.count_nonzero(often) < 10 * SKY_LOBES:
         return None
     weight = _by_brightness(seen) * often
@@ -125,14 +138,18 @@ def start_light(model: AvatarModel, views: Sequence[TrainingView], poses: Sequen
     coarse = _transport(seen, wide, wide_angles)
     sky = coarse @ _lobes(wide).astype(np.float32)
     everything = _quadratic(seen, np.concatenate([sky, coarse], axis=1), weight)
-    if everything.says_nothing():
+    advance()
+    if everything.is_undetermined():
         return None
     found = _search(everything)
+    advance()
     near = _texels_near(directions, wide[np.array(found, int) - SKY_LOBES])
     fine = _transport(seen, directions[near], solid_angles[near])
     columns = np.concatenate([sky, fine], axis=1)
     suns = _search(_quadratic(seen, columns, weight))
+    advance()
     strength = _strengths(seen, columns[:, [*range(SKY_LOBES), *suns]])
+    advance()
     radiance = _lobes(directions) @ strength[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
     radiance[near[np.array(suns, int) - SKY_LOBES]] += strength[SKY_LOBES:]
@@ -144,8 +161,8 @@ def start_light(model: AvatarModel, views: Sequence[TrainingView], poses: Sequen
     )
 
 
-def rehearse() -> None:
-    """Fit a sky to a made-up body: what linear algebra asks for once, and keeps, is then there."""
+def warm_up() -> None:
+    """Fit a sky to random data, so that linear algebra allocates its buffers."""
     draw = np.random.default_rng(0)
     transport = draw.random((8 * POINTS, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
     colour, who = 0.1 + draw.random((len(transport), 3)), np.arange(len(transport)) % POINTS
@@ -153,7 +170,7 @@ def rehearse() -> None:
     _quadratic(seen, transport, _by_brightness(seen)).fit(range(SKY_LOBES))
 
 
-def _sight(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Sightings:
+def _sightings(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Sightings:
     """Colours of the first nodes wherever they are seen well: inside the mask, in front, not clipped."""
     nodes = min(POINTS, model.config.nodes)
     spacing = float(model.spacing) * math.sqrt(len(model.points) / nodes)
@@ -197,7 +214,7 @@ class Quadratic:
     power: Floats
     seen: Floats
 
-    def says_nothing(self) -> bool:
+    def is_undetermined(self) -> bool:
         """Whether any light would do: no point is seen twice, or always alike."""
         unexplained = float(np.trace(self.disagreement.mean(0)))
         return unexplained < ROUND_OFF * float(np.trace(self.power))
@@ -294,7 +311,7 @@ def _search(form: Quadratic) -> list[int]:
         gain[columns] = -np.inf
         tried = [(form.fit([*columns, int(k)])[0], int(k)) for k in np.argsort(-gain)[:CANDIDATES]]
         after, best = min(tried)
-        if before - after < LEAST_GAIN * before:
+        if before - after < MIN_GAIN * before:
             break
         columns.append(best)
         before, strength = form.fit(columns)

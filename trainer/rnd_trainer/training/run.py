@@ -1,54 +1,152 @@
-"""A training from where it stands to its last step: the log, the states, and Ctrl-C."""
+"""A training from where it stands to its last step: log, status, states, previews, and Ctrl-C."""
 
 from __future__ import annotations
 
 import json
 import signal
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
-from rnd_runtime.core.files import atomic_path
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import atomic_path, write_json
 
-from .metrics_log import row_of
-from .training import Step, Training
+from .training import StepResult, Training
+
+METRICS_FILE, STATUS_FILE = "metrics.jsonl", "status.json"
+"""in a run's folder: a row for each step; what the training is doing now"""
+PHASES = {1: "geometry", 2: "albedo and light", 3: "unseen poses"}
+"""names of the stages"""
+WARM_UP, LIGHT_SEARCH = "warming up", "searching the light"
+STATUS_S = 1.0
+"""seconds between two writes of the status"""
+RECENT = 200
+"""steps over which the speed is estimated"""
 
 
-def run(training: Training, folder: Path, *, on_step: Callable[[Step], None], on_preview: Callable[[], None]) -> bool:
-    """Train to the last step after a rehearsal, saving every ``save_every`` steps and at the end.
+def run(
+    training: Training,
+    folder: Path,
+    *,
+    on_step: Callable[[StepResult], None],
+    on_preview: Callable[[], None],
+    on_phase: Callable[[str, float, float], None] = lambda name, done, total: None,
+) -> bool:
+    """Train to the last step, saving every ``save_every`` steps and at the end.
 
-    Ctrl-C finishes the step in hand, saves, and returns True where steps are left: resuming continues the very same
-    curve.
+    Ctrl-C finishes the current step and saves; resuming continues the same curve.
+
+    Args:
+        folder: gets ``metrics.jsonl``, ``status.json``, the states and the checkpoint.
+        on_phase: called with name, done and total as a phase begins, and as the light's search advances.
+
+    Returns:
+        Whether Ctrl-C left steps to do.
     """
     config, total = training.config, training.schedule.total
-    if training.step_index < config.steps:
-        training.rehearse()
-    with _keep_until(folder / "metrics.jsonl", training.step_index) as log, _deferred_interrupt() as interrupted:
-        while training.step_index < total and not interrupted():
-            step = training.step()
-            row = {"step": step.index, "stage": step.stage, "seconds": round(training.seconds, 3), **step.terms}
-            log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
-            on_step(step)
-            if training.step_index % config.save_every == 0:
-                log.flush()
-                training.save(folder)
-            if training.step_index % config.preview_every == 0 or training.step_index == total:
-                on_preview()
-        training.save(folder)
-        return interrupted() and training.step_index < total
+    status = _Status(training, folder / STATUS_FILE)
+    stage = 0
+
+    def begin(name: str, done: float, of: float) -> None:
+        status.write(name)
+        on_phase(name, done, of)
+
+    def search(done: int, of: int) -> None:
+        nonlocal stage
+        stage = 0  # its phase begins anew afterwards
+        begin(LIGHT_SEARCH, done, of)
+
+    training.on_light_search = search
+    try:
+        if training.step_index < config.steps:
+            begin(WARM_UP, 0, 1)
+            training.warm_up()
+        with _log_up_to(folder / METRICS_FILE, training.step_index) as log, _deferred_interrupt() as interrupted:
+            while training.step_index < total and not interrupted():
+                if training.stage != stage:
+                    stage = training.stage
+                    cost = training.schedule.cost
+                    begin(PHASES[stage], cost(training.step_index), cost(total))
+                step = training.step()
+                row = {"step": step.index, "stage": step.stage, "seconds": round(training.seconds, 3), **step.terms}
+                log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
+                status.write(PHASES[step.stage])
+                on_step(step)
+                if training.step_index % config.save_every == 0:
+                    log.flush()
+                    training.save(folder)
+                if training.step_index % config.preview_every == 0 or training.step_index == total:
+                    on_preview()
+            training.save(folder)
+    except BaseException:
+        with suppress(OSError, InputError):  # of a full disk, say
+            status.end("stopped")
+        raise
+    stopped = training.step_index < total
+    status.end("stopped" if stopped else "finished")
+    return stopped
 
 
-def _keep_until(path: Path, step: int) -> TextIO:
-    """The metrics log, without rows at or after ``step``: those steps will be done again. Damaged rows go too."""
-    kept = []
-    if path.exists():
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        kept = [line for line in lines if (row := row_of(line)) is not None and row["step"] < step]
+class _Status:
+    """``status.json``: phase, step, steps, seconds so far, seconds left, and how the training ended."""
+
+    def __init__(self, training: Training, path: Path) -> None:
+        self._training, self._path = training, path
+        self._phase, self._written = "", 0.0
+        self._seen: deque[tuple[float, float]] = deque(maxlen=RECENT)  # seconds and cost after each of the last steps
+
+    def write(self, phase: str) -> None:
+        """Note the step just done; write the file where the phase is new or the last write is a second old."""
+        training = self._training
+        self._seen.append((training.seconds, training.schedule.cost(training.step_index)))
+        if phase != self._phase or time.monotonic() - self._written > STATUS_S:
+            self._phase = phase
+            self._write(None)
+
+    def end(self, how: str) -> None:
+        """Say that the training has ``finished`` or was ``stopped``."""
+        self._write(how)
+
+    def _write(self, ended: str | None) -> None:
+        training = self._training
+        self._written = time.monotonic()
+        values: dict[str, Any] = {
+            "phase": self._phase,
+            "step": training.step_index,
+            "steps": training.schedule.total,
+            "seconds": round(training.seconds, 1),
+            "seconds_left": self._seconds_left(),
+            "ended": ended,
+        }
+        write_json(self._path, values)
+
+    def _seconds_left(self) -> float | None:
+        if not self._seen:
+            return None
+        (before, first), (now, done) = self._seen[0], self._seen[-1]
+        left = self._training.schedule.cost(self._training.schedule.total) - done
+        return round(left * (now - before) / (done - first), 1) if done > first else None
+
+
+def _log_up_to(path: Path, step: int) -> TextIO:
+    """The metrics log, without damaged rows and those from ``step`` on, which will be done again."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    valid = [line for line in lines if (row := _row(line)) is not None and row["step"] < step]
     with atomic_path(path) as temporary:
-        temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-    return path.open("a", encoding="utf-8", buffering=1)  # line by line: --view reads along
+        temporary.write_text("".join(line + "\n" for line in valid), encoding="utf-8")
+    return path.open("a", encoding="utf-8", buffering=1)  # line by line: rnd-view reads along
+
+
+def _row(line: str) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) and isinstance(row.get("step"), int) else None
 
 
 @contextmanager

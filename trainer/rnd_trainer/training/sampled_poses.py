@@ -30,7 +30,7 @@ NUDGE, NUDGED_SPEED = 0.03, 0.09
 motion as much happens in a frame"""
 
 
-def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
+def sampled_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator) -> PoseInput:
     """Five joints turned far about any axis, and a window in which they come there from up to half-way."""
     joints = len(skeleton)
     turned = 1 + rng.permutation(joints - 1)[:TURNED_JOINTS]
@@ -44,7 +44,7 @@ def drawn_pose(skeleton: Skeleton, config: ModelConfig, rng: np.random.Generator
     return pose_input(motion, skeleton, (frames - 1) / fps, config)
 
 
-def shaken_pose(
+def perturbed_pose(
     motion: Motion, skeleton: Skeleton, time_s: float, config: ModelConfig, rng: np.random.Generator
 ) -> PoseInput:
     """The pose of ``motion`` at ``time_s`` and its window, every joint but the root turned a little, by the same
@@ -59,7 +59,7 @@ def shaken_pose(
     return pose_input(shaken, skeleton, (frames - 1) / fps, config)
 
 
-def nudged_pose(pose: PoseInput, rng: np.random.Generator) -> PoseInput:
+def jittered_pose(pose: PoseInput, rng: np.random.Generator) -> PoseInput:
     """What the networks are told of ``pose``, hardly changed: all poses of its window alike, and the velocities."""
 
     def noise(like: Tensor, sigma: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""When a training does what: its three stages, how fast it learns, and what its steps cost."""
+"""The schedule of a training: stages, learning rates, and the cost of its steps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from rnd_trainer.config import TrainConfig
 
 UNSEEN_COST = 1 / 8
-"""of a step without a picture, in steps with one: 25 of 200 ms"""
+"""of a step without an image, in steps with one: 25 of 200 ms"""
 
 
 @dataclass(frozen=True)
@@ -25,18 +25,18 @@ class Schedule:
 
     @property
     def total(self) -> int:
-        """Of all stages; ``config.steps`` are those with a picture."""
+        """Of all stages; ``config.steps`` are those with an image."""
         unseen = self.config.unseen_fraction if self.config.model.dynamic_skinning else 0
         return self.config.steps + round(unseen * self.config.steps)
 
     def stage(self, step: int) -> int:
-        """1 geometry under plain colours, 2 the light, 3 skinning in poses that nobody filmed."""
+        """1 geometry under plain colours, 2 the light, 3 skinning in unseen poses."""
         if step >= self.config.steps:
             return 3
         return 1 if step < self.first_stage else 2
 
     def decay(self, step: int) -> float:
-        """Of the rates: 1 at the start, then falling slowly, and fast in the last steps with a picture.
+        """Of the rates: 1 at the start, then falling slowly, and fast in the last steps with an image.
 
         In the third stage from 1 to a tenth, exponentially.
         """
@@ -45,13 +45,13 @@ class Schedule:
             return float(0.1 ** ((step - steps) / (self.total - steps)))
         done, cooling = step / steps, config.cooling_fraction
         cooled = max(0.0, done - (1 - cooling)) / cooling if cooling > 0 else 0.0
-        return float(config.rate_kept**done * config.rate_cooled**cooled)
+        return float(config.rate_final**done * config.rate_cooled**cooled)
 
     def refines(self, step: int) -> bool:
         """Whether body poses may move by then."""
         return step >= self.config.refine_after * self.config.steps
 
-    def effort(self, steps: int) -> float:
-        """What the first ``steps`` cost, in steps with a picture: progress and time left go by it."""
-        with_picture = min(steps, self.config.steps)
-        return with_picture + UNSEEN_COST * (steps - with_picture)
+    def cost(self, steps: int) -> float:
+        """Of the first ``steps``, in steps with an image: the unit of progress and time left."""
+        with_image = min(steps, self.config.steps)
+        return with_image + UNSEEN_COST * (steps - with_image)

@@ -52,17 +52,13 @@ class TrainingState:
         except (KeyError, TypeError, InputError) as error:
             got = str(error)
             raise InputError("not a training state of this version", got=got, file=self.path) from error
-        free = {"save_every", "preview_every"} | (set() if self.part("taught") else _OF_THE_THIRD_STAGE)
+        free = {"save_every", "preview_every"} | (set() if self.part("teacher") else _OF_THE_THIRD_STAGE)
         now = _flat(to_dict(config))
         wrong = sorted(name for name, value in _flat(before).items() if now[name] != value and name not in free)
         if wrong:
             expected = "the configuration it was started with"
             raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
-        if "networks" in self.header:
-            begun, given = _in_words(self.header["networks"]), _in_words(networks)
-        else:  # states of before: all networks in one line, each once
-            begun = self.header.get("perceptual_sha256") or "none"
-            given = " ".join(dict.fromkeys(filter(None, networks.values()))) or "none"
+        begun, given = _in_words(self.header["networks"]), _in_words(networks)
         if begun != given:
             expected = f"the perceptual weights {begun}"
             raise InputError(what, expected=expected, got=given, file=self.path, hint=hint)

@@ -1,4 +1,4 @@
-"""The training loop: two stages of one picture a step, and a short third without. Read it top to bottom."""
+"""The training: two stages of one image a step, and a short third without images. Read it top to bottom."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -30,26 +31,26 @@ from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.render.probe import PROBE_SHAPE, LightProbe, as_probe
 
-from . import light_search as light_start
+from . import light_search
 from .data import TrainingView, load_views, pose_input, training_light, training_light_name
 from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
-from .sampled_poses import shaken_pose
+from .sampled_poses import perturbed_pose
 from .schedule import Schedule
 from .state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
 from .unseen import UnseenPoses
 
 REFINED_MOTION = "refined_motion.npz"
-"""beside the checkpoint: the capture's motion, its training frames corrected"""
+"""beside the checkpoint: the capture's motion with corrected training frames"""
 MAX_BAD_STEPS = 10
-"""non-finite steps in a row after which training stops: it will not recover"""
-SHAKEN_SHARE = 0.5
-"""of the third stage's steps that keep skin in a pose near a filmed one, the rest in the filmed one itself"""
+"""non-finite steps in a row after which training stops"""
+PERTURBED_SHARE = 0.5
+"""of the third stage's distillation steps in a perturbed training pose; the rest are in the training pose itself"""
 
 
 @dataclass
-class Step:
-    """What one step did: the loss terms by name, its stage, and whether it was skipped as not finite."""
+class StepResult:
+    """Loss terms of one step by name, its stage, and whether it was skipped as not finite."""
 
     index: int
     stage: int
@@ -58,14 +59,17 @@ class Step:
 
 
 class Training:
-    """All that changes while an avatar is trained, and how it is saved and resumed.
+    """The state of a training, its step, and how it is saved and resumed.
 
     Args:
-        capture: the pictures, poses and body to learn from.
+        capture: images, poses and body to learn from.
         config: schedule and weights.
-        perceptual: network of the LPIPS loss; None leaves that out.
+        perceptual: network of the LPIPS loss; None leaves it out.
         consistency: network whose features the consistency loss compares, by default ``perceptual``.
-        device: where the tensors live; random draws are made on the CPU, so that they do not depend on it.
+        device: where the tensors are; random numbers come from the CPU on every device.
+
+    Attributes:
+        on_light_search: called with done and total while the light is searched.
     """
 
     def __init__(
@@ -102,32 +106,29 @@ class Training:
         self.lit = False  # whether the second stage has begun
         self.light_found: bool | None = None  # in the search that it begins with, once that is done
         self.seconds = 0.0
+        self.on_light_search: Callable[[int, int], None] = lambda done, total: None
 
     # -- one step ------------------------------------------------------------------------------------------
 
-    def rehearse(self) -> None:
-        """Take the dearest kind of step, one of the last with a picture, for nothing: nothing changes by it.
-
-        Kernels are compiled, and what memory a step or the light's search commonly needs is asked for, now and not
-        when hours have gone by. What compilers leave behind is cleared away.
-        """
+    def warm_up(self) -> None:
+        """Take the most expensive kind of step without effect: compile its kernels, ask for its memory."""
         started = time.perf_counter()
         draws = self.generator.get_state()
         config = self.config
         period = math.lcm(config.lpips_every, config.consistency_every, config.repulsion_every)
-        dearest = (config.steps - 1) // period * period  # all terms are due in it
+        costliest = (config.steps - 1) // period * period  # all its terms are due
         stage = 1 if config.light == "none" else 2
-        terms = self.objective(self.model, self.views[0], self.poses[0], dearest, stage)
+        terms = self.objective(self.model, self.views[0], self.poses[0], costliest, stage)
         torch.stack(list(terms.values())).sum().backward()
         self.optimizer.zero_grad(set_to_none=True)
         self.generator.set_state(draws)
         if self._searches_light:
-            light_start.rehearse()
+            light_search.warm_up()
         gc.collect()
         self.seconds += time.perf_counter() - started
 
-    def step(self) -> Step:
-        """Optimise on the next picture. Raises ``InputError`` after ten non-finite steps in a row."""
+    def step(self) -> StepResult:
+        """Optimise on the next image. Raises ``InputError`` after ten non-finite steps in a row."""
         started = time.perf_counter()
         self._light_up()
         stage = self.stage
@@ -135,7 +136,7 @@ class Training:
         view_index = self._next_view()
         view, pose = self.views[view_index], self.poses[view_index]
         pose = noisy(pose, self.config.pose_noise, self.generator)
-        terms = self._picture_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
+        terms = self._image_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
         values = torch.stack(list(terms.values()))
         total = values.sum()
         self.optimizer.zero_grad(set_to_none=True)
@@ -149,20 +150,20 @@ class Training:
         self.bad_steps = 0 if finite else self.bad_steps + 1
         if self.bad_steps >= MAX_BAD_STEPS:
             raise InputError(f"training: {MAX_BAD_STEPS} steps in a row were not finite", frame=view.frame.frame)
-        done = Step(self.step_index, stage, dict(zip(terms, values.tolist())), not finite)
+        done = StepResult(self.step_index, stage, dict(zip(terms, values.tolist())), not finite)
         self.step_index += 1
         self._light_up()  # now, so that what is saved and shown after the first stage is lit
         self.seconds += time.perf_counter() - started
         return done
 
     def _light_up(self) -> None:
-        """Begin the second stage, once: albedo from the colours of the first, and a light."""
+        """Begin the second stage, once: albedo from the first stage's colours, and a light."""
         if self.stage == 2 and not self.lit:
             self._start_albedo_from_colour()
             self._start_light()
             self.lit = True
 
-    def _picture_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
+    def _image_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         refinement = self.refinement if self.schedule.refines(self.step_index) else None
         if refinement is not None:
             pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
@@ -174,11 +175,11 @@ class Training:
     def _unseen_terms(self, view: TrainingView, pose: PoseInput) -> dict[str, Tensor]:
         if self.unseen is None:
             self.unseen = self._unseen()
-        if self.refinement is not None:  # where the pictures put the skin
+        if self.refinement is not None:
             pose = dataclasses.replace(pose, bones=self.refinement.bones(view.frame.frame).detach())
         rng = np.random.default_rng((self.config.seed, self.step_index, 1))
-        if rng.random() < SHAKEN_SHARE:
-            pose = self._shaken(view, rng)
+        if rng.random() < PERTURBED_SHARE:
+            pose = self._perturbed(view, rng)
         return self.unseen(self.model, pose, self.step_index)
 
     # -- schedule ------------------------------------------------------------------------------------------
@@ -189,11 +190,11 @@ class Training:
         return self.schedule.stage(self.step_index)
 
     def light(self) -> Tensor:
-        """The light [32, 64, 3] of the training pictures: learned, or the capture's own."""
+        """The light [32, 64, 3] of the training images: learned, or the capture's own."""
         return self.objective.light()
 
     def motion(self) -> Motion:
-        """The capture's motion, its training frames corrected where poses are refined."""
+        """The capture's motion; with ``refine_poses`` its training frames are corrected."""
         return self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
 
     def _set_rates(self) -> None:
@@ -201,13 +202,13 @@ class Training:
             group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
 
     def _next_view(self) -> int:
-        """Every picture once an epoch, in an order that depends on the seed and the epoch alone."""
+        """Index of the next view: each once an epoch, in an order given by seed and epoch."""
         epoch, position = divmod(self.step_index, len(self.views))
         order = np.random.default_rng((self.config.seed, epoch)).permutation(len(self.views))
         return int(order[position])
 
     def _start_albedo_from_colour(self) -> None:
-        """The first stage's colour is the best first albedo there is: copy it, network and residual alike."""
+        """Copy the first stage's colour to the albedo, network and residual."""
         columns = list(APPEARANCE_COLUMNS)
         sizes = list(APPEARANCE_COLUMNS.values())
         start = [sum(sizes[:k]) for k in range(len(sizes))]
@@ -219,10 +220,11 @@ class Training:
             self.model.appearance_residual[:, albedo] = self.model.appearance_residual[:, colour]
 
     def _start_light(self) -> None:
-        """Search the pictures for a sky and suns, now that there is a shape that can cast shadows."""
+        """Search the images for a sky and directional lights."""
         if self._searches_light:
             motion = self.motion()
-            found = light_start.start_light(self.model, self.views, [self.pose(view, motion) for view in self.views])
+            poses = [self.pose(view, motion) for view in self.views]
+            found = light_search.start_light(self.model, self.views, poses, self.on_light_search)
             self.light_found = found is not None
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
@@ -249,15 +251,15 @@ class Training:
         return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
     def pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
-        """What the networks need to know of ``view``, in the capture's motion or another."""
+        """The networks' input for ``view``, in the capture's motion or another."""
         motion = self.capture.motion if motion is None else motion
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
 
-    def _shaken(self, view: TrainingView, rng: np.random.Generator) -> PoseInput:
+    def _perturbed(self, view: TrainingView, rng: np.random.Generator) -> PoseInput:
         motion, skeleton = self.capture.motion, self.capture.body.skeleton
         time_s = view.frame.frame / motion.fps
-        return shaken_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
+        return perturbed_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
 
     def _refinement(self) -> PoseRefinement:
         frames = [view.frame.frame for view in self.views]
@@ -267,20 +269,20 @@ class Training:
         return UnseenPoses(self.model, self.capture.body.skeleton, self.config)
 
     def _capture_light(self) -> Tensor:
-        light = training_light(self.capture)[1].resized(*PROBE_SHAPE)  # before turning: a sun stays whole
+        light = training_light(self.capture)[1].resized(*PROBE_SHAPE)  # before rotating, which keeps a sun in one texel
         return as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
 
     # -- saving and resuming -------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
-        """Write the resumable state, then the avatar, then the poses that it was corrected by."""
+        """Write the resumable state, the checkpoint, and the refined motion if there is one."""
         tensors = {f"model.{k}": v.cpu().contiguous() for k, v in self.model.state_dict().items()}
         tensors |= {f"probe.{k}": v.cpu().contiguous() for k, v in self.probe.state_dict().items()}
         if self.refinement is not None:
             tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
         if self.unseen is not None:
-            taught = self.unseen.taught.state_dict()
-            tensors |= {f"taught.{k}": v.cpu().contiguous() for k, v in taught.items()}
+            teacher = self.unseen.teacher.state_dict()
+            tensors |= {f"teacher.{k}": v.cpu().contiguous() for k, v in teacher.items()}
         for index, values in self.optimizer.state_dict()["state"].items():
             tensors |= {f"adam.{index}.{k}": torch.as_tensor(v).cpu().contiguous() for k, v in values.items()}
         tensors["generator"] = self.generator.get_state()
@@ -304,23 +306,25 @@ class Training:
             save_motion(folder / REFINED_MOTION, self.motion())
 
     def resume(self, path: Path) -> None:
-        """Continue from a saved state as if never stopped.
+        """Continue from a saved state on the same curve.
 
-        The configuration must be the same; but what concerns the third stage alone may differ before it has begun.
+        Raises:
+            InputError: another configuration, capture or network, or no state. Settings of the third stage may
+                differ before it has begun.
         """
         saved = read_state(path)
         saved.refuse_other(self.config, networks_by_role(self.perceptual, self.consistency))
-        header, taught = saved.header, saved.part("taught")
-        if header.get("learned_from_sha256", self._learned_from_sha256) != self._learned_from_sha256:
-            raise InputError("--resume", expected="the pictures and poses it was started with", got="others", file=path)
+        header, teacher = saved.header, saved.part("teacher")
+        if header.get("learned_from_sha256") != self._learned_from_sha256:
+            raise InputError("--resume", expected="the images and poses it was started with", got="others", file=path)
         try:
             self.model.load_state_dict(saved.part("model"))
             self.probe.load_state_dict(saved.part("probe"))
             if self.refinement is not None:
                 self.refinement.load_state_dict(saved.part("poses"))
-            if taught:
+            if teacher:
                 self.unseen = self._unseen()
-                self.unseen.taught.load_state_dict(taught)
+                self.unseen.teacher.load_state_dict(teacher)
             moments: dict[int, dict[str, Tensor]] = {}
             for name, value in saved.part("adam").items():
                 index, key = name.split(".")
@@ -329,8 +333,7 @@ class Training:
             self.generator.set_state(saved.tensors["generator"])
             self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
             self.bad_steps = int(header["bad_steps"])
-            # before states said so, the second stage began with its first step
-            self.lit = bool(header.get("lit", self.step_index > self.schedule.first_stage))
+            self.lit = bool(header["lit"])
         except (KeyError, RuntimeError, ValueError, TypeError) as error:
             raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
 
@@ -340,7 +343,7 @@ class Training:
         return learned_sha256(self.views, self.capture, self.config.image_scale, light)
 
     def _lights(self) -> list[str]:
-        """Names of the lights that its pictures were taken under."""
+        """Names of the lights in the training images."""
         return sorted({view.frame.light for view in self.views if view.frame.light})
 
     def info(self) -> dict[str, Any]:
@@ -358,7 +361,7 @@ class Training:
             "threads": numba.get_num_threads(),
             "machine": machine(),
             "device": "cpu" if self.device.type == "cpu" else torch.cuda.get_device_name(self.device),
-            "pictures": len(self.views),
+            "images": len(self.views),
             "spacing_m": float(self.model.spacing),
             "perceptual": None if self.perceptual is None else self.perceptual.backbone,
             "perceptual_sha256": networks_sha256(self.perceptual),
