@@ -120,7 +120,7 @@ def test_the_player_and_the_trainer_skin_by_the_same_bones(tmp_path) -> None:
 
 _PAGE = """
 import { readFileSync } from "node:fs";
-const { shareTwists } = await import(process.argv[1] + "/forearm.js");
+const { shareTwists } = await import(process.argv[1] + "/posing/forearm.js");
 const { skeleton, poses } = JSON.parse(readFileSync(0));
 const shared = poses.map((pose) => Float64Array.from(pose));
 for (const pose of shared) shareTwists(skeleton, pose);
