@@ -26,7 +26,8 @@ SHARED = {
     "rnd_runtime.motion.readers.arrays": (
         "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _DEFAULT_FPS FPS_LIMITS"
     ),
-    "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS _TURNS",
+    "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS",
+    "rnd_runtime.motion.skeleton": "_TURNS",
     "rnd_runtime.motion.interpolation": "LARGEST_STEP LARGEST_MOVE",
     "rnd_runtime.posing.forearm": "FREE MAX_SHARE",
     "rnd_runtime.posing.skinning": "SHORTEST TWIST_STEPS SMALLEST_SQUARE",

@@ -24,10 +24,10 @@ from .networks import Networks
 
 
 class Encoded(NamedTuple):
-    """What the networks say of one pose, for ``Avatar.posed``.
+    """The networks' outputs for one pose, for ``Avatar.posed``.
 
-    It is posed in the root's frame, which leaves the root's own turn and path to camera and light: float32 then has to
-    resolve a body and not its place in the world, and where all three turn together the picture stays.
+    Posing happens in the root's frame, and camera and light are taken there: float32 resolves the body whatever its
+    position in the world.
     """
 
     values: list[NDArray[np.float32]]  # node outputs: logits, unless skinning is static, offsets and visibility
@@ -46,7 +46,7 @@ class Avatar:
     Attributes:
         skeleton: its joint tree. window_poses, window_seconds: the motion window. gaussians: N.
         spacing: mean distance between Gaussians, m. trained_light: [32, 64, 3] linear radiance.
-        metadata: everything the file says of itself. advice: how it may be played.
+        metadata: all of the file's metadata. advice: how it may be played.
     """
 
     def __init__(self, networks: Networks) -> None:
@@ -82,7 +82,7 @@ class Avatar:
         return self.posed(self.encode(motion, time).in_world())
 
     def encode(self, motion: Motion, time: float) -> Encoded:
-        """The first half of ``pose``: what the networks say. Runs in onnxruntime, so it may overlap any kernel."""
+        """The first half of ``pose``: the networks. Runs in onnxruntime, so it may overlap any kernel."""
         started = perf_counter()
         window, velocity, bones, root = moment(
             motion, time, self.skeleton, poses=self.window_poses, seconds=self.window_seconds
@@ -97,8 +97,8 @@ class Avatar:
         if self._rest is None:
             means, covariances, normals, visibility = values
         else:
-            *logits, offsets, harmonics = values
-            posed = self._rest.pose(logits[0] if logits else None, offsets, harmonics, bones)
+            *logits, offsets, visibility = values
+            posed = self._rest.pose(logits[0] if logits else None, offsets, visibility, bones)
             means, covariances, normals, visibility = posed
         return Gaussians(
             means,

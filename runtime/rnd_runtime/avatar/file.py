@@ -17,8 +17,8 @@ Outputs are ``means`` [N, 3], ``covariances`` [N, 6], ``normals`` [N, 3], ``visi
 model's ``metadata_props``: ``AvatarMetadata``. What a player may do to be faster, JSON under ``rnd_player``, is
 advice: ``PlayerAdvice``.
 
-That is the whole avatar for any ONNX runtime. For ours, which poses faster than a graph does, a file also names what
-stands between its networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
+That is the whole avatar for any ONNX runtime. For our faster posing kernel a file also names the values between its
+networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
 is dynamic, ``node_logits`` [M, J], and the constants ``neighbours`` [N, K] (int32), ``neighbour_weights`` [N, K],
 ``log_template`` [N, J], ``rest_points`` [N, 3], ``rest_factors`` [N, 9], ``rest_normals`` [N, 3], ``rest_limbs`` [N, 7]
 and ``posing_limits`` [3]; see ``posing.rest.RestPose``. Without these the graph does all of the posing.
@@ -83,8 +83,8 @@ class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a file has left out for speed or size. The defaults are the whole avatar.
 
     ``encoder``: networks at every node, at fewer (``coarse``), or the template's skinning (``static``).
-    ``precision``: how constants are stored. ``nodes``: M, where networks are evaluated at most, 0 when not stated.
-    ``dynamic_nodes``: those of them where the skinning network is. ``visibility_degree``: of the harmonics kept.
+    ``precision``: how constants are stored. ``nodes``: M, the most at which networks are evaluated, 0 if unknown.
+    ``dynamic_nodes``: of the skinning network. ``visibility_degree``: of the SH coefficients stored.
     """
 
     encoder: EncoderKind = "full"
@@ -95,7 +95,7 @@ class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AvatarMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What an avatar.onnx says of itself. Unknown fields and schemas are refused.
+    """The metadata of an avatar.onnx. Unknown fields and schemas are refused.
 
     ``trained_light``: base64 of the little-endian float32 probe [32, 64, 3] it was trained under.
     """
@@ -126,7 +126,7 @@ class PlayerAdvice(msgspec.Struct, frozen=True):
 
 
 def read_advice(file: OnnxFile) -> PlayerAdvice:
-    """What ``file`` says of how it may be played; nothing where it is of before there was any."""
+    """The advice of ``file``; empty if it has none."""
     try:
         return msgspec.json.decode(file.metadata.get(ADVICE_KEY, "{}").encode(), type=PlayerAdvice)
     except msgspec.DecodeError as error:
@@ -151,12 +151,12 @@ def read_metadata(file: OnnxFile) -> AvatarMetadata:
 
 
 def metadata_of(avatar_file: Path) -> AvatarMetadata:
-    """What ``avatar_file`` says of itself. Raises ``InputError`` naming the file."""
+    """The metadata of ``avatar_file``. Raises ``InputError`` naming the file."""
     return _read(avatar_file, read_metadata)
 
 
 def advice_of(avatar_file: Path) -> PlayerAdvice:
-    """What ``avatar_file`` says of how it may be played. Raises ``InputError`` naming the file."""
+    """The advice of ``avatar_file``. Raises ``InputError`` naming the file."""
     return _read(avatar_file, read_advice)
 
 
@@ -195,7 +195,7 @@ def check_shapes(file: OnnxFile, metadata: AvatarMetadata) -> None:
 
 
 def _check_posing_shapes(outputs: Mapping[str, list[int]], n: int, joints: int) -> None:
-    """Those that the compiled kernel poses from: M nodes of at most 16 harmonics, N Gaussians of K nodes each."""
+    """Check the outputs that the compiled kernel poses from: M nodes of ≤ 16 SH coefficients, N Gaussians."""
     nodes = next(iter(outputs["node_offsets"]), 0)
     wanted: dict[str, list[int | str]] = {
         "node_offsets": ["M", 6],

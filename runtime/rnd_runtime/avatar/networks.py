@@ -37,7 +37,7 @@ class Networks:
     """The evaluated graph of one file. Get one with ``load``.
 
     Attributes:
-        metadata, advice, trained_light: what the file says of itself; see ``avatar.avatar.Avatar``.
+        metadata, advice, trained_light: of the file; see ``avatar.avatar.Avatar``.
         posed_outside: whether the graph leaves posing to the caller: then the networks are evaluated at nodes.
         materials: ``CONSTANT_OUTPUTS``, whatever the pose.
         rest: ``REST_OUTPUTS``, empty unless ``posed_outside``.

@@ -1,8 +1,8 @@
-"""Cutting what one wants out of an ONNX file, without the onnx package.
+"""Cutting subgraphs out of an ONNX file, without the onnx package.
 
 onnxruntime computes every node of a graph whatever outputs are asked for, so that half of an avatar costs as much as
 the whole. ``OnnxFile`` reads just enough of the file's protocol buffer (https://protobuf.dev/programming-guides/
-encoding and onnx.proto of IR version 8) to leave out nodes, constants and outputs that nobody wants.
+encoding and onnx.proto of IR version 8) to leave out nodes, constants and outputs that are not needed.
 """
 
 from __future__ import annotations

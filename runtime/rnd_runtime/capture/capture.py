@@ -30,7 +30,7 @@ Floats32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FrameImages:
-    """The pictures of one frame, all [H, W, …] float32 in [0, 1] unless said otherwise.
+    """The images of one frame, [H, W, …] float32 in [0, 1].
 
     Attributes:
         image_srgb: [H, W, 3] sRGB, premultiplied on black.
@@ -49,14 +49,14 @@ class FrameImages:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A capture whose files have been checked against each other; pictures are read on demand.
+    """A capture whose files have been checked against each other; images are read on demand.
 
     Attributes:
         folder: what all paths are relative to.
         cameras, lights: by name.
         body: the template.
         motion: poses of ``body.skeleton``; ``Frame.frame`` indexes it.
-        frames: every picture, in file order.
+        frames: of all images, in file order.
         name: of the file in ``folder`` that it was read from.
     """
 
@@ -80,7 +80,7 @@ class Capture:
     def motion_for(self, skeleton: Skeleton) -> Motion:
         """Its motion for an avatar of ``skeleton``, which may not be the one it was captured with.
 
-        The root is where the pictures have it, wherever either rests.
+        The root is where the images show it, whatever the rest positions.
         """
         motion, own = self.motion, self.body.skeleton
         if motion.joint_names != skeleton.names:
@@ -93,7 +93,7 @@ class Capture:
         return [frame for frame in self.frames if frame.split == name]
 
     def load_frame(self, frame: Frame) -> FrameImages:
-        """Read and decode the pictures of ``frame``."""
+        """Read and decode the images of ``frame``."""
 
         def read(name: str | None) -> Floats32 | None:
             return None if name is None else read_unit_range(self.folder / name)
@@ -127,15 +127,15 @@ class Capture:
         return normals
 
     def light_sha256(self, name: str) -> str | None:
-        """Of the map of a light, and how it is scaled and turned; None where there is no such map."""
+        """Of the map of a light, its scale and yaw; None without such a map."""
         entry = self.lights.get(name)
         if entry is None or not (self.folder / entry.file).is_file():
             return None
-        told = f"{sha256_of(self.folder / entry.file)} {entry.scale} {entry.yaw}"
-        return hashlib.sha256(told.encode()).hexdigest()
+        content = f"{sha256_of(self.folder / entry.file)} {entry.scale} {entry.yaw}"
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def load_light(self, name: str) -> Light:
-        """The light called ``name``, scaled and turned as the capture says."""
+        """The light called ``name``, with its scale and yaw."""
         if name not in self.lights:
             known = " or ".join(self.lights) or "none, as the capture lists none"
             raise InputError("light", expected=known, got=name, file=self.folder)
@@ -149,11 +149,11 @@ def capture_file(path: str | Path) -> Path:
 
 
 def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture:
-    """Read a capture and check everything that can be checked without decoding pictures.
+    """Read a capture and check everything that can be checked without decoding images.
 
     Args:
         path: the directory, or its ``capture.json``.
-        motion_file: another motion in place of the one named there, relative to the directory.
+        motion_file: another motion instead of its own, relative to the directory.
 
     Raises:
         InputError: naming file, field or frame, and both values.
@@ -192,7 +192,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
 def save_capture(capture: Capture, **information: object) -> None:
     """Write ``capture.json``, ``body.npz`` and ``motion.npz`` of ``capture`` into its folder.
 
-    Pictures and lights are the caller's to write. ``information`` (a subject, a renderer) is kept for people.
+    Images and lights are the caller's to write. ``information`` (a subject, a renderer) is kept for people.
     """
     capture.body.save(capture.folder / "body.npz")
     save_motion(capture.folder / "motion.npz", capture.motion)

@@ -1,4 +1,4 @@
-"""``capture.json`` (schema ``rnd-capture/1``) field by field, and its pictures' encodings."""
+"""``capture.json`` (schema ``rnd-capture/1``) and the encodings of its images."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rnd_runtime.core.images import read_header, read_image
 Floats32 = NDArray[np.float32]
 Split = Literal["train", "novel_view", "novel_pose", "relight"]
 TRAIN_SHARE = 0.8
-"""of the training camera's frames, where nobody has split them: the paper's"""
+"""of the training camera's frames, without splits of their own; as in the paper"""
 
 SCHEMA = "rnd-capture/1"
 _Row3 = tuple[float, float, float]
@@ -28,7 +28,7 @@ _FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0}
 
 
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One picture; paths are relative to the capture.
+    """One image with its mask and others; paths are relative to the capture.
 
     A key we do not know is an error: a misspelt ``normals`` would quietly switch a loss off.
     """
@@ -41,11 +41,11 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     normal: str | None = None  # (n + 1) / 2 in the camera's OpenCV axes
     normal_gt: str | None = None
     albedo: str | None = None  # sRGB, premultiplied
-    light: str | None = None  # None where nobody measured it
+    light: str | None = None  # None where it is unknown
 
 
 class CaptureLight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A light of a capture: the file's radiance times ``scale``, turned by ``yaw`` rad."""
+    """A light of a capture: the file's radiance times ``scale``, rotated by ``yaw`` rad."""
 
     file: str
     scale: _Row3 = (1.0, 1.0, 1.0)
@@ -104,14 +104,14 @@ def read_record(file: Path) -> CaptureRecord:
 
 
 def check_pictures(frame: Frame, camera: Camera, file: Path) -> None:
-    """Hold the headers of a frame's pictures against its camera and the format."""
+    """Check the headers of a frame's images against its camera and the format."""
     for kind, channels in _CHANNELS.items():
         name = getattr(frame, kind)
         if name is None:
             continue
-        picture = _inside(file, name)
+        image = _inside(file, name)
         try:
-            header = read_header(picture)
+            header = read_header(image)
         except InputError as error:
             raise error.at(frame=frame.frame) from error
         size, wanted = f"{header.width} x {header.height}", f"{camera.width} x {camera.height}"
@@ -123,11 +123,11 @@ def check_pictures(frame: Frame, camera: Camera, file: Path) -> None:
         )
         for what, fits, expected, got in checks:
             if not fits:
-                raise InputError(f"{what} of {kind}", expected=expected, got=got, file=picture, frame=frame.frame)
+                raise InputError(f"{what} of {kind}", expected=expected, got=got, file=image, frame=frame.frame)
 
 
 def read_unit_range(path: Path) -> Floats32:
-    """An 8- or 16-bit picture [H, W, C] as floats in [0, 1]."""
+    """An 8- or 16-bit image [H, W, C] as floats in [0, 1]."""
     pixels = read_image(path)
     return pixels.astype(np.float32) / np.float32(_FULL_SCALE[pixels.dtype.name])
 

@@ -12,7 +12,7 @@ from .errors import InputError
 
 Floats = NDArray[np.float64]
 
-_NO_SKEW = 1e-6  # of the focal length: what rounding leaves, not a thousandth of a pixel across a picture
+_NO_SKEW = 1e-6  # of the focal length: rounding, below a thousandth of a pixel across an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +97,8 @@ def _rigid(matrix: Floats) -> bool:
         return False
     rotation = matrix[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300
-        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
-    return turns and bool(np.linalg.det(rotation) > 0)
+        orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    return orthogonal and bool(np.linalg.det(rotation) > 0)
 
 
 def _ends(matrix: Floats, row: list[int]) -> bool:

@@ -30,10 +30,10 @@ class InputError(Exception):
         frame: int | None = None,
         hint: str | None = None,
     ) -> None:
-        places = [str(file)] if file is not None else []
+        words = [str(file)] if file is not None else []
         if frame is not None:
-            places.append(f"frame {frame}")
-        line = ": ".join([*places, what])
+            words.append(f"frame {frame}")
+        line = ": ".join([*words, what])
         if expected is not None:
             line += f": expected {expected}"
         if got is not None:
@@ -45,7 +45,7 @@ class InputError(Exception):
         super().__init__(" ".join(filter(None, map(str.strip, line.splitlines()))))
 
     def at(self, *, file: str | Path | None = None, frame: int | None = None) -> InputError:
-        """The same mistake with the place it lacked, for callers who know the file or the frame."""
+        """The same mistake with the file or the frame, where it lacks them."""
         return InputError(
             self.what,
             expected=self.expected,
@@ -92,8 +92,8 @@ def withheld(error: OSError) -> str | None:
     """The line for a file that the machine withholds; None of any other error."""
     if error.errno not in _WITHHELD:
         return None
-    place = "" if error.filename is None else f"{error.filename}: "
-    return f"{place}{error.strerror}"
+    file = "" if error.filename is None else f"{error.filename}: "
+    return f"{file}{error.strerror}"
 
 
 def first_line(error: Exception) -> str:

@@ -14,7 +14,7 @@ from typing import Any, TypeGuard
 
 from .errors import InputError
 
-_NAMED = 40  # letters of a temporary's name that tell whose it is; with all of them it might be too long a name
+_NAMED = 40  # letters of the final name in a temporary's: all of them may be too long
 
 
 @contextmanager

@@ -25,7 +25,7 @@ class Gaussians:
         normals: [N, 3] unit, pointing out of the body.
         albedo: [N, 3] linear Rec.709 diffuse albedo in [0, 1].
         roughness: [N] perceptual roughness γ; GGX's α is γ².
-        visibility: [N, 16] real spherical harmonics (degree 3) of the light that reaches the point, as a
+        visibility: [N, 16] SH coefficients (degree 3) of the light that reaches the point, as a
             function of the direction **towards** the light in the root's frame.
         root_rotation: [3, 3], root frame → this one.
     """
@@ -47,7 +47,7 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A splatted picture; everything is premultiplied by alpha and composites over any background.
+    """A splatted image; everything is premultiplied by alpha and composites over any background.
 
     Attributes:
         image: [H, W, C], Σ w_i feature_i.
@@ -67,7 +67,7 @@ class Raster:
 
 
 class Rasterizer(Protocol):
-    """What every rasteriser of ours looks like: the oracle, the CPU kernel, GL.
+    """The interface of all rasterisers: the oracle, the CPU kernel, GL.
 
     The rule is 3DGS's (Kerbl et al. 2023) with a dilation of 0.05 px² instead of 0.3: EWA projection,
     α = min(0.99, o·exp(−½ dᵀΣ⁻¹d)), α < 1/255 skipped, blending front to back by the camera depth of the means
@@ -82,5 +82,5 @@ class Rasterizer(Protocol):
         features: Floats32,  # [N, C]
         camera: Camera,
         *,
-        depth: bool = True,  # False: the depth picture is all zero, and costs nothing
+        depth: bool = True,  # False: the depth image is all zero, and costs nothing
     ) -> Raster: ...

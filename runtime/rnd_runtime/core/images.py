@@ -20,13 +20,13 @@ Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
 # A file that claims more pixels than deflate (1032 : 1) could hide in it is damaged; reading it would fill the memory.
-_MOST_COMPRESSED = 2000
+_MAX_COMPRESSION = 2000
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 _PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
 # Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
-_LARGEST_UNBOUNDED = 1 << 31
+_MAX_UNBOUNDED = 1 << 31
 
 
 def linear_to_srgb(linear: ArrayLike) -> Floats:
@@ -55,13 +55,13 @@ def to_bytes(values: ArrayLike) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file says about itself before its pixels are read."""
+    """The header of an image file."""
 
     width: int
     height: int
     channels: tuple[str, ...]
     pixel_type: str  # uint8, uint16, half, float, …
-    chromaticities: tuple[float, ...] | None = None  # x, y of red, green, blue and white, where an EXR says
+    chromaticities: tuple[float, ...] | None = None  # x, y of red, green, blue and white, of an EXR
 
 
 def read_header(path: str | Path) -> ImageHeader:
@@ -74,10 +74,10 @@ def read_image(path: str | Path) -> Image:
     """The pixels [H, W, C] exactly as the file stores them: uint8, uint16, or float32 for HALF and FLOAT.
 
     Nothing is converted: no colour management, no multiplication by alpha (OpenImageIO does that to PNGs
-    unless told not to). Only the first picture of a file is read.
+    by default). Only the first image of a file is read.
 
     Raises:
-        InputError: not a file, not an image, cut short, turned by EXIF, a crop of a larger canvas, or with a channel
+        InputError: not a file, not an image, cut short, rotated by EXIF, a crop of a larger canvas, or with a channel
             of another type, such as an EXR's UINT.
     """
     with _opened(path) as source:
@@ -125,7 +125,7 @@ def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str,
         reason = target.geterror()
         if not (target.close() and written):
             raise InputError("image cannot be written", got=_reason(reason or target.geterror()), file=path)
-        # of a full disk its writer says nothing
+        # its writer does not report a full disk
         if suffix == ".png" and not temporary.read_bytes().endswith(_PNG_END):
             raise InputError("image cannot be written", got="half a file: the disk may be full", file=path)
 
@@ -163,12 +163,12 @@ def _opened(path: str | Path) -> Iterator[Any]:
 
 
 def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
-    turned = spec.get_int_attribute("Orientation", 1)
-    if turned != 1:
+    orientation = spec.get_int_attribute("Orientation", 1)
+    if orientation != 1:
         raise InputError(
-            "image is stored turned",
+            "image is stored rotated",
             expected="EXIF orientation 1",
-            got=turned,
+            got=orientation,
             file=path,
             hint="save it upright: cameras are calibrated to the pixels as stored",
         )
@@ -177,14 +177,14 @@ def _checked_header(spec: Any, path: str | Path) -> ImageHeader:
     if stored != canvas or spec.deep or spec.depth != 1:
         raise InputError(
             "image layout",
-            expected="one flat picture that fills its canvas",
+            expected="one flat image that fills its canvas",
             got=f"pixels {stored} of canvas {canvas}" + (", deep" if spec.deep else ""),
             file=path,
         )
     claimed = spec.width * spec.height * spec.nchannels * spec.format.size()
     file_bytes = Path(path).stat().st_size
     unbounded = spec.get_string_attribute("compression").startswith(_UNBOUNDED_CODECS)
-    if claimed > (_LARGEST_UNBOUNDED if unbounded else _MOST_COMPRESSED * file_bytes + _SMALL_IMAGE):
+    if claimed > (_MAX_UNBOUNDED if unbounded else _MAX_COMPRESSION * file_bytes + _SMALL_IMAGE):
         expected = f"{claimed} bytes of pixels"
         raise InputError("image is cut short or damaged", expected=expected, got=f"{file_bytes} stored", file=path)
     primaries = spec.getattribute("chromaticities")
@@ -207,7 +207,7 @@ _BEGINNINGS = {
 
 
 def _other_format(path: Path) -> str | None:
-    """What ``path`` is, if its first bytes are not those of the format that its name says."""
+    """A description of ``path`` if its first bytes do not fit its suffix."""
     suffix = path.suffix.lower()
     with path.open("rb") as file:
         head = file.read(4)

@@ -1,4 +1,4 @@
-"""What a file is, whatever its place on a command line: for refusals that help."""
+"""The kind of a file, for refusals that help."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ def kind_of(path: str | Path) -> str:
     """
     try:
         return _folder(Path(path)) if os.path.isdir(path) else _file(Path(path))  # noqa: PTH112
-    except OSError:
+    except (OSError, ValueError):  # a name with a zero byte among them
         return "unknown"
 
 
 def explained(error: InputError, path: str | Path, wanted: Kind) -> InputError:
-    """The line that helps in place of a reader's ``error``, where ``path`` is not of the ``wanted`` kind."""
+    """The line that helps instead of a reader's ``error``, where ``path`` is not of the ``wanted`` kind."""
     kind = kind_of(path)
     if kind == wanted or kind not in _NAMES:
         return error.at(file=path)

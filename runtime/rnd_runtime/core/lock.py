@@ -1,4 +1,4 @@
-"""One writer a folder, for as long as it works: a second one is told who holds it."""
+"""One writer a folder at a time: a second one is refused, naming the first."""
 
 from __future__ import annotations
 

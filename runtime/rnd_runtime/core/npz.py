@@ -1,4 +1,4 @@
-"""Named arrays that somebody else wrote, in .npz archives or elsewhere, and writing ours."""
+"""Named arrays of untrusted .npz archives and of others, and writing archives."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ class Members:
         numbers = array.astype(np.float64)
         finite = np.isfinite(numbers)
         if not finite.all():
-            place = np.argwhere(~finite)[0]
-            frame = int(place[0]) if numbers.ndim > 1 else None
-            raise InputError(name, expected="finite numbers", got=numbers[tuple(place)], file=self.path, frame=frame)
+            index = np.argwhere(~finite)[0]
+            frame = int(index[0]) if numbers.ndim > 1 else None
+            raise InputError(name, expected="finite numbers", got=numbers[tuple(index)], file=self.path, frame=frame)
         return numbers
 
     def strings(self, name: str) -> tuple[str, ...]:

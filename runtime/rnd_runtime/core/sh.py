@@ -1,4 +1,4 @@
-"""Real spherical harmonics of degree 3: sixteen numbers that say how much light reaches a point from where.
+"""Real spherical harmonics of degree 3: sixteen coefficients of a function of direction.
 
 Orthonormal on the sphere, ordered ``l² + l + m``, with the signs of 3D Gaussian splatting (Condon–Shortley):
 Y_0 = 0.2820948, Y_1..3 = 0.4886025 · (−y, z, −x), and so on.
@@ -77,9 +77,9 @@ def sphere_quadrature(count: int) -> tuple[Floats, Floats]:
 
 
 def sh_rotation(rotation: ArrayLike) -> Floats:
-    """The matrix M [16, 16] that turns coefficients as ``rotation`` [3, 3] turns directions.
+    """The matrix M [16, 16] that rotates coefficients as ``rotation`` [3, 3] rotates directions.
 
-    ``turned = coefficients @ M.T`` gives ``sh_basis(R d) · turned = sh_basis(d) · coefficients`` for every d.
+    ``rotated = coefficients @ M.T`` gives ``sh_basis(R d) · rotated = sh_basis(d) · coefficients`` for every d.
     M is orthogonal and block-diagonal by degree. Each entry is ∫ Y_i(ω) Y_j(Rᵀω) dω, a polynomial of degree
     6, by a quadrature that is exact up to degree 7, hence right to rounding (1e-14).
     """
@@ -102,7 +102,7 @@ def rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-
     matrix = np.zeros((SH_COUNT, SH_COUNT))
     for k in range(len(directions)):
         x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]
-        turned = compiled_sh_columns(  # at Rᵀω
+        rotated = compiled_sh_columns(  # at Rᵀω
             rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
             rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z,
             rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z,
@@ -110,5 +110,5 @@ def rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-
         for degree in range(SH_DEGREE + 1):
             for i in range(degree * degree, (degree + 1) * (degree + 1)):
                 for j in range(degree * degree, (degree + 1) * (degree + 1)):
-                    matrix[i, j] += weighted[k, i] * turned[j]
+                    matrix[i, j] += weighted[k, i] * rotated[j]
     return matrix

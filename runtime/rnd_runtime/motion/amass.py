@@ -10,16 +10,15 @@ from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import matrix_to_axis_angle
 
 from .motion import STAND_INS, Z_UP_TO_Y_UP, Motion
-from .skeleton import Skeleton
+from .skeleton import Skeleton, moving_joints
 from .smpl import SMPL_REST_ROOT, SMPLH_NAMES
 
-# SMPL's one joint for a hand turns all its fingers, where they do not turn themselves; SMPL-H has their bases instead.
+# SMPL's one joint a hand rotates all fingers that do not rotate themselves; SMPL-H has their bases instead.
 FINGER_BASES = ("index1", "middle1", "pinky1", "ring1", "thumb1")
-_TURNS = 1e-6  # rad
 
 
 def write_amass(path: Path, motion: Motion, skeleton: Skeleton) -> tuple[str, ...]:
-    """Write ``motion`` of ``skeleton`` and return the joints that SMPL-H lacks and that moved, left out.
+    """Write ``motion`` of ``skeleton``; return the moving joints that SMPL-H lacks, which are left out.
 
     ``poses`` [F, 156] axis-angle rad, ``trans`` [F, 3] m for SMPL-H's mean body, ``betas`` [16] zero,
     ``gender`` neutral, ``mocap_framerate``; Z up. The pelvis is where it was in ``motion``.
@@ -27,7 +26,7 @@ def write_amass(path: Path, motion: Motion, skeleton: Skeleton) -> tuple[str, ..
     axis_angles = matrix_to_axis_angle(motion.rotations)
     columns = {name: k for k, name in enumerate(SMPLH_NAMES)}
     poses = np.zeros((motion.frame_count, len(SMPLH_NAMES), 3))
-    turning = {name for name, angles in zip(motion.joint_names, np.abs(axis_angles).max((0, 2))) if angles > _TURNS}
+    turning = {name for name, moves in zip(motion.joint_names, moving_joints(motion.rotations)) if moves}
     sides_with_fingers = {name.split("_")[0] for name in turning.intersection(SMPLH_NAMES[22:])}
     lost = []
     for joint, name in enumerate(motion.joint_names):
@@ -57,7 +56,7 @@ def write_amass(path: Path, motion: Motion, skeleton: Skeleton) -> tuple[str, ..
 
 
 def _stands_in(name: str, motion: Motion) -> bool:
-    """Whether joint ``name`` is a hand that turns as the index finger's base, for want of a turn of its own."""
+    """Whether joint ``name`` is a hand that repeats the index finger's base (``motion.STAND_INS``)."""
     finger = STAND_INS.get(name)
     if finger not in motion.joint_names:
         return False

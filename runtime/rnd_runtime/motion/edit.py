@@ -1,4 +1,4 @@
-"""What may be done to a motion before it is played: smoothed, closed to a loop, kept in place, sped up."""
+"""Edits of a motion before it is played: smoothing, looping, in place, speed."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# One-Euro filter (Casiez et al. 2012): how many Hz the cutoff rises per rad/s and per m/s, so that jitter goes and
-# a kick stays. At 5 rad/s, a brisk walk's knee, the cutoff is 7.5 Hz above what is asked for.
+# One-Euro filter (Casiez et al. 2012): Hz by which the cutoff rises per rad/s and per m/s. A brisk walk's knee reaches
+# 5 rad/s.
 _ROTATION_BETA = 1.5
 _TRANSLATION_BETA = 5.0
 _SPEED_CUTOFF = 1.0  # Hz, of the speed itself, as in the paper
 _SEAM_SECONDS = 0.5
-_LEAST_LOOP = 4  # frames
-_MOST_FRAMES = 2_000_000  # nine hours at 60 per second: gigabytes
+_MIN_LOOP = 4  # frames
+_MAX_FRAMES = 2_000_000  # nine hours at 60 per second: gigabytes
 
 
-EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # least and most; beyond are mistakes
+EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # minimum and maximum
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class MotionEdits:
     Attributes:
         smooth: cutoff in Hz of a One-Euro filter for joints at rest; lower is smoother.
         speed: playback speed; the frame rate stays.
-        in_place: hold the root over the place where it begins.
-        loop: blend the end into the beginning, so that the clip can be repeated.
+        in_place: keep the root above where it begins.
+        loop: blend the end into the beginning, so that the clip repeats.
 
     Raises:
         InputError: for a number beyond ``EDIT_LIMITS``.
@@ -53,11 +53,7 @@ class MotionEdits:
 
 
 def edit_motion(motion: Motion, edits: MotionEdits) -> Motion:
-    """``motion`` with ``edits`` made; notes say what they cost.
-
-    Raises:
-        InputError: for a motion too short to loop.
-    """
+    """``motion`` with ``edits`` applied and noted. Raises ``InputError`` for a motion too short to loop."""
     if edits.smooth is not None:
         motion = smoothed(motion, edits.smooth)
     if edits.speed != 1.0:
@@ -70,8 +66,7 @@ def edit_motion(motion: Motion, edits: MotionEdits) -> Motion:
 def smoothed(motion: Motion, cutoff_hz: float) -> Motion:
     """``motion`` through a One-Euro filter on its rotations and its root's path.
 
-    The filter runs forwards and backwards and the two are averaged, so that nothing lags: a live filter could not,
-    a file can.
+    The filter runs forwards and backwards; the average of both has no lag.
     """
     _check("smooth", cutoff_hz, "a cutoff in Hz")
     frames, joints = motion.rotations.shape[:2]
@@ -82,82 +77,80 @@ def smoothed(motion: Motion, cutoff_hz: float) -> Motion:
 
 
 def sped_up(motion: Motion, speed: float) -> Motion:
-    """``motion`` in 1/``speed`` of its time at the same frame rate: what depends on how fast it moves, sees it."""
+    """``motion`` in 1/``speed`` of its time at the same frame rate."""
     _check("speed", speed, "a factor")
     return replace(resampled(motion, motion.fps / speed), fps=motion.fps)
 
 
 def resampled(motion: Motion, fps: float) -> Motion:
-    """``motion`` at ``fps`` frames per second; a closed one stays so where a whole number of frames goes round.
+    """``motion`` at ``fps`` frames per second; a closed one stays closed if it has a whole number of frames.
 
-    Raises:
-        InputError: for more frames than a motion may have.
+    Raises ``InputError`` for more than ``_MAX_FRAMES``.
     """
     _check("fps", fps, "frames per second")
     count = motion.frames_at(fps)
-    if count > _MOST_FRAMES:
+    if count > _MAX_FRAMES:
         got = f"{count} in {motion.duration:.6g} s at {fps:g} per second"
-        raise InputError("frames of the motion", expected=f"at most {_MOST_FRAMES}", got=got)
+        raise InputError("frames of the motion", expected=f"at most {_MAX_FRAMES}", got=got)
     frames = motion.at(np.arange(count) / fps)
     return replace(frames, fps=fps, closed=motion.goes_round_at(fps))
 
 
 def kept_in_place(motion: Motion) -> Motion:
-    """``motion`` with its root held over where it begins; it still rises and falls."""
+    """``motion`` with its root above where it begins; its height stays."""
     translations = motion.translations.copy()
     translations[:, [0, 2]] = translations[0, [0, 2]]
     return replace(motion, translations=translations)
 
 
 def looped(motion: Motion, seam_seconds: float = _SEAM_SECONDS) -> Motion:
-    """``motion`` without its first ``seam_seconds``, into which its end is blended instead.
+    """``motion`` closed: without its first ``seam_seconds``, into which its end is blended.
 
-    The frame after the last is the first. Where the root ends elsewhere than it begins, the way back is spread
-    evenly over the clip, which slides the feet: noted, and absent in place.
+    The root's net displacement is taken back evenly over the clip. Feet slide by it, which is noted.
     """
-    if motion.frame_count < _LEAST_LOOP:
-        raise InputError("--loop", expected=f"a motion of at least {_LEAST_LOOP} frames", got=motion.frame_count)
+    if motion.frame_count < _MIN_LOOP:
+        raise InputError("--loop", expected=f"a motion of at least {_MIN_LOOP} frames", got=motion.frame_count)
     seam = min(max(round(seam_seconds * motion.fps), 1), motion.frame_count // 3)
     length = motion.frame_count - seam
-    drift = (motion.translations[length:] - motion.translations[:seam]).mean(0) * [1, 0, 1]
+    displacement = (motion.translations[length:] - motion.translations[:seam]).mean(0) * [1, 0, 1]
     steps = (np.arange(motion.frame_count) / length)[:, None]
-    translations = motion.translations - steps * drift
+    translations = motion.translations - steps * displacement
     t = (np.arange(seam) + 0.5) / seam
     weight = (t * t * (3 - 2 * t))[:, None]
     tail = slerp_matrices(motion.rotations[length:], motion.rotations[:seam], weight)
     path = (1 - weight) * translations[length:] + weight * translations[:seam]
-    way = float(np.linalg.norm(drift))
-    note = (
-        (f"--loop takes back {way:.2f} m over the clip: feet slide (--in-place holds the root)",) if way > 0.1 else ()
-    )
+    distance = float(np.linalg.norm(displacement))
+    note = (f"--loop takes back {distance:.2f} m over the clip: feet slide (--in-place keeps the root)",)
     return replace(
         motion,
         rotations=np.concatenate([motion.rotations[seam:length], tail]),
         translations=np.concatenate([translations[seam:length], path]),
-        notes=motion.notes + note,
+        notes=motion.notes + note if distance > 0.1 else motion.notes,
         closed=True,
     )
 
 
 def _one_euro(rotations: Floats, translations: Floats, fps: float, cutoff_hz: float) -> tuple[Floats, Floats]:
     """The causal filter over [F, J, 3, 3] and [F, 3]."""
-    turned, moved = rotations.copy(), translations.copy()
-    turn_speed, move_speed = np.zeros((*rotations.shape[1:2], 3)), np.zeros(3)
-    keep_speed = _share(_SPEED_CUTOFF, fps)
+    smooth_rotations, smooth_translations = rotations.copy(), translations.copy()
+    angular, linear = np.zeros((*rotations.shape[1:2], 3)), np.zeros(3)  # filtered velocities, rad/s and m/s
+    gain = _gain(_SPEED_CUTOFF, fps)
     for frame in range(1, len(rotations)):
-        turn = matrix_to_axis_angle(np.swapaxes(rotations[frame - 1], -1, -2) @ rotations[frame]) * fps
-        turn_speed = turn_speed + keep_speed * (turn - turn_speed)
-        move_speed = move_speed + keep_speed * ((translations[frame] - translations[frame - 1]) * fps - move_speed)
-        share = _share(cutoff_hz + _ROTATION_BETA * np.linalg.norm(turn_speed, axis=-1), fps)
-        left = matrix_to_axis_angle(np.swapaxes(turned[frame - 1], -1, -2) @ rotations[frame])
-        turned[frame] = turned[frame - 1] @ axis_angle_to_matrix(share[:, None] * left)
-        share_moved = _share(cutoff_hz + _TRANSLATION_BETA * float(np.linalg.norm(move_speed)), fps)
-        moved[frame] = moved[frame - 1] + share_moved * (translations[frame] - moved[frame - 1])
-    return turned, moved
+        step = matrix_to_axis_angle(np.swapaxes(rotations[frame - 1], -1, -2) @ rotations[frame])
+        angular = angular + gain * (step * fps - angular)
+        linear = linear + gain * ((translations[frame] - translations[frame - 1]) * fps - linear)
+        before = smooth_rotations[frame - 1]
+        towards = matrix_to_axis_angle(np.swapaxes(before, -1, -2) @ rotations[frame])
+        rotation_gain = _gain(cutoff_hz + _ROTATION_BETA * np.linalg.norm(angular, axis=-1), fps)
+        smooth_rotations[frame] = before @ axis_angle_to_matrix(rotation_gain[:, None] * towards)
+        before = smooth_translations[frame - 1]
+        translation_gain = _gain(cutoff_hz + _TRANSLATION_BETA * float(np.linalg.norm(linear)), fps)
+        smooth_translations[frame] = before + translation_gain * (translations[frame] - before)
+    return smooth_rotations, smooth_translations
 
 
-def _share(cutoff_hz: Floats | float, fps: float) -> Floats:
-    """How far one frame moves a low-pass filter towards its input."""
+def _gain(cutoff_hz: Floats | float, fps: float) -> Floats:
+    """Share by which a low-pass filter moves towards its input within a frame."""
     return np.asarray(1 / (1 + fps / (2 * np.pi * np.asarray(cutoff_hz))))
 
 

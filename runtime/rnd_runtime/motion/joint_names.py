@@ -1,4 +1,4 @@
-"""What other programs call the joints: tables of names, ours (``joint_names.toml``) and the user's."""
+"""Joint names of other programs: tables of ours (``joint_names.toml``) and the user's."""
 
 from __future__ import annotations
 
@@ -13,18 +13,17 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
 JointTable = dict[str, tuple[str, ...]]
-"""For each of our joints what it may be called elsewhere, the most wanted first."""
+"""For each of our joints its names elsewhere, the preferred one first."""
 
 _SIDES = ("left", "right")
-_FEWEST = 8  # of the joints found: a root, four limbs of two joints, less one
+_MIN_JOINTS = 8  # a root and four limbs of two joints, less one
 _HINT = "name them in a file given as --joint-map"
 
 
 def load_joint_map(path: str | Path) -> JointTable:
-    """Read a user's table, .toml or .json, in the form of ``joint_names.toml``; its sections are taken together.
+    """Read a user's table, .toml or .json, in the form of ``joint_names.toml``; its sections are merged.
 
-    Raises:
-        InputError: when the file is neither, or a line is not a name or a list of names.
+    Raises ``InputError`` when the file is neither, or a line is not a name or a list of names.
     """
     path = existing_file(path, what="joint map")
     try:
@@ -52,39 +51,36 @@ def match_joints(
     extra: Mapping[str, tuple[str, ...]] | None = None,
     file: str | Path | None = None,
 ) -> dict[str, int]:
-    """For each of the joints ``ours`` that can be told among ``theirs``, its index there.
+    """For each of the joints ``ours`` that is found among ``theirs``, its index there.
 
-    The naming of ``joint_names.toml`` that explains the most joints is taken whole, so that "LeftShoulder" is a
-    collar bone in one file and a shoulder in another. Lines of ``extra``, read from ``file``, come before it.
+    The one naming of ``joint_names.toml`` that matches most joints is used: "LeftShoulder" is a collar bone in one
+    file and a shoulder in another. Lines of ``extra``, read from ``file``, come before it.
 
     Raises:
-        InputError: when ``extra`` names joints that nobody has, or no naming explains enough of them.
+        InputError: ``extra`` names joints that do not exist, or no naming matches enough.
     """
-    places = {_plain(name): place for place, name in reversed(list(enumerate(theirs)))}
+    indices = {_plain(name): index for index, name in reversed(list(enumerate(theirs)))}
 
     def found(table: Mapping[str, tuple[str, ...]]) -> dict[str, int]:
+        plain = {joint: map(_plain, names) for joint, names in table.items() if joint in ours}
         hits = {
-            joint: next((places[_plain(name)] for name in names if _plain(name) in places), None)
-            for joint, names in table.items()
-            if joint in ours
+            joint: next((indices[name] for name in names if name in indices), None) for joint, names in plain.items()
         }
-        return {joint: place for joint, place in hits.items() if place is not None}
+        return {joint: index for joint, index in hits.items() if index is not None}
 
     extra = extra or {}
-    strangers = [joint for joint in extra if joint not in ours]
-    if strangers:
-        raise InputError(
-            "joint map", expected=f"joints of the avatar ({', '.join(ours)})", got=", ".join(strangers), file=file
-        )
+    if unknown := [joint for joint in extra if joint not in ours]:
+        expected = f"joints of the avatar ({', '.join(ours)})"
+        raise InputError("joint map", expected=expected, got=", ".join(unknown), file=file)
     given = found(extra)
     if len(given) < len(extra):
         absent = ", ".join(" or ".join(names) for joint, names in extra.items() if joint not in given)
         raise InputError("joint map", expected=f"joints of the motion ({', '.join(theirs)})", got=absent, file=file)
     best = max((found(table) for table in _known_tables()), key=len)
-    matched = {**{joint: place for joint, place in best.items() if place not in given.values()}, **given}
-    if len(matched) < min(_FEWEST, len(ours)):
+    matched = {joint: index for joint, index in best.items() if index not in given.values()} | given
+    if len(matched) < min(_MIN_JOINTS, len(ours)):
         raise InputError(
-            "joints of the motion", expected=f"at least {_FEWEST} that can be told", got=", ".join(theirs), hint=_HINT
+            "joints of the motion", expected=f"at least {_MIN_JOINTS} known names", got=", ".join(theirs), hint=_HINT
         )
     return matched
 

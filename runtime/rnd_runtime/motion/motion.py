@@ -21,19 +21,18 @@ from rnd_runtime.motion.readers.arrays import check_translations, read_motion_fi
 
 from .interpolation import interpolate_points, interpolate_rotations
 from .joint_names import load_joint_map, match_joints
-from .skeleton import Skeleton
+from .skeleton import Skeleton, moving_joints
 from .smpl import SMPL_REST_ROOT
 
 Floats = NDArray[np.float64]
 
 Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""(x, y, z) of a Z-up world is (x, z, −y) of ours: a quarter turn about X."""
+"""(x, y, z) of a Z-up world is (x, z, −y) of ours"""
 
-# SMPL's hands are one joint each; files with fingers drive them by the index finger's base (ml-hugs' choice).
+# Files with fingers drive SMPL's one joint a hand by the index finger's base (ml-hugs' choice).
 STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 
-_PART_OF_A_FRAME = 1e-4  # less than which the rounding of a duration, or of a rate in words, may add or take
-_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
+_PART_OF_A_FRAME = 1e-4  # rounding of a duration, or of a rate in words
 
 _MOCAP = (".bvh", ".amc")
 
@@ -48,9 +47,9 @@ class Motion:
         fps: frames per second; frame f happens at f / fps seconds.
         joint_names: J names.
         source: where it came from, for messages.
-        notes: what the reader assumed or left out, one sentence each, for the user to see.
+        notes: what the reader assumed or left out, one sentence each, for the user.
         closed: whether the frame after the last is the first again.
-        left_out: joints of the file that turn and that nothing here follows, by the file's names.
+        left_out: moving joints of the file that drive nothing, by the file's names.
     """
 
     rotations: Floats
@@ -67,7 +66,7 @@ class Motion:
         assert self.rotations.shape == (frames, joints, 3, 3), self.rotations.shape
         assert self.translations.shape == (frames, 3) and frames > 0, self.translations.shape
         assert self.fps > 0, self.fps
-        for name in ("rotations", "translations"):  # once, and not whenever a pose is asked for
+        for name in ("rotations", "translations"):
             object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
 
     @property
@@ -80,7 +79,7 @@ class Motion:
         return (self.frame_count - (not self.closed)) / self.fps
 
     def frames_at(self, fps: float) -> int:
-        """How many frames at ``fps`` show it: its first and last pose included, of a closed motion no pose twice."""
+        """Frames at ``fps`` from its first to its last pose, of a closed motion no pose twice."""
         if self.closed:
             return max(1, math.ceil(self.duration * fps - _PART_OF_A_FRAME))
         return math.floor(self.duration * fps + _PART_OF_A_FRAME) + 1
@@ -91,33 +90,32 @@ class Motion:
         return self.closed and abs(frames - round(frames)) < _PART_OF_A_FRAME
 
     def loop_notes(self, fps: float) -> tuple[str, ...]:
-        """What is to be said of it at ``fps``: that it is closed, and does not go round evenly."""
+        """A warning if it is closed and no whole number of frames at ``fps`` long."""
         if not self.closed or self.goes_round_at(fps):
             return ()
         even = max(round(self.duration * fps), 1) / self.duration
         what = f"the loop of {self.duration:.4g} s is no whole number of frames at {fps:g} per second"
-        return (f"{what}: it jerks where it begins anew ({even:.9g} go round)",)
+        return (f"{what}: it jerks at the seam ({even:.9g} per second fit)",)
 
     def at(self, times_s: ArrayLike) -> Motion:
         """The poses at ``times_s`` [T] seconds: ``.interpolation`` between frames.
 
-        Beyond its ends a motion holds its end poses; a closed one goes round. ``fps`` of the result is still that of
-        the recording and says nothing about ``times_s``.
+        Beyond its ends a motion keeps its end poses; a closed one repeats. The result has the recording's ``fps``.
         """
-        rotations, translations, place = self.path_at(times_s)
-        poses = interpolate_rotations(rotations, place), interpolate_points(translations, place)
+        rotations, translations, positions = self.path_at(times_s)
+        poses = interpolate_rotations(rotations, positions), interpolate_points(translations, positions)
         return replace(self, rotations=poses[0], translations=poses[1], closed=False)
 
     def path_at(self, times_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
-        """Rotations [F, J, 3, 3] and translations [F, 3], and where among them the poses of ``at`` lie [T]."""
-        place = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
+        """Rotations [F, J, 3, 3], translations [F, 3], and the positions [T] in frames of the poses of ``at``."""
+        positions = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
         if self.closed:
-            return *self._lap, 1 + place % self.frame_count
-        return self.rotations, self.translations, np.minimum(np.maximum(place, 0), self.frame_count - 1)
+            return *self._lap, 1 + positions % self.frame_count
+        return self.rotations, self.translations, np.minimum(np.maximum(positions, 0), self.frame_count - 1)
 
     @cached_property
     def _lap(self) -> tuple[Floats, Floats]:
-        """Rotations and translations of one round, with the frame before it and the two after it: for their slopes."""
+        """Rotations and translations of one cycle with the frame before it and two after it, for their slopes."""
         frames = np.arange(-1, self.frame_count + 2) % self.frame_count
         return self.rotations[frames], self.translations[frames]
 
@@ -133,20 +131,18 @@ def load_motion(
 ) -> Motion:
     """Read a motion file for ``skeleton``, Y up.
 
-    Arrays (.npz, .pkl, .pt, .npy; layouts: ``motion_files.read_motion_file``): joints are matched by name; the
-    root is always the root, and where a file's first joint is nobody's here, it stands above the root and turns it.
-    Joints of ``skeleton`` that the file lacks stay at rest and are noted; joints of the
-    file that ``skeleton`` lacks are left out (``Motion.left_out``). Z-up files are of the SMPL family: they place
-    the pelvis at ``J0 + trans`` with J0 of SMPL's mean body, and so do we, whatever the avatar's own rest position. In
+    Arrays (``readers.arrays``): joints are matched by name. The root is always the root; a first joint that is not
+    among ours rotates it. Joints that the file lacks stay at rest and are noted; joints that ``skeleton`` lacks are
+    left out. Z-up files are of the SMPL family: the pelvis is at ``J0 + trans`` with J0 of SMPL's mean body. In
     Y-up files ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
 
-    BVH and AMC have a skeleton of their own: ``retarget.retarget``.
+    BVH and AMC have a skeleton of their own: ``retarget``.
 
     Args:
         up: the axis that points up in the file; "auto" goes by the layout and the file's ``up_axis``.
         fps: overrides the file's frame rate.
-        joint_names: what the columns are, for files that are known to follow a skeleton's order.
-        joint_map: a file that says which of our joints is which of theirs: ``joint_names.load_joint_map``.
+        joint_names: of the columns, for files that are known to follow a skeleton's order.
+        joint_map: a file of our joints' names there: ``joint_names.load_joint_map``.
 
     Raises:
         InputError: with the file, the field and, where there is one, the frame.
@@ -219,12 +215,12 @@ def _load_arrays(
     names = list(record.joint_names)
     if joint_map is not None:
         matched = _matched(names, skeleton, joint_map)
-        names = ["" if name in matched else name for name in names]  # the table's word counts
-        for ours, place in matched.items():
-            names[place] = ours
+        names = ["" if name in matched else name for name in names]
+        for ours, column in matched.items():
+            names[column] = ours
     z_up = (record.up if up == "auto" else up) == "z"
     rotations, used, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
-    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(_turns(record.rotations)) if k not in used)
+    left_out = tuple(record.joint_names[k] for k in np.flatnonzero(moving_joints(record.rotations)) if k not in used)
     translations, rest_root = record.translations, record.rest_root
     if z_up and rest_root is None:
         rest_root = SMPL_REST_ROOT
@@ -279,17 +275,11 @@ def _match_joints(
             result[:, joint] = rotations[:, columns[name]]
     used = {columns[name] for name in skeleton.names if name in columns}
     notes = []
-    if 0 not in used and _turns(rotations)[0]:  # the first joint is above all others, and no other's
+    if 0 not in used and moving_joints(rotations)[0]:  # an unmatched joint above all others
         used.add(0)
         result[:, 0] = rotations[:, 0] @ result[:, 0]
-        notes.append(f"{names[0] or 'the first joint'}, above {skeleton.names[0]}, turns all below it")
+        notes.append(f"{names[0] or 'the first joint'}, above {skeleton.names[0]}, rotates all below it")
     missing = [name for name, found in zip(skeleton.names, matched) if not found]
     if missing:
         notes.append(f"joints that the motion lacks stay at rest: {', '.join(missing)}")
     return result, used, tuple(notes)
-
-
-def _turns(rotations: Floats) -> NDArray[np.bool_]:
-    """Which of the joints of ``rotations`` [F, J, 3, 3] turn at all: [J]."""
-    turns: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
-    return turns

@@ -1,4 +1,4 @@
-"""From a recorded skeleton to the avatar's: what turns is the same bone, whatever pose either skeleton rests in."""
+"""Retargeting: a motion recorded on one skeleton, played by another."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.readers.tree import MocapTree
 
-from .skeleton import Skeleton
+from .skeleton import Skeleton, moving_joints
 
 Floats = NDArray[np.float64]
 
-# Limbs whose bones point the same way after retargeting. The trunk is left as it is: skeletons disagree about where
-# in a back the joints lie, and a straight back must stay straight. Hands and feet follow the bone they hang on.
+# Limbs whose bones point the same way after retargeting. Skeletons disagree about the joints of a back, and a straight
+# back must stay straight; hands and feet follow their parents' bones.
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
-_STANDS = np.cos(np.radians(30))  # a zero pose that leans less is taken to stand
+_STANDS = np.cos(np.radians(30))  # a zero pose that leans less stands
 _LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # legs above the floor that hips are
 _UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero pose's up
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
 _STANDS_AT_ZERO = 0.05  # m by which the sole of a template that stands on y = 0 may be off
-_TURNS = 1e-6  # of a matrix' elements, less than which a joint stands still
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
@@ -35,7 +34,7 @@ _T_POSE_LEAP = np.radians(20)
 class Retargeted:
     """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest.
 
-    ``left_out`` are the recorded joints that turn and that nothing here follows.
+    ``left_out``: recorded joints that move and drive nothing.
     """
 
     rotations: Floats
@@ -47,19 +46,17 @@ class Retargeted:
 def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up: str = "auto") -> Retargeted:
     """The motion of ``tree`` on ``skeleton``.
 
-    A joint's world rotation is the recorded one after the rotation that takes our rest pose to the recording's
-    zero pose: ``G_k = W Q_k Bᵀ A_k``, with Q_k the recorded world rotation, B and W the turns from the zero pose's
-    and the world's axes to ours, and A_k the least rotation from our bone's direction to theirs. Lengths are scaled by
-    the legs; the feet come down to y = 0, wherever the template has its origin. Which way a recording faces says
-    nothing, so it is turned by quarters to begin facing the front (+Z). A T-pose for reference before the motion is
-    left out.
+    A joint's world rotation is ``G_k = W Q_k Bᵀ A_k``: Q_k the recorded one, B and W the rotations from the zero
+    pose's and the world's axes to ours, A_k the smallest rotation from our bone's direction to theirs. Lengths scale
+    with the legs, and the feet come down to y = 0. The recording is rotated by quarters to begin facing the front
+    (+Z). A reference T-pose before the motion is left out.
 
     Args:
         matched: for our joints the index of theirs; the rest stay at rest.
-        up: "y" or "z", the file's up axis; "auto" tells it from how the trunk stands.
+        up: "y" or "z", the file's up axis; "auto" infers it from the trunk.
 
     Raises:
-        InputError: when hips and knees are not among ``matched``: nothing then says how large the person is.
+        InputError: hips and knees, which give the person's size, are not among ``matched``.
     """
     needed = ("left_hip", "right_hip", "left_knee", "right_knee")
     if missing := [name for name in needed if name not in matched]:
@@ -70,19 +67,18 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
             hint="name them in a file given as --joint-map",
         )
     source_rest = tree.zero_positions()
-    theirs = {name: source_rest[place] for name, place in matched.items()}
+    theirs = {name: source_rest[index] for name, index in matched.items()}
     ours = {name: skeleton.rest_joints[k] for k, name in enumerate(skeleton.names) if name in matched}
     to_ours = _body_frame(ours) @ _body_frame(theirs).T
     recorded = tree.global_rotations()
     root = matched.get(skeleton.names[0], 0)
     path = tree.path(root, recorded)
-    world, said = _upright(recorded[:, root], path / _leg(theirs), to_ours, up)
-    turned = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
-    rotations = _local_rotations(turned, skeleton)
+    world, up_notes = _upright(recorded[:, root], path / _leg(theirs), to_ours, up)
+    rotations_world = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
+    rotations = _local_rotations(rotations_world, skeleton)
     limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
     first = _reference_frames(rotations[:, limbs])
-    quarters = _quarters_to_front(turned[first, 0])
-    # of the root alone: in their parents' frames others stay
+    quarters = _quarters_to_front(rotations_world[first, 0])
     turn = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
     rotations, world = rotations[first:], turn @ world
     rotations[:, 0] = turn @ rotations[:, 0]
@@ -94,9 +90,9 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     pelvis = scale * hips @ world.T - rotations[:, 0] @ hips_ours
     translations = pelvis - skeleton.rest_joints[0]
     translations[:, 1] -= _floor(skeleton, rotations, translations)
-    notes = [*tree.notes, *said]
+    notes = [*tree.notes, *up_notes]
     if quarters:
-        notes.append(f"turned by {quarters * 90:+d}° about the vertical, so that it begins facing the front")
+        notes.append(f"rotated by {quarters * 90:+d}° about the vertical, to begin facing the front")
     if first:
         notes.append("the first frame, a T-pose for reference, is left out")
     resting = [name for name in skeleton.names if name not in matched]
@@ -106,13 +102,12 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
 
 
 def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
-    """The joints of ``tree`` that turn and carry none of those ``matched``."""
+    """Moving joints of ``tree`` with none of those ``matched`` below them."""
     carry = {0, *matched}
     for joint in reversed(range(len(tree.names))):
         if joint in carry and joint:
             carry.add(tree.parents[joint])
-    turns = np.abs(tree.rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
-    return tuple(tree.names[k] for k in np.flatnonzero(turns) if k not in carry)
+    return tuple(tree.names[k] for k in np.flatnonzero(moving_joints(tree.rotations)) if k not in carry)
 
 
 def _world_rotations(
@@ -120,30 +115,25 @@ def _world_rotations(
 ) -> Floats:
     """G [F, J, 3, 3] of our joints, from theirs ``recorded`` [F, ·, 3, 3]."""
     aligned = _alignments(skeleton, matched, tree, to_ours)
-    turned: Floats = np.empty((len(recorded), len(skeleton), 3, 3))
+    rotations: Floats = np.empty((len(recorded), len(skeleton), 3, 3))
     for joint, name in enumerate(skeleton.names):
         if joint == 0 or name in matched:
-            place = matched.get(name, 0)
-            turned[:, joint] = world @ recorded[:, place] @ to_ours.T @ aligned[joint]
+            rotations[:, joint] = world @ recorded[:, matched.get(name, 0)] @ to_ours.T @ aligned[joint]
         else:
-            turned[:, joint] = turned[:, skeleton.parents[joint]]
-    return turned
+            rotations[:, joint] = rotations[:, skeleton.parents[joint]]
+    return rotations
 
 
-def _local_rotations(turned: Floats, skeleton: Skeleton) -> Floats:
-    """Of each joint in its parent's frame [F, J, 3, 3], from those in the world."""
-    above = turned[:, np.maximum(skeleton.parents, 0)].copy()
+def _local_rotations(rotations: Floats, skeleton: Skeleton) -> Floats:
+    """World rotations [F, J, 3, 3] in each parent's frame."""
+    above = rotations[:, np.maximum(skeleton.parents, 0)].copy()
     above[:, 0] = np.eye(3)
-    local: Floats = np.swapaxes(above, -1, -2) @ turned
+    local: Floats = np.swapaxes(above, -1, -2) @ rotations
     return local
 
 
 def _body_frame(joints: Mapping[str, Floats]) -> Floats:
-    """[3, 3] whose columns point left, up and forward of the body.
-
-    Left is exact in a skeleton as symmetric as people; up is the axis nearest to the trunk, which leans by where the
-    joints were put into it.
-    """
+    """[3, 3] whose columns point left (from the hips), up (the axis nearest to the trunk) and forward of the body."""
     left = joints["left_hip"] - joints["right_hip"]
     hips = (joints["left_hip"] + joints["right_hip"]) / 2
     high = [joints[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in joints]
@@ -156,16 +146,15 @@ def _body_frame(joints: Mapping[str, Floats]) -> Floats:
     axes = np.stack([np.cross(up, forward), up, forward], -1)
     lengths = np.linalg.norm(axes, axis=0)
     if lengths.min() < 1e-9:
-        raise InputError("skeleton of the motion", expected="hips apart and a trunk", got="joints in one place")
+        raise InputError("skeleton of the motion", expected="hips apart and a trunk", got="joints in one position")
     frame: Floats = axes / lengths
     return frame
 
 
 def _upright(root: Floats, path: Floats, to_ours: Floats, up: str) -> tuple[Floats, tuple[str, ...]]:
-    """The turn [3, 3] that makes the file's up axis ours, and a note where the trunk stands along another.
+    """The rotation [3, 3] from the file's up axis to ours, and a note where the trunk stands along another.
 
-    ``path`` [F, 3] is the root's, in lengths of a leg. Whose trunk lies, and whose hips are half a leg above the floor
-    rather than a leg above one across the trunk, lies or crawls.
+    ``path`` [F, 3] is the root's, in leg lengths: hips half a leg above the floor mean that the person lies or crawls.
     """
     trunk = to_ours.T[:, 1]  # up in the zero pose
     stands = (root @ trunk).mean(0)
@@ -196,14 +185,14 @@ def _overrules(axis: str) -> str:
 
 
 def _quarters_to_front(root: Floats) -> int:
-    """Quarter turns about Y, −1 to 2, after which a root turned by ``root`` [3, 3] faces +Z, more or less."""
+    """Quarters about Y, −1 to 2, that rotate a root with rotation ``root`` [3, 3] nearest to facing +Z."""
     x, _, z = root[:, 2]
-    quarters = -round(np.arctan2(x, z) / (np.pi / 2)) if np.hypot(x, z) > 0.5 else 0  # else it lies or stoops
+    quarters = -round(np.arctan2(x, z) / (np.pi / 2)) if np.hypot(x, z) > 0.5 else 0  # else the person lies
     return 2 if quarters == -2 else quarters
 
 
 def _alignments(skeleton: Skeleton, matched: Mapping[str, int], tree: MocapTree, to_ours: Floats) -> dict[int, Floats]:
-    """For each joint the rotation from our rest pose to their zero pose, in our axes."""
+    """For each joint the rotation [3, 3] from our rest pose to their zero pose, in our axes."""
     rest = tree.zero_positions()
     aligned: dict[int, Floats] = {}
     for joint, name in enumerate(skeleton.names):
@@ -223,14 +212,14 @@ def _alignments(skeleton: Skeleton, matched: Mapping[str, int], tree: MocapTree,
 
 
 def _swing(a: Floats, b: Floats) -> Floats:
-    """The least rotation that turns direction ``a`` into direction ``b``."""
+    """The smallest rotation from direction ``a`` to direction ``b``."""
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     axis, cosine = np.cross(a, b), float(a @ b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
         if cosine > 0:
             return np.eye(3)
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])  # half a turn, about anything across
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
         return axis_angle_to_matrix(np.pi * axis / np.linalg.norm(axis))
     return axis_angle_to_matrix(axis / sine * np.arctan2(sine, cosine))
 
@@ -242,12 +231,12 @@ def _leg(joints: Mapping[str, Floats]) -> float:
         chain = [joints[f"{side}_{joint}"] for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" in joints]
         lengths.append(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(chain)))
     if min(lengths) < 1e-9:
-        raise InputError("skeleton of the motion", expected="legs", got="hips and knees in one place")
+        raise InputError("skeleton of the motion", expected="legs", got="hips and knees in one position")
     return sum(lengths) / 2
 
 
 def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float:
-    """By how much feet that stand are above the floor, y = 0; none without feet."""
+    """Height in m of standing feet above the floor, y = 0; 0 without feet."""
     feet = [k for k, name in enumerate(skeleton.names) if name.endswith(tuple(_ABOVE_SOLE))]
     if not feet:
         return 0.0
@@ -256,10 +245,10 @@ def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float
 
 
 def sole(skeleton: Skeleton) -> float:
-    """The height y in m of the soles at rest; 0 for a skeleton without feet, or about as high."""
+    """Height in m of the soles at rest; 0 without feet, or for a template that about stands on y = 0."""
     heights = [
-        float(place[1]) - above
-        for name, place in zip(skeleton.names, skeleton.rest_joints)
+        float(joint[1]) - above
+        for name, joint in zip(skeleton.names, skeleton.rest_joints)
         for end, above in _ABOVE_SOLE.items()
         if name.endswith(end)
     ]
@@ -268,7 +257,7 @@ def sole(skeleton: Skeleton) -> float:
 
 
 def _reference_frames(rotations: Floats) -> int:
-    """1 where the recording begins with a T-pose that is not part of the motion, else 0; ``rotations`` of limbs."""
+    """1 where limbs' ``rotations`` [F, ·, 3, 3] begin with a T-pose apart from the motion, else 0."""
     if len(rotations) < 3:
         return 0
     local = rotations[:2]

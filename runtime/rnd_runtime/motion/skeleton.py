@@ -14,6 +14,8 @@ from .smpl import SMPL_NAMES, SMPL_PARENTS
 
 Floats = NDArray[np.float64]
 
+_TURNS = 1e-6  # of a matrix element, below which a joint stands still
+
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
@@ -88,6 +90,12 @@ class Skeleton:
         return posed.reshape(*batch, count, 4, 4)
 
 
+def moving_joints(rotations: Floats) -> NDArray[np.bool_]:
+    """Which joints [J] of ``rotations`` [F, J, 3, 3] ever leave the identity."""
+    moving: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
+    return moving
+
+
 def smpl_skeleton(rest_joints: ArrayLike) -> Skeleton:
     """SMPL's tree with its joints at ``rest_joints`` [24, 3] m."""
     return Skeleton(SMPL_NAMES, np.array(SMPL_PARENTS, np.int32), np.asarray(rest_joints, np.float64))
@@ -142,12 +150,12 @@ def chain(rotations, translations, parents, rest_joints):  # type: ignore[no-unt
         for joint in range(1, rotations.shape[1]):
             parent = posed[pose, parents[joint]]
             for row in range(3):
-                place = parent[row, 3]
+                position = parent[row, 3]
                 for k in range(3):
-                    place += parent[row, k] * (rest_joints[joint, k] - rest_joints[parents[joint], k])
-                    total = 0.0
+                    position += parent[row, k] * (rest_joints[joint, k] - rest_joints[parents[joint], k])
+                    product = 0.0
                     for inner in range(3):
-                        total += parent[row, inner] * rotations[pose, joint, inner, k]
-                    posed[pose, joint, row, k] = total
-                posed[pose, joint, row, 3] = place
+                        product += parent[row, inner] * rotations[pose, joint, inner, k]
+                    posed[pose, joint, row, k] = product
+                posed[pose, joint, row, 3] = position
     return posed

@@ -266,10 +266,6 @@ def test_what_is_no_json_object_is_refused(folder, content):
     assert "capture.json" in _refusal(folder)
 
 
-def test_folder_without_a_capture(tmp_path):
-    assert "capture not found" in _refusal(tmp_path)
-
-
 @pytest.mark.parametrize("kind", ["image", "mask", "normal"])
 def test_pictures_of_another_size_name_frame_and_both_values(folder, kind):
     channels = 1 if kind == "mask" else 3

@@ -118,7 +118,7 @@ def test_a_loop_that_no_whole_number_of_frames_goes_round_is_open():
         named = float(note.rpartition("(")[2].partition(" ")[0])
         assert long.goes_round_at(named) and long.frames_at(named) == round(long.duration * rate)
     (note,) = loop.loop_notes(26.0)
-    assert note.startswith("the loop of 0.8 s is no whole number of frames at 26") and "26.25 go round" in note
+    assert note.startswith("the loop of 0.8 s is no whole number of frames at 26") and "26.25 per second" in note
 
 
 def test_a_loop_of_few_frames_a_second_has_a_seam_of_one():

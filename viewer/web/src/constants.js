@@ -24,6 +24,7 @@ export const FPS_LIMITS = [0.001, 10000.0];
 // rnd_runtime.motion.motion
 export const Z_UP_TO_Y_UP = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]];
 export const STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"};
+// rnd_runtime.motion.skeleton
 export const TURNS = 1e-06;
 // rnd_runtime.motion.interpolation
 export const LARGEST_STEP = 1.0;

@@ -1,4 +1,4 @@
-"""The array layouts motions come in, read into one record in the file's own axes."""
+"""Motions as named arrays of known layouts, read into one record in the file's axes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPL_REST_ROOT, SMPLX_REST_R
 
 Floats = NDArray[np.float64]
 
-# What AMASS' SMPL-X files hold beside the split poses, and nobody else's
+# Members of AMASS' SMPL-X files alone, beside the split poses
 _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
-_MAX_ANGLE = 100.0  # rad: 15 turns. Fits carry a few turns at most, degrees and garbage are beyond
-# In degrees half of all rotations are; a root that goes round and round is one of 22 at least.
+_MAX_ANGLE = 100.0  # rad: fits hold a few revolutions at most, degrees and garbage more
+# In degrees half of all rotations are; a root that spins is one joint of 22.
 _MANY_BEYOND_A_TURN = 0.2
 _MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
 _DEFAULT_FPS = 60.0
@@ -29,7 +29,7 @@ FPS_LIMITS = (1e-3, 1e4)  # of a recording, least and most frames per second
 
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
-    """What a motion file says, in its own axes.
+    """The content of a motion file, in its axes.
 
     Attributes:
         rotations: [F, J, 3, 3] local rotations, the root first.
@@ -51,7 +51,7 @@ class MotionRecord:
 
 
 def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = None) -> MotionRecord:
-    """Read a motion from arrays of a known layout: an .npz, or a pickle or folder (``motion_pickles.read_track``).
+    """Read a motion from arrays of a known layout: an .npz, or a pickle or folder (``pickles.read_track``).
 
     ======================================================  ==========================================  ====
     members                                                 joints                                      up
@@ -64,7 +64,7 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     ``poses`` (F,66) or (F,22,3), ``trans``                 SMPL's body without hands                   y
     ``pose_body | body_pose`` (F,63 | 69), ``root_orient |  SMPL without its root; fingers from         y
     global_orient``, ``trans | transl``                     ``left_hand_pose``, ``right_hand_pose``
-    ``poses | poses_all``, ``Rh``, ``Th`` (or ``…_all``)    EasyMocap: turned about the origin          z
+    ``poses | poses_all``, ``Rh``, ``Th`` (or ``…_all``)    EasyMocap: rotates about the origin         z
     ``poses`` (F,3J) and ``joint_names`` (J)                any; what ``motion.save_motion`` writes  y
     ======================================================  ==========================================  ====
 
@@ -72,13 +72,13 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     ``mocap_frame_rate`` or ``fps``; without one, 60 is assumed and noted.
 
     Args:
-        joint_names: the joints of the columns, for a file whose place says so (a capture's motion).
+        joint_names: the joints of the columns, for a file without names (a capture's motion).
 
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
     if is_folder(path) or Path(path).suffix.lower() in PICKLE_SUFFIXES:
-        from .pickles import read_track  # its readers need not take part in every start
+        from .pickles import read_track
 
         track = read_track(path)
         return _read(track.members, joint_names, track.rest_root, list(track.notes))
@@ -125,7 +125,7 @@ def _read(
 
 
 def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
-    """[F, J, 3] rad with the root first, from whichever member holds the poses."""
+    """Poses [F, J, 3] rad, the root first."""
     member = archive.first_of("poses", "poses_all", "pose_body", "body_pose")
     if member is None:
         raise InputError(
@@ -156,7 +156,7 @@ def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...
 
 
 def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
-    """Thirty finger joints [F, 30, 3] beside a split body of 21 joints [F, 21, 3], where the file has them."""
+    """Thirty finger joints [F, 30, 3] of a split ``body`` of 21 joints [F, 21, 3], if the file has them."""
     if body.shape[1] != 21 or ("pose_hand" not in archive.names and "left_hand_pose" not in archive.names):
         return []
     sides = ("pose_hand",) if "pose_hand" in archive.names else ("left_hand_pose", "right_hand_pose")
@@ -168,10 +168,10 @@ def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
 
 
 def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """What ``count`` joints are called: by the file, else as ``given``, else by the SMPL family's order.
+    """Names of ``count`` joints: the file's, else as ``given``, else in the SMPL family's order.
 
     Raises:
-        InputError: there are none, nobody names them, or not as many, or not each by a name of its own.
+        InputError: there are no joints or names, another number of names, or a name occurs twice.
     """
     names = archive.strings("joint_names") if "joint_names" in archive.names else given
     if names is None:
@@ -224,7 +224,7 @@ def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path,
 
 
 def check_translations(translations: Floats, path: str | Path, first: int = 0) -> None:
-    """Raise ``InputError`` for a root too far away; ``first``: the file's frame of ``translations[0]``."""
+    """Raise ``InputError`` for a root far away; ``first``: the file's frame of ``translations[0]``."""
     distances = np.abs(translations).max(-1)
     if distances.max() > _MAX_DISTANCE:
         frame = int(np.argmax(distances > _MAX_DISTANCE))

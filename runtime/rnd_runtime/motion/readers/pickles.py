@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,22 +22,20 @@ from .video_fits import PHALP_FOCAL, VideoFits, in_order, is_phalp, read_easymoc
 Floats = NDArray[np.float64]
 
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
-_PHONE_FOCAL = 1.2  # of the picture's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
-_MOST_FILLED = 18_000  # frames, ten minutes: more of a person who is away are a mistake in the numbers
-_SCALINGS = (1e-6, 1e6)  # AIST++'s are near 94; 0 and below are no size
-_LEAST_ROW = 1e-6  # length of a rotation's row, or of what the first leaves of the second
+_PHONE_FOCAL = 1.2  # of the image's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
+_MAX_FILLED = 18_000  # frames, ten minutes: larger gaps are wrong frame numbers
+_SCALINGS = (1e-6, 1e6)  # AIST++'s are near 94
+_MIN_ROW = 1e-6  # length of a rotation's row, or of what the first leaves of the second
 _LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One person's motion as the members of an .npz (``motion_files.read_motion_file``).
+    """One person's motion as ``members`` of an .npz (``arrays.read_motion_file``).
 
-    Attributes:
-        members: ``poses`` and the like.
-        rest_root: [3] m, the pelvis' rest position that translations are relative to; None for the avatar's own.
-        notes: what was assumed or left out.
+    ``rest_root`` [3] m: the pelvis' rest position that translations are relative to; None for the avatar's own.
+    ``notes``: what was assumed or left out.
     """
 
     members: Members
@@ -48,19 +46,19 @@ class Track:
 def read_track(path: str | Path) -> Track:
     """Read the motion in a .pkl, .joblib, .pt or .npy, or in a folder of EasyMocap's JSON files.
 
-    All pickles are Y up, in a world of their own; what is known before a camera only is turned upright about it.
+    All pickles are Y up. Poses in a camera's axes are rotated upright about it.
 
     ===========  ============================================================================================
     AIST++       ``smpl_poses`` (F,72), ``smpl_trans`` (F,3), ``smpl_scaling``: metres are trans / scaling;
                  60 frames per second
     GVHMR        ``smpl_params_global`` {``body_pose`` (F,63), ``global_orient``, ``transl``}, SMPL-X
     WHAM         {person: {``pose_world`` (F,72), ``trans_world`` (F,3), ``frame_ids``}}: the person seen
-                 longest; frames between the parts of a track are filled in
-    PHALP        picture → {``tid``, ``smpl`` of rotation matrices, ``camera``}, also 4D-Humans'; depths as
+                 longest; gaps of a track are interpolated
+    PHALP        image → {``tid``, ``smpl`` of rotation matrices, ``camera``}, also 4D-Humans'; depths as
                  before a usual lens
     EasyMocap    a folder of 000000.json, …: {``id``, ``Rh``, ``Th``, ``poses``, ``shapes``}, Z up
     MDM          ``thetas`` (24,6,F) the first two rows of each rotation, or ``thetas_ori`` (24,3,F)
-                 axis-angle, and ``root_translation`` (3,F), the pelvis' place; 20 frames per second
+                 axis-angle, and ``root_translation`` (3,F), the pelvis' position; 20 frames per second
     others       a dict with the members of an .npz, or an object array of it
     ===========  ============================================================================================
 
@@ -89,7 +87,7 @@ def _track(content: Mapping[Any, Any], path: str | Path) -> Track:
         }
         return Track(Members(arrays, path), SMPL_REST_ROOT)
     if "smpl_params_global" in content:
-        return Track(Members(_with_fps(content["smpl_params_global"]), path), SMPLX_REST_ROOT, (_VIDEO_NOTE,))
+        return _video_track(content["smpl_params_global"], path, SMPLX_REST_ROOT, ())
     if "root_translation" in content and ("thetas" in content or "thetas_ori" in content):
         return _mdm(content, path)
     if is_phalp(content):
@@ -108,8 +106,8 @@ def _scaling(content: Mapping[Any, Any], path: str | Path) -> Any:
     return scaling
 
 
-def _with_fps(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    return {"fps": _VIDEO_FPS, **arrays}
+def _video_track(arrays: Mapping[str, Any], path: str | Path, rest_root: Floats, notes: Sequence[str]) -> Track:
+    return Track(Members({"fps": _VIDEO_FPS, **arrays}, path), rest_root, (_VIDEO_NOTE, *notes))
 
 
 def _mdm(content: Mapping[Any, Any], path: str | Path) -> Track:
@@ -127,7 +125,7 @@ def _mdm(content: Mapping[Any, Any], path: str | Path) -> Track:
 def _unit_rows(rows: Floats, path: str | Path) -> Floats:
     """``rows`` [F, J, 3] of length 1."""
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
-    good = (np.isfinite(lengths) & (lengths > _LEAST_ROW)).all((1, 2))
+    good = (np.isfinite(lengths) & (lengths > _MIN_ROW)).all((1, 2))
     if not good.all():
         expected, frame = "two rows of a rotation", int(np.argmin(good))
         got = "zeros, parallel rows or no numbers"
@@ -138,36 +136,35 @@ def _unit_rows(rows: Floats, path: str | Path) -> Floats:
 
 def _wham(people: Mapping[Any, Mapping[str, Any]], path: str | Path) -> Track:
     longest = max(people, key=lambda who: len(people[who]["pose"]))
-    notes = [_VIDEO_NOTE, *_left_out(longest, tuple(who for who in people if who != longest))]
+    notes = _left_out(longest, tuple(who for who in people if who != longest))
     person = people[longest]
     world = "pose_world" in person and "trans_world" in person
     poses, trans = (person[f"{name}_world" if world else name] for name in ("pose", "trans"))
     frames, (poses, trans) = in_order(person.get("frame_ids", np.arange(len(poses))), poses, trans)
     poses, trans, filled = _without_gaps(frames, poses.reshape(len(poses), -1), trans, path)
     if not world:
-        poses, trans, turned = _before_the_camera(poses, trans)
-        filled += turned
-    return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, (*notes, *filled))
+        poses, trans, level = _upright(poses, trans)
+        filled += level
+    return _video_track({"poses": poses, "trans": trans}, path, SMPL_REST_ROOT, (*notes, *filled))
 
 
 def _phalp(fits: VideoFits, path: str | Path) -> Track:
     poses, trans, filled = _without_gaps(fits.frames, fits.axis_angles, fits.translations, path)
     trans = (SMPL_REST_ROOT + trans) * [1, 1, _PHONE_FOCAL / PHALP_FOCAL] - SMPL_REST_ROOT
-    poses, trans, turned = _before_the_camera(poses, trans)
-    notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled, *turned)
-    return Track(Members(_with_fps({"poses": poses, "trans": trans}), path), SMPL_REST_ROOT, notes)
+    poses, trans, level = _upright(poses, trans)
+    notes = (*_left_out(fits.person, fits.others), *filled, *level)
+    return _video_track({"poses": poses, "trans": trans}, path, SMPL_REST_ROOT, notes)
 
 
 def _easymocap(fits: VideoFits, path: str | Path) -> Track:
-    """As SMPL's, about the pelvis: what lies between two frames lies between their pelvises, not their Th."""
+    """As SMPL's, about the pelvis, which is what gaps interpolate."""
     assert fits.turns is not None
     rest_root = SMPLX_REST_ROOT if fits.family == "SMPL-X" else SMPL_REST_ROOT
-    turns, poses = axis_angle_to_matrix(fits.turns), fits.axis_angles.copy()
-    poses[:, :3] = matrix_to_axis_angle(turns @ axis_angle_to_matrix(poses[:, :3]))
-    poses, places, filled = _without_gaps(fits.frames, poses, turns @ rest_root + fits.translations, path)
-    arrays = _with_fps({"poses": poses, "trans": places - rest_root, "up_axis": "z"})
-    notes = (_VIDEO_NOTE, *_left_out(fits.person, fits.others), *filled)
-    return Track(Members(arrays, path), rest_root, notes)
+    rotations, poses = axis_angle_to_matrix(fits.turns), fits.axis_angles.copy()
+    poses[:, :3] = matrix_to_axis_angle(rotations @ axis_angle_to_matrix(poses[:, :3]))
+    poses, pelvis, filled = _without_gaps(fits.frames, poses, rotations @ rest_root + fits.translations, path)
+    arrays = {"poses": poses, "trans": pelvis - rest_root, "up_axis": "z"}
+    return _video_track(arrays, path, rest_root, (*_left_out(fits.person, fits.others), *filled))
 
 
 def _left_out(person: Any, others: tuple[Any, ...]) -> tuple[str, ...]:
@@ -177,34 +174,34 @@ def _left_out(person: Any, others: tuple[Any, ...]) -> tuple[str, ...]:
 
 
 def _without_gaps(
-    frames: NDArray[np.int64], turns: Floats, places: Floats, path: str | Path
+    frames: NDArray[np.int64], poses: Floats, positions: Floats, path: str | Path
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Axis-angles ``turns`` [F, 3J] and ``places`` [F, 3] of ascending ``frames`` at every frame between the ends."""
+    """Axis-angle ``poses`` [F, 3J] and ``positions`` [F, 3] of ascending ``frames`` at every frame between the ends."""
     late = np.flatnonzero(np.diff(frames) <= 0)
     if len(late):
         got = "{1} after {0}".format(*frames[late[0] : late[0] + 2])
         raise InputError("frame numbers", expected="some that ascend", got=got, file=path)
     missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
     if missing == 0:
-        return turns, places, ()
-    if missing > (most := max(len(frames), _MOST_FILLED)):
+        return poses, positions, ()
+    if missing > (most := max(len(frames), _MAX_FILLED)):
         got = f"{missing} missing between {frames[0]} and {frames[-1]}"
         raise InputError("frame numbers", expected=f"at most {most} left out", got=got, file=path)
     wanted = np.arange(frames[0], frames[-1] + 1)
     after = np.clip(np.searchsorted(frames, wanted), 1, len(frames) - 1)
     t = (wanted - frames[after - 1]) / (frames[after] - frames[after - 1])
-    matrices = axis_angle_to_matrix(turns.reshape(len(turns), -1, 3))
+    matrices = axis_angle_to_matrix(poses.reshape(len(poses), -1, 3))
     filled = matrix_to_axis_angle(slerp_matrices(matrices[after - 1], matrices[after], t[:, None]))
-    between = (1 - t[:, None]) * places[after - 1] + t[:, None] * places[after]
+    between = (1 - t[:, None]) * positions[after - 1] + t[:, None] * positions[after]
     note = f"{missing} frames without the person are filled in between their neighbours"
     return filled.reshape(len(wanted), -1), between, (note,)
 
 
-def _before_the_camera(poses: Floats, trans: Floats) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """``poses`` [F, 3J] and ``trans`` [F, 3] of SMPL in a camera's axes, turned Y up, beginning over the origin."""
+def _upright(poses: Floats, trans: Floats) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """SMPL's ``poses`` [F, 3J] and ``trans`` [F, 3] in a camera's axes, rotated Y up, beginning above the origin."""
     poses = poses.copy()
     poses[:, :3] = matrix_to_axis_angle(np.diag(_LEVEL) @ axis_angle_to_matrix(poses[:, :3]))
-    places = (SMPL_REST_ROOT + trans) * _LEVEL
-    places -= places[0] * [1, 0, 1]
-    note = "no world coordinates in the file: the camera is taken to stand level; --in-place holds a root that drifts"
-    return poses, places - SMPL_REST_ROOT, (note,)
+    pelvis = (SMPL_REST_ROOT + trans) * _LEVEL
+    pelvis -= pelvis[0] * [1, 0, 1]
+    note = "no world coordinates in the file: the camera is taken to stand level; --in-place keeps the root"
+    return poses, pelvis - SMPL_REST_ROOT, (note,)

@@ -41,7 +41,7 @@ _TORCH_DTYPES = {
 _STORAGE = "torch.storage"  # our note for a storage whose bytes come later
 _TORCH_MAGIC = 0x1950A86A20F9469CFC6C
 _ARRAY_KINDS = "biufcSUO"
-_MOST_REPEATED = 10_000_000  # numbers of a tensor that says its storage many times over, as one shape for all frames
+_MAX_REPEATED = 10_000_000  # numbers of a tensor that repeats its storage, as one shape for all frames
 
 
 def read_pickle(path: str | Path, *, what: str = "pickle") -> Any:
@@ -106,8 +106,8 @@ def _read_torch(stream: BinaryIO) -> Any:
         sign: Literal[">", "<"] = ">" if order == "big" else "<"
 
         def storage(key: object) -> NDArray[np.generic]:
-            dtype, place = _torch_storage(key)
-            return np.frombuffer(archive.read(f"{folder}data/{place}"), dtype.newbyteorder(sign))
+            dtype, key = _torch_storage(key)
+            return np.frombuffer(archive.read(f"{folder}data/{key}"), dtype.newbyteorder(sign))
 
         return _understand(_Machine(io.BytesIO(archive.read(names[0])), storage).load(), {})
 
@@ -120,26 +120,26 @@ def _read_old_torch(stream: BinaryIO) -> Any:
     storages: dict[object, _Made] = {}
 
     def storage(key: object) -> _Made:
-        dtype, place = _torch_storage(key)
-        return storages.setdefault(place, _Made(_Name(*_STORAGE.split(".")), (dtype,)))
+        dtype, key = _torch_storage(key)
+        return storages.setdefault(key, _Made(_Name(*_STORAGE.split(".")), (dtype,)))
 
     for _ in range(2):
         _Machine(stream).load()
     content = _Machine(stream, storage).load()
-    for place in _Machine(stream).load():
-        dtype = storages[place].args[0].newbyteorder("<")
+    for key in _Machine(stream).load():
+        dtype = storages[key].args[0].newbyteorder("<")
         count = int.from_bytes(stream.read(8), "little", signed=True)
-        storages[place].state = np.frombuffer(stream.read(max(count, 0) * dtype.itemsize), dtype, count)
+        storages[key].state = np.frombuffer(stream.read(max(count, 0) * dtype.itemsize), dtype, count)
     return _understand(content, {})
 
 
 def _torch_storage(key: object) -> tuple[np.dtype[Any], object]:
-    """Element type and place of a storage that a torch file refers to."""
-    kind, element, place = key[:3] if isinstance(key, tuple) and len(key) >= 3 else (None, None, None)
+    """Element type and key of a storage that a torch file refers to."""
+    kind, element, name_of_data = key[:3] if isinstance(key, tuple) and len(key) >= 3 else (None, None, None)
     name = element.name.removesuffix("Storage") if isinstance(element, _Name) else ""
     if kind != "storage" or name not in _TORCH_DTYPES:
         raise InputError("torch tensor", expected=f"one of {', '.join(_TORCH_DTYPES)}", got=name or key)
-    return np.dtype(_TORCH_DTYPES[name]), place
+    return np.dtype(_TORCH_DTYPES[name]), name_of_data
 
 
 class _Name:
@@ -310,8 +310,8 @@ def _array(content: Any, dtype: np.dtype[Any], shape: tuple[int, ...], order: An
     if len(shape) == 0:
         return content[0]
     array = np.empty(len(content), object)
-    for place, item in enumerate(content):  # a slice would spread lists over the axes
-        array[place] = item
+    for index, item in enumerate(content):  # a slice would broadcast lists over the axes
+        array[index] = item
     return array.reshape(shape, order=order).tolist()
 
 
@@ -325,8 +325,8 @@ def _torch(name: str, leaf: str, args: Any) -> Any:
             return np.zeros(size, storage.dtype)
         if len(size) != len(stride) or last >= len(storage):
             raise InputError("torch tensor", expected=f"{len(storage)} numbers at most", got=last + 1)
-        if math.prod(size) > max(len(storage), _MOST_REPEATED):
-            expected = f"at most {_MOST_REPEATED} numbers made of {len(storage)}"
+        if math.prod(size) > max(len(storage), _MAX_REPEATED):
+            expected = f"at most {_MAX_REPEATED} numbers made of {len(storage)}"
             raise InputError("torch tensor", expected=expected, got=math.prod(size))
         steps = [step * storage.itemsize for step in stride]
         return np.lib.stride_tricks.as_strided(storage[offset:], size, steps).copy()

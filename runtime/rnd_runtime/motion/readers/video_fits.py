@@ -17,7 +17,7 @@ from rnd_runtime.core.rotations import matrix_to_axis_angle
 Floats = NDArray[np.float64]
 
 PHALP_FOCAL = 5000 / 256
-"""of the picture's longer side: its EXTRA.FOCAL_LENGTH over render.res, to which it scales every picture"""
+"""of the image's longer side: its EXTRA.FOCAL_LENGTH over render.res, to which it scales every image"""
 
 _HAND_COEFFICIENTS = {78: "SMPL", 87: "SMPL-X"}
 """columns of EasyMocap's SMPL-H and SMPL-X poses: after 22 joints come coefficients of hands and face, not angles"""
@@ -29,12 +29,12 @@ class VideoFits:
 
     Attributes:
         person: their number; ``others`` are in the file too.
-        frames: [F] ascending picture numbers.
+        frames: [F] ascending image numbers.
         axis_angles: [F, 3J] rad, the root first.
         translations: [F, 3] m.
         betas: [F, B].
         turns: [F, 3] rad, EasyMocap's Rh: x = R(Rh) X + translation, about the origin; None where, as in SMPL, the
-            root turns about its rest place.
+            root rotates about its rest position.
         family: "SMPL" or "SMPL-X".
     """
 
@@ -57,8 +57,8 @@ def read_easymocap_folder(folder: Path, person: int | None = None) -> VideoFits:
     if not files:
         raise InputError("EasyMocap fits", expected=".json files", got="none", file=folder)
     moments: dict[int, dict[int, Any]] = {}
-    for place, file in enumerate(files):
-        moments[trailing_number(file.stem, place)] = _people(file)
+    for index, file in enumerate(files):
+        moments[trailing_number(file.stem, index)] = _people(file)
     chosen, others = one_of([key for people in moments.values() for key in people], person, folder)
     kept = {frame: people[chosen] for frame, people in sorted(moments.items()) if chosen in people}
     try:
@@ -84,16 +84,16 @@ def easymocap_files(folder: Path) -> list[Path]:
 
 
 def is_phalp(content: Mapping[Any, Any]) -> bool:
-    """Whether ``content`` is PHALP's or 4D-Humans': picture → {``tid``, ``smpl``, ``camera``, …}."""
+    """Whether ``content`` is PHALP's or 4D-Humans': image → {``tid``, ``smpl``, ``camera``, …}."""
     moments = _moments(content)
     return bool(moments) and all({"smpl", "camera", "tid"} <= moment.keys() for moment in moments)
 
 
 def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None) -> VideoFits:
-    """Read what ``is_phalp`` recognises: rotation matrices, and places before a lens of ``PHALP_FOCAL``.
+    """Read what ``is_phalp`` recognises: rotation matrices, and positions before a lens of ``PHALP_FOCAL``.
 
-    ``person`` is a track number; the one with most frames when None. Frames are those of the picture list. A track
-    that was not seen in a picture (its last sight repeated, ``tracked_time`` frames old) is left out there.
+    ``person`` is a track number; the one with most frames when None. Images without the track (its last detection
+    is repeated, ``tracked_time`` frames old) are left out.
     """
     moments = sorted(_moments(content), key=lambda moment: int(moment.get("time", 0)))
     tracks = [_phalp_tracks(moment) for moment in moments]
@@ -102,12 +102,12 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
     for number, (moment, seen) in enumerate(zip(moments, tracks)):
         if chosen not in seen:
             continue
-        place = seen[chosen]
-        smpl = moment["smpl"][place]
+        index = seen[chosen]
+        smpl = moment["smpl"][index]
         parts = [np.asarray(smpl[key], np.float64).reshape(-1, 3, 3) for key in ("global_orient", "body_pose")]
         frames.append(int(moment.get("time", number)))
         angles.append(matrix_to_axis_angle(np.concatenate(parts)).reshape(-1))
-        translations.append(np.asarray(moment["camera"][place], np.float64).reshape(3))
+        translations.append(np.asarray(moment["camera"][index], np.float64).reshape(3))
         betas.append(np.asarray(smpl["betas"], np.float64).reshape(-1))
     return VideoFits(
         chosen, others, np.array(frames, np.int64), np.stack(angles), np.stack(translations), np.stack(betas)
@@ -115,19 +115,19 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
 
 
 def _moments(content: Mapping[Any, Any]) -> list[Mapping[str, Any]]:
-    """What ``content`` holds of pictures: some versions note other things beside."""
+    """The entries of images: some versions store other things too."""
     return [value for value in content.values() if isinstance(value, Mapping)]
 
 
 def _phalp_tracks(moment: Mapping[str, Any]) -> dict[int, int]:
-    """The place in ``moment`` of every track that was seen there."""
+    """Index in ``moment`` of every track detected there."""
     tracks = moment["tid"][: len(moment["smpl"])]
     ages = moment.get("tracked_time", [0] * len(tracks))
-    return {int(track): place for place, (track, age) in enumerate(zip(tracks, ages)) if age == 0}
+    return {int(track): index for index, (track, age) in enumerate(zip(tracks, ages)) if age == 0}
 
 
 def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tuple[int, ...]]:
-    """(chosen, others): ``person``, or whom ``seen`` (a number a sighting) holds most often, the first of equals."""
+    """(chosen, others): ``person``, or the most frequent of ``seen`` (a number for each detection)."""
     numbers = tuple(dict.fromkeys(seen))
     if not numbers:
         raise InputError("people", expected="at least one", got="none", file=path)

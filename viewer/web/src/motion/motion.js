@@ -49,7 +49,7 @@ function matchJoints({ name: file, rotations, frames, joints, jointNames }, skel
     throw refusal("joints of the motion", { expected, got: some(jointNames), file });
   }
   const above = skeleton.names.every((name) => columns.get(name) !== 0) && firstTurns(rotations, frames, joints);
-  if (above) notes.push(`${jointNames[0]}, above ${skeleton.names[0]}, turns all below it`);
+  if (above) notes.push(`${jointNames[0]}, above ${skeleton.names[0]}, rotates all below it`);
   if (missing.length) notes.push(`joints that the motion lacks stay at rest: ${missing.join(", ")}`);
   const result = new Float64Array(frames * skeleton.names.length * 9);
   const root = columns.get(skeleton.names[0]);
