@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import re
 import shutil
-import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -18,7 +16,7 @@ import pytest
 from rnd_runtime.core.files import sha256_of
 from rnd_runtime.core.images import read_image, write_image
 from rnd_trainer.config import TrainConfig, to_dict
-from rnd_viewer.report import renders as report_shots
+from rnd_viewer.report import renders
 from rnd_viewer.report.cli import main
 from rnd_viewer.report.html_parts import curve
 from support.browser import CHROMIUM, chromium
@@ -86,8 +84,8 @@ def _strip() -> np.ndarray:
 def run(tmp_path, monkeypatch) -> Path:
     """The folder of a training, as far as the report reads it; small pictures of the avatar; no assets here."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(report_shots, "SIDE", 64)
-    monkeypatch.setattr(report_shots, "SECONDS", 0.1)
+    monkeypatch.setattr(renders, "SIDE", 64)
+    monkeypatch.setattr(renders, "SECONDS", 0.1)
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(to_dict(TrainConfig(steps=100))))
@@ -107,13 +105,13 @@ def _write(run: Path, *words: str) -> tuple[str, _Page]:
     return text, _Page(text)
 
 
-def _pictures(page: _Page, tmp_path: Path) -> dict[str, np.ndarray]:
-    pictures = {}
+def _images(page: _Page, tmp_path: Path) -> dict[str, np.ndarray]:
+    images = {}
     for tag, attributes in page.tags:
         if tag == "img" and "image/png" in attributes["src"]:
             (tmp_path / "x.png").write_bytes(base64.b64decode(attributes["src"].partition(",")[2]))
-            pictures[attributes["alt"]] = read_image(tmp_path / "x.png")
-    return pictures
+            images[attributes["alt"]] = read_image(tmp_path / "x.png")
+    return images
 
 
 def test_a_whole_run_is_on_the_page(run, tmp_path):
@@ -132,14 +130,14 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     (chart,) = [attributes["src"] for _, attributes in page.tags if attributes.get("alt") == "grid"]
     assert base64.b64decode(chart.removeprefix("data:image/svg+xml;base64,")).startswith(b"<svg")
     assert "weight_normal" in page.text and "model.gaussians" in page.text
-    pictures = _pictures(page, tmp_path)
-    assert {"learned light, 0°", "learned light, 270°", "sky", "albedo", "roughness"} <= set(pictures)
-    assert (pictures["sky"] != pictures["learned light, 0°"]).any()
-    strips = [name for name in pictures if name.startswith("truth, ")]
+    images = _images(page, tmp_path)
+    assert {"learned light, 0°", "learned light, 270°", "sky", "albedo", "roughness"} <= set(images)
+    assert (images["sky"] != images["learned light, 0°"]).any()
+    strips = [name for name in images if name.startswith("truth, ")]
     assert strips == ["truth, a", "truth, b", "truth, c"]  # three of four, spread
     for what, value in (("truth", 200), ("render", 100), ("normals", 50), ("albedo", 150), ("error", 90)):
-        assert pictures[f"{what}, a"].max() == value
-    assert pictures["truth, a"].shape[:2] == (15 + 16, 6 + 16)  # cropped to the person and a margin
+        assert images[f"{what}, a"].max() == value
+    assert images["truth, a"].shape[:2] == (15 + 16, 6 + 16)  # cropped to the person and a margin
     (clip,) = [attributes["src"] for tag, attributes in page.tags if tag == "video"]
     assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
 
@@ -153,17 +151,11 @@ def _bench(folder: Path, row: dict[str, object] | None = None, *charts: str) -> 
     return folder
 
 
-def test_charts_come_from_the_run_or_else_from_a_checkout(run, tmp_path):
-    words = f"neither {run / 'bench'} nor assets/bench is there: --bench FOLDER"
-    assert words in _write(run)[1].text
-    _bench(tmp_path / "assets/bench", {"id": "P1", "what": "of the checkout"}, "crossed")
-    _, page = _write(run)
-    assert "of the checkout" in page.text
-    assert "From assets/bench/crossed.svg" in page.text and "From assets/bench/stability.json" in page.text
+def test_charts_come_from_the_run_unless_a_folder_is_named(run, tmp_path):
+    assert f"in {run / 'bench'}: --bench FOLDER" in _write(run)[1].text
     own = _bench(run / "bench", {"id": "P1", "what": "of the run"})
     _, page = _write(run)
-    assert "of the run" in page.text and "of the checkout" not in page.text
-    assert f"From {own / 'stability.json'}" in page.text
+    assert "of the run" in page.text and f"From {own / 'stability.json'}" in page.text
     named = _bench(tmp_path / "named", {"id": "P1", "what": "of another"})
     assert "of another" in _write(run, "--bench", str(named))[1].text
 
@@ -175,7 +167,7 @@ def test_one_chart_of_speed_is_shown_and_no_other(run, shown):
     _, page = _write(run)
     charts = [attributes["alt"] for _, attributes in page.tags if attributes.get("class") == "chart"]
     assert charts == [shown]
-    assert f"{shown}.svg, measured on a; b. On which avatar is not said" in page.text
+    assert f"{shown}.svg, measured on a; b. The rows do not name the avatar" in page.text
 
 
 @pytest.mark.parametrize(
@@ -185,7 +177,7 @@ def test_one_chart_of_speed_is_shown_and_no_other(run, shown):
         ((OTHER,), "Measured on another avatar, not on this run's (its checkpoint: 0123456789ab). ✓"),
         (("own", OTHER, OTHER), "1 rows measured on this run's avatar, 2 on another"),
         (("own", None), "Measured on this run's avatar. 1 of 2 rows name no avatar."),
-        ((None,), "On which avatar is not said"),
+        ((None,), "The rows do not name the avatar"),
     ],
 )
 def test_the_stability_table_says_on_whose_avatar_it_was_measured(run, checkpoints, words):
@@ -200,81 +192,10 @@ def test_the_stability_table_says_on_whose_avatar_it_was_measured(run, checkpoin
     assert words in _write(run)[1].text
 
 
-def test_a_run_without_a_checkpoint_claims_no_measurement(run):
-    _bench(run / "bench", {"id": "P1", "what": "edges", "checkpoint_sha256": OTHER})
-    assert "checkpoint 0123456789ab; this run has no avatar.ckpt to compare" in _write(run)[1].text
-
-
-def _table(page_text: str, title: str) -> list[list[tuple[str, str]]]:
-    """Rows of (class, text) of the table below ``title``, the headings first."""
-    body = page_text.partition(title)[2].partition("</table>")[0]
-    cells = re.compile(r'<t[hd](?: class="(\w+)")?>([^<]*)</t[hd]>')
-    return [cells.findall(line) for line in body.split("<tr>")[1:]]
-
-
-def test_tables_have_the_columns_that_matter_below_headings_that_stand_as_they_do(run):
-    more = {"ssim_n": 0.9, "lpips": 0.0123, "lpips_inner": 0.1, "psnr_albedo": 24.5, "outline_px": 0.25}
-    (run / "eval.json").write_text(json.dumps([ROW | more]))
-    row = {
-        "id": "P1",
-        "failure": "a squat",
-        "what": "edges",
-        "measured": 2.77897,
-        "unit": "×",
-        "line": "< 3",
-        "verdict": "fail",
-        "baseline": 3.89788,
-        "baseline_name": "LBS",
-        "machine": "a",
-        "threads": 2,
-        "size": 512,
-    }
-    _bench(run / "bench", row)
-    text, _ = _write(run)
-    scores, stability = _table(text, "Held-out quality"), _table(text, "Stability</h3>")
-    assert [cell for _, cell in scores[0]] == [
-        "split",
-        "frames",
-        "PSNR, dB",
-        "SSIM",
-        "LPIPS",
-        "PSNR in the box, dB",
-        "PSNR of normals, dB",
-        "normals off by, °",
-        "PSNR of albedo, dB",
-        "outline off by, px",
-    ]
-    assert [cell for _, cell in scores[1]] == [
-        "novel_view",
-        "2",
-        "27.35",
-        "0.9500",
-        "0.0123",
-        "22.00",
-        "19.00",
-        "10.0",
-        "24.50",
-        "0.25",
-    ]
-    assert [cell for _, cell in stability[0]] == [
-        "id",
-        "failure",
-        "what was measured",
-        "measured",
-        "limit",
-        "verdict",
-        "the plain method",
-    ]
-    cells = [cell.replace("\N{NO-BREAK SPACE}", " ") for _, cell in stability[1]]
-    assert cells == ["P1", "a squat", "edges", "2.779 ×", "&lt; 3", "✗", "LBS: 3.898 ×"]
-    for head, *lines in (scores, stability):
-        assert all([kind for kind, _ in line] == [kind for kind, _ in head] for line in lines)
-
-
 @pytest.mark.parametrize(
     ("counts", "words"),
     [
-        ({"steps": 240, "step": 360}, "· 360 steps, 240 of them with a picture ·"),
+        ({"steps": 240, "step": 360}, "· 360 steps, 240 of them with an image ·"),
         ({"steps": 240, "step": 240}, "· 240 steps ·"),
         ({"steps": 240, "step": 100}, "· 100 of 240 steps ·"),
         ({"steps": 240, "step": None}, "· 240 steps ·"),
@@ -286,7 +207,7 @@ def test_the_facts_count_steps_with_and_without_a_picture(run, counts, words):
     _, page = _write(run)
     assert words in page.text
     assert "trained on capture ·" in page.text and "capture capture" not in page.text
-    assert "flicker 24.09 of 255 (what jumps from frame to frame" in page.text
+    assert "flicker 24.09 of 255 (change from frame to frame" in page.text
 
 
 def test_pictures_of_a_split_that_are_those_of_another_are_left_out(run, tmp_path):
@@ -303,21 +224,12 @@ def test_pictures_of_a_split_that_are_those_of_another_are_left_out(run, tmp_pat
     assert sum(tag == "img" for tag, _ in page.tags) == 5 * 6
 
 
-def test_a_name_that_is_not_utf8_and_a_folder_called_as_a_chart_are_no_mistake(run, tmp_path):
-    shutil.rmtree(run / "eval")
-    (run / "avatar.onnx").unlink()
-    renamed = run.rename(tmp_path / os.fsdecode(b"r\xe9n"))
-    (tmp_path / "bench" / "grid.svg").mkdir(parents=True)
-    _, page = _write(renamed, "--bench", str(tmp_path / "bench"))
-    assert "r\\udce9n" in page.text and "neither crossed.svg nor grid.svg nor stability.json" in page.text
-
-
 def test_what_a_run_lacks_is_named(run):
     for name in ("avatar.onnx", "eval.json", "metrics.jsonl"):
         (run / name).unlink()
     shutil.rmtree(run / "eval")
     _, page = _write(run)
-    for words in ("rnd-export", "no eval.json", "--pictures RUN/eval", "no metrics.jsonl", "--bench FOLDER"):
+    for words in ("rnd-export", "no eval.json", "--strips RUN/eval", "no metrics.jsonl", "--bench FOLDER"):
         assert words in page.text
     assert not any(tag in ("img", "video", "svg") for tag, _ in page.tags)
 
@@ -334,12 +246,12 @@ def test_the_avatar_of_another_checkpoint_is_not_shown(run, capsys):
     assert made_of not in page.text and any(tag == "video" for tag, _ in page.tags)
     (run / "avatar.ckpt").write_bytes(b"trained since")
     _, page = _write(run)
-    assert made_of in page.text and f"note: {made_of}" in capsys.readouterr().out
+    assert made_of in page.text and f"warning: {made_of}" in capsys.readouterr().err
     assert not any(tag == "video" for tag, _ in page.tags)
 
 
 def test_a_second_stage_is_marked_where_the_rows_begin_it(run):
-    second = "where the second stage, the light, begins"
+    second = "marks the second stage, the light"
     text, page = _write(run)
     (mark,) = re.findall(r'<line class="stage" x1="([\d.]+)"', text)
     assert second in page.text and float(mark) == pytest.approx(42 + 25 / 99 * 270, abs=0.06)
@@ -354,29 +266,18 @@ def test_a_second_stage_is_marked_where_the_rows_begin_it(run):
 
 def test_a_probe_made_for_a_z_up_world_is_turned_upright(run, tmp_path):
     sky = "--hdr", str(ASSETS / "sky.exr")
-    pictures = [_pictures(_write(run, *sky, "--hdr-up", up)[1], tmp_path)["sky"] for up in "yz"]
-    assert (pictures[0] != pictures[1]).any()
+    images = [_images(_write(run, *sky, "--hdr-up", up)[1], tmp_path)["sky"] for up in "yz"]
+    assert (images[0] != images[1]).any()
     assert main([str(run), "--hdr-up", "z"]) == 2
 
 
-def test_pictures_are_shown_once(run, tmp_path):
+def test_as_many_strips_are_shown_as_asked_for(run, tmp_path):
     (run / "avatar.onnx").unlink()
-    for words, expected in ((("--pictures", "9"), "abcd"), (("--pictures", "2"), "ac"), (("--pictures", "0"), "")):
+    for words, expected in ((("--images", "9"), "abcd"), (("--images", "2"), "ac"), (("--images", "0"), "")):
         _, page = _write(run, *words)
-        names = [name for name in _pictures(page, tmp_path) if name.startswith("truth, ")]
+        names = [name for name in _images(page, tmp_path) if name.startswith("truth, ")]
         assert names == [f"truth, {letter}" for letter in expected]
         assert sum(tag == "img" for tag, _ in page.tags) == 5 * len(expected)
-
-
-def test_pictures_that_nobody_asked_for_are_not_missed(run):
-    assert "--pictures" not in _write(run, "--pictures", "0")[1].text
-
-
-def test_a_loss_that_was_no_number_is_left_out_of_its_curve(run):
-    rows = [{"step": k, "image": None if k == 1 else 0.5, "normal": None} for k in range(3)]
-    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    _, page = _write(run)
-    assert "image, last 0.5" in page.text and "normal, last" not in page.text
 
 
 def test_a_line_that_was_begun_when_the_training_was_ended_is_left_out(run):
@@ -386,20 +287,15 @@ def test_a_line_that_was_begun_when_the_training_was_ended_is_left_out(run):
     assert "image, last 0.5" in page.text and "2 steps" in page.text
 
 
-def test_what_is_wrong_with_motion_and_light_is_told(run, tmp_path, capsys):
+def test_notes_on_motion_and_light_are_on_the_page_and_logged(run, tmp_path, capsys):
     broken = np.ones((16, 32, 3), np.float32)
     broken[3, 4] = np.nan
     write_image(tmp_path / "nan.exr", broken)
     np.savez(tmp_path / "still.npz", poses=np.zeros((2, 72)), trans=np.zeros((2, 3)))
     _, page = _write(run, "--hdr", str(tmp_path / "nan.exr"), "--motion", str(tmp_path / "still.npz"))
-    printed = capsys.readouterr().out
+    printed = capsys.readouterr().err
     for note in ("nan.exr: 1 texels of the light were NaN", "no frame rate in the file: 60 frames per second"):
-        assert f"Note: {note}" in page.text and f"note: {note}" in printed
-
-
-def test_a_folder_of_charts_that_is_not_there_is_refused(run, capsys):
-    assert main([str(run), "--bench", str(run / "bemch")]) == 2
-    assert capsys.readouterr().err == f"rnd-report: {run / 'bemch'}: folder of --bench not found\n"
+        assert f"Note: {note}" in page.text and f"warning: {note}" in printed
 
 
 def test_a_curve_goes_through_the_points():
@@ -421,45 +317,25 @@ def test_a_curve_goes_through_the_points():
         ("eval.json", "{", "eval.json: not JSON"),
         ("metrics.jsonl", '{"step": 0\n', "metrics.jsonl: not JSON lines"),
         ("metrics.jsonl", '{"step": NaN}', "metrics.jsonl: step: expected a number, 0 to 1e+12, got NaN"),
-        ("metrics.jsonl", '{"step": 1e999}', "metrics.jsonl: step: expected a number, 0 to 1e+12, got Infinity"),
         ("metrics.jsonl", f'{{"step": 1, "image": 1{"0" * 400}}}', "image: expected a number, got 1000"),
-        ("eval.json", f'[{{"split": "a", "psnr": 1{"0" * 400}}}]', "psnr: expected a number, got 1000"),
         ("metrics.jsonl", "3", "metrics.jsonl: expected a step in every line"),
-        ("metrics.jsonl", '{"step": "1"}', 'metrics.jsonl: step: expected a number, got "1"'),
         ("metrics.jsonl", '{"step": null}', "metrics.jsonl: step: expected a number, got null"),
         ("metrics.jsonl", '{"step": 0, "image": [1]}', "metrics.jsonl: image: expected a number, got [1]"),
         ("config.json", "[]", "config.json of rnd-train: expected an object"),
-        ("config.json", "[" * 100_000, "config.json: not JSON"),
         ("eval.json", '[{"split": 3}]', "eval.json: split: expected a text, got 3"),
         ("eval.json", '[{"split": "a", "psnr": "?"}]', 'eval.json: psnr: expected a number, got "?"'),
         ("eval.json", '{"summary": [], "rows": []}', "eval.json: expected rows of rnd-eval"),  # of an ablation
-        ("bench/stability.json", "{", "stability.json: not JSON"),
         ("bench/stability.json", '[{"id": "P1"}]', "stability.json: expected rows of rnd-bench stability"),
         ("bench/grid.json", "3", "grid.json: expected rows of rnd-bench"),
-        ("avatar.onnx", "onnx", "avatar.onnx: not a readable ONNX model"),
+        ("avatar.onnx", "onnx", "avatar.onnx: "),
     ],
 )
-def test_a_damaged_run_is_one_line_and_exit_2(run, name, content, message, capsys):
+def test_a_damaged_run_is_refused_in_one_line(run, name, content, message, capsys):
     _bench(run / "bench", None, "grid")
     (run / name).unlink() if content is None else (run / name).write_text(content)
     assert main([str(run)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-    assert not (run / "report.html").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--loop", "--smooth", "2"), "--smooth: expected the default, got 2.0"),
-        (("--loop",), "--loop: expected the default, got True"),
-        (("--motion-up", "z"), "--motion-up: expected the default, got z"),
-    ],
-)
-def test_options_of_a_motion_that_is_not_there_are_refused(run, words, message, capsys):
-    assert main([str(run), *words]) == 2
-    error = capsys.readouterr().err
-    assert f"{message} (needs --motion" in error and error.count("\n") == 1
     assert not (run / "report.html").exists()
 
 
@@ -485,27 +361,13 @@ def test_what_only_an_avatar_can_show_needs_one(run, option, why, capsys):
 )
 def test_a_page_that_cannot_be_written_is_refused_before_anything_is_filmed(run, out, message, monkeypatch, capsys):
     (run / "a.html").mkdir()
-    monkeypatch.setattr(report_shots.Avatar, "load", None)
+    monkeypatch.setattr(renders.Avatar, "load", None)
     before = (run / "config.json").read_bytes()
     assert main([str(run), "--out", str(run / out)]) == 2
     assert message in capsys.readouterr().err and (run / "config.json").read_bytes() == before
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
-def test_the_slider_moves_in_a_browser(run, tmp_path):
-    text, _ = _write(run)
-    script = """<script>const i = document.querySelector(".ab input"); i.value = 20;
-      i.dispatchEvent(new Event("input"));
-      const ok = [...document.images].every(p => p.complete && p.naturalWidth);
-      document.title = [ok, getComputedStyle(i.parentElement.children[1]).clipPath].join(" ");</script></body>"""
-    page = tmp_path / "page.html"
-    page.write_text(text.replace("</body>", script), encoding="utf-8")
-    line = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1500"]
-    line += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", page.as_uri()]
-    dom = subprocess.run(line, capture_output=True, text=True, timeout=120, check=True).stdout
-    assert "<title>true inset(0px 0px 0px 20%)</title>" in dom
-
-
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_tables_fit_a_window_and_what_does_not_scrolls_in_its_own_box(run, tmp_path):
     (run / "avatar.onnx").unlink()
@@ -517,6 +379,9 @@ def test_tables_fit_a_window_and_what_does_not_scrolls_in_its_own_box(run, tmp_p
     with chromium(tmp_path / "profile", size=(1200, 900)) as page:
         page.open((run / "report.html").as_uri())
         page.wait("document.readyState === 'complete' && document.querySelector('table')")
+        page.run("const i = document.querySelector('.ab input'); i.value = 20; i.dispatchEvent(new Event('input'))")
+        clip = "getComputedStyle(document.querySelector('.ab').children[1]).clipPath"
+        assert page.run(clip) == "inset(0px 0px 0px 20%)"
         page.run("document.querySelector('details').open = true")
         boxes = "[...document.querySelectorAll('table')].map((t) => [t.offsetWidth, t.parentElement.clientWidth])"
         (quality, box), (stability, _), (options, _) = page.run(boxes)
