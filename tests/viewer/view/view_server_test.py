@@ -38,7 +38,6 @@ from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.shading.light import load_light
 from rnd_viewer.inputs.background import Background
-from rnd_viewer.play.player import Player
 from rnd_viewer.view.cli import main
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
@@ -145,8 +144,9 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     shade = changes.pop("shade", "table+sun")
     view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
-    renderer = FrameRenderer(avatar, light, shade=shade)
-    return Player(renderer, **changes).render(motion, time, camera).srgb
+    frame = FrameRenderer(avatar, light, shade=shade).render(motion, time, camera)
+    background = changes.pop("background", None)
+    return (frame if background is None else replace(frame, background=background.radiance(camera, light))).srgb
 
 
 def test_the_first_view_is_rnd_plays_to_the_bit(options):
