@@ -19,9 +19,6 @@ need_system_packages() {
     fi
 }
 
-# numba keys a kernel by its own file, so the folder is keyed by all sources
-export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/.cache/numba-$(find runtime trainer -name "*.py" -print0 | sort -z | xargs -0 cat | sha256sum | cut -c1-12)}
-
 # $1: extras of rnd-avatar to install, such as dev
 need_python_packages() {
     local python=${PYTHON:-python3}
