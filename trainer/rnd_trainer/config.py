@@ -59,7 +59,7 @@ class TrainConfig:
     stage1_fraction: float = 0.25
     """share of the steps spent on geometry with a plain colour before the light is learned"""
     unseen_fraction: float = 0.375
-    """as many steps more, by this share of them, without pictures: skinning learns poses that nobody filmed. A half
+    """as many steps more, by this share of them, without pictures: skinning learns unseen poses. A half
     costs 0.06 dB more under other lights (quick has it: a thousand steps)"""
     image_scale: float = 1.0
     """training pictures are shrunk by this factor"""
@@ -111,7 +111,7 @@ class TrainConfig:
     weight_skinning: float = 1e-2
     """of KL(W ‖ W_template); decays to a tenth over the run"""
     weight_edges: float = 400.0
-    """of the stretch of skin between bones in poses that nobody filmed, beside the mean square in mm that skin moves in
+    """of the stretch of skin between bones in unseen poses, beside the mean square in mm that skin moves in
     filmed ones: in the third stage alone. With a quarter of it a squat stretches more (P1 in docs/stability.md), and
     held-out pictures are no better"""
     weight_smooth: float = 3e4

@@ -25,9 +25,9 @@ from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.commands.eval import EvalOptions, _is_of, evaluate_run
 from rnd_trainer.config import ModelConfig
-from rnd_trainer.evaluation.evaluate import Judge, albedo_scale, evaluate, flicker
+from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate, flicker
 from rnd_trainer.evaluation.evaluator import Rendered, render_runtime
-from rnd_trainer.evaluation.held_out import picture_names, playback, score
+from rnd_trainer.evaluation.held_out import playback, score, strip_names
 from rnd_trainer.evaluation.scores import frame_scores, normal_picture, outline_length, silhouette, to_srgb8
 from rnd_trainer.losses.metrics import psnr, ssim_map
 from rnd_trainer.model.checkpoint import load_checkpoint
@@ -161,7 +161,7 @@ def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_c
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
     frame = tiny_capture.split("train")[0]
     whole, all_of_it, *fewer = (
-        Judge(checkpoint, tiny_capture, cull=cull).render(frame).image for cull in (None, -1.0, -0.5, 0.0, 1.0)
+        Evaluator(checkpoint, tiny_capture, cull=cull).render(frame).image for cull in (None, -1.0, -0.5, 0.0, 1.0)
     )
     assert torch.equal(whole, all_of_it) and fewer[-1].abs().max() == 0
     backs, backs_and_sides, everything = (float(torch.mean((image - whole) ** 2)) for image in fewer)
@@ -169,7 +169,10 @@ def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_c
 
 
 def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
-    judge, original = (Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture), type(tiny_capture).load_frame)
+    evaluator, original = (
+        Evaluator(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture),
+        type(tiny_capture).load_frame,
+    )
     first = tiny_capture.split("novel_view")[0]
 
     def with_mask(columns: slice):
@@ -182,12 +185,12 @@ def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_ca
         return load
 
     monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 2)))
-    scores = evaluate(judge, "novel_view")
+    scores = evaluate(evaluator, "novel_view")
     assert scores.frames == len(tiny_capture.split("novel_view")) and "ssim_box" in scores.scores
     assert not np.isnan(list(scores.scores.values())).any()
     assert scores.scores["normal_deg"] > 0  # of the other frames: nothing of this one's is in the sliver
     monkeypatch.setattr(type(tiny_capture), "load_frame", with_mask(slice(0, 0)))
-    assert evaluate(judge, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
+    assert evaluate(evaluator, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
 
 
 def test_normal_pictures_are_black_where_nothing_is() -> None:
@@ -217,9 +220,9 @@ def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_pat
 
 
 def test_strips_have_names_of_their_own_and_are_no_jpegs() -> None:
-    assert picture_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
+    assert strip_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
     cameras = ["cam0/000001.jpg", "cam1/000001.jpg", "cam1/000002.jpg"]
-    assert list(picture_names(cameras).values()) == ["cam0_000001", "cam1_000001", "000002"]
+    assert list(strip_names(cameras).values()) == ["cam0_000001", "cam1_000001", "000002"]
 
 
 def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp_path, monkeypatch) -> None:
@@ -270,9 +273,9 @@ def test_rows_are_written_before_the_table_whose_title_is_the_runs_name(
 
 
 def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:
-    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    evaluator = Evaluator(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
     seen = []
-    result = evaluate(judge, "novel_view", on_frame=lambda frame, rendered, target: seen.append((rendered, target)))
+    result = evaluate(evaluator, "novel_view", on_frame=lambda frame, rendered, target: seen.append((rendered, target)))
     expected = np.mean([psnr(to_srgb8(rendered.image), target) for rendered, target in seen])
     assert result.scores["psnr"] == pytest.approx(expected, rel=1e-6)
 
@@ -281,15 +284,15 @@ def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
     moves = tiny_capture.motion
     still = dataclasses.replace(moves, rotations=np.repeat(moves.rotations[:1], 6, axis=0))
-    assert flicker(Judge(checkpoint, tiny_capture, motion=still), "train") == 0
+    assert flicker(Evaluator(checkpoint, tiny_capture, motion=still), "train") == 0
     jumping = dataclasses.replace(moves, rotations=moves.rotations[[0, 1, 0, 1, 0, 1]])
-    shaken = flicker(Judge(checkpoint, tiny_capture, motion=jumping), "train")
+    shaken = flicker(Evaluator(checkpoint, tiny_capture, motion=jumping), "train")
     assert shaken is not None and shaken > 1
-    assert flicker(Judge(checkpoint, tiny_capture), "relight") is None
+    assert flicker(Evaluator(checkpoint, tiny_capture), "relight") is None
 
 
 def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:
-    """A judge of grey pictures of these sRGB ``values`` by motion frame."""
+    """A evaluator of grey pictures of these sRGB ``values`` by motion frame."""
 
     def render(frame: object, index: int) -> Rendered:
         grey = torch.full((*mask.shape, 3), float(srgb_to_linear(np.array(values[index]))))
@@ -315,10 +318,10 @@ def test_the_training_light_is_the_learned_one_and_others_the_captures(tiny_run,
     monkeypatch.setattr(rnd_trainer.evaluation.evaluate, "Shader", lambda light, mode: light)
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
     checkpoint.info["lights"] = {"noon": None}  # the capture has no map of it
-    judge = Judge(checkpoint, capture)
-    assert judge._shader("dusk") == "the true dusk"
+    evaluator = Evaluator(checkpoint, capture)
+    assert evaluator._shader("dusk") == "the true dusk"
     for name in ("noon", None):
-        assert np.array_equal(judge._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
+        assert np.array_equal(evaluator._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
 
 
 def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:
@@ -372,8 +375,8 @@ def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, t
     monkeypatch.setattr(rnd_trainer.evaluation.held_out.Avatar, "load", lambda path: None)
     monkeypatch.setattr(rnd_trainer.evaluation.held_out, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     (tmp_path / "avatar.onnx").write_bytes(bytes(3_000_000))
-    judge = Judge(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
-    assert playback(tmp_path / "avatar.onnx", judge) == {"file_mb": 3.0, "fps": pytest.approx(100)}
+    evaluator = Evaluator(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
+    assert playback(tmp_path / "avatar.onnx", evaluator) == {"file_mb": 3.0, "fps": pytest.approx(100)}
 
 
 def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
@@ -405,5 +408,5 @@ def test_the_learned_light_stands_in_for_its_own_captures_alone(tiny_run, tiny_c
     light = tiny_capture.split("train")[0].light
     assert light is not None
     foreign = dataclasses.replace(tiny_capture, folder=tmp_path)
-    own, other = (Judge(checkpoint, capture)._trained for capture in (tiny_capture, foreign))
+    own, other = (Evaluator(checkpoint, capture)._trained for capture in (tiny_capture, foreign))
     assert own == {light} and other == set()

@@ -24,11 +24,11 @@ from rnd_trainer.training.sampled_poses import (
     TURNED_JOINTS,
     WIDEST_SHAKE,
     WIDEST_TURN,
-    sampled_pose,
     jittered_pose,
     perturbed_pose,
+    sampled_pose,
 )
-from rnd_trainer.training.unseen import NODE_STRIDE, MM2, UnseenPoses
+from rnd_trainer.training.unseen import MM2, NODE_STRIDE, UnseenPoses
 from support.tiny import body
 
 COUNT = 3000

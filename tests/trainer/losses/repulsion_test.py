@@ -81,7 +81,7 @@ def test_training_holds_them_apart_every_few_steps(tiny_capture, tiny_config):
 def test_only_the_gaussians_own_residuals_are_pushed(tiny_capture, tiny_config):
     training = Training(tiny_capture, dataclasses.replace(tiny_config, least_distance=1.5))
     posed = training.model(training.poses[0])
-    training.objective._crowding(training.model, posed).backward()
+    training.objective._repulsion(training.model, posed).backward()
     pushed = {name for name, p in training.model.named_parameters() if p.grad is not None and p.grad.any()}
     assert pushed == {"geometry_residual"}
     columns = training.model.geometry_residual.grad.any(dim=0)

@@ -10,7 +10,7 @@ import torch
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.reference import shade_reference
-from rnd_trainer.render.probe import LightProbe, all_texels, draw_texels, luminance
+from rnd_trainer.render.probe import LightProbe, all_texels, luminance, sample_texels
 from rnd_trainer.render.shading import light_visibility, shade
 
 FLOAT32_RELATIVE = 2e-4  # a sum of 2 048 float32 terms, GGX peaks among them
@@ -51,7 +51,7 @@ def test_drawn_texels_are_unbiased_and_always_hold_the_sun() -> None:
     sky = truth - radiance[9, 40] * probe.solid_angles[9, 40] * weight[9 * 64 + 40]
     estimates = []
     for _ in range(400):
-        texels = draw_texels(radiance, probe.directions, probe.solid_angles, 64, generator)
+        texels = sample_texels(radiance, probe.directions, probe.solid_angles, 64, generator)
         assert torch.equal(texels.directions[0], probe.directions[9, 40])
         assert torch.allclose(texels.power[0], radiance[9, 40] * probe.solid_angles[9, 40])
         assert abs(len(texels.directions) - 64) <= 1

@@ -26,7 +26,7 @@ class Figure:
         line: the limit, such as "< 3"; empty where the number is only reported.
         passes: whether it is within the limit.
         baseline, baseline_name: the same number of the plain method, where there is one.
-        timing: the number depends on the machine's load; tests do not judge it.
+        timing: the number depends on the machine's load; tests do not assert it.
     """
 
     what: str

@@ -40,7 +40,7 @@ class SplitScore:
     scores: dict[str, float]
 
 
-class Judge:
+class Evaluator:
     """Renders a trained avatar for the frames of a capture, each under its light.
 
     The light that the avatar was trained under is the learned probe, others come from the capture: both are what a
@@ -89,7 +89,7 @@ class Judge:
 
 
 def evaluate(
-    judge: Judge,
+    evaluator: Evaluator,
     split: Split,
     *,
     albedo_scale: Tensor | None = None,
@@ -106,18 +106,18 @@ def evaluate(
         on_frame: called with each frame, its rendering and the true image [H, W, 3] (sRGB).
     """
     rows: list[dict[str, float]] = []
-    frames = judge.capture.split(split)
+    frames = evaluator.capture.split(split)
     for frame in frames:
-        truth = judge.capture.load_frame(frame)
+        truth = evaluator.capture.load_frame(frame)
         if not usable(truth.mask):
             continue
-        rendered = judge.render(frame, albedo_scale)
+        rendered = evaluator.render(frame, albedo_scale)
         rows.append(frame_scores(rendered, truth, perceptual, None if albedo_scale is not None else shown_scale))
         if on_frame is not None:
             on_frame(frame, rendered, torch.from_numpy(truth.image_srgb))
     if not rows:
         expected = "a person in one picture at least"
-        raise InputError(f"split {split!r}", expected=expected, got="none", file=judge.capture.folder)
+        raise InputError(f"split {split!r}", expected=expected, got="none", file=evaluator.capture.folder)
     figures: dict[str, list[float]] = {}
     for row in rows:
         for name, value in row.items():
@@ -125,21 +125,21 @@ def evaluate(
     return SplitScore(split, len(rows), {name: float(np.mean(values)) for name, values in figures.items()})
 
 
-def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
+def flicker(evaluator: Evaluator, split: Split = "novel_pose") -> float | None:
     """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive frames of the motion.
 
     From the split's first frame on, whether all of them are held out or not: nothing is compared with a picture.
     Motion at constant speed cancels in the second difference to first order; what jumps does not. None where the
     motion has fewer than three frames from there on, or nobody is seen.
     """
-    frames = sorted(judge.capture.split(split), key=lambda frame: (frame.camera, frame.frame))
+    frames = sorted(evaluator.capture.split(split), key=lambda frame: (frame.camera, frame.frame))
     if not frames:
         return None
     first = frames[0]
-    last = min(first.frame + FLICKER_FRAMES, judge.motion.frame_count)
+    last = min(first.frame + FLICKER_FRAMES, evaluator.motion.frame_count)
     if last - first.frame < 3:
         return None
-    shown = [judge.render(first, index=k) for k in range(first.frame, last)]
+    shown = [evaluator.render(first, index=k) for k in range(first.frame, last)]
     images = torch.stack([to_srgb8(r.image) for r in shown])
     covered = torch.stack([r.alpha for r in shown])[1:-1] > 0.5
     if not covered.any():
@@ -148,19 +148,19 @@ def flicker(judge: Judge, split: Split = "novel_pose") -> float | None:
     return float(255 * second[covered].mean())
 
 
-def albedo_scale(judge: Judge) -> Tensor | None:
+def albedo_scale(evaluator: Evaluator) -> Tensor | None:
     """Per-channel least-squares factor [3] from the learned to the true albedo, over training frames that have it.
 
     Albedo and light are known up to this factor; IntrinsicAvatar's protocol fits it before relighting.
     None where the capture has no albedo, or nothing there is covered by both.
     """
     ours, theirs = [], []
-    for frame in judge.capture.split("train"):
+    for frame in evaluator.capture.split("train"):
         if frame.albedo is None:
             continue
-        truth = judge.capture.load_frame(frame)
+        truth = evaluator.capture.load_frame(frame)
         assert truth.albedo_srgb is not None
-        rendered = judge.render(frame)
+        rendered = evaluator.render(frame)
         inside = (torch.from_numpy(truth.mask) > 0.99) & (rendered.alpha > 0.99)
         ours.append(rendered.albedo[inside])
         theirs.append(torch.from_numpy(srgb_to_linear(truth.albedo_srgb)).float()[inside])

@@ -24,7 +24,7 @@ from rnd_runtime.shading.light import Light
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.checkpoint import Checkpoint
 
-from .evaluate import HELD_OUT, Judge, albedo_scale, evaluate, flicker
+from .evaluate import HELD_OUT, Evaluator, albedo_scale, evaluate, flicker
 from .preview import contact_sheet, strip
 
 PLAYED = 40
@@ -55,29 +55,29 @@ def score(
     Raises:
         InputError: the capture has no held-out split.
     """
-    judge = Judge(checkpoint, capture, mode, cull=cull)
+    evaluator = Evaluator(checkpoint, capture, mode, cull=cull)
     lit = checkpoint.config.light != "none"  # else there is no albedo: colours that no light changes
-    scale = albedo_scale(judge) if lit else None
+    scale = albedo_scale(evaluator) if lit else None
     jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
     if scale is not None and capture.split("relight"):
         jobs.append(("relight", scale))
     if not jobs:
         raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)
     whole = {
-        "flicker": flicker(judge),
+        "flicker": flicker(evaluator),
         "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
         "shade": mode,
         "cull": cull,
         "lpips_weights": None if perceptual is None else perceptual.backbone,
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
-        **({} if avatar is None else playback(avatar, judge)),
+        **({} if avatar is None else playback(avatar, evaluator)),
         "size": sizes(capture),
         "scored_on": capture.folder.resolve().name,
         "capture_sha256": sha256_of(capture.file),
-        "motion": Path(judge.motion.source).name,
+        "motion": Path(evaluator.motion.source).name,
         **_provenance(checkpoint),
     }
-    names = picture_names([frame.image for split, _ in jobs for frame in capture.split(split)])
+    names = strip_names([frame.image for split, _ in jobs for frame in capture.split(split)])
     rows = []
     for split, factor in jobs:
         name = split if factor is None else f"{split}, albedo scaled"
@@ -89,7 +89,9 @@ def score(
                 kept.append(strip(rendered, target.numpy()))
                 write_image(folder / f"{names[frame.image]}.png", kept[-1])
 
-        result = evaluate(judge, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep)
+        result = evaluate(
+            evaluator, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep
+        )
         if not lit:
             result.scores.pop("psnr_albedo", None)
         if folder is not None:
@@ -108,7 +110,7 @@ def score(
     return rows
 
 
-def picture_names(images: Iterable[str]) -> dict[str, str]:
+def strip_names(images: Iterable[str]) -> dict[str, str]:
     """A name without folder and suffix for each of ``images``, paths in a capture.
 
     The picture's own where no other has it, else with the folders before it.
@@ -118,24 +120,24 @@ def picture_names(images: Iterable[str]) -> dict[str, str]:
     return {image: path.name if stems[path.name] == 1 else "_".join(path.parts) for image, path in paths.items()}
 
 
-def playback(avatar: Path, judge: Judge) -> dict[str, Any]:
+def playback(avatar: Path, evaluator: Evaluator) -> dict[str, Any]:
     """Size of an exported avatar in MB, and frames a second of the runtime from pose to pixels in memory.
 
     Under the learned light, shaded as it is judged, seen by the first held-out camera, over ``PLAYED`` consecutive
     poses; the median.
     """
-    frame = next(frame for split in HELD_OUT for frame in judge.capture.split(split))
+    frame = next(frame for split in HELD_OUT for frame in evaluator.capture.split(split))
     renderer = FrameRenderer(
         Avatar.load(avatar),
-        Light(judge.checkpoint.probe.numpy()),
-        judge.capture.cameras[frame.camera],
-        shade=judge.mode,
-        cull=judge.cull,
+        Light(evaluator.checkpoint.probe.numpy()),
+        evaluator.capture.cameras[frame.camera],
+        shade=evaluator.mode,
+        cull=evaluator.cull,
     )
     seconds = []
     for k in range(PLAYED):
         started = time.perf_counter()
-        renderer.render(judge.motion, (k % judge.motion.frame_count) / judge.motion.fps)
+        renderer.render(evaluator.motion, (k % evaluator.motion.frame_count) / evaluator.motion.fps)
         seconds.append(time.perf_counter() - started)
     renderer.close()
     return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}

@@ -74,11 +74,11 @@ def captions(tile: int, strips: int = 1) -> np.ndarray:
 def _write_sheet(path: Path, strips: list[np.ndarray]) -> None:
     """Strips under one another, and words above; narrower pictures stand in their columns, black on both sides."""
     tile = max(strip.shape[1] for strip in strips) // len(TILES)
-    columns = [_in_columns(strip, tile) for strip in strips]
+    columns = [_centred(strip, tile) for strip in strips]
     write_image(path, np.concatenate([captions(tile), *columns], axis=0))
 
 
-def _in_columns(strip: np.ndarray, tile: int) -> np.ndarray:
+def _centred(strip: np.ndarray, tile: int) -> np.ndarray:
     """The strip [H, 5·W, 3] with each picture in the middle of ``tile`` ≥ W pixels: [H, 5·tile, 3]."""
     pictures = strip.reshape(len(strip), len(TILES), -1, 3)
     left, right = (tile - pictures.shape[2]) // 2, (tile - pictures.shape[2] + 1) // 2

@@ -156,7 +156,7 @@ class AvatarModel(nn.Module):
         normals = nn.functional.normalize(self.rest_normals + tilt, dim=-1)
         tangents, across = part["scale"].split([2, 1], dim=-1)
         scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
-        offset = self.config.max_static_offset * torch.tanh(place) + self.strays()
+        offset = self.config.max_static_offset * torch.tanh(place) + self.residual_offset()
         low, high = ALBEDO_RANGE
         glossy, rough = ROUGHNESS_RANGE
         return Attributes(
@@ -171,7 +171,7 @@ class AvatarModel(nn.Module):
             raw_geometry_residual=self.geometry_residual,
         )
 
-    def strays(self) -> Tensor:
+    def residual_offset(self) -> Tensor:
         """How far each Gaussian's own residual takes it from the surface [N, 3] m."""
         return self.spacing * torch.tanh(_by_name(self.geometry_residual, GEOMETRY_COLUMNS)["offset"])
 

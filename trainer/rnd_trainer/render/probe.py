@@ -83,7 +83,7 @@ def all_texels(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Te
     return Texels(directions.reshape(-1, 3)[order], power[order])
 
 
-def draw_texels(
+def sample_texels(
     radiance: Tensor, directions: Tensor, solid_angles: Tensor, count: int, generator: torch.Generator
 ) -> Texels:
     """About ``count`` texels by systematic sampling with inclusion probability min(1, c · importance).

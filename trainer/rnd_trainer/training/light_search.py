@@ -31,9 +31,9 @@ from scipy.optimize import nnls
 from rnd_runtime.core.images import srgb_to_linear
 from rnd_runtime.shading.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
 from rnd_trainer.model.model import AvatarModel, PoseInput
+from rnd_trainer.render.in_sight import in_sight
 from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.render.shading import traced_visibility
-from rnd_trainer.render.sight import sight
 
 from .data import TrainingView
 
@@ -180,7 +180,7 @@ def _sightings(model: AvatarModel, views: Sequence[TrainingView], poses: Sequenc
         view, camera = views[index], views[index].camera
         with torch.no_grad():
             posed = model(poses[index])
-        visible, pixel = sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
+        visible, pixel = in_sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
         column, row = pixel.astype(int).T
         pixels = view.image[row, column]
         unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)

@@ -1,4 +1,4 @@
-"""What a training step minimises: the weighted loss terms of one picture."""
+"""What a training step minimises: the weighted loss terms of one image."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from rnd_trainer.losses.losses import (
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.losses.repulsion import repulsion
 from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
-from rnd_trainer.render.probe import LightProbe, Texels, all_texels, draw_texels
+from rnd_trainer.render.probe import LightProbe, Texels, all_texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.render.shading import sh_basis, traced_visibility
 
 from .data import TrainingView
 
-LEAST_MATCHES = 16
+MIN_MATCHES = 16
 """points that two views must share for the consistency term to mean anything"""
 
 
 class Objective:
-    """The loss of a picture in either stage.
+    """The loss of one image in either stage.
 
     Args:
         config: weights and schedule.
@@ -74,7 +74,7 @@ class Objective:
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
         if _due(step, config.weight_repulsion, config.repulsion_every):
-            terms["repulsion"] = config.repulsion_every * config.weight_repulsion * self._crowding(model, posed)
+            terms["repulsion"] = config.repulsion_every * config.weight_repulsion * self._repulsion(model, posed)
         if config.model.visibility == "pose" and config.light != "none":  # which is never shaded
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)
@@ -135,7 +135,7 @@ class Objective:
         maps = (self.light(), self.probe.directions, self.probe.solid_angles)
         if step >= config.steps * (1 - config.full_light_fraction):
             return all_texels(*maps)
-        return draw_texels(*maps, config.light_texels, self.generator)
+        return sample_texels(*maps, config.light_texels, self.generator)
 
     def _agreement(
         self,
@@ -153,7 +153,7 @@ class Objective:
         centre = posed.means[:nodes].detach().mean(dim=0)
         virtual = virtual_camera(camera, centre, self.generator)
         shared = covisible(posed, camera, virtual, nodes)
-        if len(shared) < LEAST_MATCHES:
+        if len(shared) < MIN_MATCHES:
             return None
         drawn = shared[torch.randperm(len(shared), generator=self.generator)[:POINTS].to(shared.device)]
         second = _over(self._picture(model, posed, pose, texels, virtual), background)
@@ -161,15 +161,15 @@ class Objective:
         pixels = project(points, camera), project(points, virtual)
         return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, network)
 
-    def _crowding(self, model: AvatarModel, posed: Posed) -> Tensor:
-        """Repulsion of the points, which moves each by its own residual alone: where it also moved the network that
-        all of them share, held-out pictures lost 0.1 to 0.2 dB (docs/tried.md)."""
-        strays = model.strays()
-        points = posed.attributes.points.detach() + strays - strays.detach()
+    def _repulsion(self, model: AvatarModel, posed: Posed) -> Tensor:
+        """Repulsion of the points, with gradient by their residual offsets alone: through the shared network it costs
+        0.1 to 0.2 dB on held-out images."""
+        residual_offset = model.residual_offset()
+        points = posed.attributes.points.detach() + residual_offset - residual_offset.detach()
         return repulsion(points, self.config.least_distance * float(model.spacing))
 
     def _visibility_loss(self, model: AvatarModel, posed: Posed, pose: PoseInput) -> Tensor:
-        """Square error of the harmonics against shadow-mapped visibility at the nodes, in random directions."""
+        """Square error of the SH visibility against shadow maps at the nodes, in random directions."""
         nodes = self.config.model.nodes
         directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
         directions = torch.nn.functional.normalize(directions, dim=-1).to(posed.means.device)

@@ -20,7 +20,7 @@ from rnd_runtime.shading.directional import DirectionalLight, extract_directiona
 from rnd_runtime.shading.light import Light, texel_directions, texel_solid_angles
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.shadow import directional_visibility
-from rnd_trainer.evaluation.evaluate import Judge, albedo_scale, evaluate
+from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate
 from rnd_trainer.losses.metrics import mask_box
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.training.data import usable
@@ -31,7 +31,7 @@ TEXELS = (16, 32)
 
 def relit_scale(subject: Subject) -> Result:
     """L11: relit images as they are, and with the albedo scaled per channel."""
-    evaluator = Judge(load_checkpoint(subject.checkpoint), subject.capture)
+    evaluator = Evaluator(load_checkpoint(subject.checkpoint), subject.capture)
     relit = bool(subject.capture.split("relight"))
     scale = albedo_scale(evaluator) if relit else None
     raw = evaluate(evaluator, "relight").scores if relit else None

@@ -1,4 +1,4 @@
-"""Which Gaussians a camera sees: in front of it, inside its picture, turned towards it, behind nothing."""
+"""Which Gaussians a camera sees: in front of it, in its frame, facing it, unoccluded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rnd_trainer.model.model import Posed
 
 
 @torch.no_grad()
-def sight(
+def in_sight(
     posed: Posed, camera: Camera, count: int, *, facing: float, occlusion: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Which of the first ``count`` Gaussians the camera sees [count], and their pixels [count, 2].
@@ -21,7 +21,7 @@ def sight(
         facing: least cosine between a Gaussian's normal and its direction to the camera.
         occlusion: metres by which it may lie behind the first surface and still be the one that is seen.
 
-    Pixels are x, y with centres at +0.5, 0 for what lies outside the picture.
+    Pixels are x, y with centres at +0.5, 0 for what lies outside the frame.
     """
     arrays = (posed.means, posed.covariances, posed.attributes.opacity, posed.normals)
     means, covariances, opacities, normals = (x.detach().cpu().numpy() for x in arrays)
