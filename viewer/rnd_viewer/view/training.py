@@ -17,8 +17,7 @@ from .options import ViewOptions
 from .scene import Scene
 
 METRICS, STATUS, CONFIG, PREVIEWS = "metrics.jsonl", "status.json", "config.json", "previews"
-AVATAR, CHECKPOINT = "avatar.onnx", "avatar.ckpt"
-RECENT = 200  # steps whose speed gives the time left
+AVATAR = "avatar.onnx"
 POINTS = 300  # of a curve: the page has no more pixels for it
 _PREVIEW = re.compile(r"step_\d+\.png")
 _NO_LOSSES = ("step", "stage", "seconds", "skipped")
@@ -45,17 +44,14 @@ class Training:
         with self._reading:
             rows = self._read_metrics()
         status, last = _json(self.folder / STATUS), rows[-1] if rows else {}
-        done, total = last.get("step", -1) + 1, self._steps()
-        finished = done >= total and (self.folder / CHECKPOINT).is_file()
         return {
             "name": self.folder.resolve().name,
             "phase": status.get("phase"),
-            "done": done,
-            "total": total,
-            "stage": last.get("stage"),
-            "seconds": last.get("seconds", 0),
-            "seconds_left": status.get("seconds_left", _seconds_left(rows, total)),
-            "ended": status.get("ended", "finished" if finished else None),
+            "done": status.get("step", last.get("step", -1) + 1),
+            "total": status.get("steps", 1),
+            "seconds": status.get("seconds", 0),
+            "seconds_left": status.get("seconds_left"),
+            "ended": status.get("ended"),
             "silent_s": self._silence(),
             "skipped": sum("skipped" in row for row in rows),
             "curves": _curves(rows),
@@ -101,12 +97,6 @@ class Training:
         self._rows += [row for line in complete.splitlines() if isinstance((row := _parse(line)).get("step"), int)]
         return self._rows
 
-    def _steps(self) -> int:
-        """Planned steps: with an image, and after them those of unseen poses."""
-        config = _json(self.folder / CONFIG)
-        steps, unseen = config.get("steps", 1), config.get("unseen_fraction", 0)
-        return max(round(steps * (1 + unseen)), 1)
-
     def _previews(self) -> list[str]:
         """File names, the first step first."""
         folder = self.folder / PREVIEWS
@@ -132,15 +122,6 @@ def _json(file: Path) -> dict[str, Any]:
         return _parse(file.read_bytes())
     except FileNotFoundError:
         return {}
-
-
-def _seconds_left(rows: list[dict[str, Any]], total: int) -> float | None:
-    """Time for the steps left at the speed of the last ``RECENT``."""
-    recent = rows[-RECENT:]
-    if len(recent) < 2 or recent[-1]["step"] <= recent[0]["step"]:
-        return None
-    speed = (recent[-1]["seconds"] - recent[0]["seconds"]) / (recent[-1]["step"] - recent[0]["step"])
-    return float(speed * max(total - recent[-1]["step"] - 1, 0))
 
 
 def _curves(rows: list[dict[str, Any]]) -> dict[str, list[list[float]]]:

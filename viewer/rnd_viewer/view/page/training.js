@@ -2,7 +2,6 @@
 
 const PERIOD_MS = 2000, SILENT_S = 120;
 const WIDTH = 300, HEIGHT = 70;  // of a curve, in its own units
-const PHASES = { 1: "geometry", 2: "light", 3: "unseen poses" };
 const $ = (id) => document.getElementById(id);
 let previews = [], latest = true;
 
@@ -15,7 +14,7 @@ function show(run) {
   const percent = Math.floor(100 * run.done / run.total);
   document.title = `${run.ended ?? `${percent} %`} · ${run.name}`;
   $("title").textContent = run.name;
-  $("subtitle").textContent = run.phase ?? PHASES[run.stage] ?? "";
+  $("subtitle").textContent = run.phase ?? "";
   $("progress").value = run.done / run.total;
   rows({
     step: `${run.done} of ${run.total}`,
