@@ -1,1 +1,1 @@
-"""Freezes a trained avatar to one self-contained ONNX file, and proves that it still says the same."""
+"""Freezes a trained avatar to one self-contained ONNX file and measures its difference from torch."""

@@ -92,14 +92,14 @@ def _posed(
     axes, levers, shares = graph.split(limbs, {"limb_axes": 3, "limb_levers": 3, "limb_shares": 1}, axis=0)
     excess, widened = posing.widened(linear, cofactors, axes, shares)
     offsets = graph.op("Transpose", offsets, name="offsets_by_component", perm=[1, 0])
-    offset, rotation = graph.split(graph.op("Tanh", offsets, name="bounded"), {"offset": 3, "turn": 3}, axis=0)
+    offset, rotation = graph.split(graph.op("Tanh", offsets, name="bounded"), {"offset": 3, "rotation": 3}, axis=0)
     offset = graph.op("Mul", offset, graph.constant("max_offset", np.float32(baked.max_offset)), name="offset_m")
     points = graph.op("Add", rest.by_component("rest_points"), offset, name="points_offset")
     points = posing.outwards(points, excess, levers)
     normals = rest.by_component("rest_normals")
     normals = posing.normals(linear, cofactors, posing.widened_normals(normals, excess, axes))
     rotated = posing.multiply(
-        posing.small_rotation(rotation, len(baked.points)), rest.by_component("rest_factors", (3, 3)), "turned"
+        posing.small_rotation(rotation, len(baked.points)), rest.by_component("rest_factors", (3, 3)), "rotated"
     )
     covariances = posing.covariances(posing.multiply(widened, rotated, "posed"))
     return posing.points(blend, linear, points), covariances, posing.by_gaussian(normals, "normals")

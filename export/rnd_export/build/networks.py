@@ -37,10 +37,10 @@ class Networks:
         """Positional encoding [M, E] of codes [M, 3] m; constant."""
         graph = self.graph
         with graph.scope("nodes"):
-            position = graph.constant("places", codes)  # float32: in the highest band a millimetre is 0.2 rad
+            position = graph.constant("positions", codes)  # float32: in the highest band a millimetre is 0.2 rad
             bands = graph.constant("bands", np.pi * 2.0 ** np.arange(frequencies)[:, None])
             angles = graph.op(
-                "Mul", graph.reshape(position, (-1, 1, 3), "places_row"), bands, name="angles"
+                "Mul", graph.reshape(position, (-1, 1, 3), "positions_row"), bands, name="angles"
             )  # [M, frequencies, 3]
             parts = [position]
             for kind in ("Sin", "Cos"):

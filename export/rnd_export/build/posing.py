@@ -39,9 +39,9 @@ class Posing:
     def points(self, blend: str, linear: str, points: str) -> str:
         """A_R x + A_T: [3, 4, N], points [3, N] → [N, 3]."""
         graph = self.graph
-        turned = graph.sum(graph.op("Mul", linear, points, name="products"), 1, "turned_points")
+        rotated = graph.sum(graph.op("Mul", linear, points, name="products"), 1, "rotated_points")
         moved = graph.reshape(graph.rows(blend, [3], "translation", axis=1), (3, -1), "translation_row")
-        means = graph.op("Add", turned, moved, name="means_by_component")
+        means = graph.op("Add", rotated, moved, name="means_by_component")
         return self.by_gaussian(means, "means")
 
     def multiply(self, a: str, b: str, name: str) -> str:
@@ -71,17 +71,17 @@ class Posing:
     def small_rotation(self, rotation: str, count: int) -> str:
         """Rotations [3, 3, N] of normalize(1, v/2) for v [3, N]: quadratic in the quaternion, over its square."""
         graph = self.graph
-        half = graph.op("Mul", rotation, graph.constant("half", np.float32(0.5)), name="turn_half")
+        half = graph.op("Mul", rotation, graph.constant("half", np.float32(0.5)), name="rotation_half")
         q = graph.op("Concat", graph.filled("one", (1, count), 1.0), half, name="q", axis=0)
         first = graph.rows(q, [i for i, _ in _PAIRS], "q_first")
         second = graph.rows(q, [j for _, j in _PAIRS], "q_second")
         products = graph.op("Mul", first, second, name="q_products")
         matrix = graph.op(
-            "MatMul", graph.constant("quaternion_to_matrix", _quaternion_to_matrix()), products, name="turn_unscaled"
+            "MatMul", graph.constant("quaternion_to_matrix", _quaternion_to_matrix()), products, name="unscaled"
         )
         squares = graph.op("MatMul", graph.constant("pairs_squared", _squares()), products, name="q_squared")
-        matrix = graph.op("Div", matrix, squares, name="turn9")
-        return graph.reshape(matrix, (3, 3, -1), "turn_rotation")
+        matrix = graph.op("Div", matrix, squares, name="rotation9")
+        return graph.reshape(matrix, (3, 3, -1), "small_rotation")
 
     def cofactors(self, linear: str) -> str:
         """cof(A) of [3, 3, N]."""
@@ -103,10 +103,10 @@ class Posing:
         with graph.scope("normals"):
             share = graph.constant("fallback", np.float32(NORMAL_FALLBACK))
             mixed = graph.op("Add", cofactors, graph.op("Mul", linear, share, name="linear_share"), name="mixed")
-            turned = graph.sum(graph.op("Mul", mixed, rest, name="products"), 1, "turned")
-            length = graph.op("ReduceL2", turned, self._first_axis(), name="length", keepdims=1)
+            rotated = graph.sum(graph.op("Mul", mixed, rest, name="products"), 1, "rotated")
+            length = graph.op("ReduceL2", rotated, self._first_axis(), name="length", keepdims=1)
             shortest = graph.constant("shortest", np.float32(NORMALIZE_FLOOR))
-            return graph.op("Div", turned, graph.op("Max", length, shortest, name="length_floor"), name="unit")
+            return graph.op("Div", rotated, graph.op("Max", length, shortest, name="length_floor"), name="unit")
 
     def widened(self, linear: str, cofactors: str, axes: str, shares: str) -> tuple[str, str]:
         """κ [1, N] of ``rnd_trainer.model.twist.excess``, and A_R widened by 1 + κ across the limbs' axes [3, N]."""
@@ -127,17 +127,17 @@ class Posing:
         graph = self.graph
         floor, one, half, three_halves = (
             graph.constant(name, np.float32(value))
-            for name, value in (("floor", SMALLEST_SQUARE), ("one", 1), ("half", 0.5), ("most", 1.5))
+            for name, value in (("floor", SMALLEST_SQUARE), ("one", 1), ("half", 0.5), ("three_halves", 1.5))
         )
         length = graph.op("Max", length_squared, floor, name="length_floor")
-        ratio = graph.op("Min", graph.op("Div", area, length, name="share_kept"), one, name="kept")
-        iterate, factor = graph.op("Mul", ratio, half, name="half_kept"), ""
+        ratio = graph.op("Min", graph.op("Div", area, length, name="area_ratio"), one, name="ratio")
+        iterate, factor = graph.op("Mul", ratio, half, name="iterate"), ""
         for k in range(TWIST_STEPS):
             step = graph.op("Sub", three_halves, iterate, name=f"step{k}")
             factor = graph.op("Mul", factor, step, name=f"factor{k}") if factor else step
             if k + 1 < TWIST_STEPS:
                 squared = graph.op("Mul", step, step, name=f"step{k}_squared")
-                iterate = graph.op("Mul", iterate, squared, name=f"half_kept{k}")
+                iterate = graph.op("Mul", iterate, squared, name=f"iterate{k}")
         return graph.op("Sub", factor, one, name="more")
 
     def outwards(self, points: str, excess: str, levers: str) -> str:

@@ -57,7 +57,7 @@ class RestConstants:
         """The constant ``name``, [N, C] or [N], as [*shape, N]."""
         graph = self._graph
         rows = graph.reshape(self[name], (self._shapes[name][0], -1), f"rest/{name}_rows")
-        columns = graph.op("Transpose", rows, name=f"rest/{name}_turned", perm=[1, 0])
+        columns = graph.op("Transpose", rows, name=f"rest/{name}_columns", perm=[1, 0])
         return graph.reshape(columns, (*shape, -1), f"rest/{name}_by_component")
 
     def to_outputs(self) -> None:
@@ -88,7 +88,7 @@ class RestConstants:
             if len(entries) == 0:  # one joint, or all alike
                 return graph.reshape(graph.filled("zeros", (flat.size,), 0.0), weights.shape, "log_template")
             indices = graph.packed("steps", np.diff(entries, prepend=0))
-            indices = graph.op("CumSum", indices, graph.constant("step_axis", np.int64(0)), name="places")
+            indices = graph.op("CumSum", indices, graph.constant("step_axis", np.int64(0)), name="indices")
             values = graph.stored("log_weights", flat[entries], storage)
             zeros = graph.filled("zeros", (flat.size,), 0.0)
             filled = graph.op("ScatterElements", zeros, indices, values, name="filled", axis=0)
