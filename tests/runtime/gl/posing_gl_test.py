@@ -132,7 +132,7 @@ def test_projection_is_the_cpus(device, width, height, eye):
     order = _drawn(projected)
     both = np.intersect1d(order, expected.order)
     assert len(both) >= (1 - EDGE) * max(len(order), len(expected.order)) - 2
-    places, shapes = _rows(projected.places, 2500)[both], _rows(projected.shapes, 2500)[both]
+    places, shapes = _rows(projected.positions, 2500)[both], _rows(projected.shapes, 2500)[both]
     centres, (shear, fall_y, fall_x, peak) = expected.centers[both], expected.shapes[both].T
     size = np.maximum(np.abs(centres).max(1, initial=0), 512) / 512
     from_middle = centres - [width / 2, height / 2]
