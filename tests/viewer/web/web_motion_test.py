@@ -36,8 +36,9 @@ _READER = """
 import { readFileSync } from "node:fs";
 import { createInterface } from "node:readline";
 const source = process.argv[1];
+const rooms = ["motion/motion", "files/motion_files", "files/npz"];
 const [{ fitMotion }, { readMotionFile }, { Npz }] =
-    await Promise.all(["motion/motion", "files/motion_files", "files/npz"].map((name) => import(`${source}/${name}.js`)));
+    await Promise.all(rooms.map((name) => import(`${source}/${name}.js`)));
 const attempt = (read) => { try { return read(); } catch (error) { return { refused: error.message }; } };
 const members = (bytes, file, kind) => {
     const archive = new Npz(bytes, file, "motion");

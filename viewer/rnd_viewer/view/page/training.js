@@ -14,7 +14,7 @@ function show(run) {
   const percent = Math.floor(100 * run.done / run.total);
   document.title = `${run.ended ?? `${percent} %`} · ${run.name}`;
   $("title").textContent = run.name;
-  $("subtitle").textContent = run.phase ?? "";
+  $("subtitle").textContent = run.ended === "stopped" ? "stopped; rnd-train --resume continues" : run.ended ?? run.phase ?? "";
   $("progress").value = run.done / run.total;
   rows({
     step: `${run.done} of ${run.total}`,
@@ -31,8 +31,7 @@ function show(run) {
   $("step").max = Math.max(previews.length - 1, 0);
   if (latest) $("step").value = $("step").max;
   showPreview();
-  say(run.ended ? { finished: "finished", stopped: "stopped; rnd-train --resume continues" }[run.ended] ?? run.ended
-    : run.done ? "" : `${run.phase ?? "waiting for the first step"} …`);
+  say(run.done || run.ended ? "" : `${run.phase ?? "waiting for the first step"} …`);
 }
 
 function rows(facts) {
