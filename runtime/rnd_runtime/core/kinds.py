@@ -21,7 +21,6 @@ _NAMES = {
     "image": "an image",
     "light": "a light probe (.exr or .hdr)",
     "motion": "a motion",
-    "ONNX model": "another ONNX model",
     "run": "a run's folder",
     "video": "a video",
 }
