@@ -197,7 +197,7 @@ def test_capture_has_its_splits(capture: Capture) -> None:
     assert capture.motion.fps == 30.0
 
 
-def test_capture_turns_the_person_once_around(capture: Capture) -> None:
+def test_the_person_rotates_once(capture: Capture) -> None:
     heading = capture.motion.rotations[[f.frame for f in capture.split("train")], 0, :, 2]
     yaw = np.unwrap(np.arctan2(heading[:, 0], heading[:, 2]))
     assert np.degrees(yaw.max() - yaw.min()) >= 360
@@ -228,10 +228,10 @@ def test_normals_face_the_camera(capture: Capture) -> None:
                 assert (normals[covered][:, 2] < 0).mean() > 0.99, frame
                 np.testing.assert_allclose(np.linalg.norm(normals[covered], axis=1), 1.0, atol=1e-3)
         errors.append(covered.mean())
-    assert 0.05 < np.mean(errors) < 0.25  # the person fills the picture, not more
+    assert 0.05 < np.mean(errors) < 0.25  # the person fills the image, not more
 
 
-def test_pictures_are_exposed_as_promised(capture: Capture) -> None:
+def test_images_are_exposed_as_promised(capture: Capture) -> None:
     for frame in capture.split("train")[::5]:
         images = capture.load_frame(frame)
         covered = images.mask > 0.5
@@ -243,27 +243,27 @@ def test_pictures_are_exposed_as_promised(capture: Capture) -> None:
 
 @pytest.mark.parametrize("split", ["novel_view", "novel_pose", "relight"])
 def test_light_camera_and_normals_agree(capture: Capture, split: Split) -> None:
-    """Albedo × unshadowed irradiance explains every picture better than with the light turned or mirrored.
+    """Albedo × unshadowed irradiance explains every image better than with the light rotated or mirrored.
 
     Cast shadows keep the correlation from being higher; the studio's boxes stand nearly symmetrically.
     """
     margins = []
     for frame in capture.split(split):
         right = _explained(capture, frame, np.eye(3))
-        turns = [axis_angle_to_matrix([0.0, np.radians(angle), 0.0]) for angle in (90, 180, 270)]
-        wrong = max(_explained(capture, frame, turn) for turn in [*turns, MIRROR_X, MIRROR_Z])
+        rotations = [axis_angle_to_matrix([0.0, np.radians(angle), 0.0]) for angle in (90, 180, 270)]
+        wrong = max(_explained(capture, frame, rotation) for rotation in [*rotations, MIRROR_X, MIRROR_Z])
         assert right > max(wrong, 0.5), frame.image
         margins.append(right - wrong)
     assert np.mean(margins) > 0.15
 
 
-def _explained(capture: Capture, frame: Frame, turn: np.ndarray) -> float:
-    """Correlation of the picture's shading with unshadowed irradiance of the light turned by ``turn``."""
+def _explained(capture: Capture, frame: Frame, rotation: np.ndarray) -> float:
+    """Correlation of the image's shading with unshadowed irradiance of the light rotated by ``rotation``."""
     images, light = capture.load_frame(frame), capture.load_light(frame.light or "")
     covered = images.mask > 0.99
     assert images.normal_gt is not None and images.albedo_srgb is not None
     normals = images.normal_gt[covered] @ capture.cameras[frame.camera].world_to_camera[:3, :3]
-    directions = texel_directions(16, 32).reshape(-1, 3) @ turn.T
+    directions = texel_directions(16, 32).reshape(-1, 3) @ rotation.T
     power = (downsize(light.radiance, 16, 32) @ LUMINANCE * texel_solid_angles(16, 32)).reshape(-1)
     predicted = np.maximum(normals @ directions.T, 0) @ power
     albedo = np.maximum(srgb_to_linear(images.albedo_srgb[covered]) @ LUMINANCE, 0.02)
