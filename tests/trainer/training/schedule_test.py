@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from rnd_trainer.config import from_dict, preset, to_dict
+from rnd_trainer.config import preset
 from rnd_trainer.training.schedule import Schedule
 
 
@@ -22,12 +22,6 @@ def test_rates_stay_high_until_the_last_steps_and_never_rise(name) -> None:
     third = [schedule.decay(step) for step in range(steps, schedule.total)]
     assert third[0] == 1 and third == sorted(third, reverse=True)
     assert third[-1] == pytest.approx(0.1, rel=0.02)
-
-
-def test_rates_of_a_configuration_from_before_fall_to_a_tenth() -> None:
-    before = {name: value for name, value in to_dict(preset("standard")).items() if not name.startswith("rate_")}
-    schedule = Schedule(from_dict(before))
-    assert [schedule.decay(step) for step in (0, 3000)] == pytest.approx([1, 0.1**0.5])
 
 
 def test_rates_may_fall_without_an_end_of_their_own() -> None:
