@@ -134,13 +134,13 @@ def _export(options: Options) -> None:
         what = BoundedSearch(Bound(kind, value), flag(BOUNDS[kind]), motion, **search)  # type: ignore[arg-type]
         finish(out, export_bounded(checkpoint, out, what, show=show, warn=_log_all), then=play)
         return
-    error = export(checkpoint, out, motion, Variant(**dataclasses.asdict(options.reduction)), cull=options.cull)
+    parity = export(checkpoint, out, motion, Variant(**dataclasses.asdict(options.reduction)), cull=options.cull)
     cull = advice_of(out).cull
     summary = (
-        f"{out.stat().st_size / 1e6:.2f} MB; against torch over {error.frames} frames: "
-        f"weights {error.weights:.1e}, positions {1e3 * error.position_m:.4f} mm, "
-        f"99 % within {1e3 * error.position_p99_m:.4f} mm, "
-        f"normals {error.normal:.1e}, visibility {error.visibility:.1e}; "
+        f"{out.stat().st_size / 1e6:.2f} MB; against torch over {parity.frames} frames: "
+        f"weights {parity.weights:.1e}, positions {1e3 * parity.position_m:.4f} mm, "
+        f"99 % within {1e3 * parity.position_p99_m:.4f} mm, "
+        f"normals {parity.normal:.1e}, visibility {parity.visibility:.1e}; "
         + ("players draw all of it" if cull is None else f"players leave out what faces away (n·v < {cull:g})")
     )
     finish(out, summary, then=play)

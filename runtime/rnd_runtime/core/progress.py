@@ -46,7 +46,8 @@ class Progress:
             )
             self._bar = Bar(*columns, console=console, speed_estimate_period=_WINDOW)
             self._task = self._bar.add_task("", total=None, state="", visible=False)
-        self._name, self._total = "", None
+        self._name = ""
+        self._total: float | None = None
         self._seen: deque[tuple[float, float]] = deque()
         self._next = 0.0
 

@@ -61,7 +61,8 @@ def ambient_visibility(gaussians: Gaussians) -> Floats32:
     """(1/π) ∫ v(ω) max(n·ω, 0) dω [N], clipped to [0, 1]: the share of a uniform sky's irradiance that arrives."""
     normals_root = gaussians.normals @ gaussians.root_rotation
     lobe = sh_basis(normals_root) * COSINE_LOBE
-    return np.clip((gaussians.visibility * lobe).sum(axis=1), 0, 1)
+    share: Floats32 = np.clip((gaussians.visibility * lobe).sum(axis=1), 0, 1)
+    return share
 
 
 def aov_layers(names: Sequence[str], raster: Raster, first: int) -> dict[str, Floats32]:
@@ -82,9 +83,9 @@ def aov_values(name: str, splatted: Floats32, alpha: Floats32) -> Floats32:
     if name == "albedo":
         return splatted
     covered = alpha >= MIN_COVERAGE
-    mean = np.where(covered, 1 / np.where(covered, alpha, 1), 0).astype(np.float32)[..., None] * splatted
+    mean: Floats32 = np.where(covered, 1 / np.where(covered, alpha, 1), 0).astype(np.float32)[..., None] * splatted
     if name == "normal":
-        return mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-6)
+        mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), np.float32(1e-6))
     return mean
 
 
