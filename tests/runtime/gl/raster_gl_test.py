@@ -129,6 +129,14 @@ def test_a_camera_inside_the_cloud(rasterize, eye):
     _assert_close(rasterize(*scene, camera), raster_oracle.rasterize(*scene, camera), EXACT)
 
 
+def test_off_centre_principal_point(rasterize):
+    scene, camera = _scene(), _camera()
+    shifted = Camera(96, 64, camera.K + np.array([[0, 0, 61.3], [0, 7.5, -40.2], [0, 0, 0]]), camera.world_to_camera)
+    expected = raster_oracle.rasterize(*scene, shifted)
+    assert expected.alpha.max() > 0.3
+    _assert_close(rasterize(*scene, shifted), expected, EXACT)
+
+
 @pytest.mark.parametrize("enlarged", [1e2, 1e4, 1e8, 1e16, 1e30])
 def test_huge_ellipses_are_clipped_not_lost(rasterize, enlarged):
     means, covariances, opacities, features = _scene(60)
