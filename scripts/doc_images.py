@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rnd_viewer.play.player import Player
 
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
@@ -21,7 +20,7 @@ from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light, load_light
-from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.background import Backdrop, Background
 
 ROOT = Path(__file__).parent.parent
 SIDE, TIME_S = 400, 0.55
@@ -64,8 +63,9 @@ def _strip(avatar: Avatar, walk: Motion, sky: Light) -> None:
     tiles = []
     for k in range(6):
         light = replace(sky, yaw=math.radians(50 * k - 20))
-        player = Player(FrameRenderer(avatar, light), Background("hdr"))
-        tiles.append(player.render(walk, TIME_S + CYCLE_S * k / 6, orbit(0, (k - 2) / 6)).srgb)
+        camera = orbit(0, (k - 2) / 6)
+        frame = FrameRenderer(avatar, light, camera).render(walk, TIME_S + CYCLE_S * k / 6)
+        tiles.append(Backdrop(Background("hdr")).behind(frame, camera, light).srgb)
     write_image(ROOT / "assets/bench/demo.png", np.ascontiguousarray(np.concatenate(tiles, axis=1)))
 
 

@@ -150,7 +150,7 @@ def _error(line: str) -> None:
 
 
 def _default_hint(default: str) -> str:
-    return "" if default in ("", "None", "False") else f"(default: {default})"
+    return "" if default in ("", "''", "None", "False") else f"(default: {default})"
 
 
 def option(metavar: str | None = None, **settings: Any) -> Any:

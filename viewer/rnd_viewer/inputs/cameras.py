@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.command import MAX_SIDE
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.playback.framing import CameraPath
-
-from .options import LARGEST_SIDE
 
 Floats = NDArray[np.float64]
 
@@ -29,9 +28,9 @@ class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
     world_to_camera: list[list[float]]
 
     def camera(self, file: Path) -> Camera:
-        if max(self.width, self.height) > LARGEST_SIDE:
+        if max(self.width, self.height) > MAX_SIDE:
             got = f"{self.width} x {self.height}"
-            raise InputError("camera size", expected=f"at most {LARGEST_SIDE} a side", got=got, file=file)
+            raise InputError("camera size", expected=f"at most {MAX_SIDE} a side", got=got, file=file)
         try:
             return Camera(self.width, self.height, np.array(self.K), np.array(self.world_to_camera))
         except InputError as error:

@@ -1,14 +1,25 @@
-"""The options of ``rnd-play``, and those that it shares; each comment is the option's help."""
+"""The options of ``rnd-play``, and those that other commands share; each comment is the option's help."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from rnd_runtime.core.command import (
+    Flag,
+    Number,
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalNumber,
+    OptionalSize,
+    group,
+    option,
+)
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.motion.edit import EDIT_LIMITS, MotionEdits, edit_motion
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
@@ -21,33 +32,27 @@ if TYPE_CHECKING:
 
 _EDITS = tuple(edit.name for edit in fields(MotionEdits))  # each of them an option of the same name
 OWN_CAMERAS = ("front", "orbit")
-LARGEST_SIDE = 16384  # pixels: GL's usual limit, and a typo beyond it would fill the memory
-
-
-# Help without "{None}|PATH" and "(default: None)": the text says what happens when an option is left out.
-def option(metavar: str) -> Any:
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionOptions:
-    """How a motion's file is read, and what is done to the motion before it is played."""
+    """How the motion's file is read and edited."""
 
-    motion_up: Literal["auto", "y", "z"] = "auto"
-    """Which axis points up in the motion's file."""
-    motion_fps: Annotated[float | None, option("FLOAT")] = None
-    """Frames per second of the motion's recording, whatever its file says. Default: the file's, else what its
-    program records: 60 for an .npz, 30 for WHAM and its like, 120 for an .amc."""
-    joint_map: Annotated[Path | None, option("FILE")] = None
-    """TOML or JSON file with the avatar's joints and what the motion calls them, for names we do not know."""
+    motion_up: Annotated[Literal["auto", "y", "z"], option()] = "auto"
+    """Up axis of the motion's file."""
+    motion_fps: OptionalNumber = None
+    """Frames per second of the motion's recording, whatever its file says. Default: the file's, else what its program
+    records: 60 for an .npz, 30 for WHAM and its like, 120 for an .amc."""
+    joint_map: OptionalFile = None
+    """TOML or JSON file with the avatar's joints and their names in the motion, where those are unknown."""
     smooth: Annotated[float | None, option("HZ")] = None
-    """Take jitter out of the motion: a One-Euro filter of this cutoff, 1 to 5; lower is smoother."""
-    speed: float = 1.0
-    """How many times as fast the motion is played."""
-    in_place: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Hold the motion's root over the place where it begins."""
-    loop: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Blend the motion's end into its beginning, so that the clip can be repeated."""
+    """Smooth jitter by a One-Euro filter of this cutoff, 1 to 5; lower is smoother."""
+    speed: Number = 1.0
+    """Playback speed."""
+    in_place: Flag = False
+    """Keep the root above its first position."""
+    loop: Flag = False
+    """Blend the motion's end into its beginning, for a clip that repeats."""
 
     @property
     def edits(self) -> MotionEdits:
@@ -55,22 +60,14 @@ class MotionOptions:
         return MotionEdits(**{name: getattr(self, name) for name in _EDITS})
 
     def read_motion(self, path: Path, skeleton: Skeleton) -> Motion:
-        """The motion in ``path`` for ``skeleton``, edited.
-
-        Raises:
-            InputError: for whatever cannot be used.
-        """
+        """Read and edit the motion in ``path`` for ``skeleton``. Raises ``InputError``."""
         from rnd_runtime.motion.motion import load_motion  # loads numba, which run_command prepares for
 
         motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
         return edit_motion(motion, self.edits)
 
     def refuse_unread(self, why: str, *, edited: bool = False) -> None:
-        """Refuse what is said of a motion's file where none is given, and ``why``; edits too unless one is ``edited``.
-
-        Raises:
-            InputError: for an option that would do nothing.
-        """
+        """Raise ``InputError`` for options of a motion's file where none is given; edits too unless one is edited."""
         names = (field.name for field in fields(MotionOptions))
         refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 
@@ -80,10 +77,10 @@ class MotionOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LitOptions(MotionOptions):
-    """Those of a command that lights what moves by probes, which its ``hdr`` names."""
+    """Those of a command with ``hdr``, a light probe or several."""
 
-    hdr_up: Up = "y"
-    """Which axis points up in the probe's file."""
+    hdr_up: Annotated[Up, option()] = "y"
+    """Up axis of the probe's file."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,109 +89,117 @@ class LitOptions(MotionOptions):
 
 
 @dataclass(frozen=True)
-class PlayOptions(LitOptions):
-    """Animate, relight and splat an avatar, with no GPU and no display needed.
+class _Camera:
+    """The view: a camera that shows the whole motion, or one from a file."""
+
+    camera: Annotated[str, option("front|orbit|FILE.json[:NAME]")] = "front"
+    """FILE.json holds one camera {"width": px, "height": px, "K": 3x3, "world_to_camera": 4x4} (OpenCV axes, metres),
+    or {"cameras": [one for each frame]}, or {"cameras": {NAME: camera}} as a capture's capture.json."""
+    orbit_seconds: Number = 8.0
+    """Duration of one orbit; negative orbits the other way."""
+    distance: OptionalNumber = None
+    """Metres from the motion's centre to the camera. Default: the least that shows all of it."""
+    elevation: Number = ELEVATION
+    """Degrees above the horizon."""
+    fov: Number = FIELD_OF_VIEW
+    """Vertical field of view in degrees."""
+
+    def __post_init__(self) -> None:
+        limits = {"orbit_seconds": (-1e6, 1e6), "distance": (1e-3, 1e4), "elevation": (-89, 89), "fov": (1, 170)}
+        refuse_outside(self, limits)
+        check_option(self.orbit_seconds != 0, "--orbit-seconds", "not 0", 0)
+        if self.camera != "orbit":
+            refuse_changed(self, ["orbit_seconds"], "needs --camera orbit")
+        if self.camera not in OWN_CAMERAS:
+            refuse_changed(self, ["distance", "elevation", "fov"], "the camera's file has its pose")
+
+
+@dataclass(frozen=True)
+class _Lighting:
+    """The light, the probe of --hdr or the learned one, and the background."""
+
+    hdr_up: Annotated[Up, option()] = "y"
+    """Up axis of the probe's file."""
+    hdr_yaw: Number = 0.0
+    """Degrees by which the light is rotated about the vertical axis, from +X towards +Z."""
+    hdr_turn: Annotated[float | None, option("SECONDS")] = None
+    """Duration of one rotation of the light, from --hdr-yaw on; negative rotates the other way. Default: none."""
+    exposure: Number = 0.0
+    """Stops by which the light is made brighter."""
+    background: Annotated[str, option("none|hdr|COLOUR")] = "none"
+    """none is transparent; hdr is the light itself; a COLOUR is #rgb, #rrggbb or a name such as red (sRGB), or r,g,b
+    (linear radiance)."""
+
+    def __post_init__(self) -> None:
+        refuse_outside(self, {"hdr_yaw": (-1e6, 1e6), "hdr_turn": (-1e6, 1e6), "exposure": (-30, 30)})
+        check_option(self.hdr_turn != 0, "--hdr-turn", "not 0", 0)
+
+
+@dataclass(frozen=True)
+class _Rendering:
+    """Speed against fidelity."""
+
+    shade: Annotated[str, option("ao|table|table+sun|lights:K|brute")] = "table+sun"
+    """Shading, fastest first: ao, table, table+sun (the only one with hard shadows of the sun), K of 1 to 8192
+    directional lights, brute (every texel of the probe, shadows as soft as they were learned)."""
+    cull: Annotated[float | None, option("COSINE")] = None
+    """Leave out Gaussians that face away: those whose normal has less than this cosine to the view; -1 renders all.
+    Default: what rnd-export found to be invisible, which saves 10 to 20 % of a frame."""
+    raster: Annotated[Literal["auto", "gl", "cpu"], option()] = "auto"
+    """Rasteriser: auto takes OpenGL on a graphics card and the CPU otherwise."""
+    threads: OptionalCount = None
+    """CPU threads. Default: all."""
+
+    def __post_init__(self) -> None:
+        check_cull(self.cull)
+
+
+@dataclass(frozen=True)
+class PlayOptions:
+    """Animate, relight and splat an avatar to frames and clips, with no GPU and no display needed.
 
     rnd-play avatar.onnx --motion walk.npz --hdr sky.exr --out out/
     """
 
     avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
-    """The avatar, a file that rnd-export wrote."""
-    motion: Annotated[Path | None, option("FILE")] = None
+    """The avatar, a file of rnd-export."""
+    motion: OptionalFile = None
     """Body poses over time: .npz of AMASS, SMPL or EasyMocap (or its folder), .pkl of AIST++, WHAM or 4D-Humans, .pt of
     GVHMR, .npy of MDM, .bvh, or .amc with its .asf beside it."""
-    hdr: Annotated[Path | None, option("FILE")] = None
-    """Light probe, lat-long EXR or HDR. Default: the light the avatar was captured under."""
-    out: Annotated[Path | None, option("FOLDER")] = None
-    """Folder for frames/, frames_exr/, aov/, play.mp4, play.webp and play.json."""
-
-    size: Annotated[str | None, option("N|WxH")] = None
-    """Picture size: N or WIDTHxHEIGHT pixels. Default: 512, or the camera file's own size."""
-    fps: Annotated[float | None, option("FLOAT")] = None
+    hdr: OptionalFile = None
+    """Light probe, lat-long EXR or HDR. Default: the light of the avatar's capture."""
+    out: OptionalFolder = None
+    """Folder for frames/, frames_exr/, aov/, play.mp4, play.webp and play.json. One that holds frames of anything but
+    this run is refused."""
+    size: OptionalSize = None
+    """Size of a frame in pixels; also 720p, 1080p. Default: 512, or the camera file's own."""
+    fps: OptionalNumber = None
     """Frames per second. Default: the motion's."""
     frames: Annotated[str | None, option("START:END")] = None
-    """Frames to render, END excluded, either may be missing; same pixels as in the whole run, and processes with
+    """Frames to render, END excluded, either may be missing. Pixels are those of the whole run; processes with
     different parts may share a folder. Default: all."""
     format: Annotated[str | None, option("LIST")] = None
-    """Some of png,exr,mp4,webp; webp moves too, and is transparent where png is. Default: png, and mp4 where PyAV is
+    """Some of png,exr,mp4,webp. A webp is a clip too, transparent where a png is. Default: png, and mp4 where PyAV is
     installed."""
-
-    camera: str = "front"
-    """front, orbit, FILE.json or FILE.json:NAME. The first two frame the whole motion."""
-    orbit_seconds: float = 8.0
-    """Time of one turn of --camera orbit, in seconds; negative turns the other way."""
-    distance: Annotated[float | None, option("FLOAT")] = None
-    """Metres from the middle of the motion to the camera. Default: the least that shows all."""
-    elevation: float = ELEVATION
-    """Degrees by which the camera stands above the horizon."""
-    fov: float = FIELD_OF_VIEW
-    """Vertical field of view in degrees."""
-
-    hdr_yaw: float = 0.0
-    """Turn the light about the vertical axis, in degrees; positive from +X towards +Z."""
-    hdr_turn: Annotated[float | None, option("SECONDS")] = None
-    """Time in which the light turns once, from --hdr-yaw on; negative turns the other way. Default: it stands still."""
-    exposure: float = 0.0
-    """Stops by which the light is made brighter."""
-    background: str = "none"
-    """none (transparent), hdr, #rrggbb (sRGB) or r,g,b (linear radiance)."""
-    shade: str = "table+sun"
-    """Shading: ao (fastest), table, table+sun (the only one with hard sun shadows), lights:K of 1 to 8192
-    lights, brute (every texel of the map, shadows as soft as the avatar learned them)."""
-    cull: Annotated[float | None, option("COSINE")] = None
-    """Leave out what faces away: Gaussians whose normal has less than this cosine to the view; -1 draws all. Default:
-    what rnd-export found not to show, which saves a tenth to a fifth of a frame."""
-
     aov: Annotated[str, option("LIST")] = ""
-    """Also write some of albedo,normal,roughness,visibility,depth. Normals in the camera's OpenCV axes."""
-    raster: Literal["auto", "gl", "cpu"] = "auto"
-    """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
-
-    threads: Annotated[int | None, option("INT")] = None
-    """CPU threads. Default: all."""
-    fps_floor: Annotated[float | None, option("FLOAT")] = None
-    """Frames per second to hold by shading less often, then at a lower resolution, rather than by dropping frames:
-    what is given up depends on the machine, so two runs may differ."""
-    pipeline: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True
-    """Encode the next frame and write the last while one is drawn; --no-pipeline does one after the other."""
-    doctor: Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")] = False
-    """Print renderer, providers, threads, versions and what to install for what is missing."""
+    """Also write some of albedo,normal,roughness,visibility,depth. Normals are in the camera's OpenCV axes."""
+    doctor: Flag = False
+    """Print renderer, providers, threads and versions, and what to install for what is missing."""
+    reading: Annotated[MotionOptions, *group("motion")] = field(default_factory=MotionOptions)
+    view: Annotated[_Camera, *group("camera")] = field(default_factory=_Camera)
+    lighting: Annotated[_Lighting, *group("light")] = field(default_factory=_Lighting)
+    rendering: Annotated[_Rendering, *group("rendering")] = field(default_factory=_Rendering)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        limits = {
-            "fps": (1e-3, 1000),
-            "fps_floor": (1e-3, 1000),
-            "orbit_seconds": (-1e6, 1e6),
-            "distance": (1e-3, 1e4),
-            "elevation": (-89, 89),
-            "fov": (1, 170),
-            "hdr_yaw": (-1e6, 1e6),
-            "hdr_turn": (-1e6, 1e6),
-            "exposure": (-30, 30),
-        }
-        refuse_outside(self, limits)
-        check_cull(self.cull)
-        for name in ("orbit_seconds", "hdr_turn"):
-            check_option(getattr(self, name) != 0, flag(name), "not 0", 0)
-        if self.camera != "orbit":
-            refuse_changed(self, ["orbit_seconds"], "needs --camera orbit")
-        if self.camera not in OWN_CAMERAS:
-            refuse_changed(self, ["distance", "elevation", "fov"], "the camera's file says where it stands")
-        if self.fps_floor is not None and self.aov:
-            hint = "AOVs are drawn at full quality"
-            raise InputError("--fps-floor", expected="no --aov beside it", got=self.aov, hint=hint)
+        refuse_outside(self, {"fps": (1e-3, 1000)})
+        if self.hdr is None:
+            refuse_changed(self.lighting, ["hdr_up"], "needs --hdr")
 
-
-def parse_size(text: str | None) -> tuple[int, int | None] | None:
-    """``512`` → (512, None); ``640x480`` → (640, 480); None stays None."""
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d{1,6})(?:x(\d{1,6}))?", text)
-    sides = [int(side) for side in match.groups() if side] if match else [0]
-    if not all(1 <= side <= LARGEST_SIDE for side in sides):
-        raise InputError("--size", expected=f"N or WxH, 1 to {LARGEST_SIDE}", got=text)
-    return sides[0], sides[1] if len(sides) > 1 else None
+    def settings(self) -> dict[str, Any]:
+        """All options in one mapping: name → value."""
+        groups = {"reading", "view", "lighting", "rendering"}
+        flat = {name: value for name, value in vars(self).items() if name not in groups}
+        return flat | {name: value for each in sorted(groups) for name, value in vars(getattr(self, each)).items()}
 
 
 def parse_frames(text: str | None, count: int) -> range:
@@ -202,5 +207,5 @@ def parse_frames(text: str | None, count: int) -> range:
     match = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text if text is not None else ":")
     start, end = (int(match[1] or 0), int(match[2] or count)) if match else (0, 0)
     if not 0 <= start < end <= count:
-        raise InputError("--frames", expected=f"START:END within 0:{count}, START before END", got=text)
+        raise InputError(flag("frames"), expected=f"START:END within 0:{count}, START before END", got=text)
     return range(start, end)

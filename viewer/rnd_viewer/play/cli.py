@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import tyro
-
-from rnd_runtime.core.command import parse_options, run_command
+from rnd_runtime.core.command import parse, run_command, show
 from rnd_runtime.playback.start import load_ahead
 from rnd_viewer.inputs.options import PlayOptions
 
@@ -16,24 +14,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 when all frames are written, 2 for unusable input (one line on stderr), 130 after Ctrl-C.
     """
+    return run_command("rnd-play", lambda: _play(parse(PlayOptions, "rnd-play", arguments)))
 
-    def command() -> int:
-        options = parse_options(lambda: tyro.cli(PlayOptions, prog="rnd-play", args=arguments))
-        if options.doctor:
-            return _doctor()
-        ahead = load_ahead(options.avatar, options.threads)
-        from .play import play  # here, so that --help and --doctor work where a library does not load
 
-        return play(options, ahead)
+def _play(options: PlayOptions) -> int:
+    if options.doctor:
+        return _doctor()
+    ahead = load_ahead(options.avatar, options.rendering.threads)
+    from .play import play  # here, so that --help and --doctor work where a library does not load
 
-    return run_command("rnd-play", command)
+    return play(options, ahead)
 
 
 def _doctor() -> int:
     from rnd_runtime.playback.doctor import report
-    from rnd_viewer.inputs.console import print_findings
 
     from .video import finding
 
-    print_findings([*report(), finding()])
+    for found in [*report(), finding()]:
+        show(f"{found.label:<14} {found.value}")
+        if found.advice is not None:
+            show(f"{'':<14} → {found.advice}")
     return 0

@@ -1,7 +1,6 @@
-"""Overlapping the stages of consecutive frames: while one is drawn, the next is encoded and the last is written.
+"""Overlap the stages of consecutive frames: while one is drawn, the next is encoded and the last is written.
 
-onnxruntime, the compiled kernels and the writers all let go of Python's lock, so three threads fill the gaps in which a
-stage keeps one core busy. What comes out, and in which order, is what one thread would make.
+onnxruntime, the compiled kernels and the writers release Python's lock. Results and order are those of one thread.
 """
 
 from __future__ import annotations
@@ -14,8 +13,7 @@ from typing import TypeVar
 Encoded = TypeVar("Encoded")
 Drawn = TypeVar("Drawn")
 
-_AHEAD = 1  # frames encoded before they are drawn: more would only delay them
-_BEHIND = 2  # frames drawn and not yet written: what they hold is memory
+_BEHIND = 2  # frames drawn and not yet written: each takes memory
 
 
 def run(
@@ -23,32 +21,19 @@ def run(
     encode: Callable[[int], Encoded],
     draw: Callable[[int, Encoded], Drawn],
     write: Callable[[int, Drawn], None],
-    *,
-    overlap: bool = True,
 ) -> Iterator[int]:
     """Take each of ``frames`` through the three stages and yield its number once it is drawn.
 
     Drawing stays in the caller's thread, where its OpenGL context lives; each stage sees the frames in order. When a
     stage raises, or the caller stops, frames that were drawn before are still written, and the exception goes on.
     """
-    if not overlap:
-        for number in frames:
-            write(number, draw(number, encode(number)))
-            yield number
-        return
-    numbers = iter(frames)
     with ThreadPoolExecutor(1, "encode") as encoder, _writer(write) as submit:
-        waiting: list[tuple[int, Future[Encoded]]] = []
-
-        def fill() -> None:
-            while len(waiting) < _AHEAD and (number := next(numbers, None)) is not None:
-                waiting.append((number, encoder.submit(encode, number)))
-
-        fill()
+        encodings = ((number, encoder.submit(encode, number)) for number in frames)  # one ahead: more add latency
+        waiting = next(encodings, None)
         while waiting:
-            number, encoded = waiting.pop(0)
+            number, encoded = waiting
             values = encoded.result()
-            fill()
+            waiting = next(encodings, None)
             submit(number, draw(number, values))
             yield number
 

@@ -3,51 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from rnd_runtime import __version__
 from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.command import finish, is_quiet, log, size_text, warn
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import is_folder, output_folder
+from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
+from rnd_runtime.core.progress import track
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, frame_motion, front_path, orbit_path
 from rnd_runtime.shading.light import light_notes
-from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.cameras import file_path, split_camera
-from rnd_viewer.inputs.console import FRAME, LATENCY, print_summary, tell, warn, with_progress
 from rnd_viewer.inputs.lights import chosen_light
-from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames, parse_size
-from rnd_viewer.view.governor import Governor
+from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames
 
 from .pipeline import run
-from .player import Player
-from .run_folder import claim, is_of_a_run, part_name
+from .run_folder import is_of_a_run, mark_of, part_name, refuse_others
 from .timing import StageTimes
 from .video import clip_notes
-from .writers import frame_writer, parse_formats, tone_map_for, write_report
+from .writers import frame_writer, parse_formats, tone_map_for
 
-DEFAULT_SIZE = 512
-OWN_TO_A_PROCESS = (
-    "frames",
-    "threads",
-    "format",
-    "pipeline",
-    "raster",
-)  # options that do not tell one run from another
-FILES = ("avatar", "motion", "hdr", "joint_map")  # a run goes by what they are, however their paths are spelt
+FRAME = "frame to frame"
+LATENCY = "pose to pixels"
+_DEFAULT_SIZE = 512, None
+_OWN_TO_A_PROCESS = {"frames", "threads", "format", "raster"}  # options that may differ between parts of a run
+_FILES = {"avatar", "motion", "hdr", "joint_map"}  # a run is identified by their content
 
 
 def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
@@ -59,39 +55,41 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
     Raises:
         InputError: for whatever cannot be used; what was finished before stays.
     """
-    played = _Run.of(options, ahead)
-    for note in played.notes:
+    playing = _Run.of(options, ahead)
+    for note in playing.notes:
         warn(note)
-    seconds = played.render()
-    for note in played.afterthoughts():
-        played.note(note)
-    played.report(seconds)
+    seconds = playing.render()
+    if not playing.in_view:
+        playing.notes.append("nothing of the avatar is in view in any of these frames")
+        warn(playing.notes[-1])
+    playing.report(seconds)
     return 0
 
 
-class _Turn(NamedTuple):
-    """A frame that is encoded and waits to be drawn; ``asked`` is when its turn began, both in seconds."""
+class _Pending(NamedTuple):
+    """An encoded frame; ``asked`` is when its encoding began, in seconds."""
 
     asked: float
-    encoding: float
     encoded: Encoded
 
 
 @dataclass(eq=False)
 class _Run:
-    """What ``rnd-play`` was asked for, with everything loaded, and what is learnt on the way.
+    """A run with everything loaded.
 
     Attributes:
+        mark: of the folder.
         frames: those that this process renders, out of ``count``; frame k shows the motion at k / ``fps`` seconds.
-        notes: what the inputs' readers found, and what the run itself has to say.
-        qualities: of every frame that was drawn, in turn.
-        in_view: whether anything of the avatar was seen yet.
+        notes: of the inputs' readers and of the run.
+        in_view: whether a frame has shown anything of the avatar yet.
     """
 
     options: PlayOptions
-    out: Path
+    mark: Path
     formats: tuple[str, ...]
-    player: Player
+    aovs: tuple[str, ...]
+    renderer: FrameRenderer
+    backdrop: Backdrop
     motion: Motion
     fps: float
     frames: range
@@ -99,48 +97,61 @@ class _Run:
     framing: Framing
     camera_at: CameraPath
     notes: list[str]
-    governor: Governor | None
-    scales: list[float] = field(default_factory=list)
+    times: StageTimes
     in_view: bool = False
 
     @classmethod
     def of(cls, options: PlayOptions, ahead: Future[Networks] | None) -> _Run:
         """Check the options, the cheap ones first, and load what they name."""
         avatar_file, motion_file, out = _required(options)
-        background, aovs = Background.parse(options.background), parse_aovs(options.aov)
-        formats, size = parse_formats(options.format), parse_size(options.size)
-        set_threads(options.threads)
-
+        lighting, rendering = options.lighting, options.rendering
+        background, aovs, formats = (
+            Background.parse(lighting.background),
+            parse_aovs(options.aov),
+            parse_formats(options.format),
+        )
+        set_threads(rendering.threads)
         times = StageTimes()
         with times.stage("load"):
-            avatar = Avatar.load(avatar_file, threads=options.threads, ahead=ahead)
-            motion = options.read_motion(motion_file, avatar.skeleton)
-            light = chosen_light(avatar, options.hdr, up=options.hdr_up, yaw=options.hdr_yaw, exposure=options.exposure)
+            avatar = Avatar.load(avatar_file, threads=rendering.threads, ahead=ahead)
+            motion = options.reading.read_motion(motion_file, avatar.skeleton)
+            light = chosen_light(
+                avatar, options.hdr, up=lighting.hdr_up, yaw=lighting.hdr_yaw, exposure=lighting.exposure
+            )
+            fps = options.fps or motion.fps
+            count = motion.frames_at(fps)
+            frames = parse_frames(options.frames, count)
+            framing = frame_motion(avatar.skeleton, motion)
+            camera_at = _camera_path(options, framing, frames)
+            inputs = _inputs(options)
+            for path in inputs:
+                if is_of_a_run(path, out):
+                    raise InputError("cannot be an input: runs write such files into --out", file=path)
+            mark = mark_of(out, _common(options), inputs)
+            refuse_others(mark)
             if kernels_are_cold():
-                tell(COMPILING)
-            renderer = FrameRenderer(avatar, light, shade=options.shade, raster=options.raster, cull=options.cull)
-        for path in _inputs(options):
-            if is_of_a_run(path, out):
-                raise InputError("cannot be an input: runs write such files into --out", file=path)
-        player = Player(renderer, background, aovs, times)
-        fps = options.fps or motion.fps
-        count = motion.frames_at(fps)
-        frames = parse_frames(options.frames, count)
-        framing = frame_motion(avatar.skeleton, motion)
+                log(COMPILING)
+            renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
         return cls(
             options=options,
-            out=out,
+            mark=mark,
             formats=formats,
-            player=player,
+            aovs=aovs,
+            renderer=renderer,
+            backdrop=Backdrop(background),
             motion=motion,
             fps=fps,
             frames=frames,
             count=count,
             framing=framing,
-            camera_at=_camera_path(options, size, framing, frames),
+            camera_at=camera_at,
             notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light), *clip_notes(formats, fps)],
-            governor=Governor(options.fps_floor) if options.fps_floor else None,
+            times=times,
         )
+
+    @property
+    def out(self) -> Path:
+        return self.mark.parent
 
     @property
     def name(self) -> str:
@@ -151,71 +162,50 @@ class _Run:
         return self.camera_at(number, number / self.fps)
 
     def render(self) -> float:
-        """Leave every frame in the folder; how many seconds it took."""
-        times, overlap = self.player.times, self.options.pipeline
-        clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=times, begin=self._begin)
-        with self.player.renderer, clips as write:
+        """Write every frame into the folder; seconds that it took."""
+
+        def begin(number: int) -> None:
+            self.mark.touch()  # not before: a run that fails at once leaves the folder as it was
+
+        clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=self.times, begin=begin)
+        with self.renderer, clips as write:
             started = before = perf_counter()
 
-            def put(number: int, drawn: tuple[RenderedFrame, Camera]) -> None:
-                write(number, drawn[0], _reach(self.framing, drawn[1]))
+            def put(number: int, rendered: tuple[RenderedFrame, Camera]) -> None:
+                write(number, rendered[0], _reach(self.framing, rendered[1]))
 
-            for _ in with_progress(self.frames, run(self.frames, self._encode, self._draw, put, overlap=overlap)):
+            for _ in track("rendering", run(self.frames, self._encode, self._draw, put), len(self.frames)):
                 now = perf_counter()
-                times.add(FRAME, now - before)
+                self.times.add(FRAME, now - before)
                 before = now
         return perf_counter() - started
 
-    def _begin(self, number: int) -> None:
-        if number != self.frames.start:
-            return
-        # not before: what fails at once leaves the folder as it was
-        if removed := claim(self.out, _common(self.options), _inputs(self.options)):
-            self.note(f"{removed} files that another run had left in {self.out} were removed")
-
-    def note(self, note: str) -> None:
-        """Say ``note``, here and in the report."""
-        self.notes.append(note)
-        warn(note)
-
-    def _encode(self, number: int) -> _Turn:
+    def _encode(self, number: int) -> _Pending:
         asked = perf_counter()
-        encoded = self.player.encode(self.motion, number / self.fps)
-        return _Turn(asked, perf_counter() - asked, encoded)
+        with self.times.stage("encoders"):
+            return _Pending(asked, self.renderer.avatar.encode(self.motion, number / self.fps))
 
-    def _draw(self, number: int, turn: _Turn) -> tuple[RenderedFrame, Camera]:
-        started = perf_counter()
-        player, camera = self.player, self.camera(number)
-        if self.options.hdr_turn:
-            yaw = math.radians(self.options.hdr_yaw) + math.tau * number / self.fps / self.options.hdr_turn
-            player.renderer.turn(yaw)
-        self.scales.append(self.governor.scale if self.governor else 1.0)
-        frame = player.draw(turn.encoded, camera, self.scales[-1])
+    def _draw(self, number: int, pending: _Pending) -> tuple[RenderedFrame, Camera]:
+        renderer, camera, lighting = self.renderer, self.camera(number), self.options.lighting
+        if lighting.hdr_turn:
+            renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * number / self.fps / lighting.hdr_turn)
+        frame = renderer.draw(pending.encoded, camera, aovs=self.aovs, srgb=False)
+        for stage, seconds in frame.stage_seconds.items():
+            self.times.add(stage, seconds)
+        with self.times.stage("background"):
+            frame = self.backdrop.behind(frame, camera, renderer.light)
         self.in_view = self.in_view or bool(frame.alpha.any())
         if number == 0 and not self.in_view:
             raise _out_of_view(self.framing, camera, number)
-        with player.times.stage("tonemap"):
+        with self.times.stage("tonemap"):
             tone_map_for(self.formats, frame)
-        now = perf_counter()
-        player.times.add(LATENCY, now - turn.asked)
-        if self.governor:
-            drawing = now - started
-            longest = max(turn.encoding, drawing) if self.options.pipeline else turn.encoding + drawing
-            self.governor.observe(longest)
+        self.times.add(LATENCY, perf_counter() - pending.asked)
         return frame, camera
-
-    def afterthoughts(self) -> Iterator[str]:
-        """What can be said of the frames only once they are there."""
-        if lowered := sum(scale < 1 for scale in self.scales):
-            share = f"{lowered} of {len(self.frames)} frames"
-            yield f"{share} at less than full resolution, for {self.options.fps_floor:g} frames/s"
-        if not self.in_view:
-            yield "nothing of the avatar is in view in any of these frames"
 
     def report(self, seconds: float) -> None:
         """Write play.json and print the summary of a run of so many seconds."""
-        camera, light = self.camera(self.frames.stop - 1), self.player.renderer.light
-        raster, summary = self.player.renderer.draws_with, self.player.times.summary()
+        camera, light, raster = self.camera(self.frames.stop - 1), self.renderer.light, self.renderer.draws_with
+        summary = self.times.summary()
         report = {
             "version": __version__,
             "settings": _settings(self.options),
@@ -223,32 +213,44 @@ class _Run:
             "fps": self.fps,
             "size": [camera.width, camera.height],
             "raster": raster,
-            "cull": self.player.renderer.cull,
+            "cull": self.renderer.cull,
             "light": {"maximum": light.maximum, "repaired_texels": light.repaired},
             "notes": self.notes,
             "times": summary,
         }
-        write_report(self.out / f"{self.name}.json", report)
+        write_json(self.out / f"{self.name}.json", report)
+        _print_times(summary)
         rate = len(self.frames) / seconds
-        headline = f"{len(self.frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
-        print_summary(summary, headline=f"{headline} ({raster}, {self.options.shade}) in {self.out}")
+        made = f"{len(self.frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
+        finish(self.out, f"{made} ({raster}, {self.options.rendering.shade})")
+
+
+def _print_times(summary: dict[str, dict[str, float]]) -> None:
+    table = Table("stage", box=None, pad_edge=False)
+    for heading in ("median ms", "p95 ms", "total s"):
+        table.add_column(heading, justify="right")
+    for name, row in summary.items():
+        table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
+    Console(quiet=is_quiet()).print(table)
 
 
 def _common(options: PlayOptions) -> dict[str, object]:
     """The settings that all processes of one run share, beside its ``_inputs``."""
-    camera = options.camera if options.camera in OWN_CAMERAS else split_camera(options.camera)[1]
-    settings = _settings(options) | {"camera": camera}
-    return {key: value for key, value in settings.items() if key not in (*OWN_TO_A_PROCESS, *FILES)}
+    settings = _settings(options)
+    if options.view.camera not in OWN_CAMERAS:
+        settings["camera"] = split_camera(options.view.camera)[1]
+    return {key: value for key, value in settings.items() if key not in _OWN_TO_A_PROCESS | _FILES}
 
 
 def _settings(options: PlayOptions) -> dict[str, object]:
     """The options as JSON has them, without the folder: two runs into two folders give the same report."""
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in options.settings().items()}
+    values["size"] = None if options.size is None else size_text(options.size)
     return {name: value for name, value in values.items() if name not in ("out", "doctor")}
 
 
 def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
-    """The three files without which there is nothing to play."""
+    """Avatar, motion and folder."""
     given = {"AVATAR.onnx": options.avatar, "--motion": options.motion, "--out": options.out}
     if missing := [name for name, value in given.items() if value is None]:
         raise InputError(f"missing {', '.join(missing)}", hint="rnd-play AVATAR.onnx --motion FILE --out FOLDER")
@@ -259,27 +261,22 @@ def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
 
 
 def _inputs(options: PlayOptions) -> list[Path]:
-    """Every file that the pictures are made from."""
-    given = [options.avatar, options.hdr, options.joint_map]
+    """Every file that the frames depend on."""
+    given = [options.avatar, options.hdr, options.reading.joint_map]
     if options.motion:
         given += motion_inputs(options.motion)
-    if options.camera not in OWN_CAMERAS:
-        given.append(split_camera(options.camera)[0])
+    if options.view.camera not in OWN_CAMERAS:
+        given.append(split_camera(options.view.camera)[0])
     return [path for path in given if path is not None]
 
 
-def _camera_path(
-    options: PlayOptions, size: tuple[int, int | None] | None, framing: Framing, frames: range
-) -> CameraPath:
-    if options.camera not in OWN_CAMERAS:
-        return file_path(options.camera, size, frames)
-    width, height = size or (DEFAULT_SIZE, None)
-    view = CameraOptions(
-        width, height or width, math.radians(options.fov), math.radians(options.elevation), options.distance
-    )
-    if options.camera == "orbit":
-        return orbit_path(framing, view, options.orbit_seconds)
-    return front_path(framing, view)
+def _camera_path(options: PlayOptions, framing: Framing, frames: range) -> CameraPath:
+    view = options.view
+    if view.camera not in OWN_CAMERAS:
+        return file_path(view.camera, options.size, frames)
+    width, height = options.size or _DEFAULT_SIZE
+    camera = CameraOptions(width, height or width, math.radians(view.fov), math.radians(view.elevation), view.distance)
+    return orbit_path(framing, camera, view.orbit_seconds) if view.camera == "orbit" else front_path(framing, camera)
 
 
 def _reach(framing: Framing, camera: Camera) -> tuple[float, float]:

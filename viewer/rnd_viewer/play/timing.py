@@ -1,4 +1,4 @@
-"""Where a frame's time goes: one list of seconds for each stage."""
+"""Seconds of each stage of a frame."""
 
 from __future__ import annotations
 

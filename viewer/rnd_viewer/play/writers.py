@@ -1,12 +1,12 @@
-"""What a run leaves in its folder. Every file is whole or absent, also after Ctrl-C.
+"""What a run leaves in its folder. Every file is complete or absent, also after Ctrl-C.
 
 ::
 
-    out/frames/000010.png        the picture: 8-bit sRGB, with straight alpha when there is no background
+    out/frames/000010.png        the frame: 8-bit sRGB, with straight alpha when there is no background
     out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV
-    out/aov/normal/000010.png    AOVs to look at
+    out/aov/normal/000010.png    AOVs as images
     out/play.mp4, out/play.webp      clips; the WebP is transparent where the PNG is
-    out/play.json                settings, what was found in the inputs, stage times
+    out/play.json                settings, notes, stage times
     out/play_000010-000050.*     the same of a part of a run, see ``play.run_folder``
 """
 
@@ -16,13 +16,12 @@ import importlib.util
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import output_folder, write_json
+from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.images import write_image
 from rnd_runtime.playback.aov import CHANNELS, aov_image
 from rnd_runtime.playback.frame import RenderedFrame
@@ -31,7 +30,7 @@ from .timing import StageTimes
 from .video import CLIPS, clip_writer, load_pyav
 
 FORMATS = ("png", "exr", *CLIPS)
-TRANSPARENT = {"png", "webp"}  # where nothing stands behind the avatar
+TRANSPARENT = {"png", "webp"}  # without a background
 FrameWriter = Callable[[int, RenderedFrame, tuple[float, float]], None]
 
 
@@ -71,8 +70,8 @@ def frame_writer(
 ) -> Iterator[FrameWriter]:
     """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
 
-    ``reach`` is the range of depths in metres that the depth picture spans. AOVs go into the EXR if there is
-    one, and into pictures of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
+    ``reach`` is the range of depths in metres that the depth image spans. AOVs go into the EXR if there is
+    one, and into images of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
     at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse, and before any
     file of it is written.
     """
@@ -95,8 +94,8 @@ def frame_writer(
                     files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
                 if "png" in formats or "exr" not in formats:
                     for aov, values in frame.aovs.items():
-                        picture = aov_image(aov, values, frame.alpha, reach)
-                        files[folder / f"aov/{aov}/{number_name}.png"] = picture
+                        image = aov_image(aov, values, frame.alpha, reach)
+                        files[folder / f"aov/{aov}/{number_name}.png"] = image
                 for path, pixels in files.items():
                     write_image(path, pixels)
                 if "exr" in formats:
@@ -109,8 +108,3 @@ def _write_exr(path: Path, frame: RenderedFrame) -> None:
     layers = [frame.linear(), *frame.aovs.values()]
     names = ("R", "G", "B", "A", *(channel for aov in frame.aovs for channel in CHANNELS[aov]))
     write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)
-
-
-def write_report(file: Path, report: dict[str, Any]) -> None:
-    """Write ``play.json``, under the name of its part of a run."""
-    write_json(file, report)
