@@ -21,7 +21,8 @@ def max_threads() -> int:
 
 def check_threads(threads: int) -> None:
     """Raise ``InputError`` unless the compiled kernels can run on so many."""
-    if not 1 <= threads <= (most := max_threads()):
+    most = max_threads()
+    if not 1 <= threads <= most:
         raise InputError("--threads", expected=f"1 to {most}", got=threads)
 
 

@@ -11,7 +11,8 @@ import pytest
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_viewer.inputs.cameras import CameraOptions, file_path, frame_motion, front_path, orbit_path
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
+from rnd_viewer.inputs.cameras import file_path
 from support.play_fakes import fake_motion, fake_skeleton
 
 ONE = range(1)

@@ -9,9 +9,8 @@ import pytest
 from rnd_viewer.play.pipeline import run
 
 
-@pytest.mark.parametrize("overlap", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_every_frame_goes_through_every_stage_in_order(overlap, count):
+def test_every_frame_goes_through_every_stage_in_order(count):
     encoded, drawn, written = [], [], []
 
     def encode(number):
@@ -27,7 +26,7 @@ def test_every_frame_goes_through_every_stage_in_order(overlap, count):
         assert frame == f"drawn {number}"
         written.append(number)
 
-    numbers = list(run(range(5, 5 + count), encode, draw, write, overlap=overlap))
+    numbers = list(run(range(5, 5 + count), encode, draw, write))
     assert numbers == encoded == drawn == written == list(range(5, 5 + count))
 
 
@@ -54,8 +53,7 @@ def test_one_frame_is_encoded_ahead_and_no_more():
 
 
 @pytest.mark.parametrize("stage", ["encode", "draw", "write"])
-@pytest.mark.parametrize("overlap", [True, False])
-def test_what_a_stage_raises_arrives_and_what_was_drawn_is_written(stage, overlap):
+def test_what_a_stage_raises_arrives_and_what_was_drawn_is_written(stage):
     drawn, written = [], []
 
     def fail(name, number):
@@ -71,7 +69,7 @@ def test_what_a_stage_raises_arrives_and_what_was_drawn_is_written(stage, overla
         written.append(number)
 
     with pytest.raises(ValueError, match=f"{stage} 3"):
-        list(run(range(9), lambda number: fail("encode", number), draw, write, overlap=overlap))
+        list(run(range(9), lambda number: fail("encode", number), draw, write))
     assert written[:3] == [0, 1, 2]
     if stage != "write":
         assert written == drawn == [0, 1, 2]

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
-from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pytest
@@ -18,14 +15,12 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.core.sh import sh_basis, sphere_quadrature
 from rnd_runtime.playback.aov import CHANNELS, ambient_visibility, parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
+from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light
-from rnd_viewer.inputs.background import Background
-from rnd_viewer.inputs.cameras import CameraOptions, frame_motion, front_path
-from rnd_viewer.inputs.options import parse_frames, parse_size
-from rnd_viewer.play import run_folder
-from rnd_viewer.play.player import Player
-from rnd_viewer.play.run_folder import claim
+from rnd_viewer.inputs.background import Backdrop, Background
+from rnd_viewer.inputs.options import parse_frames
+from rnd_viewer.play.run_folder import mark_of, refuse_others
 from rnd_viewer.play.timing import StageTimes
 from support.play_fakes import FakeAvatar, fake_motion, white_light
 
@@ -46,9 +41,8 @@ class FlatShader:
         return self
 
 
-def _player(radiance: float = 0.18, light: Light | None = None, **options) -> Player:
-    shader = FlatShader(radiance, light or white_light())
-    return Player(FrameRenderer(FakeAvatar(), shader, raster=rasterize), **options)
+def _renderer(radiance: float = 0.18) -> FrameRenderer:
+    return FrameRenderer(FakeAvatar(), FlatShader(radiance, white_light()), raster=rasterize)
 
 
 def _camera(width: int = 96, height: int = 80) -> Camera:
@@ -57,7 +51,7 @@ def _camera(width: int = 96, height: int = 80) -> Camera:
 
 def test_grey_card_is_118():
     """18 % is 118 of 255, and the coding comes after the blending."""
-    frame = _player().render(MOTION, 0.2, _camera())
+    frame = _renderer().render(MOTION, 0.2, _camera())
     inside = frame.alpha > INSIDE
     assert inside.sum() > 200
     over_itself = replace(frame, background=np.full(3, 0.18, np.float32))
@@ -66,7 +60,7 @@ def test_grey_card_is_118():
 
 
 def test_blending_is_linear():
-    frame = _player(0.9).render(MOTION, 0.2, _camera())
+    frame = _renderer(0.9).render(MOTION, 0.2, _camera())
     over = replace(frame, background=np.full(3, 0.1, np.float32))
     expected = 0.9 * frame.alpha + 0.1 * (1 - frame.alpha)
     edge = (frame.alpha > 0.2) & (frame.alpha < 0.8)
@@ -76,26 +70,26 @@ def test_blending_is_linear():
 
 
 def test_a_frame_depends_on_nothing_but_its_arguments():
-    player, camera = _player(), _camera()
-    first = player.render(MOTION, 0.1, camera)
-    player.render(MOTION, 0.3, _camera(64, 64))
-    again = player.render(MOTION, 0.1, camera)
+    renderer, camera = _renderer(), _camera()
+    first = renderer.render(MOTION, 0.1, camera)
+    renderer.render(MOTION, 0.3, _camera(64, 64))
+    again = renderer.render(MOTION, 0.1, camera)
     np.testing.assert_array_equal(first.radiance, again.radiance)
-    np.testing.assert_array_equal(first.radiance, _player().render(MOTION, 0.1, camera).radiance)
-    assert (player.render(MOTION, 0.3, camera).radiance != first.radiance).any()
+    np.testing.assert_array_equal(first.radiance, _renderer().render(MOTION, 0.1, camera).radiance)
+    assert (renderer.render(MOTION, 0.3, camera).radiance != first.radiance).any()
 
 
 def test_nothing_in_view_gives_the_background_back():
     camera = Camera.look_at([0, 1, 5], [0, 1, 10], width=8, height=6, fov_y=0.5)  # its back to the body
-    frame = _player(background=Background.parse("#336699")).render(MOTION, 0.0, camera)
+    backdrop = Backdrop(Background.parse("#369"))
+    frame = backdrop.behind(_renderer().render(MOTION, 0.0, camera), camera, white_light())
     assert not frame.alpha.any()
     np.testing.assert_array_equal(frame.srgb, np.tile([0x33, 0x66, 0x99], (6, 8, 1)))
 
 
 def test_aovs_are_those_of_the_surface():
-    player = _player(aovs=parse_aovs("depth,visibility,roughness,normal,albedo"))
     camera = _camera()
-    frame = player.render(MOTION, 0.2, camera)
+    frame = _renderer().render(MOTION, 0.2, camera, aovs=parse_aovs("depth,visibility,roughness,normal,albedo"))
     inside = frame.alpha > INSIDE
     assert list(frame.aovs) == list(CHANNELS)
     np.testing.assert_allclose(
@@ -109,14 +103,14 @@ def test_aovs_are_those_of_the_surface():
     depth = frame.aovs["depth"][inside]
     distance = np.linalg.norm(camera.position - FakeAvatar().pose(MOTION, 0.2).means.mean(axis=0))
     assert np.abs(depth - distance).max() < 0.5
-    plain = _player().render(MOTION, 0.2, camera)
+    plain = _renderer().render(MOTION, 0.2, camera)
     np.testing.assert_allclose(frame.radiance, plain.radiance, atol=1e-6)  # more channels change nothing
 
 
 def test_normals_are_in_the_cameras_axes():
     """The upper half of every ball points up, which is −Y for the camera."""
-    player, camera = _player(aovs=("normal",)), _camera(200, 200)
-    frame = player.render(MOTION, 0.0, camera)
+    camera = _camera(200, 200)
+    frame = _renderer().render(MOTION, 0.0, camera, aovs=("normal",))
     head = FakeAvatar().skeleton.rest_joints[15]
     for offset, axis, sign in (([0, 0.08, 0.03], 1, -1), ([0.08, 0, 0.03], 0, 1), ([-0.08, 0, 0.03], 0, -1)):
         x, y, z = camera.K @ (camera.world_to_camera @ [*(head + offset), 1])[:3]
@@ -142,18 +136,20 @@ def test_ambient_visibility_is_the_cosine_weighted_mean():
     assert 0.2 < expected.min() < expected.max() < 0.8
 
 
-@pytest.mark.parametrize(("text", "colour"), [("#ff8000", [1, 0x80 / 255, 0]), ("#000000", [0, 0, 0])])
-def test_hex_colours_are_srgb(text, colour):
-    np.testing.assert_allclose(Background.parse(text).colour, srgb_to_linear(np.array(colour)))
+@pytest.mark.parametrize(
+    ("text", "colour"), [("#ff8000", [1, 128 / 255, 0]), ("#f0a", [1, 0, 2 / 3]), ("Red", [1, 0, 0])]
+)
+def test_named_and_hex_colours_are_srgb(text, colour):
+    np.testing.assert_allclose(Background.parse(text).colour, srgb_to_linear(np.array(colour) / 255))
 
 
 def test_number_colours_are_linear():
     assert Background.parse("0.1,0.2,3").colour == (0.1, 0.2, 3.0)
 
 
-@pytest.mark.parametrize("text", ["", "red", "#12345", "1,2", "1,2,3,4", "nan,0,0", "-1,0,0", "inf,0,0", "1e39,0,0"])
+@pytest.mark.parametrize("text", ["", "reds", "#12345", "1,2", "1,2,3,4", "nan,0,0", "-1,0,0", "inf,0,0", "1e39,0,0"])
 def test_other_backgrounds_are_refused(text):
-    with pytest.raises(InputError, match="none, hdr, #rrggbb or r,g,b"):
+    with pytest.raises(InputError, match="--background: expected none, hdr"):
         Background.parse(text)
 
 
@@ -176,14 +172,13 @@ def test_the_light_stands_behind_the_avatar_where_it_shines_from(yaw):
 
 
 def test_srgb_alpha_ignores_the_background():
-    frame = _player().render(MOTION, 0.0, _camera())
+    frame = _renderer().render(MOTION, 0.0, _camera())
     seen = frame.srgb_alpha[..., 3] > 20
     assert np.abs(frame.srgb_alpha[seen][:, :3].astype(int) - 118).max() <= 1
     assert isinstance(frame, RenderedFrame)
 
 
 def test_options_parse():
-    assert parse_size("512") == (512, None) and parse_size("64x48") == (64, 48) and parse_size(None) is None
     assert parse_frames(None, 9) == range(9) and parse_frames("2:", 9) == range(2, 9)
     assert parse_frames(":3", 9) == range(3) and parse_frames("2:5", 9) == range(2, 5)
     assert parse_aovs("") == () and parse_aovs("depth, albedo,albedo") == ("albedo", "depth")
@@ -202,12 +197,6 @@ def test_empty_or_impossible_ranges_are_refused(text):
         parse_frames(text, 9)
 
 
-@pytest.mark.parametrize("text", ["0", "x", "12x", "-5", "99999", "1x99999", "3.5", ""])
-def test_impossible_sizes_are_refused(text):
-    with pytest.raises(InputError, match="--size"):
-        parse_size(text)
-
-
 def test_stage_times_summary():
     times = StageTimes()
     for seconds in (0.001, 0.002, 0.009):
@@ -215,89 +204,26 @@ def test_stage_times_summary():
     assert times.summary() == {"a": {"runs": 3, "median_ms": 2.0, "p95_ms": 8.3, "total_s": 0.012}}
 
 
-def test_the_same_inputs_elsewhere_are_the_same_run(tmp_path) -> None:
-    """As on two machines that share the folder for pictures alone, each with a clone of its own."""
-    out, frame = tmp_path / "out", tmp_path / "out" / "frames" / "000001.png"
-    frame.parent.mkdir(parents=True)
-    for place, content in (("one", b"walk"), ("other", b"walk"), ("third", b"jump")):
-        (tmp_path / place).write_bytes(content)
-    claim(out, {}, [tmp_path / "one"])
-    _date(next(out.glob(".run-*")), 1)
-    frame.write_bytes(b"one's")
-    _date(frame, 1)  # long before what comes
-    assert claim(out, {}, [tmp_path / "other"]) == 0 and frame.exists()
-    assert claim(out, {}, [tmp_path / "third"]) == 1 and not frame.exists()
+def test_a_run_is_known_by_settings_and_contents(tmp_path):
+    for name, content in (("one", b"walk"), ("other", b"walk"), ("third", b"jump")):
+        (tmp_path / name).write_bytes(content)
+    mark = mark_of(tmp_path, {"size": 1}, [tmp_path / "one"])
+    assert mark == mark_of(tmp_path, {"size": 1}, [tmp_path / "other"])  # as on another machine
+    assert mark != mark_of(tmp_path, {"size": 1}, [tmp_path / "third"])
+    assert mark != mark_of(tmp_path, {"size": 2}, [tmp_path / "one"])
 
 
-def test_pictures_that_no_run_left_stay(tmp_path) -> None:
-    """Names such as 000001.png are ffmpeg's, too; those of another run are taken away."""
-    inner = tmp_path / "frames" / "cam01" / "000001.png"
-    mine, other = tmp_path / "frames" / "000001.png", tmp_path / "frames" / "000002.png"
-    inner.parent.mkdir(parents=True)
-    for file in (mine, inner, other, tmp_path / "play.mp4"):
-        file.write_bytes(b"mine")
-        _date(file, 1)
-    assert claim(tmp_path, {"size": 1}, []) == 0
-    _date(next(tmp_path.glob(".run-*")), 2)
-    for file in (other, inner):
-        _date(file, 3)
-    assert claim(tmp_path, {"size": 2}, []) == 1 and len(list(tmp_path.glob(".run-*"))) == 1
-    assert mine.exists() and (tmp_path / "play.mp4").exists() and not other.exists()
-    assert inner.exists()  # no run writes there
-
-
-@pytest.mark.parametrize("locks", [True, False])
-def test_a_part_that_starts_while_the_folder_is_cleaned_keeps_its_frames(tmp_path, monkeypatch, locks) -> None:
-    """Where the file system has locks it waits; elsewhere its frames are younger than the mark."""
-    if not locks:
-        monkeypatch.setattr(run_folder, "_lock", lambda file: None)
-    frames, original = _left_by_another_run(tmp_path), Path.unlink
-    at_hand: list[Path] = []
-
-    def render() -> None:
-        claim(tmp_path, {"size": 2}, [])
-        for frame in set(frames) - set(at_hand):
-            frame.write_bytes(b"new")
-
-    def unlink(file: Path, missing_ok: bool = False) -> None:
-        if not at_hand:
-            at_hand.append(file)
-            part.start()
-            part.join(timeout=0.3)
-        original(file, missing_ok)
-
-    part = Thread(target=render)
-    monkeypatch.setattr(Path, "unlink", unlink)
-    claim(tmp_path, {"size": 2}, [])
-    part.join()
-    assert sorted(frame.read_bytes() for frame in frames if frame.exists()) == [b"new", b"new"]
-
-
-def test_what_an_interrupted_run_did_not_take_away_the_next_one_does(tmp_path, monkeypatch) -> None:
-    frames, original = _left_by_another_run(tmp_path), Path.unlink
-
-    def unlink(file: Path, missing_ok: bool = False) -> None:
-        if sum(frame.exists() for frame in frames) == 2:
-            raise KeyboardInterrupt
-        original(file, missing_ok)
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Path, "unlink", unlink)
-        claim(tmp_path, {"size": 2}, [])
-    assert claim(tmp_path, {"size": 2}, []) == 2 and not any(frame.exists() for frame in frames)
-
-
-def _left_by_another_run(folder: Path) -> list[Path]:
-    """Three frames, of long ago."""
-    frames = [folder / "frames" / f"{number:06d}.png" for number in range(3)]
-    frames[0].parent.mkdir()
-    claim(folder, {"size": 1}, [])
-    _date(next(folder.glob(".run-*")), 1)
-    for frame in frames:
-        frame.write_bytes(b"old")
-        _date(frame, 1)
-    return frames
-
-
-def _date(file: Path, seconds: int) -> None:
-    os.utime(file, (seconds, seconds))
+@pytest.mark.parametrize("name", ["frames/000001.png", "frames/mine.jpg", "aov/depth/000001.png", "play.mp4"])
+def test_a_folder_with_frames_of_others_is_refused_and_kept(tmp_path, name):
+    mark, file = mark_of(tmp_path, {}, []), tmp_path / name
+    for harmless in ("notes.txt", "frames/cam01/000001.png", "frames/.part.png"):
+        (tmp_path / harmless).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / harmless).touch()
+    refuse_others(mark)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(b"mine")
+    with pytest.raises(InputError, match=f"--out holds {name}"):
+        refuse_others(mark)
+    assert file.read_bytes() == b"mine"
+    mark.touch()  # another part of the run has claimed it
+    refuse_others(mark)

@@ -1,7 +1,7 @@
 """One folder for a run, also where several processes render parts of it.
 
-A run is identified by its settings and the content of its inputs; a hidden file, ``.run-ID``, marks its folder. Files
-of another run, or a user's under the names that runs write, are never touched: the folder is refused.
+A run is identified by its settings and the content of its inputs; a hidden file, ``.run-ID``, marks its folder. A
+folder with frames or clips of another run or a user is refused.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ from pathlib import Path
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import sha256_of
 
-_FRAME = r"\d{6,}\.(png|exr)"
-_OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/{_FRAME}|play(_\d{{6,}}-\d{{6,}})?\.(json|mp4|webp)")
+_FOLDERS = ("frames/[!.]*", "frames_exr/[!.]*", "aov/*/[!.]*")
+_CLIP = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp)")
+_OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/\d{{6,}}\.(png|exr)|{_CLIP.pattern}")
 
 
 def mark_of(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> Path:
@@ -27,19 +28,14 @@ def mark_of(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]
 
 
 def refuse_others(mark: Path) -> None:
-    """Raise ``InputError`` if the folder of ``mark`` holds frames or clips, but not the mark: of another run, or a
-    user's."""
+    """Raise ``InputError`` if the folder of ``mark`` holds frames or clips, but not the mark."""
     folder = mark.parent
-    found = next((file for file in _candidates(folder) if is_of_a_run(file, folder)), None)
+    frames = (file for pattern in _FOLDERS for file in folder.glob(pattern) if file.is_file())
+    clips = (file for file in folder.glob("play*") if _CLIP.fullmatch(file.name))
+    found = next(frames, None) or next(clips, None)
     if found is not None and not mark.exists():  # in this order: other parts of the run mark first, then write
-        hint = "choose another --out, or remove what is there"
         what = f"--out holds {found.relative_to(folder)}, which this run did not write"
-        raise InputError(what, file=folder, hint=hint)
-
-
-def _candidates(folder: Path) -> Iterable[Path]:
-    for pattern in ("play*", "frames/*", "frames_exr/*", "aov/*/*"):
-        yield from folder.glob(pattern)
+        raise InputError(what, file=folder, hint="choose another --out, or remove what is there")
 
 
 def is_of_a_run(file: Path, folder: Path) -> bool:

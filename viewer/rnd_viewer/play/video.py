@@ -1,7 +1,7 @@
-"""Clips: mp4 whose colours survive, and WebP, which moves wherever a picture may stand and keeps what is transparent.
+"""Clips: mp4 whose colours survive, and WebP, which keeps transparency.
 
-A player that finds no tags guesses BT.601 for small pictures, and ffmpeg's converter assumes BT.601 unless
-told; either one alone costs 16 dB. So mp4's conversion to BT.709 is written out here, said in the file and tested
+A player that finds no tags guesses BT.601 for small frames, and ffmpeg's converter assumes BT.601 by
+default; either one alone costs 16 dB. So mp4's conversion to BT.709 is written out here, said in the file and tested
 through a decoder. WebP has one way to keep colours (BT.601, full chroma range halved), which its encoder does itself.
 """
 
@@ -43,12 +43,12 @@ BT709 = {
 }
 
 # The same frames must give the same bytes. So one thread: x264's output depends on their number. And no macroblock
-# tree: its vector code reads past the end of pictures narrower than 128 pixels (13 different files in 30 runs).
+# tree: its vector code reads past the end of frames narrower than 128 pixels (13 different files in 30 runs).
 # CRF 18 then costs 0.1 dB against 16 at 512², where the halved chroma alone holds everything below 46 dB.
 X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtree=0"}
 WEBP = {"quality": "85", "compression_level": "4"}
 
-WEBP_LEAST_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
+WEBP_MIN_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
 
 INSTALL = "pip install 'rnd-avatar[video]'"
 
@@ -63,7 +63,7 @@ def load_pyav(otherwise: str = "") -> ModuleType:
 
 
 def finding() -> Finding:
-    """What the doctor says of clips."""
+    """The doctor's line on clips."""
     try:
         return Finding("PyAV (mp4, webp)", str(load_pyav().__version__), None)
     except InputError:
@@ -123,7 +123,7 @@ CLIPS = tuple(_KINDS)
 
 
 def clip_notes(kinds: Iterable[str], fps: float) -> list[str]:
-    """What is to be said of clips of frames of so many a second."""
+    """Notes on clips of ``fps`` frames per second."""
     every = _webp_every(fps)
     if "webp" not in kinds or every == 1:
         return []
@@ -132,7 +132,7 @@ def clip_notes(kinds: Iterable[str], fps: float) -> list[str]:
 
 def _webp_every(fps: float) -> int:
     """One frame in how many a WebP keeps."""
-    return math.ceil(fps * WEBP_LEAST_MS / 1000)
+    return math.ceil(fps * WEBP_MIN_MS / 1000)
 
 
 @contextmanager
@@ -164,7 +164,7 @@ def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], N
                 stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, kind.pixels
                 _tag(stream.codec_context, kind.tags)
             if (frame.width, frame.height) != (stream.width, stream.height):
-                expected = f"pictures of one size, {stream.width}x{stream.height}"
+                expected = f"frames of one size, {stream.width}x{stream.height}"
                 raise InputError(name, expected=expected, got=size, file=path)
             _tag(frame, kind.tags)
             try:
