@@ -51,6 +51,7 @@ class _SeenThrough(Avatar):
         self._opacities = np.float32(0.2) * self._opacities
 
 
+@pytest.mark.slow
 def test_the_most_is_left_out_that_does_not_show() -> None:
     avatar = Avatar.load(ASSETS / "avatar.onnx")
     motion = random_motion(avatar.skeleton, frames=30, seed=1)
@@ -60,10 +61,10 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
     around = views_around(motion, (SIZE, SIZE), lambda time: avatar.pose(motion, time))
 
     def coded(cull: float) -> np.ndarray:
-        """8-bit pictures as they are looked at."""
-        shots = [*around.seen, *around.held_out]
-        drawn = (FrameRenderer(avatar, light, s.camera, cull=cull).render(motion, s.time) for s in shots)
-        return np.array([frame.srgb for frame in drawn]) / 255.0
+        """8-bit images."""
+        views = [*around.seen, *around.held_out]
+        frames = (FrameRenderer(avatar, light, s.camera, cull=cull).render(motion, s.time) for s in views)
+        return np.array([frame.srgb for frame in frames]) / 255.0
 
     whole, nearer = coded(-1), COSINES[COSINES.index(found) - 1]
     off = [np.sqrt(np.mean((coded(cull) - whole) ** 2)) for cull in (found, nearer)]
@@ -71,7 +72,8 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
     assert off[0] < 1.05 * MAX_DIFFERENCE < 1.15 * off[1]
 
 
-def test_of_what_is_seen_through_nothing_is_left_out() -> None:
+def test_of_what_is_seen_through_nothing_is_left_out(monkeypatch) -> None:
+    monkeypatch.setattr("rnd_export.reduce.culling.SIZE", 128)
     avatar = _SeenThrough.load(ASSETS / "avatar.onnx")
     assert find_cull(avatar, random_motion(avatar.skeleton, frames=10, seed=1)) is None
 

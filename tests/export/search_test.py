@@ -51,7 +51,8 @@ def bench(tiny_checkpoint) -> Workbench:
     return Workbench(load_checkpoint(tiny_checkpoint), SearchScene(moves, light, size=(96, 96), shade="table"), _clock)
 
 
-def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
+@pytest.mark.slow
+def test_a_least_psnr_holds_in_held_out_views(bench) -> None:
     steps = []
     found = search(bench, Bound("psnr", 32.0), steps.append)
     again = bench.measure(found.model, bench.held_out)
@@ -62,6 +63,7 @@ def test_a_least_psnr_holds_in_shots_that_were_not_searched(bench) -> None:
     assert not seen & held_out
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
     tiny_checkpoint, tiny_avatar, tmp_path, monkeypatch, capsys
 ) -> None:
@@ -195,6 +197,7 @@ def test_a_machine_that_becomes_calm_is_noticed_once() -> None:
     assert timer.ms(machine.player(10.0)) == pytest.approx(10.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bound", ["--target-ms", "--max-mb"])
 def test_a_search_on_a_busy_machine_begins_again_where_time_counts(
     bound, tiny_checkpoint, tmp_path, monkeypatch, capsys
@@ -407,6 +410,7 @@ def test_what_is_said_to_be_left_is_what_the_file_has(bench) -> None:
     assert given_up(bench, plan)[0].startswith(f"{left} of {bench.config.gaussians} Gaussians")
 
 
+@pytest.mark.slow
 def test_a_search_looks_at_the_captures_views(tiny_checkpoint, tmp_path, monkeypatch) -> None:
     capture = load_capture(ASSETS / "capture")
     seen, fitted, held_out = views_of(capture, 40)
