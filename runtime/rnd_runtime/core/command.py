@@ -274,18 +274,6 @@ def _with_general(kind: type[Any]) -> type[Any]:
     )
 
 
-def parse_options(parser: Callable[[], Any]) -> Any:
-    """What ``parser``, a call of tyro's, makes of the command line; errors as of ``parse``."""
-    page = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(page), registry():
-            return parser()
-    except SystemExit as leaving:
-        if not leaving.code:  # --help
-            raise
-        raise refusal(page.getvalue()) from None
-
-
 def _parsed(parser: Callable[[], Any]) -> Any:
     page = io.StringIO()
     try:

@@ -137,7 +137,7 @@ def test_ambient_visibility_is_the_cosine_weighted_mean():
 
 
 @pytest.mark.parametrize(
-    ("text", "colour"), [("#ff8000", [1, 128 / 255, 0]), ("#f0a", [1, 0, 2 / 3]), ("Red", [1, 0, 0])]
+    ("text", "colour"), [("#ff8000", [255, 128, 0]), ("#f0a", [255, 0, 170]), ("Red", [255, 0, 0])]
 )
 def test_named_and_hex_colours_are_srgb(text, colour):
     np.testing.assert_allclose(Background.parse(text).colour, srgb_to_linear(np.array(colour) / 255))

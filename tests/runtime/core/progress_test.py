@@ -1,0 +1,50 @@
+"""Progress where stderr is no terminal."""
+
+import pytest
+
+from rnd_runtime.core import progress
+from rnd_runtime.core.command import run_command
+from rnd_runtime.core.progress import Progress, track
+
+
+@pytest.fixture
+def clock(monkeypatch) -> list[float]:
+    """Seconds; the test moves it."""
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_line_for_each_phase_and_every_30_seconds(clock, capsys):
+    def work() -> None:
+        with Progress() as bar:
+            bar.phase("fitting the light", 40)
+            for done in range(1, 9):
+                clock[0] += 10
+                bar.update(done, loss=0.5 / done)
+            bar.phase("writing")
+            clock[0] += 31
+            bar.update(7, step="7 files")
+
+    run_command("rnd-x", work)
+    assert capsys.readouterr().err.splitlines() == [
+        "rnd-x: fitting the light",
+        "rnd-x: fitting the light · 3/40 · loss 0.1667 · 6 min left",
+        "rnd-x: fitting the light · 6/40 · loss 0.0833 · 6 min left",
+        "rnd-x: writing",
+        "rnd-x: writing · 7 files",
+    ]
+
+
+def test_a_resumed_phase_does_not_count_what_was_done_before(clock, capsys):
+    with Progress() as bar:
+        bar.phase("training", 100, done=90)
+        clock[0] += 50
+        bar.update(95)
+    assert "95/100 · 50 s left" in capsys.readouterr().err
+
+
+def test_quiet_is_silent_and_items_pass(monkeypatch, capsys):
+    monkeypatch.setattr("rnd_runtime.core.command._running.quiet", True)
+    assert list(track("counting", range(3), 3)) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")
