@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from rnd_trainer.config import from_dict, to_dict
 from rnd_trainer.losses.repulsion import repulsion
 from rnd_trainer.training.training import Training
 
@@ -86,9 +85,3 @@ def test_only_the_gaussians_own_residuals_are_pushed(tiny_capture, tiny_config):
     assert pushed == {"geometry_residual"}
     columns = training.model.geometry_residual.grad.any(dim=0)
     assert columns.tolist() == [False] * 10 + [True] * 3  # opacity, rotation, scale, normal; offset
-
-
-def test_a_checkpoint_from_before_the_term_was_trained_without_it(tiny_config):
-    values = to_dict(tiny_config)
-    assert values.pop("weight_repulsion") > 0
-    assert from_dict(values).weight_repulsion == 0

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rnd_runtime.shading.light import texel_directions, texel_solid_angles
-from rnd_trainer.training import light_search as light_start
+from rnd_trainer.training import light_search
 from rnd_trainer.training.light_search import Sightings, start_light
 
 COUNT, PICTURES = 700, 24
@@ -29,7 +29,7 @@ def _turning_ball(sun: np.ndarray, strength: float) -> Sightings:
         angle = 2 * math.pi * k / PICTURES
         turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
         normals = points @ turn.T
-        seen = (normals[:, 2] > light_start.FACING).nonzero()[:, 0]
+        seen = (normals[:, 2] > light_search.FACING).nonzero()[:, 0]
         arriving = 1 + strength / math.pi * (normals[seen] @ torch.as_tensor(sun).float()).clamp(min=0)
         who.append(seen.numpy())
         colour.append((albedo[seen] * arriving[:, None]).double().numpy())
@@ -43,7 +43,7 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
     sun /= np.linalg.norm(sun)
     ball = _turning_ball(sun, strength)
-    monkeypatch.setattr(light_start, "_sight", lambda *_: ball)
+    monkeypatch.setattr(light_search, "_sightings", lambda *_: ball)
     found = start_light(None, [], [])  # type: ignore[arg-type]  # the sightings are given
     assert found is not None
     light, exposure = found.radiance, found.exposure
@@ -53,7 +53,7 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     normals = np.concatenate([n[ball.who[ball.picture == k]] for k, (_, n) in enumerate(ball.posed)])
     cosines = np.maximum(normals @ texel_directions(32, 64).reshape(-1, 3).T, 0)
     arriving = (cosines @ (grey * solid_angles).reshape(-1) / math.pi).mean()
-    assert ball.colour.mean() / arriving == pytest.approx(light_start.REFLECTANCE, rel=SHADOWS)
+    assert ball.colour.mean() / arriving == pytest.approx(light_search.REFLECTANCE, rel=SHADOWS)
     assert (grey * exposure).sum() == pytest.approx(arriving, rel=SHADOWS)
     near = texel_directions(32, 64) @ sun > math.cos(math.radians(12))
     share = (grey * solid_angles)[near].sum() / (grey * solid_angles).sum()
@@ -77,7 +77,7 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
     draw = np.random.default_rng(0)
     ball.colour *= np.exp(0.3 * draw.normal(size=(len(ball.colour), 1)))
     ball.colour[shade[draw.random(len(shade)) < 1 / 4]] *= 2
-    monkeypatch.setattr(light_start, "_sight", lambda *_: ball)
+    monkeypatch.setattr(light_search, "_sightings", lambda *_: ball)
     found = start_light(None, [], [])  # type: ignore[arg-type]
     assert found is not None
     energy = found.radiance.mean(-1) * texel_solid_angles(32, 64)
@@ -99,14 +99,14 @@ def test_pictures_that_are_all_alike_give_none(monkeypatch) -> None:
     )
     once = Sightings(ball.who[first], ball.colour[first], ball.picture[first], ball.posed[:1], ball.spacing)
     for seen in (alike, once):
-        monkeypatch.setattr(light_start, "_sight", lambda *_, seen=seen: seen)
+        monkeypatch.setattr(light_search, "_sightings", lambda *_, seen=seen: seen)
         assert start_light(None, [], []) is None  # type: ignore[arg-type]
 
 
 def test_too_few_sightings_give_none(monkeypatch) -> None:
     ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 0.0)
     few = Sightings(ball.who[:20], ball.colour[:20], ball.picture[:20], ball.posed, 0.1)
-    monkeypatch.setattr(light_start, "_sight", lambda *_: few)
+    monkeypatch.setattr(light_search, "_sightings", lambda *_: few)
     assert start_light(None, [], []) is None  # type: ignore[arg-type]
 
 
@@ -115,5 +115,5 @@ def test_what_is_seen_once_or_twice_invents_no_sun(monkeypatch) -> None:
     ball = _turning_ball(np.array([0.7, 0.5, 0.51]), 6.0)
     few = np.isin(ball.picture, (0, 8, 16))
     seen = Sightings(ball.who[few], ball.colour[few], ball.picture[few] // 8, ball.posed[::8], ball.spacing)
-    monkeypatch.setattr(light_start, "_sight", lambda *_: seen)
+    monkeypatch.setattr(light_search, "_sightings", lambda *_: seen)
     assert start_light(None, [], []) is None  # type: ignore[arg-type]
