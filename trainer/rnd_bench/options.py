@@ -30,7 +30,7 @@ class Files:
 class Raster:
     """The CPU and GL rasterisers against a plain-torch tile rasteriser, with their errors to the oracle.
 
-    Example: rnd-bench raster --json out/raster.json
+    rnd-bench raster --json out/raster.json
     """
 
     json: OptionalFile = None
@@ -49,7 +49,7 @@ class Raster:
 class Frame:
     """One point: a frame from pose to pixels, all stages, with its error against the full reference.
 
-    Example: rnd-bench frame assets --shade table
+    rnd-bench frame assets --shade table
     """
 
     files: tyro.conf.OmitArgPrefixes[Files]
@@ -88,7 +88,7 @@ class Frame:
 class Grid:
     """Every point of the speed–accuracy chart, each in a process of its own; resumes; draws the chart.
 
-    Example: rnd-bench grid assets --quick
+    rnd-bench grid assets --quick
     """
 
     files: tyro.conf.OmitArgPrefixes[Files]
@@ -109,7 +109,7 @@ class Grid:
 class Step:
     """Where the time of a training step goes.
 
-    Example: rnd-bench step assets/capture --preset quick
+    rnd-bench step assets/capture --preset quick
     """
 
     capture: Annotated[Path, tyro.conf.Positional, option("CAPTURE")]
@@ -128,7 +128,7 @@ class Step:
 class Compare:
     """Frames of one avatar by two checkouts of this project, alternating: paired ratios of their times.
 
-    Example: rnd-bench compare ../before . --avatar assets/avatar.onnx --motion assets/walk.npz --hdr assets/sky.exr
+    rnd-bench compare ../before . --avatar assets/avatar.onnx --motion assets/walk.npz --hdr assets/sky.exr
     """
 
     before: Annotated[Path, tyro.conf.Positional, option("BEFORE")]

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class StageOptions:
     """Render a coded person on a light stage: many views, many lights, and the truth beside every image.
 
-    Example: rnd-stage out/lumberjack --frames 20 --cameras 4 --size 256
+    rnd-stage out/lumberjack --frames 20 --cameras 4 --size 256
     """
 
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]

@@ -226,7 +226,8 @@ def parse(
     """
     words = _words(prog, arguments)
     refuse_unknown([*names(kind), *names(_General)], prog, words, unknown or {})
-    return _parsed(lambda: tyro.cli(_with_general(kind), prog=prog, args=words, registry=registry()))
+    options: Options = _parsed(lambda: tyro.cli(_with_general(kind), prog=prog, args=words, registry=registry()))
+    return options
 
 
 def parse_subcommand(
@@ -245,7 +246,7 @@ def parse_subcommand(
     if words[0] in kinds:
         taken = [*names(kinds[words[0]]), *names(_General)]
         refuse_unknown(taken, f"{prog} {words[0]}", words[1:], unknown or {})
-    commands = {name: _with_general(kind) for name, kind in kinds.items()}
+    commands: dict[str, Callable[..., Any]] = {name: _with_general(kind) for name, kind in kinds.items()}
     return _parsed(
         lambda: tyro.extras.subcommand_cli_from_dict(
             commands, prog=prog, args=words, description=description, registry=registry()

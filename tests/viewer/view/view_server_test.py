@@ -38,6 +38,7 @@ from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.shading.light import load_light
 from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.options import MotionOptions
 from rnd_viewer.view.cli import main
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
@@ -420,7 +421,7 @@ def test_live_frames_get_smaller_to_hold_the_frame_rate_and_exact_ones_do_not(op
 
 def test_the_motion_is_edited_as_rnd_play_does(options):
     edits = MotionEdits(speed=2.0, in_place=True)
-    scene = Scene(replace(options, speed=edits.speed, in_place=edits.in_place))
+    scene = Scene(replace(options, reading=MotionOptions(speed=edits.speed, in_place=edits.in_place)))
     untouched = load_motion(options.motion, scene.avatar.skeleton)
     expected = edit_motion(untouched, edits)
     assert scene.motion.duration == expected.duration < untouched.duration
@@ -431,11 +432,10 @@ def test_the_motion_is_edited_as_rnd_play_does(options):
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
-        ({"motion_up": "z"}, "--motion-up"),
-        ({"joint_map": Path("t.toml")}, "--joint-map"),
-        ({"loop": True}, "--loop"),
-        ({"capture": Path("b"), "motion_up": "z"}, "--motion-up"),
-        ({"motion": Path("b"), "smooth": 0}, "--smooth"),
+        ({"reading": MotionOptions(motion_up="z")}, "--motion-up"),
+        ({"reading": MotionOptions(joint_map=Path("t.toml"))}, "--joint-map"),
+        ({"reading": MotionOptions(loop=True)}, "--loop"),
+        ({"capture": Path("b"), "reading": MotionOptions(motion_up="z")}, "--motion-up"),
         ({"port": 99999}, "--port"),
         ({"size": (8, None)}, "--size"),
         ({"fps_floor": 0}, "--fps-floor"),

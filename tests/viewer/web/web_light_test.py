@@ -148,7 +148,7 @@ RGB_AND = ("R", "G", "B", "A", "id")
     ("said", "message"),
     [
         ({"names": ("view.R", "view.G", "view.B")}, "expected channels R, G and B, of no layer, got view.B, view.G"),
-        ({"window": (3, 0)}, "image layout: expected one flat picture that fills its canvas, got pixels 3,0,76,36 of"),
+        ({"window": (3, 0)}, "image layout: expected one flat image that fills its canvas, got pixels 3,0,76,36 of"),
         ({"kind": "uint"}, "pixels: expected half or float in all channels, got B of whole numbers"),
         ({"compression": "b44"}, "compression: expected none, RLE, ZIPS, ZIP, PIZ, PXR24, DWAA, DWAB, got B44"),
     ],

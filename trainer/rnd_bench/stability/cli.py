@@ -29,7 +29,7 @@ SMALL_STEPS = 600
 class Stability:
     """The cases in which methods of this kind break, beside a plain baseline; --fuzz, --soak and --kill take hours.
 
-    Example: rnd-bench stability assets/capture --rows P1,L8
+    rnd-bench stability assets/capture --rows P1,L8
     """
 
     capture: Annotated[Path, tyro.conf.Positional, option("CAPTURE")]

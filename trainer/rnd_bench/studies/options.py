@@ -50,7 +50,7 @@ class Trainings:
 class Ablations(Trainings):
     """The paper's ablations: dynamic skinning, L_gc, encoders, window lengths, light, visibility.
 
-    Example: rnd-bench study ablations runs/ablations assets/capture --seeds 1
+    rnd-bench study ablations runs/ablations assets/capture --seeds 1
     """
 
 
@@ -58,7 +58,7 @@ class Ablations(Trainings):
 class Causes(Trainings):
     """What limits quality: light, normals, poses, number of Gaussians.
 
-    Example: rnd-bench study causes runs/causes CAPTURE
+    rnd-bench study causes runs/causes CAPTURE
     """
 
 
@@ -66,7 +66,7 @@ class Causes(Trainings):
 class Lengths(Trainings):
     """An eighth to five times the steps.
 
-    Example: rnd-bench study lengths runs/lengths assets/capture
+    rnd-bench study lengths runs/lengths assets/capture
     """
 
 
@@ -111,7 +111,7 @@ class PeopleSizes:
 class People:
     """Render four people on the light stage, train on one camera's white light, score the rest; resumes.
 
-    Example: rnd-bench study people out/people --json out/people.json
+    rnd-bench study people out/people --json out/people.json
     """
 
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]
@@ -131,7 +131,7 @@ class People:
 class Agreement:
     """Our renderer with true attributes of a ball and of a person against Mitsuba, under every light of the stage.
 
-    Example: rnd-bench study agreement out/agreement.json
+    rnd-bench study agreement out/agreement.json
     """
 
     json: Annotated[Path, tyro.conf.Positional, option("FILE")]

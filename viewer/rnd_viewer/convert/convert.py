@@ -57,7 +57,7 @@ def _splats(options: SplatOptions) -> None:
     options.refuse_unfit(formats)
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
-    motion = options.read_motion(options.motion, avatar.skeleton)
+    motion = options.reading.read_motion(options.motion, avatar.skeleton)
     _log_notes(motion.notes)
     frames = parse_frames(options.frames, motion.frame_count)
     if "visionary" in formats:
@@ -133,7 +133,7 @@ def _mesh(options: MeshOptions) -> None:
     formats = _formats(options.format, MESH_FORMATS)
     options.refuse_unfit(formats)
     body = Body.load(options.body)
-    motion = options.read_motion(options.motion, body.skeleton)
+    motion = options.reading.read_motion(options.motion, body.skeleton)
     _log_notes(motion.notes)
     motion = replace(motion, rotations=share_twists(body.skeleton, motion.rotations))  # as an avatar is posed
     frames = parse_frames(options.frames, motion.frame_count)
@@ -152,9 +152,9 @@ def _mesh(options: MeshOptions) -> None:
 def _motion(options: AmassOptions) -> None:
     check_option(options.out.suffix.lower() == ".npz", "--out", "a name in .npz", options.out)
     file = existing_file(options.skeleton, what="avatar or body")
-    refuse_input(options.out, file, *motion_inputs(options.motion), options.joint_map)
+    refuse_input(options.out, file, *motion_inputs(options.motion), options.reading.joint_map)
     skeleton = Body.load(file).skeleton if file.suffix.lower() == ".npz" else Avatar.load(file).skeleton
-    motion = options.read_motion(options.motion, skeleton)
+    motion = options.reading.read_motion(options.motion, skeleton)
     _log_notes(motion.notes)
     if options.fps is not None:
         _log_notes(motion.loop_notes(options.fps))

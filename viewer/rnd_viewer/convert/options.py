@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,11 +12,11 @@ import tyro
 from rnd_runtime.core.command import File, Folder, Number, OptionalFile, OptionalNumber, option
 from rnd_runtime.core.errors import check_option, refuse_changed, refuse_outside
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
-from rnd_viewer.inputs.options import LitOptions, MotionOptions
+from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
 
 
 @dataclass(frozen=True)
-class SplatOptions(LitOptions):
+class SplatOptions:
     """Write posed, relit frames as plain 3D Gaussians.
 
     rnd-convert splats avatar.onnx --motion walk.npz --hdr sky.exr --frames 10:12 --format ply,glb --out out/splats
@@ -36,6 +36,8 @@ class SplatOptions(LitOptions):
     """Shaded by the light, or the material's own colour."""
     hdr: OptionalFile = None
     """Light probe, lat-long EXR or HDR. Default: the light of the avatar's capture."""
+    hdr_up: ProbeUp = "y"
+    """Up axis of the probe's file."""
     hdr_yaw: Number = 0.0
     """Rotation of the light, degrees."""
     exposure: Number = 0.0
@@ -50,9 +52,11 @@ class SplatOptions(LitOptions):
     """srgb for viewers that show colours as they are; linear radiance for renderers that code the blended image."""
     ply_axes: Annotated[Literal["3dgs", "y-up"], option("3dgs|y-up")] = "3dgs"
     """Axes of .ply, .spz and .sog. 3dgs: Y down, rotated by 180° about Z, as their viewers expect. A .glb is Y up."""
+    reading: MotionGroup = field(default_factory=MotionOptions)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if self.hdr is None:
+            refuse_changed(self, ["hdr_up"], "needs --hdr")
         refuse_outside(self, {"exposure": (-30, 30), "hdr_yaw": (-1e6, 1e6)})
 
     def refuse_unfit(self, formats: Sequence[str]) -> None:
@@ -70,7 +74,7 @@ class SplatOptions(LitOptions):
 
 
 @dataclass(frozen=True)
-class MeshOptions(MotionOptions):
+class MeshOptions:
     """Write the posed template: one .glb with skeleton, weights and the whole motion, or an .obj a frame.
 
     rnd-convert mesh body.npz --motion walk.npz --format glb,obj --frames 0:10 --out out/mesh
@@ -86,6 +90,7 @@ class MeshOptions(MotionOptions):
     """Some of glb,obj."""
     frames: Annotated[str, option("START:END")] = "0:1"
     """Frames to write as .obj, END excluded; either may be missing."""
+    reading: MotionGroup = field(default_factory=MotionOptions)
 
     def refuse_unfit(self, formats: Sequence[str]) -> None:
         """Refuse options that files in ``formats`` cannot follow, with an ``InputError``."""
@@ -94,7 +99,7 @@ class MeshOptions(MotionOptions):
 
 
 @dataclass(frozen=True)
-class AmassOptions(MotionOptions):
+class AmassOptions:
     """Write a motion as an AMASS .npz (SMPL-H, Z up), which SMPL tools read.
 
     rnd-convert motion avatar.onnx --motion run.bvh --out run.npz
@@ -108,9 +113,9 @@ class AmassOptions(MotionOptions):
     """The .npz to write."""
     fps: OptionalNumber = None
     """Frames per second to write. Default: the motion's."""
+    reading: MotionGroup = field(default_factory=MotionOptions)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         refuse_outside(self, {"fps": FPS_LIMITS})
 
 

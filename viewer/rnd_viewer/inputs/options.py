@@ -75,17 +75,8 @@ class MotionOptions:
         refuse_outside(self, {"motion_fps": FPS_LIMITS, **EDIT_LIMITS})
 
 
-@dataclass(frozen=True, kw_only=True)
-class LitOptions(MotionOptions):
-    """Those of a command with ``hdr``, a light probe or several."""
-
-    hdr_up: Annotated[Up, option()] = "y"
-    """Up axis of the probe's file."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not vars(self)["hdr"]:
-            refuse_changed(self, ["hdr_up"], "needs --hdr")
+MotionGroup = Annotated[MotionOptions, *group("motion")]
+ProbeUp = Annotated[Up, option()]
 
 
 @dataclass(frozen=True)
@@ -118,7 +109,7 @@ class _Camera:
 class _Lighting:
     """The light, the probe of --hdr or the learned one, and the background."""
 
-    hdr_up: Annotated[Up, option()] = "y"
+    hdr_up: ProbeUp = "y"
     """Up axis of the probe's file."""
     hdr_yaw: Number = 0.0
     """Degrees by which the light is rotated about the vertical axis, from +X towards +Z."""
@@ -185,7 +176,7 @@ class PlayOptions:
     """Also write some of albedo,normal,roughness,visibility,depth. Normals are in the camera's OpenCV axes."""
     doctor: Flag = False
     """Print renderer, providers, threads and versions, and what to install for what is missing."""
-    reading: Annotated[MotionOptions, *group("motion")] = field(default_factory=MotionOptions)
+    reading: MotionGroup = field(default_factory=MotionOptions)
     view: Annotated[_Camera, *group("camera")] = field(default_factory=_Camera)
     lighting: Annotated[_Lighting, *group("light")] = field(default_factory=_Lighting)
     rendering: Annotated[_Rendering, *group("rendering")] = field(default_factory=_Rendering)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,13 +21,13 @@ from rnd_runtime.core.command import (
     run_command,
     warn,
 )
-from rnd_runtime.core.errors import InputError, check_option, flag
+from rnd_runtime.core.errors import InputError, check_option, flag, refuse_changed
 from rnd_runtime.core.files import is_folder, output_file
-from rnd_viewer.inputs.options import LitOptions
+from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
 
 
 @dataclass(frozen=True)
-class ReportOptions(LitOptions):
+class ReportOptions:
     """One HTML page about a training: clip, relights, held-out scores, truth against render, losses, options.
 
     rnd-report runs/me --motion walk.npz --hdr sky.exr
@@ -41,16 +41,20 @@ class ReportOptions(LitOptions):
     """Body poses for the turntable. Default: the rest pose."""
     hdr: Files = ()
     """Light probes to show the avatar under, beside the learned light."""
+    hdr_up: ProbeUp = "y"
+    """Up axis of the probes' files."""
     bench: OptionalFolder = None
     """Folder of rnd-bench with crossed.svg or grid.svg, and stability.json. Default: RUN/bench."""
     images: Count = 3
     """Images of each held-out split."""
+    reading: MotionGroup = field(default_factory=MotionOptions)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if not self.hdr:
+            refuse_changed(self, ["hdr_up"], "needs --hdr")
         check_option(self.images >= 0, "--images", "0 or more", self.images)
         if self.motion is None:
-            self.refuse_unread("needs --motion: the rest pose does not move")
+            self.reading.refuse_unread("needs --motion: the rest pose does not move")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -74,7 +78,7 @@ def _report(options: ReportOptions) -> int:
     notes = write_run_report(
         options.run,
         out,
-        motion=None if options.motion is None else partial(options.read_motion, options.motion),
+        motion=None if options.motion is None else partial(options.reading.read_motion, options.motion),
         hdrs=options.hdr,
         hdr_up=options.hdr_up,
         bench=options.bench,

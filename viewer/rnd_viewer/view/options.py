@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -18,14 +18,14 @@ from rnd_runtime.core.command import (
     option,
     size_text,
 )
-from rnd_runtime.core.errors import InputError, refuse_outside
-from rnd_viewer.inputs.options import LitOptions
+from rnd_runtime.core.errors import InputError, refuse_changed, refuse_outside
+from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
 
 SIZES = 64, 2048  # px: the least and the largest side of a frame
 
 
 @dataclass(frozen=True)
-class ViewOptions(LitOptions):
+class ViewOptions:
     """Look at an avatar in the browser: rotate it, play it, relight it; or watch a training. No GPU needed.
 
     rnd-view avatar.onnx --motion walk.npz --hdr sky.exr
@@ -37,6 +37,8 @@ class ViewOptions(LitOptions):
     """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the rest pose."""
     hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = ()
     """Light probes to choose from, .exr or .hdr, or folders of them. The avatar's own light is always there."""
+    hdr_up: ProbeUp = "y"
+    """Up axis of the probes' files."""
     capture: OptionalFolder = None
     """A capture: its images can be shown beside the avatar, from their cameras and under their lights."""
 
@@ -55,13 +57,15 @@ class ViewOptions(LitOptions):
     """Rasteriser: auto takes GL on a graphics card and the CPU kernel otherwise."""
     threads: OptionalCount = None
     """CPU threads. Default: all."""
+    reading: MotionGroup = field(default_factory=MotionOptions)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if not self.hdr:
+            refuse_changed(self, ["hdr_up"], "needs --hdr")
         if self.motion is None:
             captured = self.capture is not None
             ours = "the capture's own is read by its rules" if captured else "the rest pose does not move"
-            self.refuse_unread(f"needs --motion: {ours}", edited=captured)
+            self.reading.refuse_unread(f"needs --motion: {ours}", edited=captured)
         refuse_outside(self, {"fps_floor": (1e-3, 1000)})
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)

@@ -149,9 +149,9 @@ class Scene:
 
     def _motion(self, options: ViewOptions) -> Motion:
         if options.motion:
-            return options.read_motion(options.motion, self.avatar.skeleton)
+            return options.reading.read_motion(options.motion, self.avatar.skeleton)
         if self.capture:
-            return edit_motion(self._captured_motion, options.edits)
+            return edit_motion(self._captured_motion, options.reading.edits)
         joints = len(self.avatar.skeleton)
         rest = np.broadcast_to(np.eye(3), (1, joints, 3, 3))
         return Motion(rest, np.zeros((1, 3)), 30.0, self.avatar.skeleton.names, "at rest")
