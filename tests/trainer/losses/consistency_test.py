@@ -12,7 +12,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_trainer.losses.consistency import GRAZING, PITCH, YAW, consistency_loss, covisible, project, virtual_camera
 from rnd_trainer.losses.perceptual import Perceptual, load_perceptual
 from rnd_trainer.losses.perceptual_nets import BACKBONES
-from rnd_trainer.model.model import Attributes, Posed
+from rnd_trainer.model.model import Attributes, PosedGaussians
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +28,13 @@ def perceptual(tmp_path_factory) -> Perceptual:
     return load_perceptual(path)
 
 
-def _ball(count: int = 4000, radius: float = 0.2) -> Posed:
+def _ball(count: int = 4000, radius: float = 0.2) -> PosedGaussians:
     generator = torch.Generator().manual_seed(0)
     normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     size = (0.008**2) * torch.tensor([1.0, 0, 0, 1.0, 0, 1.0])
     one = torch.ones(count)
     static = Attributes(0.99 * one, *(normals,) * 6, one, normals)
-    return Posed(radius * normals, size.expand(count, 6).contiguous(), normals, one, one, one, static)
+    return PosedGaussians(radius * normals, size.expand(count, 6).contiguous(), normals, one, one, one, static)
 
 
 def _camera() -> Camera:

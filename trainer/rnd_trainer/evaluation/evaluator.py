@@ -17,12 +17,12 @@ from rnd_runtime.raster.in_view import in_view
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.model.encoders import SH_DC_OF_ONE
-from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+from rnd_trainer.model.model import AvatarModel, PosedGaussians, PoseInput
 from rnd_trainer.render.shading import view_visibility
 
 
 @torch.no_grad()
-def to_gaussians(posed: Posed, pose: PoseInput) -> Gaussians:
+def to_gaussians(posed: PosedGaussians, pose: PoseInput) -> Gaussians:
     """Posed Gaussians as the runtime's arrays."""
     static = posed.attributes
     tensors = (
@@ -91,7 +91,7 @@ def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
 
 
 def _shade(
-    model: AvatarModel, gaussians: Gaussians, posed: Posed, pose: PoseInput, camera: Camera, shader: Shader
+    model: AvatarModel, gaussians: Gaussians, posed: PosedGaussians, pose: PoseInput, camera: Camera, shader: Shader
 ) -> NDArray[np.float32]:
     """Radiance [N, 3]; the ablated kinds of visibility see no shadows, and the paper's dims by direction."""
     kind = model.config.visibility

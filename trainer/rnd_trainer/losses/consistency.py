@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from rnd_runtime.core.camera import Camera
-from rnd_trainer.model.model import Posed
+from rnd_trainer.model.model import PosedGaussians
 from rnd_trainer.render.in_sight import in_sight
 
 from .perceptual import Perceptual
@@ -51,7 +51,7 @@ def virtual_camera(camera: Camera, centre: Tensor, generator: torch.Generator) -
     return dataclasses.replace(camera, world_to_camera=swung)
 
 
-def covisible(posed: Posed, first: Camera, second: Camera, count: int) -> Tensor:
+def covisible(posed: PosedGaussians, first: Camera, second: Camera, count: int) -> Tensor:
     """Indices of those of the first ``count`` Gaussians that both cameras see."""
     seen = [in_sight(posed, camera, count, facing=GRAZING, occlusion=OCCLUSION)[0] for camera in (first, second)]
     return torch.from_numpy(np.flatnonzero(seen[0] & seen[1])).to(posed.means.device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rnd_trainer.model.model import Posed
+from rnd_trainer.model.model import PosedGaussians
 from rnd_trainer.render.probe import luminance, natural_sky
 
 from .metrics import SSIM_WINDOW, ssim_map
@@ -51,7 +51,7 @@ def stretch_penalty(stretch: Tensor) -> Tensor:
     return torch.relu(stretch - ALLOWED_STRETCH).square().sum() / max(len(stretch), 1)
 
 
-def geometry_prior(posed: Posed, weight_offset: float, weight_residual: float) -> Tensor:
+def geometry_prior(posed: PosedGaussians, weight_offset: float, weight_residual: float) -> Tensor:
     """Mean squares of the pose offset (in units of its bound) and of the geometric residuals."""
     residual = posed.attributes.raw_geometry_residual
     return weight_offset * posed.offset.square().mean() + weight_residual * residual.square().mean()

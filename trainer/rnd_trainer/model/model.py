@@ -67,7 +67,7 @@ class Attributes:
 
 
 @dataclass
-class Posed:
+class PosedGaussians:
     """Posed Gaussians, world frame: means [N, 3] m, covariances [N, 6] m², normals [N, 3] unit.
 
     visibility [N, 16] in the root's frame; skinning weights [N, J] and the pose's offset [N, 3] m feed the
@@ -175,8 +175,8 @@ class AvatarModel(nn.Module):
         """How far each Gaussian's own residual takes it from the surface [N, 3] m."""
         return self.spacing * torch.tanh(_by_name(self.geometry_residual, GEOMETRY_COLUMNS)["offset"])
 
-    def forward(self, pose: PoseInput) -> Posed:
-        """Pose the avatar; see ``Posed``."""
+    def forward(self, pose: PoseInput) -> PosedGaussians:
+        """Pose the avatar; see ``PosedGaussians``."""
         encoded = self.encoded_nodes()
         nodes = len(encoded)
         static = self.attributes(encoded)
@@ -204,7 +204,7 @@ class AvatarModel(nn.Module):
             static.normals,
             TwistFrames(self.limb_axes, self.limb_levers, self.limb_shares),
         )
-        return Posed(
+        return PosedGaussians(
             means=means,
             covariances=upper,
             normals=normals,

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.raster.cpu import rasterize
-from rnd_trainer.model.model import Posed
+from rnd_trainer.model.model import PosedGaussians
 
 
 @torch.no_grad()
 def in_sight(
-    posed: Posed, camera: Camera, count: int, *, facing: float, occlusion: float
+    posed: PosedGaussians, camera: Camera, count: int, *, facing: float, occlusion: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Which of the first ``count`` Gaussians the camera sees [count], and their pixels [count, 2].
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rnd_runtime.core.camera import Camera
-from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+from rnd_trainer.model.model import AvatarModel, PosedGaussians, PoseInput
 
 from .probe import Texels
 from .raster import rasterize
@@ -24,7 +24,7 @@ class Splat:
     alpha: Tensor
 
 
-def splat(posed: Posed, radiance: Tensor, camera: Camera) -> Splat:
+def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera) -> Splat:
     """Rasterise linear ``radiance`` [N, 3] and the normals of posed Gaussians in one pass."""
     rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
     features = torch.cat([radiance, posed.normals @ rotation.T], dim=-1)
@@ -33,7 +33,7 @@ def splat(posed: Posed, radiance: Tensor, camera: Camera) -> Splat:
 
 
 def shade_visible(
-    posed: Posed, pose: PoseInput, texels: Texels, camera: Camera, model: AvatarModel, traced_texels: int
+    posed: PosedGaussians, pose: PoseInput, texels: Texels, camera: Camera, model: AvatarModel, traced_texels: int
 ) -> Tensor:
     """Radiance [N, 3] of the Gaussians that may be seen; zero for those facing away.
 

@@ -22,7 +22,7 @@ from rnd_trainer.losses.losses import (
 )
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.losses.repulsion import repulsion
-from rnd_trainer.model.model import AvatarModel, Posed, PoseInput
+from rnd_trainer.model.model import AvatarModel, PosedGaussians, PoseInput
 from rnd_trainer.render.probe import LightProbe, Texels, all_texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.render.shading import sh_basis, traced_visibility
@@ -111,7 +111,7 @@ class Objective:
         return torch.from_numpy(srgb_to_linear(drawn[:3].numpy()))
 
     def _picture(
-        self, model: AvatarModel, posed: Posed, pose: PoseInput, texels: Texels | None, camera: Camera
+        self, model: AvatarModel, posed: PosedGaussians, pose: PoseInput, texels: Texels | None, camera: Camera
     ) -> Splat:
         """The posed avatar from ``camera``: plain colours, or shaded under ``texels``."""
         if texels is None:
@@ -141,7 +141,7 @@ class Objective:
         self,
         network: Perceptual,
         model: AvatarModel,
-        posed: Posed,
+        posed: PosedGaussians,
         pose: PoseInput,
         texels: Texels,
         camera: Camera,
@@ -161,14 +161,14 @@ class Objective:
         pixels = project(points, camera), project(points, virtual)
         return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, network)
 
-    def _repulsion(self, model: AvatarModel, posed: Posed) -> Tensor:
+    def _repulsion(self, model: AvatarModel, posed: PosedGaussians) -> Tensor:
         """Repulsion of the points, with gradient by their residual offsets alone: through the shared network it costs
         0.1 to 0.2 dB on held-out images."""
         residual_offset = model.residual_offset()
         points = posed.attributes.points.detach() + residual_offset - residual_offset.detach()
         return repulsion(points, self.config.least_distance * float(model.spacing))
 
-    def _visibility_loss(self, model: AvatarModel, posed: Posed, pose: PoseInput) -> Tensor:
+    def _visibility_loss(self, model: AvatarModel, posed: PosedGaussians, pose: PoseInput) -> Tensor:
         """Square error of the SH visibility against shadow maps at the nodes, in random directions."""
         nodes = self.config.model.nodes
         directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
