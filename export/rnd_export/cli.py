@@ -31,8 +31,7 @@ from rnd_runtime.core.command import (
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed
 from rnd_runtime.shading.light import Up
 
-BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}
-"""options of the search, by kind of bound"""
+BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}  # options of the search, by kind of bound
 MIN_SIDE = 16
 UNKNOWN = {"light": "the light probe of the search is --hdr FILE", "target": "rnd-convert splats writes clips"}
 

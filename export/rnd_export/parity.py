@@ -18,14 +18,10 @@ from rnd_runtime.posing.window import motion_window
 from rnd_trainer.model.checkpoint import Checkpoint
 from rnd_trainer.training.data import pose_input
 
-MAX_FRAMES = 1_000
-"""compared at most: half a minute with 30 000 Gaussians"""
-MAX_WEIGHT_ERROR = 1e-4
-"""of a skinning weight"""
-MAX_POSITION_ERROR_M = 1e-4
-"""0.1 mm, a tenth of a pixel at 512² and arm's length"""
-MAX_RELATIVE_ERROR = 1e-3
-"""of a unit normal, a visibility coefficient, and a covariance over its longest axis"""
+MAX_FRAMES = 1_000  # compared at most: half a minute with 30 000 Gaussians
+MAX_WEIGHT_ERROR = 1e-4  # of a skinning weight
+MAX_POSITION_ERROR_M = 1e-4  # 0.1 mm, a tenth of a pixel at 512² and arm's length
+MAX_RELATIVE_ERROR = 1e-3  # of a unit normal, a visibility coefficient, and a covariance over its longest axis
 MAX_P99_M: dict[Precision, float] = {"f32": MAX_POSITION_ERROR_M, "f16": 1e-3, "int8": 3e-3}
 """99th percentile of the position errors of all Gaussians in all frames"""
 

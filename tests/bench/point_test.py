@@ -34,10 +34,8 @@ pytestmark = pytest.mark.slow
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
 LAST_BITS = 1e-5
 """of radiance in float32: a kernel that a process compiled itself and the same out of numba's cache differ by an ulp"""
-BRUTE_DB = 65.0
-"""the fastest exact path against the reference: float32 against float64, numba against numpy"""
-SUNS_DB = 50.0
-"""tables, and suns by their middle and spread; 56.4 measured"""
+BRUTE_DB = 65.0  # the fastest exact path against the reference: float32 against float64, numba against numpy
+SUNS_DB = 50.0  # tables, and suns by their middle and spread; 56.4 measured
 
 
 def _played(avatar_file, shade) -> Measured:

@@ -34,8 +34,7 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.checkpoint import load_checkpoint
 from support.tiny import ASSETS
 
-CONFIG = ModelConfig(nodes=7_500)
-"""whose formulas below have as many nodes to give up"""
+CONFIG = ModelConfig(nodes=7_500)  # whose formulas below have as many nodes to give up
 
 
 def _clock(avatar: Avatar) -> float:

@@ -9,8 +9,7 @@ import pytest
 
 from support.paths import ASSETS
 
-SMALL = {"subject": 0, "frames": 5, "cameras": 2, "size": 64, "samples": 9}
-"""seconds, not minutes"""
+SMALL = {"subject": 0, "frames": 5, "cameras": 2, "size": 64, "samples": 9}  # seconds, not minutes
 
 
 @pytest.fixture(scope="session")

@@ -22,8 +22,7 @@ from .builder import GraphBuilder, Storage
 
 LAYER_NORM_EPSILON = 1e-5
 LANES = 8
-NO_SHARE = -1e9
-"""score of a padding joint"""
+NO_SHARE = -1e9  # score of a padding joint
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ STORAGE: dict[Precision, tuple[Storage, Storage, Storage]] = {
 }
 """storage of most constants, of lengths, and of the networks"""
 
-SMALLEST_LOG = 1e-4
-"""log weights this near to the smallest of their row are stored as it"""
+SMALLEST_LOG = 1e-4  # log weights this near to the smallest of their row are stored as it
 
 
 class RestConstants:

@@ -15,10 +15,8 @@ from rnd_runtime.shading.light import Light
 
 from .views import views_around
 
-COSINES = (-0.3, -0.4, -0.5, -0.6, -0.7, -0.8)
-"""candidates; nearer to 0 outlines begin to fray"""
-MAX_DIFFERENCE = 1 / 255
-"""root mean square over all pixels, of sRGB from 0 to 1"""
+COSINES = (-0.3, -0.4, -0.5, -0.6, -0.7, -0.8)  # candidates; nearer to 0 outlines begin to fray
+MAX_DIFFERENCE = 1 / 255  # root mean square over all pixels, of sRGB from 0 to 1
 SIZE = 512
 
 

@@ -17,12 +17,9 @@ from rnd_runtime.raster import cpu as raster_cpu
 Floats = NDArray[np.float64]
 PosedView = tuple[Gaussians, Camera]
 
-MIN_CONTRIBUTION = 1e-3
-"""of the mean: below it a Gaussian makes no difference that 8 bits can show"""
-CG_STEPS = 8
-"""of conjugate gradients; the residual falls little after six"""
-RIDGE = 1e-3
-"""of the mean contribution, for the albedo of what is hardly seen"""
+MIN_CONTRIBUTION = 1e-3  # of the mean: below it a Gaussian makes no difference that 8 bits can show
+CG_STEPS = 8  # of conjugate gradients; the residual falls little after six
+RIDGE = 1e-3  # of the mean contribution, for the albedo of what is hardly seen
 ALBEDO = (0.0, 1.0)
 MERGED_FIELDS = ("points", "factors", "normals", "opacities", "albedo", "roughness")
 

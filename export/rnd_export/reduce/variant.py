@@ -17,8 +17,7 @@ from rnd_runtime.core.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
 
-COARSE_SHARE = 4
-"""``coarse`` evaluates the networks at one of this many nodes"""
+COARSE_SHARE = 4  # ``coarse`` evaluates the networks at one of this many nodes
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,10 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 
-COUNT = 6
-"""views to search in, and held-out ones"""
-FIT_COUNT = 24
-"""views to fit in; with six the dancer loses 1 to 2 dB in other views"""
+COUNT = 6  # views to search in, and held-out ones
+FIT_COUNT = 24  # views to fit in; with six the dancer loses 1 to 2 dB in other views
 FIELD_OF_VIEW = 0.6
-GOLDEN_ANGLE = 2 * np.pi * 0.381966
-"""rad, between one view and the next: no two from one side"""
+GOLDEN_ANGLE = 2 * np.pi * 0.381966  # rad, between one view and the next: no two from one side
 
 
 @dataclass(frozen=True, eq=False)

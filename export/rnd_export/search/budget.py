@@ -31,10 +31,8 @@ LADDERS: dict[str, tuple[float, ...]] = {
     "window": (0.5, 0.3, 0.2),
 }
 """steps of each choice; nodes, Gaussians and window poses as shares of the checkpoint's"""
-MARGIN_DB = 0.3
-"""above a required PSNR: held-out views are a little worse"""
-MIN_GAIN = 0.01
-"""share of the cost that a step must save; smaller steps are taken when none is left"""
+MARGIN_DB = 0.3  # above a required PSNR: held-out views are a little worse
+MIN_GAIN = 0.01  # share of the cost that a step must save; smaller steps are taken when none is left
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from .timing import PairedTimer, milliseconds
 Floats = NDArray[np.float64]
 
 USUAL_FRAMES = 90
-FIT_SIDE = 256
-"""longer side, px, of the images that contributions and albedo are computed from"""
+FIT_SIDE = 256  # longer side, px, of the images that contributions and albedo are computed from
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-TIMED, UNTIMED = 12, 2
-"""measured frames, and warm-up frames before them"""
-CALIBRATED = 36
-"""frames of the reference at the start; their fastest sixth is its time"""
-RECALIBRATION_GAIN = 0.1
-"""by what share the reference must become faster to be calibrated again"""
+TIMED, UNTIMED = 12, 2  # measured frames, and warm-up frames before them
+CALIBRATED = 36  # frames of the reference at the start; their fastest sixth is its time
+RECALIBRATION_GAIN = 0.1  # by what share the reference must become faster to be calibrated again
 
 
 def milliseconds(

@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from rnd_runtime.shading.light import Light, texel_directions
 
-SUN_RADIUS = 0.02
-"""rad; four times the sun's, so that a map of 128 rows holds it in some texels"""
+SUN_RADIUS = 0.02  # rad; four times the sun's, so that a map of 128 rows holds it in some texels
 
 
 def sun_and_sky(height: int = 128, *, sun: ArrayLike = (0.8, 0.5, 0.33), radiance: float = 900.0) -> Light:

@@ -12,8 +12,7 @@ from rnd_runtime.core.images import linear_to_srgb
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-IDENTICAL_DB = 200.0
-"""PSNR of equal images: JSON has no infinity"""
+IDENTICAL_DB = 200.0  # PSNR of equal images: JSON has no infinity
 
 
 def srgb(linear: ArrayLike) -> Floats:

@@ -26,8 +26,7 @@ from .poses import EXTREMES
 USUAL, INSIDE, SQUAT, SUN = get_args(SceneName)
 HARDEST = (INSIDE, SQUAT, SUN)
 SUN_RADIANCE = 1e6
-NECK, FEET = (0.0, 1.5, 0.0), (0.0, 0.3, 0.1)
-"""m, of the body that stands at the origin"""
+NECK, FEET = (0.0, 1.5, 0.0), (0.0, 0.3, 0.1)  # m, of the body that stands at the origin
 
 
 class BenchScene(NamedTuple):

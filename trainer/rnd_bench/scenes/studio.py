@@ -24,8 +24,7 @@ from .lights import sun_and_sky
 from .poses import ARMS_DOWN, CROSSED, EXTREMES, FPS, Angles
 
 POINTS = 6000
-HELD_OUT = (*EXTREMES.values(), CROSSED)
-"""poses of the split novel_pose"""
+HELD_OUT = (*EXTREMES.values(), CROSSED)  # poses of the split novel_pose
 STRIPES = 25.0
 """rad/m of the painted stripes, light and dark: with equal ones, albedo error is only where light falls (L12)"""
 

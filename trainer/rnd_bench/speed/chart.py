@@ -20,23 +20,16 @@ from .point import Row, Setting
 
 BUDGET_MS, BUDGET_DB = 1000 / 60, 45.0
 COLOURS = {4_000: "#7fb3d5", 8_000: "#2e86c1", 15_000: "#16a085", 30_000: "#d35400", 60_000: "#8e44ad"}
-SEEDED = "seeded"
-"""``avatar`` of a row with untrained networks"""
-HARD = "X"
-"""marks a frame of one of the hardest scenes"""
+SEEDED = "seeded"  # ``avatar`` of a row with untrained networks
+HARD = "X"  # marks a frame of one of the hardest scenes
 EDGES = {"ao": "#aaaaaa", "table": "#000000", "table+sun": "#f4d03f", "lights": "#ff4fa3", "brute": "#00c8ff"}
 """of a mark: its shading"""
 MARKERS = {"full": "o", "coarse": "s", "static": "^"}
-EDGE = 0.9
-"""points wide"""
-CEILING_DB = 60.0
-"""points above it are plotted on it"""
-MIN_SPAN = 5.0
-"""a panel's greatest milliseconds over its least, at least: room for two of the ticks 1, 2, 5, 10 …"""
-CROWDED = 500.0
-"""that ratio from which on only 0.1, 1, 10 … have room"""
-COLUMNS, WIDE = 5, 3
-"""panels side by side, and how many of them the overview is as wide as"""
+EDGE = 0.9  # points wide
+CEILING_DB = 60.0  # points above it are plotted on it
+MIN_SPAN = 5.0  # a panel's greatest milliseconds over its least, at least: room for two of the ticks 1, 2, 5, 10 …
+CROWDED = 500.0  # that ratio from which on only 0.1, 1, 10 … have room
+COLUMNS, WIDE = 5, 3  # panels side by side, and how many of them the overview is as wide as
 
 
 def check_chart(*files: Path) -> None:

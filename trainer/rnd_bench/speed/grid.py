@@ -21,8 +21,7 @@ from rnd_runtime.playback.doctor import machine
 
 from .point import FULL_N, Inputs, Row, Setting, measured
 
-CULLS = (-0.2, -0.5)
-"""cosines below which n·v is left out"""
+CULLS = (-0.2, -0.5)  # cosines below which n·v is left out
 FACTORS: dict[str, tuple[Any, ...]] = {
     "n": (4_000, 8_000, 15_000, FULL_N, 60_000),
     "size": (256, 512, 1024),

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from .figures import Figure
 
-SMALL_STEPS = 600
-"""of the avatar that is trained where none is given"""
+SMALL_STEPS = 600  # of the avatar that is trained where none is given
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from .figures import Figure, Result, at_most, holds
 from .processes import export, play, run_commands
 
 THREADS = (1, 2)
-FRAMES = 8
-"""of a motion in which every joint turns"""
+FRAMES = 8  # of a motion in which every joint turns
 
 
 def same_bytes(subject: Subject) -> Result:

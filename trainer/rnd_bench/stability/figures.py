@@ -12,8 +12,7 @@ import numpy as np
 from rnd_bench.scenes.psnr import Bytes
 from rnd_runtime.core.errors import InputError
 
-Baseline = tuple[str, float] | None
-"""name and figure of the plain method"""
+Baseline = tuple[str, float] | None  # name and figure of the plain method
 
 
 @dataclass(frozen=True)

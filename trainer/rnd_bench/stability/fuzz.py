@@ -19,10 +19,8 @@ from .figures import Figure, at_most, holds
 from .hostile import READERS, target_of
 from .processes import environment
 
-WAIT_S = 3600.0
-"""for a batch"""
-BATCH = 2000
-"""inputs in one process: what a crash loses"""
+WAIT_S = 3600.0  # for a batch
+BATCH = 2000  # inputs in one process: what a crash loses
 MEMORY_FACTOR = 2.0
 
 

@@ -25,10 +25,8 @@ from rnd_runtime.core.errors import InputError
 
 from .damage import damage, json_damage, npz_damage, safetensors_damage
 
-HANG_S = 5.0
-"""of processor time for one input, so that a busy machine is not taken for a hang"""
-SPARE_BYTES = 2 << 30
-"""address space beyond what importing took"""
+HANG_S = 5.0  # of processor time for one input, so that a busy machine is not taken for a hang
+SPARE_BYTES = 2 << 30  # address space beyond what importing took
 EVENTS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pickle.find_class"}
 """of Python's audit, that no reader of ours has a reason for"""
 READERS = ("capture", "motion", "body", "exr", "hdr", "checkpoint", "avatar")

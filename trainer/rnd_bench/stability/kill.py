@@ -26,10 +26,8 @@ from .processes import TRAIN, Command, environment, export, play
 from .small import studio
 
 STEPS, SAVED_EVERY = 48, 4
-STEP_SECONDS = 60.0
-"""the latest moment at which a command is killed"""
-PATIENCE = 4
-"""runs for each kill, at most: some end by themselves first"""
+STEP_SECONDS = 60.0  # the latest moment at which a command is killed
+PATIENCE = 4  # runs for each kill, at most: some end by themselves first
 
 
 def kill_all(subject: Subject, times: int) -> list[Figure]:

@@ -13,8 +13,7 @@ from typing import NamedTuple
 PLAY, EXPORT, TRAIN = "rnd_viewer.play.cli", "rnd_export.cli", "rnd_trainer.commands.train"
 PATIENCE_S = 600
 
-Command = tuple[str, list[str]]
-"""the module whose ``main`` is run, and its arguments"""
+Command = tuple[str, list[str]]  # the module whose ``main`` is run, and its arguments
 
 # Several commands in one interpreter, since each start costs seconds: their exit codes and stderr come back as JSON.
 _DRIVER = """

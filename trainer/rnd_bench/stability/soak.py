@@ -29,13 +29,10 @@ from .figures import Figure, at_most, below, not_measured
 from .small import studio, tiny_config
 
 SLOPE_BYTES = 1000.0
-WARM = 200
-"""frames or steps before memory is watched: caches fill"""
-EVERY = 20
-"""frames or steps between two readings"""
+WARM = 200  # frames or steps before memory is watched: caches fill
+EVERY = 20  # frames or steps between two readings
 TOO_SHORT = "too few in one go"
-PACE = 1.2
-"""median of the last tenth over that of the first, among frames or steps of one kind"""
+PACE = 1.2  # median of the last tenth over that of the first, among frames or steps of one kind
 
 
 def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:

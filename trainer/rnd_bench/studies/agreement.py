@@ -31,8 +31,7 @@ from rnd_stage.render import RenderSet, Surface
 
 Floats = NDArray[np.float64]
 
-MODES = ("brute", "table+sun")
-"""shading modes of the runtime that are compared"""
+MODES = ("brute", "table+sun")  # shading modes of the runtime that are compared
 # Visibility is traced in 2 · 14² = 392 directions. Against 800, the person's irradiance under a white sky differs by
 # 0.8 % rms and 0.004 % on average.
 QUADRATURE = 14

@@ -32,8 +32,7 @@ from .variants import CAUSES, LENGTHS, VARIANTS, StudyRow, chosen
 
 STUDIES: dict[type[Trainings], tuple[StudyRow, ...]] = {Ablations: VARIANTS, Causes: CAUSES, Lengths: LENGTHS}
 MAX_SEEDS = 100
-WIDTH = 140
-"""characters of the widest table"""
+WIDTH = 140  # characters of the widest table
 
 
 def run_trainings(options: Trainings) -> None:

@@ -8,8 +8,7 @@ from typing import Any
 
 from .variants import StudyRow
 
-MEANS = ("psnr", "ssim", "lpips", "psnr_n")
-"""figures whose means a summary has"""
+MEANS = ("psnr", "ssim", "lpips", "psnr_n")  # figures whose means a summary has
 
 
 def summarise(

@@ -28,19 +28,14 @@ from rnd_trainer.training.training import StepResult, Training
 
 from .variants import StudyRow
 
-ROWS = "rows.json"
-"""of one run, in its folder"""
+ROWS = "rows.json"  # of one run, in its folder
 MOTION = "motion"
 """of a row: the file of the poses that were scored in, and learned from unless the method says otherwise"""
-CAPTURE = "capture_sha256"
-"""of a row: the digest of capture.json, which names the images of every split"""
-FEATURES = "consistency_sha256"
-"""of a row: the network whose features L_gc compared in training"""
+CAPTURE = "capture_sha256"  # of a row: the digest of capture.json, which names the images of every split
+FEATURES = "consistency_sha256"  # of a row: the network whose features L_gc compared in training
 ELSEWHERE = "another folder for RUN, or delete this one"
-NOISY_MOTION = "motion_noisy.npz"
-"""beside a capture's exact motion"""
-TIMED = 20
-"""evaluations of the motion encoder whose median is reported"""
+NOISY_MOTION = "motion_noisy.npz"  # beside a capture's exact motion
+TIMED = 20  # evaluations of the motion encoder whose median is reported
 
 
 def ablate(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LADDER = (1.0, 0.75, 0.5)
-"""shares of the full width and height, from the best to the fastest"""
+LADDER = (1.0, 0.75, 0.5)  # shares of the full width and height, from the best to the fastest
 _WINDOW = 4  # frames whose median decides to give something up: one slow frame does not
 _SMOOTH = 24  # frames that must all have been fast before something is taken back
 _HEADROOM = 0.6  # of the budget: what is taken back costs up to as much again

@@ -18,10 +18,8 @@ from rnd_runtime.core.images import read_image, write_image
 from rnd_trainer.training.data import load_views
 
 Breaker = Callable[[Path, dict[str, Any]], None]
-FRAME = 2
-"""index in capture.json of the image that is broken"""
-COPIED = 6
-"""training images of a copy"""
+FRAME = 2  # index in capture.json of the image that is broken
+COPIED = 6  # training images of a copy
 _FEW = f"fewer than {COPIED} training images in this capture"
 
 

@@ -25,8 +25,7 @@ from rnd_trainer.losses.metrics import mask_box
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.training.data import usable
 
-TEXELS = (16, 32)
-"""of the sky under which visibility is compared: every texel's shadow is traced"""
+TEXELS = (16, 32)  # of the sky under which visibility is compared: every texel's shadow is traced
 
 
 def relit_scale(subject: Subject) -> Result:

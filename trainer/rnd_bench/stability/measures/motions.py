@@ -15,8 +15,7 @@ from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.motion.readers.arrays import read_motion_file
 from rnd_runtime.motion.skeleton import smpl_skeleton
 
-HIGH = 6.0
-"""m: no camera that sees a body there sees one at the origin"""
+HIGH = 6.0  # m: no camera that sees a body there sees one at the origin
 
 
 def _fields(subject: Subject, frames: int) -> dict[str, Any]:

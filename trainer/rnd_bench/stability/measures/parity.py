@@ -24,8 +24,7 @@ from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.template import along_curve
 from rnd_trainer.training.data import pose_input
 
-PRECISIONS = {"f16": 1.0, "int8": 3.0}
-"""mm that 99 % of the Gaussians may be off by"""
+PRECISIONS = {"f16": 1.0, "int8": 3.0}  # mm that 99 % of the Gaussians may be off by
 
 
 def wild_motion(subject: Subject, frames: int) -> Motion:

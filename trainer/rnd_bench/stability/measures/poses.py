@@ -27,8 +27,7 @@ from rnd_trainer.losses.metrics import mask_box
 from rnd_trainer.training.data import usable
 
 BYTE = 1 / 255
-HOLE_MARGIN = 0.006
-"""of the image's side, by which silhouettes are eroded: their edges are soft"""
+HOLE_MARGIN = 0.006  # of the image's side, by which silhouettes are eroded: their edges are soft
 
 
 def out_of_distribution(subject: Subject) -> Result:

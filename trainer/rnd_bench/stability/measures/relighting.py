@@ -30,13 +30,10 @@ from rnd_runtime.shading.shader import Shader
 
 from .captures import flipped_normals
 
-HALF_MAX = 65504.0
-"""the largest half float; a brighter texel is infinity in a half EXR"""
+HALF_MAX = 65504.0  # the largest half float; a brighter texel is infinity in a half EXR
 SUNS = (1e5, 1e6, HALF_MAX)
-FIREFLY = 4.0
-"""times the brightest neighbour"""
-GRAZING = 0.1
-"""cosine between normal and view below which a view grazes"""
+FIREFLY = 4.0  # times the brightest neighbour
+GRAZING = 0.1  # cosine between normal and view below which a view grazes
 ELEVATIONS = (-90.0, -60.0, -10.0, 0.0, 20.0, 45.0, 75.0, 88.0, 90.0)
 
 

@@ -29,16 +29,12 @@ from rnd_trainer.render.raster_reference import rasterize as rasterize_by_torch
 from .poses import BYTE
 
 Floats32 = NDArray[np.float32]
-Splats = tuple[Floats32, Floats32, Floats32, Floats32]
-"""means, covariances, opacities, features"""
+Splats = tuple[Floats32, Floats32, Floats32, Floats32]  # means, covariances, opacities, features
 
 NEEDLE = 10
-SCREEN_FILLING = 50
-"""per cent of the image that one Gaussian of more than half opacity may cover"""
-SLOWEST = 3
-"""times the median that the slowest frame of a flight may take"""
-UPPER = [0, 1, 2, 4, 5, 8]
-"""of a covariance [3, 3] as nine numbers"""
+SCREEN_FILLING = 50  # per cent of the image that one Gaussian of more than half opacity may cover
+SLOWEST = 3  # times the median that the slowest frame of a flight may take
+UPPER = [0, 1, 2, 4, 5, 8]  # of a covariance [3, 3] as nine numbers
 GL_BACKENDS: tuple[Backend, ...] = ("egl", "osmesa")
 
 

@@ -19,8 +19,7 @@ from rnd_runtime.motion.motion import Motion
 from rnd_trainer.training.training import MAX_BAD_STEPS, Training
 
 NOISE_DEGREES = 2.0
-SHORT = 12
-"""steps with an image of a training that is only compared with another; more without one follow"""
+SHORT = 12  # steps with an image of a training that is only compared with another; more without one follow
 
 
 def noisy_training_poses(subject: Subject) -> Result:

@@ -12,14 +12,10 @@ from rnd_bench.scenes.subject import Subject
 from rnd_bench.stability.figures import Result, above, below, reported
 from rnd_runtime.core.gaussians import Gaussians
 
-RING_M = 0.02
-"""length of a slice of a limb whose radius is measured"""
-RING_COUNT = 8
-"""Gaussians that a slice needs to have a radius"""
-NEIGHBOURS = 12
-"""that define the surface around a Gaussian"""
-FEWER_OR_MORE = (9, 16)
-"""neighbours: how well a twisted surface's normals are known at all"""
+RING_M = 0.02  # length of a slice of a limb whose radius is measured
+RING_COUNT = 8  # Gaussians that a slice needs to have a radius
+NEIGHBOURS = 12  # that define the surface around a Gaussian
+FEWER_OR_MORE = (9, 16)  # neighbours: how well a twisted surface's normals are known at all
 
 
 def candy_wrapper(subject: Subject) -> Result:
