@@ -1,4 +1,4 @@
-"""Every number that a training depends on, with its reason, in one frozen dataclass."""
+"""Configuration of a training: model, schedule, rates and loss weights."""
 
 from __future__ import annotations
 
@@ -9,170 +9,156 @@ from typing import Any, Literal
 from rnd_runtime.core.errors import InputError, check_option
 
 MAX_NODES = 1_875
-"""3 cm apart on a body, over which what the networks say is smooth. Twice as many gain less than 0.1 dB in held-out
-pictures, 0.14 at most under other lights, and networks take twice as long (docs/tried.md)"""
+"""spacing 3 cm on a body; twice as many gain less than 0.1 dB held out, 0.14 dB relit, and double the networks' time"""
 NODE_SHARE = 8
-"""Gaussians to each node, where that makes fewer"""
+"""Gaussians per node, below ``MAX_NODES``"""
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """What the avatar is made of; stored in the checkpoint, since it says how to rebuild the networks."""
+    """Size and variant of the avatar; stored in the checkpoint to rebuild the networks."""
 
     gaussians: int = 30_000
-    """Gaussians on the template's surface; fixed, nothing is densified or pruned"""
+    """Gaussians on the template's surface; no densification or pruning"""
     nodes: int = MAX_NODES
-    """points at which the networks are evaluated; the Gaussians interpolate between them (smooth quantities)"""
+    """points at which the networks are evaluated; Gaussians interpolate between them"""
     window_poses: int = 10
-    """d: poses in the motion window (the paper's ablation: 20 gains little over 10)"""
+    """d, poses in the motion window; 20 gain little over 10 (the paper's ablation)"""
     window_seconds: float = 0.3
-    """time that the window spans, so that a 120 fps file and its 30 fps copy give the same pose"""
+    """time span of the window, independent of the motion's frame rate"""
     width: int = 64
-    """width of the attention and of the hidden layers; the query side is baked, so it costs little at playback"""
+    """width of the attention and of the hidden layers"""
     heads: int = 2
-    """attention heads: with four every figure is the same (docs/tried.md)"""
+    """attention heads; four give the same scores"""
     frequencies: int = 7
-    """bands of the positional encoding; the 8th lies past the Nyquist limit of 8 mm spacing"""
+    """bands of the positional encoding; the 8th exceeds the Nyquist limit of 8 mm spacing"""
     attribute_width: int = 96
     """hidden width of the attribute encoders D_g and D_a"""
     max_offset: float = 0.06
-    """bound of the pose-dependent offset Δx, metres"""
+    """bound of the pose-dependent offset Δx, m"""
     max_static_offset: float = 0.12
-    """bound of a Gaussian's offset from the unclothed template (hair, loose cloth), metres"""
+    """bound of the static offset from the unclothed template (hair, loose cloth), m"""
     dynamic_skinning: bool = True
-    """False: the template's weights, the paper's static baseline"""
+    """False: the template's weights (the paper's static baseline)"""
     motion_encoder: Literal["full", "spatial"] = "full"
-    """'spatial': no temporal attention, the paper's ablation"""
+    """'spatial': no temporal attention (the paper's ablation)"""
     visibility: Literal["pose", "paper", "none"] = "pose"
-    """'paper': of x_c and the normal, at the direction to the camera; 'none': no shadows. Ablations, not exported"""
+    """'paper': from x_c and the normal, towards the camera; 'none': no shadows. Ablations, not exported"""
     learned_normals: bool = True
-    """False: the template's normals (mesh-normal shading, an ablation)"""
+    """False: the template's normals (ablation)"""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Schedule, losses and rates. `preset()` gives the three that are offered."""
+    """Schedule, losses and rates; see ``preset``."""
 
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
     steps: int = 6_000
-    """optimisation steps, one picture each: 20 to 25 minutes on two cores"""
+    """optimisation steps of one image each; 20 to 25 minutes on two cores"""
     stage1_fraction: float = 0.25
-    """share of the steps spent on geometry with a plain colour before the light is learned"""
+    """share of the steps with a plain colour per Gaussian, before albedo and light"""
     unseen_fraction: float = 0.375
-    """as many steps more, by this share of them, without pictures: skinning learns unseen poses. A half
-    costs 0.06 dB more under other lights (quick has it: a thousand steps)"""
+    """additional steps in unseen poses, as a share of ``steps``; 0.5 costs 0.06 dB more under other lights"""
     image_scale: float = 1.0
-    """training pictures are shrunk by this factor"""
+    """scale of the training images"""
     seed: int = 0
-    """of every random draw"""
+    """seed of all random numbers"""
     light: Literal["learn", "capture", "none"] = "learn"
-    """'capture': the capture's own light map, an oracle that tells what the learned light costs; 'none': plain
-    colours to the end, as avatars that cannot be relit are trained"""
+    """'capture': the capture's light map (oracle); 'none': plain colours to the end, an avatar that cannot be relit"""
     normals: Literal["estimated", "true"] = "estimated"
-    """'true': the capture's exact normals, an oracle"""
+    """'true': the capture's exact normals (oracle)"""
     probe_channels: Literal[1, 3] = 3
-    """1: a grey light, as printed in the paper"""
-
+    """1: a grey light, as in the paper"""
     light_search: bool = True
-    """start the second stage from a sky and suns found by least squares, instead of from a white probe"""
-
+    """initialise the probe with a least-squares sky and directional lights; False: white"""
     rate_networks: float = 2e-3
-    """Adam's step for the networks, at the start"""
+    """initial learning rate of the networks"""
     rate_residuals: float = 3e-2
-    """Adam's step for the per-Gaussian residuals. Half of it leaves LPIPS higher, twice as much loses 0.2 dB
-    (docs/tried.md)"""
+    """of the per-Gaussian residuals; half of it raises LPIPS, twice as much loses 0.2 dB"""
     rate_light: float = 1e-2
-    """Adam's step for the logarithms of the probe's texels"""
+    """of the probe's log radiance"""
     rate_final: float = 0.5
-    """share of all rates that is left at the last picture, falling exponentially. A tenth, as it was, ends a training
-    before it has learned what it could: half a dB at a quarter of the steps (docs/tried.md)"""
+    """factor on all rates at the last image, reached exponentially; 0.1 loses 0.5 dB at a quarter of the steps"""
     rate_cooled: float = 0.15
-    """what is left of that after the last steps, over which rates fall once more: large ones leave noise"""
+    """further factor, reached over the last ``cooling_fraction`` of the steps"""
     cooling_fraction: float = 0.15
-    """share of the steps that are these"""
+    """share of the steps over which ``rate_cooled`` applies"""
 
     weight_dssim: float = 0.2
-    """of 1 − SSIM beside L1, in image terms"""
+    """1 − SSIM, beside L1 on the image"""
     dssim_scales: int = 3
-    """halvings over which 1 − SSIM is averaged where there is no perceptual network"""
+    """scales over which 1 − SSIM is averaged where there is no perceptual network"""
     weight_lpips: float = 0.05
-    """of LPIPS, with --perceptual-weights: four times as much takes a quarter off it in training pictures, a hundredth
-    in held-out ones, and costs 0.1 to 0.3 dB"""
+    """LPIPS; four times as much lowers held-out LPIPS by 1 % and costs 0.1 to 0.3 dB"""
     lpips_every: int = 2
-    """steps between evaluations of LPIPS: it costs as much as everything else in a step"""
+    """steps between evaluations of LPIPS, which cost as much as the rest of a step"""
     weight_consistency: float = 0.002
-    """of L_gc, with --perceptual-weights"""
+    """L_gc"""
     consistency_every: int = 8
-    """steps between evaluations of L_gc: a second picture and two feature stacks"""
+    """steps between evaluations of L_gc, which render a second image"""
     weight_mask: float = 0.5
-    """of L1 between alpha and the mask"""
+    """L1 between alpha and the mask"""
     weight_normal: float = 0.1
-    """λ_n, of L1 between splatted and estimated normals: estimates err by about 10 degrees, so it must not rule"""
+    """λ_n, L1 between splatted and estimated normals; estimates err by about 10°"""
     weight_skinning: float = 1e-2
-    """of KL(W ‖ W_template); decays to a tenth over the run"""
+    """KL(W ‖ W_template); decays to a tenth over the run"""
     weight_edges: float = 400.0
-    """of the stretch of skin between bones in unseen poses, beside the mean square in mm that skin moves in
-    filmed ones: in the third stage alone. With a quarter of it a squat stretches more (P1 in docs/stability.md), and
-    held-out pictures are no better"""
+    """edge stretch in unseen poses, beside the distillation in mm²; a quarter of it stretches a squat more and
+    leaves held-out scores as they are"""
     weight_smooth: float = 3e4
-    """of the mean square change of such skin's weights where a pose hardly changes, in the third stage alone: without
-    it some trainings flicker in slow motion (P9 in docs/stability.md)"""
+    """smoothness of skinning weights over jittered unseen poses; without it some avatars flicker in slow motion"""
     weight_offset: float = 2.0
-    """of the mean square of Δx in units of its bound"""
+    """mean square of Δx in units of its bound"""
     weight_residual: float = 0.02
-    """of the mean square of the geometric residuals: an unseen Gaussian follows its neighbours. Ten times as much gains
-    0.1 dB in novel views and loses 0.2 under other lights"""
+    """mean square of the geometric residuals; ten times as much gains 0.1 dB in novel views and loses 0.2 dB relit"""
     weight_repulsion: float = 0.02
-    """of pairs of Gaussians that lie nearer than ``least_distance``"""
+    """repulsion of pairs of Gaussians nearer than ``least_distance``"""
     least_distance: float = 0.5
-    """spacings between two Gaussians below which they repel one another"""
+    """in units of the spacing"""
     repulsion_every: int = 8
-    """steps between evaluations of the repulsion: finding the pairs takes a k-d tree"""
+    """steps between evaluations of the repulsion, which builds a k-d tree"""
     weight_visibility: float = 0.2
-    """of the traced visibility's square error"""
+    """square error of the SH visibility against traced visibility"""
     weight_light_grey: float = 0.02
-    """of the chroma of the probe as a whole: white light on average"""
-
+    """chroma of the mean light"""
     weight_light_sky: float = 0.03
-    """of the distance from a natural sky, sun apart: what lights the side that is never seen is like the rest"""
+    """robust distance of the probe from a natural sky"""
 
     black_backgrounds: float = 0.5
-    """share of the steps over black, where an outline drawn too wide shows most; the rest over random colours, which
-    what is opaque must hide. None: LPIPS 2 % higher, everything else within the spread of the seeds"""
-
+    """share of the steps over black, the rest over random colours; with 0 LPIPS is 2 % higher"""
     light_texels: int = 128
-    """texels of the probe drawn for a step, by luminance × solid angle"""
+    """texels of the probe sampled per step, by luminance × solid angle"""
     traced_texels: int = 4
-    """brightest drawn texels whose shadows are traced instead of read from the spherical harmonics"""
+    """brightest sampled texels, whose shadows are traced instead of evaluated from SH coefficients"""
     full_light_fraction: float = 0.05
-    """share of the last steps that sum over all texels"""
+    """share of the steps, at the end, that sum over all texels"""
     visibility_directions: int = 12
-    """directions a step in which visibility is traced to supervise its network"""
+    """directions per step in which visibility is traced to supervise its network"""
     pose_noise: float = 0.05
-    """radians of noise on the encoders' input poses: they must not memorise the frames"""
+    """standard deviation of the noise on the encoders' input poses, rad"""
 
     refine_poses: bool = False
     """correct the capture's body poses while training"""
     refine_after: float = 0.08
-    """share of the steps before poses may move: the first shape is too rough to correct anything by"""
+    """share of the steps before poses are corrected"""
     rate_poses: float = 1.5e-3
-    """Adam's step for pose corrections, radians and metres, at each look at a frame"""
+    """learning rate of pose corrections, rad and m"""
     weight_poses: float = 1e-3
-    """of the mean square correction in units of its bounds"""
+    """mean square correction in units of its bounds"""
 
     preview_every: int = 500
-    """steps between preview pictures"""
+    """steps between previews"""
     save_every: int = 500
     """steps between saved states"""
 
 
 def preset(name: str) -> TrainConfig:
-    """The offered schedules: `quick` for a look, `standard` for use, `full` when time does not matter."""
+    """The configuration named ``quick``, ``standard`` or ``full``."""
     standard = TrainConfig()
     if name == "standard":
         return standard
     if name == "full":
-        # over so many steps the standard's high rates are worse: 34.67 dB and LPIPS .0156, not 34.77 and .0147
+        # at the standard's rates: 34.67 instead of 34.77 dB, LPIPS .0156 instead of .0147
         return dataclasses.replace(standard, steps=5 * standard.steps, rate_final=0.1, rate_cooled=1.0)
     if name == "quick":
         quick = resized(standard, 12_000, 2_000)
@@ -181,12 +167,12 @@ def preset(name: str) -> TrainConfig:
 
 
 def nodes_for(gaussians: int) -> int:
-    """At how many nodes the networks of so many Gaussians are evaluated."""
+    """Number of nodes for a number of Gaussians."""
     return max(16, min(gaussians // NODE_SHARE, MAX_NODES))
 
 
 def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> TrainConfig:
-    """``config`` with another number of Gaussians (and the nodes for them) and of steps, where given."""
+    """``config`` with another number of Gaussians, their nodes, and steps; None keeps a value."""
     model = config.model
     if gaussians is not None:
         model = dataclasses.replace(model, gaussians=gaussians, nodes=nodes_for(gaussians))
@@ -194,7 +180,7 @@ def resized(config: TrainConfig, gaussians: int | None, steps: int | None) -> Tr
 
 
 def check_sizes(config: TrainConfig) -> None:
-    """Raise ``InputError``, naming the option, where a training cannot be of that size."""
+    """Raise ``InputError``, naming the option, for a size that cannot be trained."""
     gaussians, scale = config.model.gaussians, config.image_scale
     check_option(config.steps >= 1, "--steps", "at least 1", config.steps)
     check_option(0 < scale <= 1, "--image-scale", "more than 0, at most 1", scale)
@@ -207,7 +193,7 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
 
 
 def from_dict(values: dict[str, Any]) -> TrainConfig:
-    """Rebuild a configuration. Raises ``InputError`` for an unknown or a missing field."""
+    """Rebuild a configuration; raises ``InputError`` for an unknown or missing field."""
     return _build(TrainConfig, {**values, "model": _build(ModelConfig, values["model"])})
 
 
