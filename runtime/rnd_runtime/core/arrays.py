@@ -1,4 +1,4 @@
-"""What every compiled rasteriser asks of the arrays it is given."""
+"""Checks and conversions of kernel inputs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .gaussians import Floats32
 
 
 def floats(array: ArrayLike) -> Floats32:
-    """``array`` as the kernels are compiled for: float32, contiguous, aligned, writable; copied only if needed."""
+    """``array`` as kernels need it: float32, contiguous, aligned, writable; copied only if needed."""
     if type(array) is np.ndarray and array.dtype == np.float32 and array.flags.carray:
         return array
     return np.require(array, np.float32, ["C", "A", "W"])
 
 
 def mask(chosen: ArrayLike | None, count: int) -> NDArray[np.bool_]:
-    """Which of ``count`` Gaussians are ``chosen``, as the kernels are compiled for; all where it is None."""
+    """Boolean mask [``count``] of ``chosen`` Gaussians; all by default."""
     if chosen is None:
         return np.ones(count, np.bool_)
     given = np.require(chosen, np.bool_, ["C", "A", "W"])
@@ -28,7 +28,7 @@ def mask(chosen: ArrayLike | None, count: int) -> NDArray[np.bool_]:
 
 
 def check_shape(what: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
-    """Raise ``InputError`` where ``array`` has another shape: the kernels look at no bounds."""
+    """Raise ``InputError`` for another shape; kernels do not check bounds."""
     if array.shape != shape:
         raise InputError(what, expected=f"shape {shape}", got=f"{array.shape}")
 
@@ -36,7 +36,7 @@ def check_shape(what: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
 def checked(
     means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, features: ArrayLike
 ) -> tuple[Floats32, Floats32, Floats32, Floats32]:
-    """The four arrays through ``floats``: [N, 3], [N, 6], [N] and [N, C], or an ``InputError``."""
+    """``floats`` of arrays of shapes [N, 3], [N, 6], [N] and [N, C]; ``InputError`` for other shapes."""
     arrays = floats(means), floats(covariances), floats(opacities), floats(features)
     count = len(arrays[0]) if arrays[0].ndim else 0
     channels = arrays[3].shape[-1] if arrays[3].ndim else 0

@@ -12,7 +12,7 @@ from .errors import InputError
 
 Floats = NDArray[np.float64]
 
-_NO_SKEW = 1e-6  # of the focal length: rounding, below a thousandth of a pixel across an image
+_NO_SKEW = 1e-6  # of the focal length: rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,12 +20,12 @@ class Camera:
     """A pinhole camera: +X right, +Y down, +Z forward, pixel centres at +0.5.
 
     Attributes:
-        width, height: image size in pixels.
-        K: intrinsics [3, 3] in pixels, (fx 0 cx; 0 fy cy; 0 0 1); the principal point may be off-centre.
+        width, height: image size, pixels.
+        K: intrinsics [3, 3] in pixels, (fx 0 cx; 0 fy cy; 0 0 1).
         world_to_camera: [4, 4] rigid transform, metres.
 
     Raises:
-        InputError: for any other matrix, such as one with skew or one that is transposed.
+        InputError: for any other matrix.
     """
 
     width: int
@@ -54,13 +54,12 @@ class Camera:
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same view with another pixel grid: intrinsics scale with the image."""
+        """The same view at another resolution; intrinsics scale with the image."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return Camera(width, height, scale @ self.K, self.world_to_camera)
 
     def in_frame(self, frame_to_world: Floats) -> Camera:
-        """The same view for points in another frame, which ``frame_to_world`` [4, 4] (rigid, m) takes to the world."""
-        # what is rigid stays so and need not be looked at again in every frame
+        """The same view for points in another frame; ``frame_to_world`` [4, 4] is rigid, in m."""
         return shallow_copy(self, world_to_camera=self.world_to_camera @ frame_to_world)
 
     @classmethod
@@ -74,14 +73,14 @@ class Camera:
         fov_y: float,
         up: tuple[float, float, float] = (0.0, 1.0, 0.0),
     ) -> Camera:
-        """A camera at ``eye`` [3] m that looks at ``target`` [3] m with vertical field of view ``fov_y`` rad."""
+        """A camera at ``eye`` [3] m looking at ``target`` [3] m, vertical field of view ``fov_y`` rad."""
         eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
         forward = target - eye
         if np.linalg.norm(forward) < 1e-9:
             raise InputError("look_at", expected="eye and target apart", got=eye.tolist())
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, np.float64))
-        if np.linalg.norm(right) < 1e-6:  # looking along `up`: any axis across it will do, +Z first
+        if np.linalg.norm(right) < 1e-6:  # looking along `up`: any other axis, +Z first
             right = np.cross(forward, np.eye(3)[2 if abs(forward[2]) < 0.9 else 1])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
@@ -96,11 +95,11 @@ def _rigid(matrix: Floats) -> bool:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not _ends(matrix, [0, 0, 0, 1]):
         return False
     rotation = matrix[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):  # of numbers like 1e300
+    with np.errstate(over="ignore", invalid="ignore"):
         orthogonal = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     return orthogonal and bool(np.linalg.det(rotation) > 0)
 
 
 def _ends(matrix: Floats, row: list[int]) -> bool:
-    """Whether the last row of ``matrix`` is ``row``, but for rounding."""
+    """Whether the last row of ``matrix`` is ``row``, up to rounding."""
     return np.allclose(matrix[-1], row, rtol=0, atol=1e-6)

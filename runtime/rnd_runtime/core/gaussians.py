@@ -1,4 +1,4 @@
-"""The arrays that travel between the avatar, the shading and the rasterisers."""
+"""Arrays exchanged by avatar, shading and rasterisers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Floats32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N posed Gaussians with their material, in the frame of camera and light: the world, or in playback the root.
+    """N posed Gaussians with their material, in the frame of camera and light (world; the root's frame in playback).
 
     Attributes:
         means: [N, 3] m.
         covariances: [N, 6] m², upper triangle (xx, xy, xz, yy, yz, zz).
         opacities: [N] in [0, 1].
-        normals: [N, 3] unit, pointing out of the body.
+        normals: [N, 3] unit, outward.
         albedo: [N, 3] linear Rec.709 diffuse albedo in [0, 1].
         roughness: [N] perceptual roughness γ; GGX's α is γ².
-        visibility: [N, 16] SH coefficients (degree 3) of the light that reaches the point, as a
-            function of the direction **towards** the light in the root's frame.
+        visibility: [N, 16] SH coefficients of the visibility of a light as a function of the direction **towards** it,
+            root frame.
         root_rotation: [3, 3], root frame → this one.
     """
 
@@ -40,23 +40,22 @@ class Gaussians:
     root_rotation: Floats32
 
     def only(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Gaussians:
-        """Those of a mask [N] or of indices."""
+        """The Gaussians of a mask [N] or of indices."""
         names = (name for name in vars(self) if name != "root_rotation")
         return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
 
 @dataclass(frozen=True, eq=False)
 class Raster:
-    """A splatted image; everything is premultiplied by alpha and composites over any background.
+    """A splatted image, premultiplied by alpha.
 
     Attributes:
         image: [H, W, C], Σ w_i feature_i.
         alpha: [H, W], Σ w_i.
-        depth: [H, W] m, Σ w_i z_i with z the camera-space depth of the mean (divide by alpha).
-        seconds: how long each stage took, by its name: "projection", "sort" and "raster" from the CPU, from a GL target
-            "projection+sort", "raster" and "read-back"; who draws whole frames adds what comes before and after.
-        srgb: [H, W, 3] 8-bit over black, the bytes of ``raster.tone.tone_map``, if they were made with the
-            rest: by a device, or in one call of the CPU's.
+        depth: [H, W] m, Σ w_i z_i, z the camera-space depth of the mean.
+        seconds: duration of each stage: "projection", "sort" and "raster" on the CPU, "projection+sort", "raster" and
+            "read-back" with GL, and stages added by the renderer of whole frames.
+        srgb: [H, W, 3] 8-bit over black as by ``raster.tone.tone_map``, where made along with the rest.
     """
 
     image: Floats32
@@ -67,7 +66,7 @@ class Raster:
 
 
 class Rasterizer(Protocol):
-    """The interface of all rasterisers: the oracle, the CPU kernel, GL.
+    """Interface of all rasterisers.
 
     The rule is 3DGS's (Kerbl et al. 2023) with a dilation of 0.05 px² instead of 0.3: EWA projection,
     α = min(0.99, o·exp(−½ dᵀΣ⁻¹d)), α < 1/255 skipped, blending front to back by the camera depth of the means
@@ -82,5 +81,5 @@ class Rasterizer(Protocol):
         features: Floats32,  # [N, C]
         camera: Camera,
         *,
-        depth: bool = True,  # False: the depth image is all zero, and costs nothing
+        depth: bool = True,  # False: the depth image is zero
     ) -> Raster: ...

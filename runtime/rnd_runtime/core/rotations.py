@@ -1,7 +1,6 @@
-"""Rotations in float64: axis-angle at file borders, matrices inside, quaternions (wxyz) where safest.
+"""Rotations in float64: axis-angle in files, matrices inside, quaternions (wxyz) in between.
 
-Everything broadcasts over leading dimensions. Nothing here flips signs: a rotation has one result, and paths
-are interpolated through the matrices' relative rotation, never through quaternions of arbitrary sign.
+All functions broadcast over leading dimensions.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ def axis_angle_to_matrix(axis_angle: ArrayLike) -> Floats:
     """Rotation matrices [..., 3, 3] of axis-angle vectors [..., 3] rad (Rodrigues), exact near zero."""
     vector = np.asarray(axis_angle, np.float64)
     angle = np.sqrt((vector * vector).sum(-1))[..., None, None]
-    # np.sinc(x) is sin(πx)/(πx): both factors below stay accurate where sin θ/θ and (1−cos θ)/θ² are 0/0
+    # np.sinc(x) = sin(πx)/(πx), accurate where sin θ/θ and (1−cos θ)/θ² are 0/0
     sine = np.sinc(angle / np.pi)
     versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
     cross = _cross_matrix(vector)
@@ -27,8 +26,7 @@ def axis_angle_to_matrix(axis_angle: ArrayLike) -> Floats:
 def matrix_to_axis_angle(matrix: ArrayLike) -> Floats:
     """Axis-angle [..., 3] rad, angle in [0, π], of rotation matrices [..., 3, 3].
 
-    Goes through the quaternion, so it keeps full accuracy near 0 and at π, where the textbook
-    ``acos((trace − 1)/2)`` loses half the digits and the axis.
+    Accurate near 0 and π, where ``acos((trace − 1)/2)`` loses half the digits.
     """
     quaternion = matrix_to_quaternion(matrix)
     w, xyz = quaternion[..., :1], quaternion[..., 1:]
@@ -41,7 +39,7 @@ def matrix_to_axis_angle(matrix: ArrayLike) -> Floats:
 def matrix_to_quaternion(matrix: ArrayLike) -> Floats:
     """Unit quaternions [..., 4] (wxyz, w ≥ 0) of rotation matrices [..., 3, 3].
 
-    Divides by the largest of the four components (Shepperd 1978), so no rotation is ill-conditioned.
+    Source: Shepperd 1978 (division by the largest component).
     """
     m = np.asarray(matrix, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -64,7 +62,7 @@ def matrix_to_quaternion(matrix: ArrayLike) -> Floats:
 
 
 def quaternion_to_matrix(quaternion: ArrayLike) -> Floats:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4] (wxyz) of any length but zero."""
+    """Rotation matrices [..., 3, 3] of non-zero quaternions [..., 4] (wxyz) of any length."""
     q = np.asarray(quaternion, np.float64)
     q = q / np.sqrt((q * q).sum(-1, keepdims=True))
     cross = _cross_matrix(q[..., 1:])
@@ -83,10 +81,7 @@ def slerp_matrices(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> Floats:
 
 
 def rotation_6d(matrix: ArrayLike) -> Floats:
-    """The first two columns of [..., 3, 3], one after the other: [..., 6] (Zhou et al. 2019).
-
-    The only representation here that is continuous over all rotations, hence what networks read.
-    """
+    """The first two columns of [..., 3, 3], concatenated: [..., 6] (Zhou et al. 2019)."""
     m = np.asarray(matrix, np.float64)
     return np.concatenate([m[..., :, 0], m[..., :, 1]], -1)
 

@@ -1,7 +1,7 @@
-"""Real spherical harmonics of degree 3: sixteen coefficients of a function of direction.
+"""Real spherical harmonics (SH) of degree 3.
 
-Orthonormal on the sphere, ordered ``l² + l + m``, with the signs of 3D Gaussian splatting (Condon–Shortley):
-Y_0 = 0.2820948, Y_1..3 = 0.4886025 · (−y, z, −x), and so on.
+Orthonormal, ordered ``l² + l + m``, with the signs of 3D Gaussian splatting (Condon–Shortley): Y_0 = 0.2820948,
+Y_1..3 = 0.4886025 · (−y, z, −x), and so on.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ Floats = NDArray[np.float64]
 
 SH_DEGREE = 3
 SH_COUNT = (SH_DEGREE + 1) ** 2
-SH_DEGREES = np.repeat(np.arange(SH_DEGREE + 1), 2 * np.arange(SH_DEGREE + 1) + 1)  # the degree of each function
+SH_DEGREES = np.repeat(np.arange(SH_DEGREE + 1), 2 * np.arange(SH_DEGREE + 1) + 1)  # of each function
 
 COSINE_LOBE = np.array([1, 2 / 3, 1 / 4, 0], np.float32)[SH_DEGREES]
-"""What max(cos, 0)/π leaves of each function (Ramamoorthi, Hanrahan 2001)."""
+"""Factor of max(cos, 0)/π for each function (Ramamoorthi, Hanrahan 2001)."""
 
 _C0 = sqrt(1 / (4 * pi))
 _C1 = sqrt(3 / (4 * pi))
@@ -30,10 +30,9 @@ _C3_3, _C3_2, _C3_1, _C3_0 = (sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(2
 
 
 def sh_columns(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
-    """The sixteen functions at unit directions given by their columns, in whatever ``x, y, z`` compute with.
+    """The sixteen functions at unit directions (x, y, z), each of the shape of ``x``.
 
-    Only ``+ − ×`` are used, so numpy arrays, torch tensors and scalars or lanes inside a numba kernel all do; each
-    of the 16 results has the shape of ``x``.
+    Only ``+ − ×`` are used: accepts numpy arrays, torch tensors, and numba scalars or lanes.
     """
     xx, yy, zz = x * x, y * y, z * z
     return (
@@ -57,16 +56,16 @@ def sh_columns(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
 
 
 def sh_basis(directions: ArrayLike) -> NDArray[Any]:
-    """The sixteen functions [..., 16] at unit ``directions`` [..., 3], in the precision that comes in."""
+    """The sixteen functions [..., 16] at unit ``directions`` [..., 3], in the input's precision."""
     directions = np.asarray(directions)
     return np.stack(sh_columns(directions[..., 0], directions[..., 1], directions[..., 2]), axis=-1)
 
 
 @cache
 def sphere_quadrature(count: int) -> tuple[Floats, Floats]:
-    """Directions [2·count², 3] and weights (sum 4π) that integrate degree ``2·count − 1`` exactly.
+    """Directions [2·count², 3] and weights (sum 4π), exact up to degree ``2·count − 1``.
 
-    Gauss–Legendre nodes in z times 2·count equal steps of azimuth (Atkinson, Han 2012, §5.1).
+    Source: Atkinson, Han 2012, §5.1 (Gauss–Legendre in z, equal steps of azimuth).
     """
     z, weights = np.polynomial.legendre.leggauss(count)
     azimuth = (np.arange(2 * count) + 0.5) * pi / count
@@ -77,18 +76,17 @@ def sphere_quadrature(count: int) -> tuple[Floats, Floats]:
 
 
 def sh_rotation(rotation: ArrayLike) -> Floats:
-    """The matrix M [16, 16] that rotates coefficients as ``rotation`` [3, 3] rotates directions.
+    """Matrix M [16, 16] that rotates SH coefficients as ``rotation`` [3, 3] rotates directions.
 
-    ``rotated = coefficients @ M.T`` gives ``sh_basis(R d) · rotated = sh_basis(d) · coefficients`` for every d.
-    M is orthogonal and block-diagonal by degree. Each entry is ∫ Y_i(ω) Y_j(Rᵀω) dω, a polynomial of degree
-    6, by a quadrature that is exact up to degree 7, hence right to rounding (1e-14).
+    With ``rotated = coefficients @ M.T``: ``sh_basis(R d) · rotated = sh_basis(d) · coefficients``. Entries are
+    ∫ Y_i(ω) Y_j(Rᵀω) dω, of degree 6, by a quadrature exact up to degree 7.
     """
     return np.asarray(rotation_matrix(*sh_quadrature(), np.array(rotation, np.float64, order="C")))
 
 
 @cache
 def sh_quadrature() -> tuple[Floats, Floats]:
-    """Of ``sh_rotation``: directions [32, 3], and the functions there times their weights [32, 16]."""
+    """Directions [32, 3] of ``sh_rotation``, and the weighted functions there [32, 16]."""
     directions, weights = sphere_quadrature(SH_DEGREE + 1)
     return directions, sh_basis(directions) * weights[:, None]
 
@@ -98,7 +96,7 @@ compiled_sh_columns = njit(sh_columns)
 
 @njit(nogil=True, cache=True)
 def rotation_matrix(directions, weighted, rotation):  # type: ignore[no-untyped-def]
-    """``sh_rotation`` with its ``sh_quadrature``. In numba: every frame needs one, and numpy takes 0.1 ms."""
+    """``sh_rotation`` from its ``sh_quadrature``. Compiled: numpy takes 0.1 ms per frame."""
     matrix = np.zeros((SH_COUNT, SH_COUNT))
     for k in range(len(directions)):
         x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]

@@ -1,4 +1,4 @@
-"""Numeric constants of Python's kernels as macros for the shaders: no number stands twice."""
+"""Numeric constants of Python's kernels as GLSL macros."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SH = ("_C0", "_C1", "_C2_SIDE", "_C2_ZONAL", "_C3_3", "_C3_2", "_C3_1", "_C3_0"
 
 @cache
 def shared_constants() -> dict[str, str]:
-    """GLSL's text of each constant, by its name."""
+    """GLSL text of each constant by name."""
     values: dict[str, Any] = {
         "ONE_OVER_PI": 1 / pi,
         "F0": brdf.F0,

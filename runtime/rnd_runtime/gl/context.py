@@ -1,8 +1,7 @@
-"""OpenGL contexts without a display: EGL first, then OSMesa, then a hidden window; 4.3 where there is, else 3.3.
+"""Headless OpenGL contexts: EGL first, then OSMesa, then a hidden window; 4.3 where available, else 3.3.
 
-A context is current inside ``with context:`` and only there, releases of its objects included; outside none is. So
-several live in one process, on EGL and OSMesa side by side: these two share Mesa's one "current" slot of the thread
-without knowing of each other, hence the blocks must not be nested.
+A context is current only inside ``with context:``, releases of its objects included. Several may exist in one process.
+The blocks must not be nested: EGL and OSMesa share Mesa's one "current" slot per thread without coordination.
 """
 
 from __future__ import annotations
@@ -23,15 +22,15 @@ Backend = Literal["auto", "egl", "osmesa", "window"]
 
 INSTALL = {"egl": "apt-get install libegl1 libgl1-mesa-dri", "osmesa": "apt-get install libosmesa6"}
 OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
-GL_VERSION = 330  # core; all that drawing needs
-COMPUTE_VERSION = 430  # has compute shaders, which order Gaussians where they lie
+GL_VERSION = 330  # core, the minimum
+COMPUTE_VERSION = 430  # compute shaders, for sorting on the device
 SOFTWARE_RENDERERS = re.compile(
     r"llvmpipe|softpipe|swrast|swiftshader|software render|software raster|basic render", re.I
 )
 
 
 class Loader(Protocol):
-    """What moderngl asks of a platform's context."""
+    """The interface that moderngl needs of a platform's context."""
 
     def load_opengl_function(self, name: str) -> int: ...
 
@@ -44,21 +43,21 @@ class Loader(Protocol):
 
 @dataclass(frozen=True)
 class Platform:
-    """Kept in ``context.extra``: which backend made the context, and glFlush, which moderngl does not have."""
+    """Content of ``context.extra``: the backend, and glFlush, which moderngl lacks."""
 
     backend: str
     flush: Callable[[], None]
 
 
 def create_context(backend: Backend = "auto") -> moderngl.Context:
-    """Make a headless OpenGL core context: of 4.3 or newer, or of 3.3 where there is no other.
+    """Make a headless OpenGL core context, 4.3 or newer where available, else 3.3.
 
     Args:
         backend: "egl" (GPUs and Mesa's llvmpipe), "osmesa" (software, Mesa before 25.1), "window" (X11, Windows,
             macOS) or "auto", the first of them that works.
 
     Raises:
-        InputError: none works; the message says what to install.
+        InputError: none works; the message names the packages to install.
     """
     if backend not in get_args(Backend):
         raise InputError("OpenGL backend", expected=" | ".join(get_args(Backend)), got=repr(backend))
@@ -76,7 +75,7 @@ def create_context(backend: Backend = "auto") -> moderngl.Context:
 
 
 def is_software(context: moderngl.Context) -> bool:
-    """Whether the context draws on the CPU (llvmpipe, softpipe, SwiftShader), told by GL_RENDERER."""
+    """Whether the context renders on the CPU (llvmpipe, softpipe, SwiftShader), by GL_RENDERER."""
     return SOFTWARE_RENDERERS.search(renderer(context)) is not None
 
 
@@ -86,7 +85,7 @@ def renderer(context: moderngl.Context) -> str:
 
 
 def _context_of(backend: str, loader: Loader, version: int) -> moderngl.Context:
-    with loader:  # leaving it undoes that a new context becomes current at once
+    with loader:  # a new context becomes current; leaving resets that
         try:
             settings: dict[str, Any] = {"context": loader}
             context = moderngl.create_context(require=version, standalone=True, **settings)
@@ -95,14 +94,14 @@ def _context_of(backend: str, loader: Loader, version: int) -> moderngl.Context:
             raise
         flush = ctypes.CFUNCTYPE(None)(loader.load_opengl_function("glFlush"))
         context.extra = Platform(backend, flush)
-        context.info  # noqa: B018  moderngl asks GL the first time, and only now is the context surely current
+        context.info  # noqa: B018  moderngl caches it, and queries GL while the context is current
     return context
 
 
 def _open_egl(version: int) -> Loader:
     if sys.platform != "linux":
         raise OSError(f"not on {sys.platform}")
-    # EGL hands out GL's functions itself, so that libGL need not be installed
+    # EGL provides GL's functions itself: libGL need not be installed
     loader: Loader = glcontext.get_backend_by_name("egl")(
         mode="standalone", glversion=version, libgl="libEGL.so.1", libegl="libEGL.so.1"
     )
@@ -122,7 +121,7 @@ _LOADERS: dict[str, Callable[[int], Loader]] = {"egl": _open_egl, "osmesa": _ope
 
 
 class OSMesa:
-    """Mesa's off-screen context (GL/osmesa.h) in the form that moderngl takes as ``context=``."""
+    """Mesa's off-screen context (GL/osmesa.h) as moderngl's ``context=``."""
 
     _UNSIGNED_BYTE = 0x1401
 
@@ -146,7 +145,7 @@ class OSMesa:
         self._handle = self._library.OSMesaCreateContextAttribs(attributes, None)
         if not self._handle:
             raise OSError("OSMesaCreateContextAttribs failed")
-        self._pixel = (ctypes.c_ubyte * 4)()  # its own 1 × 1 image, which nobody draws to
+        self._pixel = (ctypes.c_ubyte * 4)()  # its unused 1 × 1 image
 
     def load_opengl_function(self, name: str) -> int:
         return self._library.OSMesaGetProcAddress(name.encode()) or 0

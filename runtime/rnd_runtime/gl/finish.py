@@ -1,7 +1,6 @@
-"""What is done to a blended image on an OpenGL device before it comes back: outlines, tone mapping, packing.
+"""Finishing of a blended image on the device: outlines, tone mapping, packing.
 
-The device writes arrays as the CPU wants them: red, green and blue of pixel after pixel, without gaps, so that nothing
-has to be moved once it has arrived.
+Images are read back as contiguous RGB arrays, so the CPU need not repack them.
 """
 
 from __future__ import annotations
@@ -31,12 +30,11 @@ class Finished(NamedTuple):
 
 
 class GlFinish:
-    """Finishes images of three channels; the context must be current whenever it is used.
+    """Finishes images of three channels; the context must be current.
 
     Args:
-        context: where.
-        tone: make 8-bit images too, to the bit those of ``raster.tone.tone_map``; by default where a
-            graphics card does it, as the CPU is faster at it than OpenGL that runs there.
+        tone: make 8-bit images too, to the bit as ``raster.tone.tone_map``; by default on GPUs, as the CPU is faster
+            than software OpenGL.
     """
 
     def __init__(self, context: moderngl.Context, tone: bool | None = None) -> None:
@@ -61,7 +59,7 @@ class GlFinish:
         self._alpha_pass.fill()
 
     def read(self, camera: Camera) -> Finished:
-        """What ``run`` made for ``camera``."""
+        """The result of ``run`` for ``camera``."""
         packed, coverage = (targets.framebuffer for targets in self._targets_for(camera))
         alpha = np.empty((camera.height, camera.width), np.float32)
         coverage.read_into(alpha, components=1, dtype="f4", alignment=1)
@@ -81,7 +79,7 @@ class GlFinish:
         self._targets = None
 
     def _targets_for(self, camera: Camera) -> tuple[Targets, Targets]:
-        """Of packed numbers, and of coverage; those of another size are released."""
+        """Targets of packed numbers, and of alpha; those of another size are released."""
         size, old = (camera.width, camera.height), self._targets
         if old is None or old[1].framebuffer.size != size:
             packed, texture = (_texels(camera.width), camera.height), self._context.texture
@@ -89,17 +87,17 @@ class GlFinish:
             coverage = [texture(size, 1, dtype="f4")]
             self._targets = Targets.of(self._context, textures), Targets.of(self._context, coverage)
             for targets in old or ():
-                targets.release()  # only now: moderngl binds the one in use again whenever it makes another
+                targets.release()  # only now: on making a framebuffer moderngl rebinds the one in use
         assert self._targets is not None
         return self._targets
 
 
 def _texels(width: int) -> int:
-    """In a packed row of ``width`` pixels; the last one may have numbers to spare."""
+    """Texels of a packed row of ``width`` pixels."""
     return -(-CHANNELS * width // PACKED)
 
 
 def _unpacked(rows: NDArray, camera: Camera) -> NDArray:  # type: ignore[type-arg]
-    """[H, 4 · texels] → [H, W, 3]; a view, unless rows have numbers to spare."""
+    """[H, 4 · texels] → [H, W, 3]; a view where rows are not padded."""
     exact = rows[:, : CHANNELS * camera.width]
     return np.ascontiguousarray(exact).reshape(camera.height, camera.width, CHANNELS)

@@ -1,6 +1,6 @@
-"""Frames on an OpenGL device: posed, projected, shaded, splatted and tone mapped there.
+"""Frames rendered on an OpenGL device: posing, projection, shading, splatting, tone mapping.
 
-The networks' outputs go up and the image comes back; where the device can sort, nothing else crosses.
+Only network outputs are uploaded and images read back, where the device can sort.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from .raster import GlRasterizer, splat_pass
 from .shading import GlShading
 from .surfaces import SurfaceUpload
 
-RADIANCE = 3  # attributes that the splats carry
+RADIANCE = 3  # attributes of the splats
 
 
 class GlRenderer:
-    """Draws an avatar under a light; keeps programs, tables and textures between calls.
+    """Renders an avatar under a light; keeps programs, tables and textures between calls.
 
     Args:
-        rasterizer: whose context and targets are rendered with; to be closed after this.
+        rasterizer: provides context and targets; close it after this.
         sorting: see ``gl.projection.GlProjection``.
     """
 
@@ -39,20 +39,18 @@ class GlRenderer:
         self._passes: _Passes | None = None
 
     def draw(self, body: Gaussians | Unposed, shader: Shader, camera: Camera, *, cull: float | None = None) -> Raster:
-        """The image's linear radiance [H, W, 3], outlines sharpened, without depth.
-
-        Only Gaussians that reach it are shaded.
+        """Render linear radiance [H, W, 3] with sharpened outlines, without depth.
 
         Args:
-            body: posed on the CPU, or what is posed here.
-            cull: as of ``playback.frame.FrameRenderer``; what is culled casts shadows all the same.
+            body: posed Gaussians, or those to be posed on the device.
+            cull: as in ``playback.frame.FrameRenderer``; culled Gaussians still cast shadows.
 
         Returns:
-            With ``seconds`` of "posing" or "upload", "projection+sort", "shading", "raster" and "read-back", each until
-            the device has finished it.
+            The raster; ``seconds`` has "posing" or "upload", "projection+sort", "shading", "raster" and "read-back",
+            each until the device has finished.
 
         Raises:
-            InputError: an array has the wrong shape, or there is more than GL can hold.
+            InputError: an array has the wrong shape or exceeds a limit of GL.
         """
         self._rasterizer.check_limits(len(body.opacities), camera)
         with self._rasterizer.context as context:
@@ -112,7 +110,7 @@ class GlRenderer:
 
 
 class _Passes:
-    """All that is kept on the device."""
+    """All objects on the device."""
 
     def __init__(self, context: moderngl.Context, sorting: Sorting) -> None:
         self.posing, self.upload = GlPosing(context), SurfaceUpload(context)

@@ -1,7 +1,7 @@
-"""What passes over Gaussians share: textures with some texels for each of them, and programs put together from parts.
+"""Textures with some texels per Gaussian, and shader programs assembled from files.
 
-A fragment stands for a Gaussian: Gaussian i is texel (i % ROW_GAUSSIANS, i // ROW_GAUSSIANS), and where it has several
-texels they lie side by side. Where it has many, ROW_WIDE make a row.
+Gaussian i is texel (i % ROW_GAUSSIANS, i // ROW_GAUSSIANS); several texels of one are adjacent. With many texels
+ROW_WIDE Gaussians make a row.
 """
 
 from __future__ import annotations
@@ -18,18 +18,17 @@ from .constants import shared_constants
 from .context import GL_VERSION
 
 ROW_GAUSSIANS = 1024  # Gaussians in a row of a texture
-ROW_WIDE = 256  # Gaussians, or nodes, of many texels in a row: GL promises no more than 1024 and gives 16384
+ROW_WIDE = 256  # Gaussians or nodes of many texels in a row; GL guarantees 1024 texels, drivers have 16384
 
 
 class GaussianTexture:
-    """A texture that grows with the number of Gaussians; its context must be current whenever it is used.
+    """A texture that grows with the number of Gaussians; the context must be current.
 
     Args:
-        context: where it lives.
-        components: numbers in a texel.
-        texels: for each Gaussian.
+        components: numbers per texel.
+        texels: per Gaussian.
         dtype: "f4" or "i4".
-        row: Gaussians in a row.
+        row: Gaussians per row.
     """
 
     def __init__(
@@ -46,7 +45,7 @@ class GaussianTexture:
         self._texture: moderngl.Texture | None = None
 
     def reserve(self, count: int) -> moderngl.Texture:
-        """The texture, with room for ``count`` Gaussians; what it held is lost when it grows."""
+        """The texture with capacity for ``count`` Gaussians; growth discards its content."""
         rows = max(-(-count // self._row), 1)
         if self._texture is None or self._texture.height < rows:
             self.release()
@@ -72,7 +71,7 @@ class GaussianTexture:
 
 
 class GaussianTargets:
-    """Float32 textures with the same texels for each Gaussian, of ``components`` each, that one pass draws into."""
+    """Float32 textures as targets of one pass, each with its ``components`` and the same texels per Gaussian."""
 
     def __init__(self, context: moderngl.Context, components: tuple[int, ...], *, texels: int = 1) -> None:
         self._context, self._texels = context, texels
@@ -80,7 +79,7 @@ class GaussianTargets:
         self._made: tuple[list[moderngl.Texture], moderngl.Framebuffer] | None = None
 
     def reserve(self, count: int) -> tuple[list[moderngl.Texture], moderngl.Framebuffer]:
-        """The textures and a framebuffer of them, bound and cut to the rows of ``count`` Gaussians."""
+        """The textures and their framebuffer, bound, with a viewport of the rows of ``count`` Gaussians."""
         old, textures = self._made, [texture.reserve(count) for texture in self._textures]
         if old is None or old[0][0] is not textures[0]:
             self._made = textures, self._context.framebuffer(textures)
@@ -89,7 +88,7 @@ class GaussianTargets:
         framebuffer.viewport = (0, 0, ROW_GAUSSIANS * self._texels, -(-count // ROW_GAUSSIANS))
         framebuffer.use()
         if old is not None and old is not self._made:
-            old[1].release()  # only now: moderngl binds the one in use again whenever it makes another
+            old[1].release()  # only now: on making a framebuffer moderngl rebinds the one in use
         return self._made
 
     def release(self) -> None:
@@ -101,7 +100,7 @@ class GaussianTargets:
 
 
 class Targets(NamedTuple):
-    """Textures of one size that a pass draws into, and the framebuffer of them."""
+    """Textures of one size as targets of a pass, and their framebuffer."""
 
     textures: list[moderngl.Texture]
     framebuffer: moderngl.Framebuffer
@@ -117,12 +116,12 @@ class Targets(NamedTuple):
 
 
 class Pass:
-    """A program without vertex arrays: its vertex shader makes everything of ``gl_VertexID``.
+    """A program without vertex arrays, driven by ``gl_VertexID``.
 
     Args:
         context: current now.
-        vertex, fragment: names of the files in ``shaders`` that make up either shader, in this order.
-        macros: what the shaders ask to be defined, beside ROW_GAUSSIANS and ROW_WIDE.
+        vertex, fragment: file names in ``shaders`` that make up each shader, in order.
+        macros: definitions for the shaders, besides ROW_GAUSSIANS and ROW_WIDE.
     """
 
     def __init__(
@@ -140,10 +139,7 @@ class Pass:
         self._uniforms: dict[str, Any] = {name: self._program[name] for name in self._program}
 
     def bind(self, textures: Mapping[str, moderngl.Texture], **uniforms: Any) -> None:
-        """Textures by the names of their samplers; uniforms as int, or as arrays of numbers (matrices by column).
-
-        Names that the program does not use are passed over.
-        """
+        """Bind textures by sampler name; uniforms are ints or arrays (matrices by column). Unused names are ignored."""
         for unit, (name, texture) in enumerate(textures.items()):
             if name in self._uniforms:
                 texture.use(unit)
@@ -154,7 +150,7 @@ class Pass:
             uniform = self._uniforms[name]
             if isinstance(value, int):
                 uniform.value = value
-            else:  # of an array the compiler keeps no more than the program uses
+            else:  # the compiler truncates an array to the elements in use
                 data = np.ascontiguousarray(value, np.float32).tobytes()
                 uniform.write(data[: uniform.array_length * uniform.element_size])
 
@@ -162,7 +158,7 @@ class Pass:
         self._vertices.render(mode, vertices, first=first)
 
     def fill(self) -> None:
-        """Run the fragment shader for every texel of the framebuffer in use."""
+        """Run the fragment shader for every texel of the bound framebuffer."""
         self.render(moderngl.TRIANGLES, 3)
 
     def release(self) -> None:
@@ -177,6 +173,6 @@ def shader_head(macros: Mapping[str, object], *, version: int = GL_VERSION) -> s
 
 
 def shader_source(names: tuple[str, ...]) -> str:
-    """The files of ``shaders`` by these names, one after the other."""
+    """The named files of ``shaders``, concatenated."""
     folder = resources.files(__package__) / "shaders"
     return "\n".join((folder / name).read_text("utf-8") for name in names)

@@ -1,8 +1,7 @@
-"""Projection, culling and depth order of Gaussians that lie on an OpenGL device.
+"""Projection, culling and depth order of Gaussians on an OpenGL device.
 
-A fragment for each Gaussian projects it, in float32. Their order is that of depths in float64, by compute shaders
-(``gl.sort``). Without them (OpenGL before 4.3, so all of macOS), and where OpenGL runs on the CPU, the CPU's radix sort
-does it. Both give the same order.
+A fragment per Gaussian projects it in float32. Depths are sorted in float64: by compute shaders (``gl.sort``), or by
+the CPU's radix sort before OpenGL 4.3 and with software OpenGL. Both give the same order.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ from .surfaces import Surfaces
 
 Sorting = Literal["auto", "cpu", "device"]
 
-_EVERYTHING = -2.0  # least n·v where nothing is culled
+_EVERYTHING = -2.0  # min n·v without culling
 
 
 class Projected(NamedTuple):
-    """What splat.vert reads of N Gaussians."""
+    """Input of splat.vert for N Gaussians."""
 
-    order: moderngl.Texture  # of each rank, back to front; −1 where there is none
+    order: moderngl.Texture  # Gaussian of each rank, back to front; −1 for none
     positions: moderngl.Texture  # by Gaussian
     shapes: moderngl.Texture
-    ranks: int  # at least as many as are rendered
+    ranks: int  # at least the number of rendered Gaussians
 
     def textures(self) -> dict[str, moderngl.Texture]:
         """By the names of their samplers."""
@@ -45,12 +44,10 @@ class GlProjection:
     """Projects Gaussians for a camera; the context must be current.
 
     Args:
-        context: where.
-        sorting: by the "cpu", by the "device", or by the device unless it is the CPU or has no compute shaders that
-            its driver compiles ("auto").
+        sorting: "cpu", "device" or "auto": the device, unless it is software or its compute shaders fail to compile.
 
     Raises:
-        InputError: the device shall sort and cannot.
+        InputError: sorting on the device is requested and not possible.
     """
 
     def __init__(self, context: moderngl.Context, sorting: Sorting = "auto") -> None:
@@ -63,14 +60,14 @@ class GlProjection:
         self._order = GaussianTexture(context, 1, dtype="i4") if self._sort is None else None
 
     def project(self, surfaces: Surfaces, camera: Camera, cull: float | None) -> Projected:
-        """All of ``surfaces`` that can be seen, but those whose n·v is below ``cull``."""
+        """Project visible Gaussians, except those with n·v below ``cull``."""
         count = surfaces.gaussians
         (positions, shapes, drawn), target = self._targets.reserve(count)
         view = pinhole(camera)
         self._pass.bind(
             surfaces.textures(),
             count=count,
-            axes=view.rotation,  # by column its rows, the camera's axes
+            axes=view.rotation,  # uploaded by column, which transposes it
             translation=view.translation,
             eye=camera.position,
             pinhole=(view.fx, view.fy, view.cx, view.cy),
@@ -95,12 +92,12 @@ class GlProjection:
 
 
 def _device_sort(context: moderngl.Context, sorting: Sorting) -> DepthSort | None:
-    """Compute shaders that sort, where they are asked for, or are there and worth it; None: the CPU sorts."""
+    """The device's sort as chosen by ``sorting``; None for the CPU's."""
     if sorting == "cpu" or (sorting == "auto" and (is_software(context) or not can_sort(context))):
         return None
     try:
         return DepthSort(context)
-    except InputError:  # the driver promises compute shaders and does not compile these
+    except InputError:  # the driver has compute shaders and does not compile these
         if sorting == "device":
             raise
         return None
@@ -108,8 +105,7 @@ def _device_sort(context: moderngl.Context, sorting: Sorting) -> DepthSort | Non
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def _back_to_front(drawn, forward):  # type: ignore[no-untyped-def]
-    """Indices [V] by how far means lie along ``forward`` of those whose fourth number is positive; equal ones by
-    falling index."""
+    """Indices [V] of Gaussians with ``drawn[:, 3]`` > 0 by falling depth along ``forward``, then falling index."""
     count = len(drawn)
     depths, starts = np.empty(count, np.float64), np.zeros(count + 1, np.int64)
     for i in range(count):

@@ -1,11 +1,10 @@
 """The OpenGL rasteriser: one triangle per Gaussian, blended back to front in float32, any number of channels.
 
-Against ``core.gaussians.Rasterizer``'s rule there is one difference: blending cannot stop at a pixel, so
-the Gaussian that would have taken the transmittance below 1e-4, and those behind it, still add what is left: less than
-0.01 of their features, and that only where α is near its clamp.
+One difference to ``core.gaussians.Rasterizer``'s rule: blending cannot stop at a pixel, so Gaussians beyond a
+transmittance of 1e-4 still add less than 0.01 of their features, only where α is near its clamp.
 
-Projection, order and culling are the CPU rasteriser's own, in float64. On one Mesa, EGL and OSMesa and any number of
-threads give the same bits.
+Projection, order and culling are the CPU rasteriser's, in float64. EGL and OSMesa of one Mesa, with any number of
+threads, give the same bits.
 """
 
 from __future__ import annotations
@@ -31,18 +30,17 @@ from .context import Backend, create_context
 from .passes import ROW_GAUSSIANS, Pass, Targets
 
 LOG2_255 = float(np.log2(255.0))
-GEOMETRY_TEXELS = 2  # centre from the image's middle, reach, peak; √fall_x, √fall_y, shear, –
-PER_TARGET = 3  # attributes of a target; its fourth component is α
-FLUSHES = 4  # llvmpipe fills pixels of one part of the triangles while it sets up the next: 10 % faster
+GEOMETRY_TEXELS = 2  # centre − image centre, reach, peak; √fall_x, √fall_y, shear, –
+PER_TARGET = 3  # attributes per target; the fourth component is α
+FLUSHES = 4  # parts of the triangles, so that llvmpipe overlaps setup and filling: 10 % faster
 
 
 class GlRasterizer:
-    """Obeys ``core.gaussians.Rasterizer``; keeps its programs and framebuffers between calls.
+    """A ``core.gaussians.Rasterizer``; keeps programs and framebuffers between calls.
 
     Args:
         backend: see ``gl.context.create_context``.
-        context: draw in this context of ``gl.context.create_context`` instead, which is released by
-            ``close`` all the same.
+        context: from ``gl.context.create_context``, instead of ``backend``; released by ``close``.
 
     Raises:
         InputError: no context; arrays of the wrong shape; an image or a number of Gaussians above GL's limits.
@@ -67,10 +65,7 @@ class GlRasterizer:
         *,
         depth: bool = True,
     ) -> Raster:
-        """Splat N Gaussians: means [N, 3] m, covariances [N, 6] m², opacities [N], features [N, C].
-
-        Up to three channels without ``depth`` need one target; each three more attributes need another.
-        """
+        """Splat N Gaussians: means [N, 3] m, covariances [N, 6] m², opacities [N], features [N, C]."""
         means, covariances, opacities, features = checked(means, covariances, opacities, features)
         self.check_limits(len(means), camera)
         channels = features.shape[1]
@@ -79,12 +74,12 @@ class GlRasterizer:
         seconds = {"projection+sort": perf_counter() - started, "raster": 0.0, "read-back": 0.0}
         target_images: list[Floats32] = []  # [H, W, ≤ 4] of every target
         with self.context:
-            total = channels + 1 if depth or channels == 0 else channels  # something must carry α
+            total = channels + 1 if depth or channels == 0 else channels  # at least one, for α
             for first in range(0, total, self._max_attributes):
                 attributes = min(total - first, self._max_attributes)
                 started = perf_counter()
                 self._draw(splats, first, attributes, camera)
-                self.context.finish()  # else the read-back would be charged with the drawing
+                self.context.finish()  # so that the read-back is timed by itself
                 drawn = perf_counter()
                 target_images += self.read(attributes, camera)
                 seconds["raster"] += drawn - started
@@ -92,7 +87,7 @@ class GlRasterizer:
         return _assembled(target_images, channels, depth, seconds)
 
     def close(self) -> None:
-        """Release everything, the context too."""
+        """Release everything, including the context."""
         with self.context:
             for targets in self._targets.values():
                 targets.release()
@@ -112,7 +107,7 @@ class GlRasterizer:
         self.close()
 
     def check_limits(self, count: int, camera: Camera) -> None:
-        """Raise an ``InputError`` where the image or the number of Gaussians is above GL's limits."""
+        """Raise an ``InputError`` where the image or the number of Gaussians exceeds GL's limits."""
         size = f"{camera.width} x {camera.height}"
         if max(camera.width, camera.height) > self._max_size:
             raise InputError("image size", expected=f"at most {self._max_size} x {self._max_size}", got=size)
@@ -120,7 +115,7 @@ class GlRasterizer:
             raise InputError("Gaussians", expected=f"at most {self._max_size * ROW_GAUSSIANS}", got=count)
 
     def _draw(self, splats: Ellipses, first: int, attributes: int, camera: Camera) -> None:
-        """Draw attributes ``first`` … ``first + attributes`` of all splats into this pass's targets."""
+        """Render attributes ``first`` … ``first + attributes`` of all splats."""
         count = len(splats.order)
         records = self._upload(_records(splats, first, attributes, camera)) if count else None
         if attributes not in self._programs:
@@ -130,7 +125,7 @@ class GlRasterizer:
     def blend(
         self, splat: Pass, textures: Mapping[str, moderngl.Texture], count: int, attributes: int, camera: Camera
     ) -> None:
-        """Clear the targets of ``attributes`` and draw ``count`` triangles of ``splat_pass``, first to last."""
+        """Clear the targets of ``attributes`` and draw ``count`` triangles of ``splat_pass``, in order."""
         targets = self.targets_for(attributes, camera)
         targets.framebuffer.use()
         targets.framebuffer.clear()
@@ -156,7 +151,7 @@ class GlRasterizer:
         return texture
 
     def read(self, attributes: int, camera: Camera) -> list[Floats32]:
-        """What was drawn: an image [H, W, ≤ 4] for each target; the first one's fourth channel is alpha."""
+        """Images [H, W, ≤ 4] of each target; the first one's fourth channel is alpha."""
         targets = self.targets_for(attributes, camera)
         target_images = []
         for index, texture in enumerate(targets.textures):
@@ -177,7 +172,7 @@ class GlRasterizer:
                 components = 4 if first == 0 or left >= PER_TARGET else left
                 textures.append(self.context.texture((camera.width, camera.height), components, dtype="f4"))
             self._targets[key] = Targets.of(self.context, textures)
-            # only now: making a framebuffer, moderngl binds the one in use before again, which must still be there
+            # only now: on making a framebuffer moderngl rebinds the one in use
             for other in [old for old in self._targets if old[1:] != key[1:]]:
                 self._targets.pop(other).release()
         return self._targets[key]
@@ -186,7 +181,7 @@ class GlRasterizer:
 def splat_pass(context: moderngl.Context, attributes: int, *, lit: bool = False) -> Pass:
     """The program that draws a triangle for each Gaussian, back to front.
 
-    With ``lit`` the three attributes are the ``radiance`` texture's, and what else it reads stands in splat.vert.
+    With ``lit`` the three attributes come from the ``radiance`` texture.
     """
     values = [f"attributes[{i // 4}].{'xyzw'[i % 4]}" for i in range(attributes)]
     values += ["0.0"] * (-attributes % PER_TARGET)
@@ -204,9 +199,9 @@ def splat_pass(context: moderngl.Context, attributes: int, *, lit: bool = False)
 
 
 class Ellipses(NamedTuple):
-    """Projected Gaussians; see ``raster.tiles.Splats`` for the rows."""
+    """Projected Gaussians; rows as in ``raster.tiles.Splats``."""
 
-    order: NDArray[np.int32]  # [V] of those drawn, front to back
+    order: NDArray[np.int32]  # [V] indices of rendered ones, front to back
     centers: NDArray[np.float64]
     shapes: Floats32
     attributes: Floats32  # [N, C + 1] features, depth
@@ -218,7 +213,7 @@ def sorted_ellipses(
     return Ellipses(*_project_and_sort(means, covariances, opacities, features, view))
 
 
-# One thread: numba's others would still spin, waiting for more, when llvmpipe's want the cores (14 of 62 ms).
+# Single-threaded: idle numba threads spin and slow llvmpipe's (14 of 62 ms).
 @njit(error_model="numpy", nogil=True, cache=True)
 def _project_and_sort(means, covariances, opacities, features, view):  # type: ignore[no-untyped-def]
     count = means.shape[0]
@@ -235,7 +230,7 @@ def _project_and_sort(means, covariances, opacities, features, view):  # type: i
 
 
 def _records(splats: Ellipses, first: int, attributes: int, camera: Camera) -> Floats32:
-    """The texture the shaders read, back to front: [rows, ROW_GAUSSIANS · texels, 4]."""
+    """The shaders' texture, back to front: [rows, ROW_GAUSSIANS · texels, 4]."""
     texels = GEOMETRY_TEXELS + -(-attributes // 4)
     rows = -(-len(splats.order) // ROW_GAUSSIANS)
     records = np.empty((rows * ROW_GAUSSIANS, 4 * texels), np.float32)
@@ -259,7 +254,7 @@ def _fill_records(records, order, centers, shapes, values, middle, first, attrib
 
 
 def _assembled(target_images: list[Floats32], channels: int, depth: bool, seconds: dict[str, float]) -> Raster:
-    """Targets [H, W, ≤ 4] → the raster; what needs no copy is a view."""
+    """Targets [H, W, ≤ 4] → the raster; views where possible."""
     if channels <= PER_TARGET:
         image = target_images[0][..., :channels]
     else:

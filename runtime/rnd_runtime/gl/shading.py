@@ -1,8 +1,7 @@
-"""Shading on an OpenGL device: radiance of each Gaussian by one fragment.
+"""Shading on an OpenGL device: radiance of each Gaussian in one fragment.
 
-GLSL versions of ``shading.ambient``, ``shading.tables``, ``shading.sum`` and ``shading.direct``, evaluated in the light
-probe's frame: the light's tables are uploaded once, and turning light or body costs a few uniforms. Depth maps of
-directional lights are rendered here too (``gl.shadow``). Nothing is read back.
+GLSL versions of ``shading.ambient``, ``shading.tables``, ``shading.sum`` and ``shading.direct`` in the light probe's
+frame: tables are uploaded once per light, and rotations are uniforms. Depth maps of directional lights: ``gl.shadow``.
 """
 
 from __future__ import annotations
@@ -30,18 +29,18 @@ Floats32 = NDArray[np.float32]
 
 _ROW_LIGHTS = 128  # lights in a row of their texture: 8192 fit into 768 × 64 texels
 _LIGHT_TEXELS = 6
-_DIFFUSE_TEXELS = 12  # of a node: sixteen numbers of each colour
-# The blocks of 4 × 4 of a rotation of SH coefficients that are not all zero, as surface.glsl multiplies them.
+_DIFFUSE_TEXELS = 12  # of a node: sixteen numbers per colour
+# Non-zero 4 × 4 blocks of a rotation of SH coefficients, in surface.glsl's order
 _ROTATION_BLOCKS = ((0, 0), (1, 1), (1, 2), (2, 1), (2, 2), (2, 3), (3, 2), (3, 3))
 
 
 class GlShading:
-    """Obeys ``shading.shader.Shader`` on the device; the context must be current whenever it is used."""
+    """Shades as ``shading.shader.Shader`` on the device; the context must be current."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self._shadows = ShadowMaps(context)
-        self._passes: dict[tuple[type, int], Pass] = {}  # by the kind of sky and the number of directional lights
+        self._passes: dict[tuple[type, int], Pass] = {}  # by kind of sky and number of directional lights
         self._sky: tuple[Any, dict[str, moderngl.Texture], dict[str, Any]] | None = None
         self._lobes: moderngl.Texture | None = None
         self._radiance = GaussianTargets(context, (4,))
@@ -55,11 +54,11 @@ class GlShading:
         eye: ArrayLike,
         root_rotation: ArrayLike,
     ) -> moderngl.Texture:
-        """Linear radiance of ``ranks`` Gaussians towards ``eye`` [3] m, a texel for each rank.
+        """Linear radiance of ``ranks`` Gaussians towards ``eye`` [3] m, a texel per rank.
 
         Args:
-            order: of type i4, the Gaussian of each rank. All Gaussians of ``surfaces`` cast shadows.
-            root_rotation: [3, 3], root frame → that of the surfaces.
+            order: i4, the Gaussian of each rank. All Gaussians of ``surfaces`` cast shadows.
+            root_rotation: [3, 3], root frame → frame of the surfaces.
         """
         light_to_world = shader.light_to_world
         textures, uniforms = self._sky_of(shader.sky)
@@ -81,7 +80,7 @@ class GlShading:
             textures,
             count=ranks,
             eye=np.asarray(eye, np.float32),
-            world_to_light=light_to_world,  # by column it is the transpose
+            world_to_light=light_to_world,  # uploaded by column, which transposes it
             turn=_rotation_blocks(sh_rotation(light_to_world.T @ np.asarray(root_rotation, np.float64))),
             **uniforms,
         )
@@ -109,7 +108,7 @@ class GlShading:
     def _sky_of(
         self, sky: AmbientLight | SkyTables | DistantLights
     ) -> tuple[dict[str, moderngl.Texture], dict[str, Any]]:
-        """Textures and uniforms of a sky; uploaded when it is another than before."""
+        """Textures and uniforms of a sky, uploaded when it changes."""
         if self._sky is None or self._sky[0] is not sky:
             self._forget_sky()
             made: dict[str, Floats32] = {}
@@ -156,13 +155,13 @@ class GlShading:
 
 
 def _rotation_blocks(rotation: NDArray[np.float64]) -> Floats32:
-    """The blocks [8, 4, 4] of a rotation [16, 16] of SH coefficients, by column."""
+    """Blocks [8, 4, 4] of a rotation [16, 16] of SH coefficients, by column."""
     blocks = rotation.reshape(4, 4, 4, 4).swapaxes(1, 2)  # row of blocks, column of blocks, row, column
     return np.asarray(np.stack([blocks[at].T for at in _ROTATION_BLOCKS]), np.float32)
 
 
 def _light_rows(lights: DistantLights) -> Floats32:
-    """[rows, _ROW_LIGHTS · 6, 4]: direction and flux.r; flux.g, flux.b; sixteen SH coefficients at the direction."""
+    """[rows, _ROW_LIGHTS · 6, 4]: direction and flux.r; flux.g, flux.b; sixteen SH coefficients of the direction."""
     rows = max(-(-len(lights.directions) // _ROW_LIGHTS), 1)
     packed = np.zeros((rows * _ROW_LIGHTS, _LIGHT_TEXELS, 4), np.float32)
     used = packed[: len(lights.directions)].reshape(-1, 4 * _LIGHT_TEXELS)

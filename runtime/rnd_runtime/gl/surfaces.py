@@ -1,4 +1,4 @@
-"""Posed Gaussians on an OpenGL device, and how they get there from the CPU."""
+"""Posed Gaussians on an OpenGL device, and their upload."""
 
 from __future__ import annotations
 
@@ -17,33 +17,37 @@ from .passes import GaussianTexture
 
 
 class Surfaces(NamedTuple):
-    """N Gaussians in textures as ``gl.passes.GaussianTexture`` lays them out.
+    """N Gaussians in textures laid out as ``gl.passes.GaussianTexture``.
 
-    What the shaders call world is the frame of camera and light, as in ``core.gaussians.Gaussians``.
+    "World" in the shaders is the frame of camera and light, as in ``core.gaussians.Gaussians``.
     """
 
     points: moderngl.Texture  # mean m; disc radius m, 0 where it casts no shadow
     normals: moderngl.Texture  # unit; opacity
     covariances: moderngl.Texture  # xx, xy, xz, yy m²
     covariances_z: moderngl.Texture  # yz, zz
-    visibility: moderngl.Texture  # four texels: SH coefficients in the root's frame
+    visibility: moderngl.Texture  # four texels: SH coefficients, root frame
     materials: moderngl.Texture  # albedo, roughness
     gaussians: int  # N
 
     def textures(self) -> dict[str, moderngl.Texture]:
-        """By the names of their samplers."""
+        """Textures by sampler name."""
         return {name: value for name, value in self._asdict().items() if name != "gaussians"}
 
 
 class SurfaceUpload:
-    """Brings ``core.gaussians.Gaussians`` to the device; the context must be current."""
+    """Uploads ``core.gaussians.Gaussians``; the context must be current."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._four = [GaussianTexture(context, 4) for _ in range(4)]
         self._two, self._visibility = GaussianTexture(context, 2), GaussianTexture(context, 4, texels=4)
 
     def write(self, gaussians: Gaussians) -> Surfaces:
-        """Raises ``InputError`` where an array has the wrong shape."""
+        """Upload ``gaussians``.
+
+        Raises:
+            InputError: an array has the wrong shape.
+        """
         means, covariances, opacities, normals = checked(
             gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.normals
         )

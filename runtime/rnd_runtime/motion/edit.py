@@ -16,14 +16,13 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# One-Euro filter (Casiez et al. 2012): Hz by which the cutoff rises per rad/s and per m/s. A brisk walk's knee reaches
-# 5 rad/s.
+# One-Euro filter (Casiez et al. 2012): rise of the cutoff, Hz per rad/s and per m/s. A brisk walk's knee: 5 rad/s
 _ROTATION_BETA = 1.5
 _TRANSLATION_BETA = 5.0
-_SPEED_CUTOFF = 1.0  # Hz, of the speed itself, as in the paper
+_SPEED_CUTOFF = 1.0  # Hz, as in the paper
 _SEAM_SECONDS = 0.5
 _MIN_LOOP = 4  # frames
-_MAX_FRAMES = 2_000_000  # nine hours at 60 per second: gigabytes
+_MAX_FRAMES = 2_000_000  # 9 h at 60 per second
 
 
 EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # minimum and maximum
@@ -31,12 +30,12 @@ EDIT_LIMITS = {"smooth": (1e-2, 1e3), "speed": (1e-2, 100.0)}  # minimum and max
 
 @dataclass(frozen=True)
 class MotionEdits:
-    """Changes to a motion, made in this order; the defaults change nothing.
+    """Changes to a motion, applied in this order.
 
     Attributes:
-        smooth: cutoff in Hz of a One-Euro filter for joints at rest; lower is smoother.
+        smooth: cutoff in Hz of a One-Euro filter at rest; lower is smoother.
         speed: playback speed; the frame rate stays.
-        in_place: keep the root above where it begins.
+        in_place: keep the root above its start.
         loop: blend the end into the beginning, so that the clip repeats.
 
     Raises:
@@ -53,7 +52,11 @@ class MotionEdits:
 
 
 def edit_motion(motion: Motion, edits: MotionEdits) -> Motion:
-    """``motion`` with ``edits`` applied and noted. Raises ``InputError`` for a motion too short to loop."""
+    """``motion`` with ``edits`` applied.
+
+    Raises:
+        InputError: the motion is too short to loop.
+    """
     if edits.smooth is not None:
         motion = smoothed(motion, edits.smooth)
     if edits.speed != 1.0:
@@ -64,10 +67,7 @@ def edit_motion(motion: Motion, edits: MotionEdits) -> Motion:
 
 
 def smoothed(motion: Motion, cutoff_hz: float) -> Motion:
-    """``motion`` through a One-Euro filter on its rotations and its root's path.
-
-    The filter runs forwards and backwards; the average of both has no lag.
-    """
+    """``motion`` through a One-Euro filter on rotations and root path, without lag: the mean of both directions."""
     _check("smooth", cutoff_hz, "a cutoff in Hz")
     frames, joints = motion.rotations.shape[:2]
     forth = _one_euro(motion.rotations, motion.translations, motion.fps, cutoff_hz)
@@ -97,16 +97,16 @@ def resampled(motion: Motion, fps: float) -> Motion:
 
 
 def kept_in_place(motion: Motion) -> Motion:
-    """``motion`` with its root above where it begins; its height stays."""
+    """``motion`` with its root above its start; its height stays."""
     translations = motion.translations.copy()
     translations[:, [0, 2]] = translations[0, [0, 2]]
     return replace(motion, translations=translations)
 
 
 def looped(motion: Motion, seam_seconds: float = _SEAM_SECONDS) -> Motion:
-    """``motion`` closed: without its first ``seam_seconds``, into which its end is blended.
+    """``motion`` closed: its end is blended into its first ``seam_seconds``, which are cut.
 
-    The root's net displacement is taken back evenly over the clip. Feet slide by it, which is noted.
+    The root's net displacement is distributed over the clip, so feet slide, which is noted.
     """
     if motion.frame_count < _MIN_LOOP:
         raise InputError("--loop", expected=f"a motion of at least {_MIN_LOOP} frames", got=motion.frame_count)
@@ -150,7 +150,7 @@ def _one_euro(rotations: Floats, translations: Floats, fps: float, cutoff_hz: fl
 
 
 def _gain(cutoff_hz: Floats | float, fps: float) -> Floats:
-    """Share by which a low-pass filter moves towards its input within a frame."""
+    """Share by which a low-pass filter approaches its input within a frame."""
     return np.asarray(1 / (1 + fps / (2 * np.pi * np.asarray(cutoff_hz))))
 
 

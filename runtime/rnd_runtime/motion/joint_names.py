@@ -1,4 +1,4 @@
-"""Joint names of other programs: tables of ours (``joint_names.toml``) and the user's."""
+"""Joint names of other programs: the tables of ``joint_names.toml`` and the user's."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
 JointTable = dict[str, tuple[str, ...]]
-"""For each of our joints its names elsewhere, the preferred one first."""
+"""Names of each of the avatar's joints in other programs, preferred ones first."""
 
 _SIDES = ("left", "right")
-_MIN_JOINTS = 8  # a root and four limbs of two joints, less one
+_MIN_JOINTS = 8  # nearly a root and four limbs of two joints
 _HINT = "name them in a file given as --joint-map"
 
 
 def load_joint_map(path: str | Path) -> JointTable:
     """Read a user's table, .toml or .json, in the form of ``joint_names.toml``; its sections are merged.
 
-    Raises ``InputError`` when the file is neither, or a line is not a name or a list of names.
+    Raises:
+        InputError: the file is neither, or a line is not a name or a list of names.
     """
     path = existing_file(path, what="joint map")
     try:
@@ -51,13 +52,13 @@ def match_joints(
     extra: Mapping[str, tuple[str, ...]] | None = None,
     file: str | Path | None = None,
 ) -> dict[str, int]:
-    """For each of the joints ``ours`` that is found among ``theirs``, its index there.
+    """Index in ``theirs`` of each joint of ``ours`` that is found there.
 
-    The one naming of ``joint_names.toml`` that matches most joints is used: "LeftShoulder" is a collar bone in one
-    file and a shoulder in another. Lines of ``extra``, read from ``file``, come before it.
+    Uses the one naming of ``joint_names.toml`` that matches most joints: "LeftShoulder" may be a collar bone or a
+    shoulder. Entries of ``extra``, read from ``file``, take precedence.
 
     Raises:
-        InputError: ``extra`` names joints that do not exist, or no naming matches enough.
+        InputError: ``extra`` names unknown joints, or no naming matches enough.
     """
     indices = {_plain(name): index for index, name in reversed(list(enumerate(theirs)))}
 
@@ -91,7 +92,7 @@ def _known_tables() -> list[JointTable]:
 
 
 def _table(section: Mapping[str, Any]) -> JointTable:
-    """One naming with its sides spelled out."""
+    """One naming with its sides expanded."""
     sides = section.get("sides", list(_SIDES))
     if not (isinstance(sides, list) and len(sides) == 2 and all(isinstance(side, str) for side in sides)):
         raise InputError("sides", expected='two names such as ["Left", "Right"]', got=sides)

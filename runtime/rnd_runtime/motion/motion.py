@@ -27,12 +27,12 @@ from .smpl import SMPL_REST_ROOT
 Floats = NDArray[np.float64]
 
 Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""(x, y, z) of a Z-up world is (x, z, −y) of ours"""
+"""(x, y, z) of a Z-up world → (x, z, −y)"""
 
-# Files with fingers drive SMPL's one joint a hand by the index finger's base (ml-hugs' choice).
+# In files with fingers the index finger's base drives SMPL's joint of the hand, as in ml-hugs.
 STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 
-_PART_OF_A_FRAME = 1e-4  # rounding of a duration, or of a rate in words
+_PART_OF_A_FRAME = 1e-4  # tolerance of rounded durations and rates
 
 _MOCAP = (".bvh", ".amc")
 
@@ -44,12 +44,12 @@ class Motion:
     Attributes:
         rotations: [F, J, 3, 3] local rotations relative to the rest pose, the root first.
         translations: [F, 3] m, added to the root's rest position.
-        fps: frames per second; frame f happens at f / fps seconds.
+        fps: frames per second; frame f is at f / fps seconds.
         joint_names: J names.
-        source: where it came from, for messages.
-        notes: what the reader assumed or left out, one sentence each, for the user.
-        closed: whether the frame after the last is the first again.
-        left_out: moving joints of the file that drive nothing, by the file's names.
+        source: origin, for messages.
+        notes: assumptions and omissions of the reader, for the user.
+        closed: whether the first frame follows the last.
+        left_out: unused moving joints of the file, by its names.
     """
 
     rotations: Floats
@@ -75,22 +75,22 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first frame to the last; of a closed motion to its first frame's return."""
+        """Seconds from the first frame to the last; of a closed motion to the first frame's return."""
         return (self.frame_count - (not self.closed)) / self.fps
 
     def frames_at(self, fps: float) -> int:
-        """Frames at ``fps`` from its first to its last pose, of a closed motion no pose twice."""
+        """Number of frames at ``fps``; a closed motion repeats no pose."""
         if self.closed:
             return max(1, math.ceil(self.duration * fps - _PART_OF_A_FRAME))
         return math.floor(self.duration * fps + _PART_OF_A_FRAME) + 1
 
     def goes_round_at(self, fps: float) -> bool:
-        """Whether it is closed, and a whole number of frames at ``fps`` long."""
+        """Whether it is closed and a whole number of frames long at ``fps``."""
         frames = self.duration * fps
         return self.closed and abs(frames - round(frames)) < _PART_OF_A_FRAME
 
     def loop_notes(self, fps: float) -> tuple[str, ...]:
-        """A warning if it is closed and no whole number of frames at ``fps`` long."""
+        """A warning if it is closed and not a whole number of frames long at ``fps``."""
         if not self.closed or self.goes_round_at(fps):
             return ()
         even = max(round(self.duration * fps), 1) / self.duration
@@ -98,16 +98,16 @@ class Motion:
         return (f"{what}: it jerks at the seam ({even:.9g} per second fit)",)
 
     def at(self, times_s: ArrayLike) -> Motion:
-        """The poses at ``times_s`` [T] seconds: ``.interpolation`` between frames.
+        """Poses at ``times_s`` [T] seconds, by ``.interpolation``; ``fps`` stays.
 
-        Beyond its ends a motion keeps its end poses; a closed one repeats. The result has the recording's ``fps``.
+        Beyond its ends a motion keeps its end poses; a closed one repeats.
         """
         rotations, translations, positions = self.path_at(times_s)
         poses = interpolate_rotations(rotations, positions), interpolate_points(translations, positions)
         return replace(self, rotations=poses[0], translations=poses[1], closed=False)
 
     def path_at(self, times_s: ArrayLike) -> tuple[Floats, Floats, Floats]:
-        """Rotations [F, J, 3, 3], translations [F, 3], and the positions [T] in frames of the poses of ``at``."""
+        """Rotations [F, J, 3, 3], translations [F, 3], and positions [T] in frames of the poses of ``at``."""
         positions = np.atleast_1d(np.asarray(times_s, np.float64)) * self.fps
         if self.closed:
             return *self._lap, 1 + positions % self.frame_count
@@ -115,7 +115,7 @@ class Motion:
 
     @cached_property
     def _lap(self) -> tuple[Floats, Floats]:
-        """Rotations and translations of one cycle with the frame before it and two after it, for their slopes."""
+        """Rotations and translations of one cycle with one frame before and two after it, for the slopes."""
         frames = np.arange(-1, self.frame_count + 2) % self.frame_count
         return self.rotations[frames], self.translations[frames]
 
@@ -131,18 +131,16 @@ def load_motion(
 ) -> Motion:
     """Read a motion file for ``skeleton``, Y up.
 
-    Arrays (``readers.arrays``): joints are matched by name. The root is always the root; a first joint that is not
-    among ours rotates it. Joints that the file lacks stay at rest and are noted; joints that ``skeleton`` lacks are
-    left out. Z-up files are of the SMPL family: the pelvis is at ``J0 + trans`` with J0 of SMPL's mean body. In
-    Y-up files ``trans`` is an offset from the avatar's rest position, unless their layout says otherwise.
-
-    BVH and AMC have a skeleton of their own: ``retarget``.
+    Arrays (``readers.arrays``): joints are matched by name. The first joint is the root, or rotates it if unknown.
+    Missing joints stay at rest and are noted; joints that ``skeleton`` lacks are left out. Z-up files are of the SMPL
+    family, with the pelvis at ``J0 + trans``, J0 of SMPL's mean body. In Y-up files ``trans`` is an offset from the
+    avatar's rest position, unless their layout differs. BVH and AMC have their own skeleton: ``retarget``.
 
     Args:
-        up: the axis that points up in the file; "auto" goes by the layout and the file's ``up_axis``.
+        up: the file's up axis; "auto" uses the layout and the file's ``up_axis``.
         fps: overrides the file's frame rate.
-        joint_names: of the columns, for files that are known to follow a skeleton's order.
-        joint_map: a file of our joints' names there: ``joint_names.load_joint_map``.
+        joint_names: names of the columns.
+        joint_map: a file of the avatar's joints' names in the motion: ``joint_names.load_joint_map``.
 
     Raises:
         InputError: with the file, the field and, where there is one, the frame.
@@ -235,10 +233,9 @@ def _load_arrays(
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:
-    """Write ``motion`` as an AMASS-like .npz that ``load_motion`` reads back for any skeleton.
+    """Write ``motion`` as an AMASS-like .npz that ``load_motion`` reads for any skeleton.
 
-    Members: ``poses`` (F, 3J) axis-angle rad, ``trans`` (F, 3) m, ``mocap_framerate``, ``joint_names``,
-    ``up_axis`` "y".
+    Members: ``poses`` (F, 3J) axis-angle rad, ``trans`` (F, 3) m, ``mocap_framerate``, ``joint_names``, ``up_axis`` y.
     """
     save_npz(
         path,

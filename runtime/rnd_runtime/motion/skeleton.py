@@ -1,4 +1,4 @@
-"""Joint trees and how they are posed."""
+"""Joint trees and their posing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .smpl import SMPL_NAMES, SMPL_PARENTS
 
 Floats = NDArray[np.float64]
 
-_TURNS = 1e-6  # of a matrix element, below which a joint stands still
+_TURNS = 1e-6  # min change of a matrix element of a moving joint
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +22,12 @@ class Skeleton:
     """A joint tree in its rest pose.
 
     Attributes:
-        names: J joint names, the root first, each once.
-        parents: [J] index of the parent; −1 for the root; a parent comes before its children.
+        names: J unique joint names, the root first.
+        parents: [J] parent indices, −1 for the root; parents come first.
         rest_joints: [J, 3] m, joint positions in the rest pose.
 
     Raises:
-        InputError: when the arrays do not describe one tree rooted at joint 0.
+        InputError: the arrays are not one tree rooted at joint 0.
     """
 
     names: tuple[str, ...]
@@ -36,7 +36,7 @@ class Skeleton:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
-        parents = np.asarray(self.parents)  # as given: a cast would wrap what is too large around
+        parents = np.asarray(self.parents)  # not cast yet, which could overflow
         object.__setattr__(self, "rest_joints", np.asarray(self.rest_joints, np.float64))
         count = len(self.names)
         if count == 0 or parents.shape != (count,) or self.rest_joints.shape != (count, 3):
@@ -65,8 +65,7 @@ class Skeleton:
     def joint_transforms(self, rotations: ArrayLike, translation: ArrayLike) -> Floats:
         """World transforms ``G`` [..., J, 4, 4] of the posed joints.
 
-        ``G_k = G_parent(k) · [R_k | rest_k − rest_parent]``; the root turns about its rest position and is
-        then translated.
+        ``G_k = G_parent(k) · [R_k | rest_k − rest_parent]``; the root rotates about its rest position, then translates.
 
         Args:
             rotations: [..., J, 3, 3] local rotations relative to the rest pose.
@@ -91,18 +90,18 @@ class Skeleton:
 
 
 def moving_joints(rotations: Floats) -> NDArray[np.bool_]:
-    """Which joints [J] of ``rotations`` [F, J, 3, 3] ever leave the identity."""
+    """Joints [J] of ``rotations`` [F, J, 3, 3] that ever leave the identity."""
     moving: NDArray[np.bool_] = np.abs(rotations - np.eye(3)).max((0, 2, 3)) > _TURNS
     return moving
 
 
 def smpl_skeleton(rest_joints: ArrayLike) -> Skeleton:
-    """SMPL's tree with its joints at ``rest_joints`` [24, 3] m."""
+    """SMPL's tree with joints at ``rest_joints`` [24, 3] m."""
     return Skeleton(SMPL_NAMES, np.array(SMPL_PARENTS, np.int32), np.asarray(rest_joints, np.float64))
 
 
 def bone_transforms(skeleton: Skeleton, rotations: ArrayLike, translation: ArrayLike) -> NDArray[np.float32]:
-    """What moves a point of the rest pose with each bone: ``G(pose) · G(rest)⁻¹`` as [..., J, 3, 4] float32.
+    """Transforms of rest-pose points by each bone: ``G(pose) · G(rest)⁻¹`` as [..., J, 3, 4] float32.
 
     Args:
         skeleton: J joints.
@@ -115,7 +114,7 @@ def bone_transforms(skeleton: Skeleton, rotations: ArrayLike, translation: Array
 
 
 def taken_along(bones: ArrayLike, motion: Floats) -> NDArray[np.float32]:
-    """Bones [J, 3, 4] m after ``motion`` [4, 4] (rigid, m) of what they have posed."""
+    """Bones [J, 3, 4] m followed by ``motion`` [4, 4] (rigid, m)."""
     moved = np.asarray(motion[:3, :3] @ np.asarray(bones, np.float64))
     moved[:, :, 3] += motion[:3, 3]
     return moved.astype(np.float32)
@@ -138,7 +137,7 @@ def bones_of(posed, rest_joints):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def chain(rotations, translations, parents, rest_joints):  # type: ignore[no-untyped-def]
-    """``Skeleton.joint_transforms`` [B, J, 4, 4] of poses [B, J, 3, 3] and their translations [B, 3]."""
+    """``Skeleton.joint_transforms`` [B, J, 4, 4] of rotations [B, J, 3, 3] and translations [B, 3]."""
     posed = np.zeros((*rotations.shape[:2], 4, 4))
     for pose in range(rotations.shape[0]):
         for joint in range(rotations.shape[1]):

@@ -1,4 +1,4 @@
-"""The joints of the SMPL family and the pelvis of its mean bodies."""
+"""Joints of the SMPL family and the pelvis of its mean bodies."""
 
 from __future__ import annotations
 
@@ -21,6 +21,6 @@ SMPLH_NAMES: tuple[str, ...] = SMPL_NAMES[:22] + _HANDS
 SMPLX_NAMES: tuple[str, ...] = (*SMPL_NAMES[:22], "jaw", "left_eye", "right_eye", *_HANDS)
 NAMES_BY_COUNT = {22: SMPL_NAMES[:22], 24: SMPL_NAMES, 52: SMPLH_NAMES, 55: SMPLX_NAMES}
 
-# m, the pelvis of the mean body (betas 0): translations of these files place the origin, not the pelvis
+# m, pelvis of the mean body (betas 0); translations of these files are of the origin
 SMPL_REST_ROOT: NDArray[np.float64] = np.array([-0.0018, -0.2233, 0.0282])
 SMPLX_REST_ROOT: NDArray[np.float64] = np.array([0.0031, -0.3514, 0.0120])

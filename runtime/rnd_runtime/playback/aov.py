@@ -11,7 +11,7 @@ depth       near is bright, over the body's reach    Z: metres along the camera'
 ==========  =======================================  ==================================================
 
 Normals are in the camera's OpenCV axes, as captures have them: what faces the camera has z < 0.
-All but albedo are averages over what covers the pixel: zero where that is less than ``MIN_COVERAGE``.
+All but albedo are averages over the covered part of a pixel, zero below ``MIN_COVERAGE``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rnd_runtime.core.gaussians import Floats32, Gaussians, Raster
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.core.sh import COSINE_LOBE, sh_basis
 
-# Channels of each output in the raster's features and in the EXR; depth comes from the raster itself.
+# EXR channels of each output
 CHANNELS = {
     "albedo": ("albedo.R", "albedo.G", "albedo.B"),
     "normal": ("normal.X", "normal.Y", "normal.Z"),
@@ -47,7 +47,7 @@ def parse_aovs(text: str) -> tuple[str, ...]:
 
 
 def splat_features(names: Sequence[str], gaussians: Gaussians, camera: Camera) -> list[Floats32]:
-    """Features to rasterise for ``names``, one array [N, C] each; depth has none."""
+    """Features [N, C] to rasterise for each of ``names``; depth has none."""
     features = {
         "albedo": lambda: gaussians.albedo,
         "normal": lambda: gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32),
@@ -58,7 +58,7 @@ def splat_features(names: Sequence[str], gaussians: Gaussians, camera: Camera) -
 
 
 def ambient_visibility(gaussians: Gaussians) -> Floats32:
-    """(1/π) ∫ v(ω) max(n·ω, 0) dω [N], clipped to [0, 1]: the share of a uniform sky's irradiance that arrives."""
+    """(1/π) ∫ v(ω) max(n·ω, 0) dω [N], clipped to [0, 1]: the visible share of a uniform sky's irradiance."""
     normals_root = gaussians.normals @ gaussians.root_rotation
     lobe = sh_basis(normals_root) * COSINE_LOBE
     share: Floats32 = np.clip((gaussians.visibility * lobe).sum(axis=1), 0, 1)
@@ -66,7 +66,7 @@ def ambient_visibility(gaussians: Gaussians) -> Floats32:
 
 
 def aov_layers(names: Sequence[str], raster: Raster, first: int) -> dict[str, Floats32]:
-    """``aov_values`` of ``names``, whose channels begin at ``first`` in the raster's image."""
+    """``aov_values`` of ``names``; their channels begin at ``first`` in the raster's image."""
     layers = {}
     for name in names:
         if name == "depth":
@@ -79,7 +79,7 @@ def aov_layers(names: Sequence[str], raster: Raster, first: int) -> dict[str, Fl
 
 
 def aov_values(name: str, splatted: Floats32, alpha: Floats32) -> Floats32:
-    """What the EXR layer of ``name`` holds [H, W, C], from the raster's premultiplied channels."""
+    """EXR layer of ``name`` [H, W, C] from the raster's premultiplied channels."""
     if name == "albedo":
         return splatted
     covered = alpha >= MIN_COVERAGE

@@ -1,4 +1,4 @@
-"""What this machine offers an avatar, and what to install where something is missing: ``rnd-play --doctor``."""
+"""Diagnosis of this machine, with installation advice: ``rnd-play --doctor``."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import NamedTuple
 from rnd_runtime.core.threads import cores
 from rnd_runtime.gl.context import INSTALL
 
-PROBE_SECONDS = 60.0  # a driver that hangs must not hang us
+PROBE_SECONDS = 60.0  # time limit: drivers may hang
 PACKAGES = ("numpy", "numba", "onnxruntime", "moderngl", "OpenImageIO")
 
-# Run by another interpreter each: a broken GL driver may take its process down.
+# Each runs in its own process, as a broken GL driver may crash it.
 _GL_PROBE = """
 from rnd_runtime.gl.context import create_context
 info = create_context({backend!r}).info
@@ -45,11 +45,11 @@ print(", ".join(onnxruntime.get_available_providers()))
 class Finding(NamedTuple):
     label: str
     value: str
-    advice: str | None  # one line, where something can be done
+    advice: str | None  # one line
 
 
 def report() -> list[Finding]:
-    """Look at renderers, onnxruntime, numba, the CPU and versions. Takes a few seconds; raises nothing."""
+    """Examine renderers, onnxruntime, numba, the CPU and versions; takes a few seconds and raises nothing."""
     probes = {
         "egl": _start(_GL_PROBE.format(backend="egl")),
         "osmesa": _start(_GL_PROBE.format(backend="osmesa")),
@@ -71,9 +71,9 @@ def report() -> list[Finding]:
 
 
 def machine() -> str:
-    """CPU model, its microarchitecture as LLVM calls it, and cores, for the record beside a measured figure.
+    """CPU model, its microarchitecture as named by LLVM, and cores.
 
-    A cloud's model names tell little: what calls itself AMD EPYC has AVX-512 or has not.
+    The model's name alone does not tell whether it has AVX-512 on cloud machines.
     """
     return f"{_cpu_model()} ({_microarchitecture()}), {cores()} cores"
 
@@ -83,7 +83,7 @@ def _start(code: str) -> subprocess.Popen[str]:
 
 
 def _outcome(process: subprocess.Popen[str]) -> tuple[bool, str]:
-    """Whether the probe worked, and its line, or the last line of what went wrong."""
+    """Whether the probe succeeded, and its last line of output or error."""
     try:
         output, errors = process.communicate(timeout=PROBE_SECONDS)
     except subprocess.TimeoutExpired:
@@ -104,7 +104,7 @@ def _gl_finding(label: str, backend: str, works: bool, value: str, *, needed: bo
 
 
 def _rasterizer(works: bool, line: str) -> tuple[str, str | None]:
-    """What ``--raster auto`` takes: it asked itself, in a process that a driver may take down."""
+    """Choice of ``--raster auto``."""
     return (line, None) if works else ("cpu", f"--raster cpu, as looking for a GPU fails: {line}")
 
 
@@ -131,6 +131,6 @@ def _cpu_model() -> str:
 def _microarchitecture() -> str:
     try:
         from llvmlite.binding import get_host_cpu_name  # type: ignore[import-untyped]
-    except (ImportError, OSError):  # numba's, of which the doctor says that it is missing
+    except (ImportError, OSError):  # numba is missing
         return platform.machine()
     return str(get_host_cpu_name())

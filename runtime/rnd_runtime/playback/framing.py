@@ -1,7 +1,6 @@
 """Cameras that show a whole motion, from the front or from an orbit.
 
-A camera path is a function ``(frame, time_s) -> Camera`` of its arguments alone, so that any part of a run can be
-rendered by itself and gives the same pixels.
+A camera path ``(frame, time_s) -> Camera`` depends on its arguments alone, so any part of a run gives the same pixels.
 """
 
 from __future__ import annotations
@@ -16,28 +15,28 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.camera import Camera
 
-if TYPE_CHECKING:  # so that a command's options need no kernel
+if TYPE_CHECKING:  # a command's options must not import kernels
     from rnd_runtime.motion.motion import Motion
     from rnd_runtime.motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
 CameraPath = Callable[[int, float], Camera]
 
-ELEVATION, FIELD_OF_VIEW = 5.0, 35.0  # degrees: the usual view
+ELEVATION, FIELD_OF_VIEW = 5.0, 35.0  # degrees
 PADDING = 0.14
-"""share of the skeleton's height that flesh, clothing and crown reach beyond the nearest joint: 0.23 m for SMPL"""
-_ORBIT_SAMPLES = 72  # azimuths at which an orbit is checked to hold the body
+"""reach of body and clothes beyond the joints, as a share of the skeleton's height: 0.23 m for SMPL"""
+_ORBIT_SAMPLES = 72  # azimuths that determine an orbit's distance
 
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """What an automatic camera must show: every joint in every frame of a motion.
+    """Extent of a motion for an automatic camera.
 
     Attributes:
-        joints: [P, 3] m, world.
-        centre: [3] m, the middle of their bounding box.
-        padding: m that the body may reach beyond its joints.
-        facing: rad, azimuth ``atan2(x, z)`` of the direction in which the body faces in the first frame.
+        joints: [P, 3] m, world: every joint in every frame.
+        centre: [3] m, centre of their bounding box.
+        padding: m, reach of the body beyond its joints.
+        facing: rad, azimuth ``atan2(x, z)`` that the body faces in the first frame.
     """
 
     joints: Floats
@@ -47,7 +46,7 @@ class Framing:
 
     @property
     def radius(self) -> float:
-        """Radius in metres of a sphere about ``centre`` that holds the body at all times."""
+        """Radius in m of a sphere about ``centre`` that contains the body at all times."""
         return float(np.linalg.norm(self.joints - self.centre, axis=1).max()) + self.padding
 
 
@@ -59,7 +58,7 @@ class CameraOptions:
         width, height: pixels.
         fov_y: vertical field of view, rad.
         elevation: rad above the horizon.
-        distance: m from the framing's centre; None takes the smallest that shows the whole motion.
+        distance: m from the framing's centre; by default the smallest that shows the whole motion.
     """
 
     width: int
@@ -70,7 +69,7 @@ class CameraOptions:
 
 
 def frame_motion(skeleton: Skeleton, motion: Motion) -> Framing:
-    """The ``Framing`` of ``motion`` [F frames] played by ``skeleton``."""
+    """The ``Framing`` of ``motion`` on ``skeleton``."""
     joints = skeleton.joint_transforms(motion.rotations, motion.translations)[:, :, :3, 3].reshape(-1, 3)
     height = float(np.ptp(skeleton.rest_joints, axis=0).max())
     forward = motion.rotations[0, 0] @ np.array([0.0, 0.0, 1.0])  # a body at rest faces +Z
@@ -79,7 +78,7 @@ def frame_motion(skeleton: Skeleton, motion: Motion) -> Framing:
 
 
 def front_path(framing: Framing, view: CameraOptions) -> CameraPath:
-    """A standing camera that looks the body in the face as it is in the first frame."""
+    """A fixed camera in front of the body as it faces in the first frame."""
     distance = view.distance or _fitting_distance(framing, view, np.array([framing.facing]))
     camera = _camera_around(framing.centre, view, framing.facing, distance)
     return lambda frame, time_s: camera
@@ -101,7 +100,7 @@ def _camera_around(centre: Floats, view: CameraOptions, azimuth: float, distance
 
 
 def _fitting_distance(framing: Framing, view: CameraOptions, azimuths: Floats) -> float:
-    """The smallest distance in metres at which every padded joint lies in the image at all ``azimuths``.
+    """The smallest distance in m at which every padded joint is in the image at all ``azimuths``.
 
     A sphere of radius r at (x, y, z) from the centre, in camera axes, is inside the plane with half-angle a
     when d ≥ (|x| cos a + r) / sin a − z.

@@ -1,4 +1,4 @@
-"""Choosing between the OpenGL rasteriser and the CPU kernel."""
+"""Choice between the OpenGL and the CPU rasteriser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Floats32, Raster
 from rnd_runtime.raster import cpu as raster_cpu
 
-if TYPE_CHECKING:  # OpenGL is loaded where it draws: a twentieth of a start
+if TYPE_CHECKING:  # importing OpenGL takes 1/20 of a start
     from rnd_runtime.gl.context import Backend
     from rnd_runtime.gl.frame import GlRenderer
     from rnd_runtime.gl.raster import GlRasterizer
@@ -19,11 +19,11 @@ Kind = Literal["auto", "gl", "gl-egl", "gl-osmesa", "cpu"]
 
 
 class ChosenRasterizer:
-    """A ``core.gaussians.Rasterizer`` that knows its ``name`` and can be closed (or used with ``with``).
+    """A ``core.gaussians.Rasterizer`` with a name; a context manager.
 
     Attributes:
         name: such as ``gl (egl, llvmpipe (LLVM 15.0.6, 256 bits))`` or ``cpu``.
-        renderer: shades on the device too; None where the CPU draws.
+        renderer: renders whole frames on the device; None for the CPU.
     """
 
     def __init__(self, name: str, gl: GlRasterizer | None = None) -> None:
@@ -66,11 +66,12 @@ class ChosenRasterizer:
 def make_rasterizer(kind: Kind = "auto") -> ChosenRasterizer:
     """Make the rasteriser ``kind``.
 
-    "auto" takes OpenGL on a GPU, and the CPU kernel where GL cannot draw at all or would draw on the CPU too,
-    five to seven times as slowly. "gl-egl" and "gl-osmesa" name the backend; "gl" takes the first that works.
+    Args:
+        kind: "auto" is OpenGL on a GPU, else the CPU kernel, which is five to seven times as fast as software OpenGL.
+            "gl-egl" and "gl-osmesa" name the backend; "gl" takes the first that works.
 
     Raises:
-        InputError: "gl" and no OpenGL, or no such kind.
+        InputError: "gl" without OpenGL, or another kind.
     """
     if kind not in get_args(Kind):
         raise InputError("rasteriser", expected=" | ".join(get_args(Kind)), got=repr(kind))

@@ -1,4 +1,4 @@
-"""Loads an avatar's networks while the rest of a command is imported."""
+"""Loading of an avatar's networks during a command's imports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def load_ahead(avatar: str | Path | None, threads: int | None = None) -> Future[Networks] | None:
-    """Begin to load the networks of ``avatar`` in another thread, for ``avatar.avatar.Avatar.load``.
+    """Start loading the networks of ``avatar`` in another thread, for ``avatar.avatar.Avatar.load``.
 
     None without an avatar, or with more ``threads`` (of onnxruntime) than cores.
     """

@@ -1,1 +1,1 @@
-"""From a moment of a motion to posed Gaussians."""
+"""Posed Gaussians of an avatar at a moment of a motion."""

@@ -1,4 +1,4 @@
-"""Posing as it is defined, in plain float64: what the compiled pass of ``skinning`` is measured against."""
+"""Float64 numpy reference of posing; the compiled pass (``skinning``) is tested against it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 def pose_reference(
     rest: RestPose, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """``RestPose.pose`` in plain float64: what the compiled pass is measured against."""
+    """``RestPose.pose`` in float64."""
     offsets, visibility, bones = (np.asarray(a, np.float64) for a in (offsets, visibility, bones))
     weights = np.asarray(rest.neighbour_weights, np.float64)[..., None]
     logarithms = np.asarray(rest.log_template, np.float64)

@@ -1,10 +1,8 @@
 """The CPU rasteriser: numba, float32 with float64 projection, forward and backward, any number of channels.
 
-The rule is ``core.gaussians.Rasterizer``'s. Besides, a Gaussian with a number that is not finite,
-a covariance of trace zero or a projection that is not positive definite is not drawn and gets zero gradients.
-
-The result does not depend on the number of threads, to the bit. Kernels compile on first use (seconds) and
-are cached beside the package.
+The rule is ``core.gaussians.Rasterizer``'s. Gaussians with non-finite numbers, a covariance of trace zero or a
+projection that is not positive definite are skipped and get zero gradients. The result does not depend on the number of
+threads, to the bit.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ _EVERYTHING = np.empty(0, np.bool_)
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What ``backward`` needs of a forward pass; hold it, do not look into it."""
+    """Opaque result of ``forward`` for ``backward``."""
 
     means: Floats32
     covariances: Floats32
@@ -52,17 +50,17 @@ def rasterize(
     outlines: bool = False,
     seen: ArrayLike | None = None,
 ) -> Raster:
-    """Splat N Gaussians: projection, culling, sorting into tiles and blending.
+    """Splat N Gaussians.
 
     Args:
         means: [N, 3] m, world.
         covariances: [N, 6] m², world, upper triangle (xx, xy, xz, yy, yz, zz).
         opacities: [N].
-        features: [N, C], any C.
+        features: [N, C].
         camera: the view.
-        depth: False leaves the depth image all zero and saves its time.
-        outlines: they are sharp, see ``.outline``.
-        seen: [N] the Gaussians to be drawn, as ``raster.in_view.in_view`` tells them; by default all.
+        depth: False leaves the depth image zero.
+        outlines: sharpen them (``.outline``).
+        seen: [N] Gaussians to render, from ``raster.in_view.in_view``; all by default.
 
     Raises:
         InputError: an array has the wrong shape.
@@ -81,10 +79,7 @@ def forward(
     *,
     depth: bool = True,
 ) -> tuple[Raster, State]:
-    """``rasterize`` that also returns what ``backward`` needs.
-
-    Without ``depth`` the depth image is all zero and costs nothing.
-    """
+    """``rasterize`` that also returns the input of ``backward``."""
     arrays = checked(means, covariances, opacities, features)
     view = pinhole(camera)
     raster, splats, image = _splat(arrays, _EVERYTHING, view, depth, True, False)
@@ -99,7 +94,7 @@ def _splat(
     differentiable: bool,
     outlines: bool,
 ) -> tuple[Raster, Splats, Floats32]:
-    """The images, what ``backward`` needs of their making, and features and depth in one image [H, W, K]."""
+    """The raster, the splats, and features and depth in one image [H, W, K]."""
     started = perf_counter()
     threads, channels = get_num_threads(), arrays[3].shape[1]
     centers, shapes, boxes, attributes, depths, slot_starts = project(*arrays, seen, view, depth)
@@ -119,12 +114,12 @@ def backward(
 ) -> tuple[Floats32, Floats32, Floats32, Floats32]:
     """Gradients of means [N, 3], covariances [N, 6], opacities [N] and features [N, C].
 
-    Args:
-        state: of ``forward``.
-        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's images, [H, W, C], [H, W] and [H, W]; the
-            last is ignored where the forward pass was run without depth.
+    Zero where α is clamped at 0.99 and for skipped Gaussians.
 
-    Zero where α is clamped at 0.99 and for what was not drawn.
+    Args:
+        state: from ``forward``.
+        grad_image, grad_alpha, grad_depth: ∂L/∂ of the raster's images, [H, W, C], [H, W] and [H, W]; the last is
+            ignored without depth in the forward pass.
     """
     wanted, wanted_alpha = floats(grad_image), floats(grad_alpha)
     check_shape("gradient of the image", wanted, (*state.coverage.shape, state.channels))

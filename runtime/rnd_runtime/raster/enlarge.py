@@ -1,4 +1,4 @@
-"""Bilinear enlargement of an image that was rendered at less than its full resolution (numba)."""
+"""Bilinear enlargement of an image rendered below full resolution (numba)."""
 
 from __future__ import annotations
 

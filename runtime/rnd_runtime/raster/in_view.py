@@ -1,4 +1,4 @@
-"""Which Gaussians a camera may see: what has to be shaded before anything is rendered (numba)."""
+"""Visibility of Gaussians to a camera, before shading (numba)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rnd_runtime.core.simd import WIDTH, load, load_points, sqrt, store_mask
 from .oracle import ALPHA_MIN, DILATION, NEAR
 from .project import Pinhole, pinhole
 
-# Of α = 1/255 at opacity 1, in standard deviations, and a hundredth for a camera's rotation that is one to 1e-4 only
+# Standard deviations to α = 1/255 at opacity 1, plus 1 % as camera rotations are orthonormal to 1e-4 only
 REACH = 1.01 * math.sqrt(-2 * math.log(ALPHA_MIN))
 MIN_OPACITY = np.float32(ALPHA_MIN)
 ZERO = np.float32(0)
-EVERYTHING = np.float32(-1)  # no cosine is below it
-CHUNK = 128 * WIDTH  # Gaussians looked at by a thread at a time
+EVERYTHING = np.float32(-1)  # min cosine without culling
+CHUNK = 128 * WIDTH  # Gaussians per unit of parallel work
 
 
 def in_view(
@@ -33,14 +33,14 @@ def in_view(
     normals: ArrayLike | None = None,
     cull: float | None = None,
 ) -> NDArray[np.bool_]:
-    """[N] all that reach the image of ``raster.cpu.rasterize``, and few others.
+    """Conservative mask [N] of the Gaussians that reach the image of ``raster.cpu.rasterize``.
 
-    Cheaper than projecting them, since a Gaussian counts as the ball that holds it: one whose σ is √‖Σ‖, Frobenius'
-    norm, which no direction exceeds. Arguments as of ``rasterize``.
+    A Gaussian is bounded by a ball of σ = √‖Σ‖ (Frobenius norm). Arguments are as for ``rasterize``.
 
-    With ``cull`` those are left out that face away, where the cosine n·v of ``normals`` [N, 3] (unit) and the direction
-    to the camera is below it: a closed, opaque body hides them. A little below 0 the silhouette's Gaussians stay. What
-    it costs: docs/performance.md (``rnd-bench frame --cull``).
+    Args:
+        normals: [N, 3] unit.
+        cull: leave out Gaussians whose cosine n·v of normal and direction to the camera is below this. Slightly below 0
+            the silhouette stays. Error: docs/performance.md (``rnd-bench frame --cull``).
 
     Raises:
         InputError: an array has the wrong shape.
@@ -68,17 +68,17 @@ def seen_of(gaussians: Gaussians, camera: Camera, cull: float | None = None) -> 
 
 
 def opacities_of(gaussians: Gaussians, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """[N]; 0 for what is not ``seen``, so that rasterisers that ask for no mask leave it out."""
+    """Opacities [N], 0 where not ``seen``, for rasterisers without a mask."""
     return np.where(seen, gaussians.opacities, np.float32(0))
 
 
 @njit(inline="always")
 def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, high: float):  # type: ignore[no-untyped-def]
-    """An image's side as a plane: x, y, z, constant, and how far a ball of σ = 1 m reaches beyond it.
+    """Plane of an image's side: x, y, z, constant, and the reach of a ball of σ = 1 m beyond it.
 
-    A point of the camera's frame is projected to u = f x/z + c, and its ball reaches REACH·√(|m|² σ² + DILATION) px
-    from there, where |m|² = (f/z)² (1 + s²) and s is the slope that ``Pinhole`` bounds. It may touch the pixels
-    u ≥ 0 if z u + REACH (f √(1 + s²) σ + z √DILATION) ≥ 0, which is linear in the point.
+    A point projects to u = f x/z + c, and its ball reaches REACH·√(|m|² σ² + DILATION) px from there, with
+    |m|² = (f/z)² (1 + s²) and s the slope bounded by ``Pinhole``. It may touch the pixels u ≥ 0 if
+    z u + REACH (f √(1 + s²) σ + z √DILATION) ≥ 0, which is linear in the point.
     """
     r, t = view.rotation, view.translation
     ahead = centre + REACH * math.sqrt(DILATION)
@@ -94,7 +94,7 @@ def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, hig
 
 @njit(inline="always")
 def _ahead(view):  # type: ignore[no-untyped-def]
-    """What is nearer than NEAR as a plane, which a ball's middle must pass."""
+    """Plane z = NEAR, that a ball's centre must pass."""
     r, t = view.rotation, view.translation
     return r[2, 0], r[2, 1], r[2, 2], t[2] - 0.999 * NEAR, 0.0
 
@@ -126,7 +126,7 @@ def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def find_in_view(means, covariances, opacities, normals, eye, min_cosine, view):  # type: ignore[no-untyped-def]
-    """``in_view`` from ``eye`` [3], where n·v is ``min_cosine`` or more; EVERYTHING looks at no normal."""
+    """``in_view`` from ``eye`` [3] with n·v ≥ ``min_cosine``; EVERYTHING ignores normals."""
     seen = np.empty(len(means), np.bool_)
     sides = np.empty((5, 5), np.float64)
     sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
@@ -147,7 +147,7 @@ def _find_in_view(first, last, arrays, sides, limits, seen):  # type: ignore[no-
     means, covariances, opacities, normals = arrays
     eye, min_cosine = limits
     culling = min_cosine > EVERYTHING
-    # Of most the middle is in the image: seen sixteen at a time, and rounding may err, for the others are looked at
+    # Most centres are inside the image: a float32 test of sixteen at a time; the rest are tested in float64 below
     a, b, c, d, e = (_rounded(sides[0]), _rounded(sides[1]), _rounded(sides[2]), _rounded(sides[3]), _rounded(sides[4]))
     sixteens = last // WIDTH * WIDTH
     for i in range(first, sixteens, WIDTH):

@@ -1,8 +1,8 @@
-"""The slow, trusted rasteriser: float64 numpy, no tiles, one Gaussian after the other.
+"""The reference rasteriser: float64 numpy, no tiles, one Gaussian after the other.
 
-Every other rasteriser of ours is tested against this one. Each line of the rule
-(``core.gaussians.Rasterizer``) is a public function here, tested by itself. Equation numbers are
-of Kerbl et al., "3D Gaussian Splatting" (2023) and Zwicker et al., "EWA Splatting" (2002).
+All rasterisers are tested against it. Each line of the rule (``core.gaussians.Rasterizer``) is a public function.
+
+Source: Kerbl et al., "3D Gaussian Splatting" (2023); Zwicker et al., "EWA Splatting" (2002).
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ from rnd_runtime.core.gaussians import Floats32, Raster
 
 Floats = NDArray[np.float64]
 
-# m: what lies nearer is not drawn. At 1 cm a Gaussian of 8 mm filled the image; at 5 cm one of a sparse avatar still
-# covered half of it (the stability suite's G3); 3DGS draws nothing within 20 cm
+# m, nearest depth rendered. At 1 cm a Gaussian of 8 mm fills the image; at 5 cm one of a sparse avatar covers half of
+# it (stability suite, G3). 3DGS has 0.2.
 NEAR = 0.1
-# px² added to both variances, so that little falls between pixels' centres. 3DGS has 0.3, Mip-Splatting (Yu et al.
-# 2024) 0.1, a pixel's box 1/12. It makes an opaque body wider, the more the smaller the image is, whatever was
-# learned: docs/tried.md
+# px² added to both variances against aliasing. 3DGS has 0.3, Mip-Splatting (Yu et al. 2024) 0.1, a pixel's box 1/12.
+# It widens an opaque body, more so in small images: docs/tried.md
 DILATION = 0.05
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
-# 1e-4, less a hair: two Gaussians clamped at 0.99 leave 1e-4 exactly, which rounding must not decide
+# Below 1e-4, as two Gaussians clamped at 0.99 leave exactly 1e-4
 TRANSMITTANCE_MIN = 0.9999e-4
-FIELD_OF_VIEW_MARGIN = 0.3  # gsplat's 1.3 × field of view, the margin measured from each border of the image
+FIELD_OF_VIEW_MARGIN = 0.3  # of half the field of view beyond each border, as in gsplat
 
 
 def symmetric(triangles: ArrayLike) -> Floats:
@@ -47,10 +46,9 @@ def image_points(points: Floats, camera: Camera) -> Floats:
 
 
 def clamped_slopes(points: Floats, camera: Camera) -> Floats:
-    """x/z and y/z [N, 2], held within the image widened by 0.3 half fields of view on each side.
+    """x/z and y/z [N, 2], clamped to the image widened by 0.3 half fields of view on each side.
 
-    The affine approximation of the projection explodes far outside the image; 3DGS and gsplat evaluate it
-    at the clamped direction. The limits follow the principal point.
+    Far outside the image the affine approximation of the projection diverges; 3DGS and gsplat clamp it too.
     """
     size, focal = np.array([camera.width, camera.height]), camera.K[[0, 1], [0, 1]]
     centre, margin = camera.K[:2, 2], FIELD_OF_VIEW_MARGIN * 0.5 * size / focal
@@ -66,7 +64,7 @@ def projection_jacobians(points: Floats, camera: Camera) -> Floats:
 
 
 def image_covariances(means: ArrayLike, covariances: ArrayLike, camera: Camera) -> Floats:
-    """Σ' = J W Σ Wᵀ Jᵀ + 0.05·I, [N, 2, 2] px² (eq. 5 of Kerbl et al., with our dilation)."""
+    """Σ' = J W Σ Wᵀ Jᵀ + 0.05·I, [N, 2, 2] px² (eq. 5 of Kerbl et al., with another dilation)."""
     to_image = projection_jacobians(camera_points(means, camera), camera) @ camera.world_to_camera[:3, :3]
     return to_image @ symmetric(covariances) @ to_image.transpose(0, 2, 1) + DILATION * np.eye(2)
 
@@ -88,16 +86,16 @@ def reach(covariance: Floats, opacity: float) -> Floats:
 def drawn(
     means: ArrayLike, covariances: ArrayLike, opacities: ArrayLike, features: ArrayLike, camera: Camera
 ) -> NDArray[np.bool_]:
-    """Which Gaussians are rendered at all [N].
+    """Mask [N] of rendered Gaussians.
 
-    All numbers finite, at least NEAR in front of the camera, opacity at least 1/255, a covariance that is
-    not zero and whose projection is positive definite.
+    All numbers finite, depth at least NEAR, opacity at least 1/255, and a non-zero covariance with a positive definite
+    projection.
     """
     rows = [np.asarray(array, np.float64) for array in (means, covariances, features)]
     opacities = np.asarray(opacities, np.float64)
     finite = np.logical_and.reduce([np.isfinite(array).all(axis=1) for array in rows]) & np.isfinite(opacities)
     finite &= (np.trace(symmetric(covariances), axis1=1, axis2=2) > 0) & (opacities >= ALPHA_MIN)
-    with np.errstate(all="ignore"):  # rows that are not finite are refused whatever comes of them
+    with np.errstate(all="ignore"):  # of rows that are not finite
         in_front = camera_points(means, camera)[:, 2] >= NEAR
         flat = image_covariances(means, covariances, camera)
         definite = (flat[:, 0, 0] > 0) & (flat[:, 1, 1] > 0) & (np.linalg.det(flat) > 0)
@@ -111,10 +109,9 @@ def front_to_back(depths: Floats) -> NDArray[np.intp]:
 
 
 def blend(transmittance: Floats, alpha: Floats) -> tuple[Floats, Floats]:
-    """One step of blending: the weights T·α and the transmittance T·(1 − α) left behind.
+    """One blending step: weights T·α and the remaining transmittance T·(1 − α).
 
-    A pixel is finished, marked by a negative transmittance, before the Gaussian that would take it below
-    1e-4.
+    A pixel is finished (negative transmittance) before the Gaussian that would take it below 1e-4.
     """
     left = transmittance * (1.0 - alpha)
     finished = (transmittance < 0) | (left < TRANSMITTANCE_MIN)
@@ -132,7 +129,7 @@ def rasterize(
 ) -> Raster:
     """Splat N Gaussians; shapes as ``core.gaussians.Rasterizer``, results in float64.
 
-    Each Gaussian meets every pixel of the box outside of which its α is below 1/255.
+    Each Gaussian is evaluated at every pixel of the box outside of which its α is below 1/255.
     """
     indices = drawn(means, covariances, opacities, features, camera)
     points = camera_points(means[indices], camera)

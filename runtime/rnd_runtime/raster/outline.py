@@ -1,11 +1,11 @@
-"""Outlines as sharp as a body's: what is done to an image of an avatar after its Gaussians are blended.
+"""Sharpening of an avatar's outlines after blending.
 
-Overlapping discs fade over three pixels or four at an outline. The coverage α of a blended image is therefore
-sharpened, symmetrically about one half:
+Overlapping discs fade over three to four pixels at an outline. The coverage α is sharpened symmetrically about ½, and
+features / α stays:
 
     α' = α² (3 − 2 α)        features' = features · α (3 − 2 α)
 
-so that means over what covers a pixel, features / α, stay. Training and files of splats blend without it.
+Training and splat files blend without it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ZERO, _ONE, _TWO, _THREE = (np.float32(x) for x in (0, 1, 2, 3))
 
 
 def sharpened(raster: Raster) -> Raster:
-    """``raster`` with a body's outlines; its own arrays are changed, and the time is counted as blending ("raster")."""
+    """``raster`` with sharpened outlines; modifies its arrays, and counts the time as "raster"."""
     started = perf_counter()
     image, alpha, depth = (np.require(a, np.float32, ["C", "W"]) for a in (raster.image, raster.alpha, raster.depth))
     _sharpen(image, alpha, depth)
@@ -33,7 +33,7 @@ def sharpened(raster: Raster) -> Raster:
 
 @njit(inline="always")
 def sharpening(covered):  # type: ignore[no-untyped-def]
-    """What the coverage and the features of a pixel are multiplied with, of which ``covered`` is covered."""
+    """Factor for coverage and features of a pixel with coverage ``covered``."""
     return covered * (_THREE - _TWO * covered) if _ZERO < covered < _ONE else _ONE
 
 

@@ -1,6 +1,6 @@
-"""From Gaussians in the world to ellipses in the image, and the way back for gradients (numba, float64).
+"""Projection of Gaussians to ellipses in the image, and its gradient (numba, float64).
 
-An ellipse is kept as the conditional form of its log-density, which no float32 rounding can make indefinite:
+An ellipse is stored as the conditional form of its log-density, which float32 rounding cannot make indefinite:
 
     log2 α(x, y) = peak − fall_y·dy² − fall_x·(dx − shear·dy)²,
     shear = Σxy/Σyy,  fall_y = h/Σyy,  fall_x = h/(Σxx − Σxy²/Σyy),  h = ½·log2(e),  peak = log2(opacity).
@@ -20,7 +20,7 @@ from rnd_runtime.core.camera import Camera
 from .oracle import DILATION, FIELD_OF_VIEW_MARGIN, NEAR
 
 TILE_SHIFT = 4
-TILE = 1 << TILE_SHIFT  # pixels; a multiple of the 4×4 block that fills sixteen lanes
+TILE = 1 << TILE_SHIFT  # pixels; a multiple of the 4×4 block of sixteen lanes
 HALF_LOG2_E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
 LOG2_ALPHA_MIN = -math.log2(255.0)
@@ -28,7 +28,7 @@ CHUNK = 1024  # Gaussians projected at a time
 
 
 class Pinhole(NamedTuple):
-    """A camera as numbers for a kernel: pixels, and limits of x/z and y/z where the Jacobian is taken."""
+    """A camera for a kernel: pixels, and limits of x/z and y/z in the Jacobian."""
 
     width: int
     height: int
@@ -85,7 +85,7 @@ def _clamped_slopes(view: Pinhole, x: float, y: float, z: float) -> Any:
 
 @njit(inline="always")
 def _projection_rows(view: Pinhole, slope_x: float, slope_y: float, z: float) -> Any:
-    """Rows of M = J·W [2, 3]: how pixels move with world metres."""
+    """Rows of M = J·W [2, 3], pixels per world metre."""
     r = view.rotation
     a, b = view.fx / z, view.fy / z
     return (
@@ -100,7 +100,7 @@ def _projection_rows(view: Pinhole, slope_x: float, slope_y: float, z: float) ->
 
 @njit(inline="always")
 def _times_covariance(covariances: Any, i: int, u: float, v: float, w: float) -> Any:
-    """Σ·(u, v, w) with Σ from its upper triangle."""
+    """Σ·(u, v, w) with Σ given by its upper triangle."""
     xx, xy, xz = np.float64(covariances[i, 0]), np.float64(covariances[i, 1]), np.float64(covariances[i, 2])
     yy, yz, zz = np.float64(covariances[i, 3]), np.float64(covariances[i, 4]), np.float64(covariances[i, 5])
     return xx * u + xy * v + xz * w, xy * u + yy * v + yz * w, xz * u + yz * v + zz * w
@@ -114,9 +114,9 @@ def tile_range(boxes, i):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def project_range(first, last, means, covariances, opacities, features, seen, view, outputs):  # type: ignore[no-untyped-def]
-    """Fill rows first … last − 1; ``tiles`` counts the tiles each reaches, 0 if it is not drawn.
+    """Fill rows first … last − 1; ``tiles`` counts the tiles of each, 0 where it is skipped.
 
-    ``seen`` are those to look at, all where it is empty. NaN fails every guard.
+    ``seen`` is a mask, or empty for all. NaN fails every guard.
     """
     centers, shapes, boxes, attributes, depths, tiles = outputs
     channels = features.shape[1]
@@ -146,8 +146,7 @@ def project_range(first, last, means, covariances, opacities, features, seen, vi
         peak = np.float64(math.log2(opacities[i]))
         reach = max(peak - LOG2_ALPHA_MIN, 0.0) / HALF_LOG2_E  # 2·ln(255·opacity)
         reach_x, reach_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
-        # Pixel i has its centre at i + ½; a thousandth of a pixel keeps rounding from losing one on the border.
-        # What is truncated below is not negative, so truncation is the floor.
+        # Pixel i has its centre at i + ½, with 1e-3 px of margin for rounding. Operands of int() are not negative.
         left, right = max(center_x - reach_x + 0.499, 0.0), min(center_x + reach_x - 0.499, view.width - 1.0)
         top, bottom = max(center_y - reach_y + 0.499, 0.0), min(center_y + reach_y - 0.499, view.height - 1.0)
         if not (left < view.width and top < view.height and right >= 0 and bottom >= 0):
@@ -182,8 +181,8 @@ def project(means, covariances, opacities, features, seen, view, with_depth):  #
         boxes: [N, 4] pixels x0, y0, x1, y1 (inclusive) that α ≥ 1/255 can reach.
         attributes: [N, K] features, then the depth if asked for.
         depths: [N] m, float64.
-        slot_starts: [N + 1]; Gaussian i reaches slot_starts[i + 1] − slot_starts[i] tiles, none if it is not
-            drawn, and its other rows are then undefined.
+        slot_starts: [N + 1]; Gaussian i reaches slot_starts[i + 1] − slot_starts[i] tiles. Other rows of a Gaussian
+            without tiles are undefined.
     """
     count = means.shape[0]
     centers, shapes = np.empty((count, 2), np.float64), np.empty((count, 4), np.float32)
@@ -202,8 +201,7 @@ def project(means, covariances, opacities, features, seen, view, with_depth):  #
 
 @njit(error_model="numpy")
 def _project_range_backward(first, last, arrays, channels, view, slot_starts, slots, grads):  # type: ignore[no-untyped-def]
-    """Chain rule from the summed slots (see ``.blend.blend_backward``) of Gaussians first … last − 1 to
-    their world parameters."""
+    """Gradients of Gaussians first … last − 1 from their summed slots (``.blend.blend_backward``)."""
     means, covariances, opacities = arrays
     grad_means, grad_covariances, grad_opacities, grad_features = grads
     r = view.rotation
@@ -220,7 +218,7 @@ def _project_range_backward(first, last, arrays, channels, view, slot_starts, sl
             grad_features[i, c] = sums[6 + c]
         # Σg, Σg·d, Σg·d², Σg·dy, Σg·dy², Σg·d·dy with g = ∂L/∂log2 α and d = dx − shear·dy
         s, sd, sdd, sy, syy, sdy = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-        grad_depth = sums[6 + channels]  # stays zero where no depth was asked for
+        grad_depth = sums[6 + channels]  # zero without depth
 
         x, y, z = _camera_point(view, means, i)
         slope_x, slope_y = _clamped_slopes(view, x, y, z)
@@ -242,7 +240,7 @@ def _project_range_backward(first, last, arrays, channels, view, slot_starts, sl
         half_xy = 0.5 * grad_shear / yy - shear * grad_xx
         grad_yy = (fall_y * syy - shear * grad_shear) / yy + shear * shear * grad_xx
 
-        # Σ' = M Σ Mᵀ with rows m0, m1 of M; an off-diagonal element of Σ stands for two
+        # Σ' = M Σ Mᵀ with rows m0, m1 of M; an off-diagonal element of Σ counts twice
         p0, p1, p2 = (grad_xx * m00 + half_xy * m10, grad_xx * m01 + half_xy * m11, grad_xx * m02 + half_xy * m12)
         q0, q1, q2 = (half_xy * m00 + grad_yy * m10, half_xy * m01 + grad_yy * m11, half_xy * m02 + grad_yy * m12)
         grad_covariances[i, 0] = m00 * p0 + m10 * q0
@@ -268,10 +266,9 @@ def _project_range_backward(first, last, arrays, channels, view, slot_starts, sl
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
 def project_backward(means, covariances, opacities, channels, view, slot_starts, slots):  # type: ignore[no-untyped-def]
-    """Sum each Gaussian's slots in their fixed order and take the sums back to the world.
+    """Gradients of means [N, 3], covariances [N, 6], opacities [N] and features [N, C]; zero for skipped Gaussians.
 
-    ``slots`` [P, 6 + K] as ``.blend.blend_backward`` fills them. Returns gradients of means [N, 3],
-    covariances [N, 6], opacities [N] and features [N, C], zero where a Gaussian was not drawn.
+    Sums each Gaussian's ``slots`` [P, 6 + K] of ``.blend.blend_backward`` in a fixed order.
     """
     count = means.shape[0]
     grads = (

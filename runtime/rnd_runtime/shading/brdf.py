@@ -1,4 +1,4 @@
-"""The one reflectance formula of trainer, runtime and tests: Lambert plus GGX, metallic 0.
+"""The BRDF of trainer, runtime and tests: Lambert plus GGX, metallic 0.
 
     f = albedo/π + D·F·G / (4 n·l n·v)
 
@@ -8,12 +8,10 @@ with the half vector h = (l + v)/|l + v|, α = γ² (γ the perceptual roughness
     G = G1(n·l) G1(n·v),  G1(μ) = 2μ / (μ + √(α² + (1 − α²)μ²))       Walter et al. 2007, eq. 23 and 34
     F = F0 + (1 − F0)(1 − v·h)⁵,  F0 = 0.04                            Schlick 1994
 
-That is Disney's lobe (Burley 2012, which the paper names) without its remapping of α, and what Mitsuba and the data
-rendered by it have. Smith's G is exact, not the k = (γ+1)²/8 shortcut, which loses 17–23 % of the energy. With masking
-and shadowing correlated by height (Heitz 2014, eq. 99) G is larger where light and view both graze, 1.4 times at
-cosines of 0.2 and γ = 0.8: a sun behind the person then draws too bright a rim. G / (4 n·l n·v) is evaluated as one
-fraction, which has no 0/0. Cosines below 1e-4 count as 1e-4 in it: a Gaussian that faces slightly away from the camera
-keeps the shading of its silhouette. Below the light's horizon the caller's max(n·l, 0) makes all zero.
+This is Disney's lobe (Burley 2012) without its remapping of α, as in Mitsuba. Smith's G is exact: the shortcut
+k = (γ+1)²/8 loses 17–23 % of the energy. Height-correlated masking and shadowing (Heitz 2014, eq. 99) is 1.4 times G
+at cosines of 0.2 and γ = 0.8 and makes rims too bright. Cosines are clamped to at least 1e-4 in G / (4 n·l n·v), which
+is evaluated as one fraction without 0/0.
 
 Directions l (to the light), v (to the camera) and n are unit vectors in one frame.
 """
@@ -33,18 +31,17 @@ F0 = 0.04
 ROUGHNESS_RANGE = (0.09, 0.99)  # GGX's D overflows half floats below 0.089
 COSINE_FLOOR = 1e-4
 LARGEST_ALBEDO = 1 - F0 - (1 - F0) / 21
-"""of what gives back no more than it gets, whatever its roughness: a smooth surface's gloss gives back the mean of F
-over all views, ∫ F(μ) 2μ dμ = F0 + (1 − F0)/21, and a rough one's less"""
-_HALF_FLOOR = 1e-8  # |l + v|² where light and camera are opposite and h does not exist
+"""max albedo that conserves energy at any roughness; F averages to ∫ F(μ) 2μ dμ = F0 + (1 − F0)/21 over all views"""
+_HALF_FLOOR = 1e-8  # min |l + v|², where light and camera are opposite
 
 
 def brdf(albedo: Any, roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
-    """f in 1/sr, without the cosine, for arrays that broadcast (numpy or torch alike)."""
+    """f in 1/sr, without the cosine, for arrays that broadcast (numpy or torch)."""
     return albedo * (1 / pi) + specular(roughness, n_dot_l, n_dot_v, l_dot_v)
 
 
 def specular(roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
-    """D·F·G / (4 n·l n·v) in 1/sr from three cosines, for arrays that broadcast (numpy or torch alike)."""
+    """D·F·G / (4 n·l n·v) in 1/sr from three cosines, for arrays that broadcast (numpy or torch)."""
     half_squared = (2 + 2 * l_dot_v).clip(min=_HALF_FLOOR)  # |l + v|²
     n_dot_h = n_dot_l + n_dot_v
     sine_squared = (1 - n_dot_h * n_dot_h / half_squared).clip(min=0)
@@ -52,12 +49,12 @@ def specular(roughness: Any, n_dot_l: Any, n_dot_v: Any, l_dot_v: Any) -> Any:
 
 
 def roughness_to_alpha(roughness: Any) -> Any:
-    """GGX's α = γ² with γ clamped to its range."""
+    """GGX's α = γ², γ clamped to its range."""
     return roughness.clip(*ROUGHNESS_RANGE) ** 2
 
 
 def _ggx(sqrt: Callable[[Any], Any], at_least: Callable[[Any, Any], Any], number: Callable[[float], Any]) -> Any:
-    """The specular term for values that ``sqrt``, ``at_least`` and constants of type ``number`` compute with."""
+    """The specular term for values that ``sqrt``, ``at_least`` and constants of type ``number`` accept."""
     zero, half, one, f0, floor, one_over_pi = (number(x) for x in (0, 0.5, 1, F0, COSINE_FLOOR, 1 / pi))
 
     def ggx(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared):  # type: ignore[no-untyped-def]
@@ -67,7 +64,7 @@ def _ggx(sqrt: Callable[[Any], Any], at_least: Callable[[Any, Any], Any], number
         shadowing = n_dot_l + sqrt(alpha_squared + (one - alpha_squared) * n_dot_l * n_dot_l)
         masking = n_dot_v + sqrt(alpha_squared + (one - alpha_squared) * n_dot_v * n_dot_v)
         grazing = at_least(one - half * sqrt(half_squared), zero)  # 1 − v·h = 1 − |l + v|/2
-        grazing_squared = grazing * grazing  # numpy's x**5 costs more than all the rest
+        grazing_squared = grazing * grazing  # numpy's x**5 is slower than all the rest
         fresnel = f0 + (one - f0) * grazing_squared * grazing_squared * grazing
         return one_over_pi * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
 

@@ -1,8 +1,8 @@
-"""What directional lights lay on Gaussians, sixteen at a time (numba over sixteen lanes): Lambert and GGX.
+"""Direct light of directional lights on Gaussians, Lambert and GGX (numba, sixteen lanes).
 
-A mirror shows a disc of radius ρ at its own radiance: with E = πρ²L and D = 1/(πα²), E·D/(4 v·h) = L asks for
-α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. Added to the surface's own α². A sun of one
-texel is a point, see ``.directional``.
+A light of radius ρ widens the lobe. A mirror shows the disc at its own radiance L: with E = πρ²L and D = 1/(πα²),
+E·D/(4 v·h) = L requires α² = ρ²/(4 v·h), where v·h = |l + v|/2 and the mean square angle is ρ²/2. It is added to the
+surface's α².
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from .lanes import (
 
 Floats32 = NDArray[np.float32]
 
-# What faces away is seen only through what gaps the front leaves: 6 % of a back in the sun, white specks on a front in
-# shade. Suns fade out over these n·v, chosen on training images of the dancer (36.19 dB without, 36.27 with).
+# n·v over which light fades out, as 6 % of Gaussians that face away show through gaps of the front. Chosen on training
+# images of the dancer: 36.27 dB, 36.19 dB without.
 TURNED_AWAY, AT_SILHOUETTE = np.float32(-0.2), np.float32(0)
 
 _ROUGHNESS_HIGH = np.float32(ROUGHNESS_RANGE[1])
-_OPEN = FREE  # a row of a thread's working memory
+_OPEN = FREE  # a row of scratch
 _SCRATCH = FREE + WIDTH
 
 
 class DirectionalArrays(NamedTuple):
-    """S directional lights: where they are, what they lay on a surface that faces them, and how wide they are."""
+    """S directional lights."""
 
     directions: Floats32  # [S, 3] unit
-    irradiance: Floats32  # [S, 3]
+    irradiance: Floats32  # [S, 3] on a surface that faces the light
     spread_squared: Floats32  # [S] rad²
 
 
@@ -58,7 +58,7 @@ class DirectionalArrays(NamedTuple):
 def add_directional(surfaces, visibility, camera, lights, seen, radiance):  # type: ignore[no-untyped-def]
     """Add direct light on the Gaussians ``seen`` [N] to ``radiance`` [N, 3], where ``visibility`` [N, S] is not 0.
 
-    ``surfaces`` as of ``.lanes.gather``, ``camera`` [3] m.
+    ``surfaces`` as for ``.lanes.gather``; ``camera`` [3] m.
     """
     lit = np.empty(len(seen), np.bool_)
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
@@ -79,7 +79,7 @@ def add_directional(surfaces, visibility, camera, lights, seen, radiance):  # ty
 
 @njit(error_model="numpy")
 def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-untyped-def]
-    """What the directional lights add, over the albedo in ``scratch``."""
+    """Direct light, written over the albedo in ``scratch``."""
     normal, view = load3(scratch, NORMAL), unit(load3(scratch, VIEW))
     n_dot_v = normal[0] * view[0] + normal[1] * view[1] + normal[2] * view[2]
     facing = clamped((n_dot_v - TURNED_AWAY) / (AT_SILHOUETTE - TURNED_AWAY), ONE)

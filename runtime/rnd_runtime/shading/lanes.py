@@ -1,7 +1,7 @@
-"""What shades sixteen Gaussians at a time (numba over sixteen lanes): their gathering, and their specular lobes.
+"""Shared kernels that shade sixteen Gaussians at a time: gathering, table look-ups, specular lobes.
 
-Where a Gaussian looks into a table is worked out in lanes, one Gaussian each. The tables' rows are sixteen numbers
-wide, so a look-up is a few loads of whole rows for one Gaussian; transposed, the rows are lanes of Gaussians again.
+Cells of tables are found in lanes, one Gaussian each. Table rows have sixteen numbers: a look-up loads whole rows for
+one Gaussian, and a transpose turns them into lanes of Gaussians again.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from rnd_runtime.core.simd import WIDTH, at_least, broadcast, floor, load, magni
 from .brdf import ROUGHNESS_RANGE
 from .specular_lobe import COSINE_COUNT, ROUGHNESS_COUNT
 
-CHUNK = 512  # Gaussians that a thread shades at a time
+CHUNK = 512  # Gaussians per unit of parallel work
 ZERO, ONE = np.float32(0), np.float32(1)
 TINY = np.float32(1e-12)
 ROUGHNESS_LOW = np.float32(ROUGHNESS_RANGE[0])
 ROUGHNESS_SPAN = np.float32(ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 ONE_OVER_PI = np.float32(1 / np.pi)
 
-# Rows of sixteen in the working memory of a thread: what goes in, what comes out in place of the albedo, where to look
+# Rows of sixteen in a thread's scratch: inputs, radiance in place of the albedo, table cells
 (NORMAL, VIEW, ALBEDO) = (0, 3 * WIDTH, 6 * WIDTH)  # three each, one after the other
 RADIANCE = ALBEDO
 ROUGHNESS = 9 * WIDTH
 _GATHERED = 10 * WIDTH
-(ROW, COLUMN, S, T, _W00, _W01, _W10, _W11) = (WIDTH * k for k in range(10, 18))  # a cell of a table, see store_cell
+(ROW, COLUMN, S, T, _W00, _W01, _W10, _W11) = (WIDTH * k for k in range(10, 18))  # see store_cell
 FREE = 18 * WIDTH
 
 
 @njit(error_model="numpy")
 def gather(first, last, seen, surfaces, camera, indices, scratch):  # type: ignore[no-untyped-def]
-    """The next sixteen of the Gaussians ``seen`` [N] from ``first`` on: where the search goes on, and how many.
+    """Gather the next sixteen of the Gaussians ``seen`` [N] from ``first`` on; return the next position and the count.
 
-    ``surfaces``: means, normals, albedo, roughness, visibility. Of fewer than sixteen the first stands in for the rest.
+    ``surfaces``: means, normals, albedo, roughness, visibility. Fewer than sixteen are padded with the first.
     """
     means, normals, albedo, roughness, _ = surfaces
     i, k = first, 0
@@ -58,7 +58,7 @@ def gather(first, last, seen, surfaces, camera, indices, scratch):  # type: igno
 
 @njit(inline="always")
 def scatter(count, indices, scratch, radiance):  # type: ignore[no-untyped-def]
-    """Radiance [N, 3] of the Gaussians that were gathered."""
+    """Write the gathered Gaussians' radiance [N, 3]."""
     for k in range(count):
         for channel in range(3):
             radiance[indices[k], channel] = scratch[RADIANCE + channel * WIDTH + k]
@@ -87,9 +87,9 @@ def visibility_in_lanes(indices, visibility, rows, columns):  # type: ignore[no-
 
 @njit(inline="always")
 def nan_lanes(scratch, visibility):  # type: ignore[no-untyped-def]
-    """NaN in the lanes of Gaussians that have a number that is not finite, else 0: ``at_least`` may lose that.
+    """NaN in lanes of Gaussians with a non-finite number, which ``at_least`` may drop, else 0.
 
-    Asks for all that were gathered in ``scratch``, and for the visibility as [16, lanes].
+    Covers the gathered inputs in ``scratch`` and the visibility [16, lanes].
     """
     sum_of_all = load(scratch, 0)
     for at in range(WIDTH, _GATHERED, WIDTH):
@@ -114,9 +114,9 @@ def lobes_in_lanes(lobes, n_dot_v, scratch, rows, columns):  # type: ignore[no-u
 
 @njit(inline="always")
 def lobe_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
-    """Unit directions of the lobes, whose shares along mirrored tangent and normal stand in ``lobe``."""
+    """Unit directions of the lobes from their shares along mirrored tangent and normal in ``lobe``."""
     (nx, ny, nz), (vx, vy, vz) = normal, view
-    # the tangent away from the camera; in a view along the normal there is none, and none is needed
+    # the tangent away from the camera; 0 in a view along the normal
     tx, ty, tz = n_dot_v * nx - vx, n_dot_v * ny - vy, n_dot_v * nz - vz
     along_tangent = load(lobe, WIDTH) / at_least(sqrt(tx * tx + ty * ty + tz * tz), TINY)
     along_normal = load(lobe, 2 * WIDTH)
@@ -130,14 +130,14 @@ def lobe_direction(lobe, normal, view, n_dot_v):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def clamped(x, high):  # type: ignore[no-untyped-def]
-    """x within 0 and ``high``; 0 for NaN."""
+    """x clamped to [0, ``high``]; 0 for NaN."""
     x = at_least(x, ZERO)
     return select(x < high, x, high)
 
 
 @njit(inline="always")
 def store_cell(a, b, rows, columns, scratch):  # type: ignore[no-untyped-def]
-    """Where (a, b) lies among so many rows and columns of nodes: the cell's first corner and all corners' shares."""
+    """Cell of (a, b) in a grid of ``rows`` × ``columns`` nodes: its first corner and all corners' weights."""
     a, b = clamped(a, np.float32(rows - 1)), clamped(b, np.float32(columns - 1))
     row, column = floor(clamped(a, np.float32(rows - 2))), floor(clamped(b, np.float32(columns - 2)))
     t, s = a - row, b - column
@@ -153,7 +153,7 @@ def store_cell(a, b, rows, columns, scratch):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def four_corners(table, at, right, down, scratch, k):  # type: ignore[no-untyped-def]
-    """Gaussian k's mean of the four rows of sixteen at its cell's corners."""
+    """Gaussian k's weighted mean of the four rows of sixteen at its cell's corners."""
     upper = broadcast(scratch, _W00 + k) * load(table, at) + broadcast(scratch, _W01 + k) * load(table, at + right)
     at += down
     return upper + (

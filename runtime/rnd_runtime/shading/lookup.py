@@ -1,4 +1,4 @@
-"""Shading from tables, sixteen Gaussians at a time (numba over sixteen lanes); the tables: ``.tables``."""
+"""Shading from tables, sixteen Gaussians at a time (numba, sixteen lanes); the tables: ``.tables``."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ from .lanes import (
     visibility_in_lanes,
 )
 
-DIFFUSE_SIZE = 33  # nodes along the square: 6°, where M_j bends over 5° at the sharpest
+DIFFUSE_SIZE = 33  # nodes along the square, 6° apart
 SPECULAR_SIZE = 49
 
-# A row of the specular table: RGB and nothing, of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1) in (s, t). A
-# corner's share is (s or 1 − s)(t or 1 − t): constant plus slope times s, times the same of t.
+# A row of the specular table: RGB and 0 of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1) in (s, t). A corner's
+# weight is (s or 1 − s)(t or 1 − t) = (constant + slope · s)(constant + slope · t).
 _SIGNS = np.array([-1, 1], np.float32)
 _S_SLOPE = np.tile(np.repeat(_SIGNS, 4), 2)
 _T_SLOPE = np.repeat(_SIGNS, 8)
 _S_CONSTANT, _T_CONSTANT = np.maximum(-_S_SLOPE, 0), np.maximum(-_T_SLOPE, 0)
 
-(_LEVEL, _UP) = (FREE, FREE + WIDTH)  # rows of a thread's working memory
+(_LEVEL, _UP) = (FREE, FREE + WIDTH)  # rows of scratch
 _IRRADIANCE = FREE + 2 * WIDTH  # three
 _SCRATCH = FREE + 5 * WIDTH
 
@@ -71,7 +71,8 @@ def shade_from_tables(surfaces, camera, rotations, tables, seen, radiance):  # t
 
     Args:
         surfaces: means [N, 3] m, normals [N, 3], albedo [N, 3], roughness [N] and visibility [N, 16].
-        camera: [3] m. rotations: light → world and root → light, [3, 3] each.
+        camera: [3] m.
+        rotations: light → world and root → light, [3, 3] each.
         tables: diffuse [33·33, 3·16] for visibility in the root's frame; specular [49·49, 7, 16] of cells; lobes
             [16, 49, 16].
     """
@@ -88,7 +89,7 @@ def shade_from_tables(surfaces, camera, rotations, tables, seen, radiance):  # t
 
 @njit(error_model="numpy")
 def _shade_sixteen(indices, visibility, rotations, tables, scratch, rows, columns):  # type: ignore[no-untyped-def]
-    """Radiance over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+    """Radiance, written over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are scratch."""
     light_to_world, root_to_light = rotations
     diffuse, specular, lobes = tables
     normal = transposed(light_to_world, load3(scratch, NORMAL))
@@ -137,7 +138,7 @@ def _shade_sixteen(indices, visibility, rotations, tables, scratch, rows, column
 
 @njit(inline="always")
 def _octahedral_cell(x, y, z, size, scratch):  # type: ignore[no-untyped-def]
-    """See ``.tables.octahedral_nodes``."""
+    """Cell of a direction on the grid of ``.tables.octahedral_nodes``."""
     scale = ONE / at_least(magnitude(x) + magnitude(y) + magnitude(z), TINY)
     a, b = x * scale, y * scale
     below = z < ZERO
@@ -167,9 +168,9 @@ def _mean_visibility(root_to_light, mean, shrink, visibility):  # type: ignore[n
 
 @njit(parallel=True, nogil=True, cache=True)
 def rotated(diffuse, rotation):  # type: ignore[no-untyped-def]
-    """Diffuse tables [33·33, 3·16] that take coefficients before ``rotation`` [16, 16]: 3 267 rows instead of N.
+    """Diffuse tables [33·33, 3·16] for coefficients before ``rotation`` [16, 16].
 
-    In numba, since a BLAS product would leave threads spinning that slow the look-up threefold.
+    Compiled: idle BLAS threads spin and slow the look-up threefold.
     """
     result = np.empty_like(diffuse)
     for i in prange(len(diffuse)):

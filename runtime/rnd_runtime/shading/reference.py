@@ -1,4 +1,4 @@
-"""Shading as it is defined, in plain float64: what every faster way is measured against."""
+"""Float64 reference of shading."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from .shadow import directional_visibility
 
 Floats = NDArray[np.float64]
 
-_AT_A_TIME = 2**14  # pairs of a Gaussian and a texel: arrays of 128 kB, which a core's own cache holds
+_AT_A_TIME = 2**14  # pairs of Gaussian and texel: arrays of 128 kB
 
 
 def shade_reference(
     gaussians: Gaussians, light: Light, camera_position: ArrayLike, *, texels: tuple[int, int] = (32, 64)
 ) -> Floats:
-    """Linear radiance [N, 3] that each Gaussian sends to the camera, summed over every texel of the light.
+    """Linear radiance [N, 3] of each Gaussian towards the camera, summed over every texel of the light.
 
         L_o = max(0, Σ_k L_k Δω_k v(ω_k) f(ω_k, ω_o) max(n·ω_k, 0)),   v(ω) = Σ_j v_j Y_j(ω)
 
-    over the light downsized to ``texels`` (height, width). v is linear: it is **not** clamped to [0, 1], since
-    that costs 5 dB under an overcast sky; only the sum is clamped, at 0.
+    v is **not** clamped to [0, 1], which would cost 5 dB under an overcast sky; only the sum is clamped, at 0.
 
     Args:
         camera_position: [3] m, world.
+        texels: (height, width) the light is downsized to.
     """
     probe = light.resized(*texels)
     directions = texel_directions(*texels).reshape(-1, 3) @ light.rotation.T  # world
     flux = (probe.radiance.astype(np.float64) * texel_solid_angles(*texels)[..., None]).reshape(-1, 3)
-    # rows times R: the root's frame
+    # rows times R: root frame
     basis = sh_basis(directions @ np.asarray(gaussians.root_rotation, np.float64))
     coefficients = np.asarray(gaussians.visibility, np.float64)
     summed = _sum_over_texels(gaussians, directions, flux, lambda part: coefficients[part] @ basis.T, camera_position)
@@ -48,12 +48,12 @@ def shade_reference(
 def shade_reference_with_directional(
     gaussians: Gaussians, light: Light, camera_position: ArrayLike, *, texels: tuple[int, int] = (32, 64)
 ) -> Floats:
-    """What ``table+sun`` stands for: the sky as ``shade_reference``, and every texel of the directional lights.
+    """Reference of ``table+sun``: the sky as in ``shade_reference``, and every texel of the directional lights.
 
         L_o = sky + Σ_s V_s Σ_{k in s} ΔL_k Δω_k f(ω_k, ω_o) max(n·ω_k, 0)
 
-    with ΔL what ``directional.extract_directional`` takes out of the map for the nearest light s, and V_s the
-    visibility of its centre by ``Shader``'s own depth maps. Arguments as of ``shade_reference``.
+    ΔL is what ``directional.extract_directional`` removes for the nearest light s, V_s the visibility of its centre by
+    ``Shader``'s depth maps. Arguments as for ``shade_reference``.
     """
     sky, lights = extract_directional(light)
     radiance = shade_reference(gaussians, sky, camera_position, texels=texels)
@@ -76,7 +76,7 @@ def shade_reference_with_directional(
 
 
 def _reached_by_lights(gaussians: Gaussians, directions: Floats, camera_position: ArrayLike) -> Floats:
-    """How much of directional lights in world ``directions`` [S, 3] the shader lets reach each Gaussian: [N, S]."""
+    """Visibility [N, S] of directional lights in world ``directions`` [S, 3], with the shader's fade."""
     shadows = directional_visibility(
         gaussians.means, gaussians.normals, directions, radii=shadow_radii(gaussians), resolution=SHADOW_RESOLUTION
     )
@@ -99,7 +99,7 @@ def _sum_over_texels(
 ) -> Floats:
     """Σ_k flux_k v f max(n·ω_k, 0) [N, 3] of texels with world ``directions`` [K, 3] and L Δω ``flux`` [K, 3].
 
-    ``visibility`` of some Gaussians is [n, K] or [n, 1].
+    ``visibility`` maps a slice of n Gaussians to [n, K] or [n, 1].
     """
     to_camera = _to_camera(gaussians, camera_position)
     radiance = np.empty((len(gaussians.means), 3))
@@ -111,7 +111,7 @@ def _sum_over_texels(
         n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
         arriving = visibility(part) * np.maximum(n_dot_l, 0)
-        # f is albedo/π and the specular term, which three channels share
+        # f = albedo/π + specular, which all channels share
         specular_sum = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
         radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + specular_sum @ flux
     return radiance

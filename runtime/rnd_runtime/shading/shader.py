@@ -1,15 +1,14 @@
-"""Relighting posed Gaussians, at whatever price per frame one is willing to pay.
+"""Relighting of posed Gaussians, by modes of increasing cost.
 
 ============  =====================================================================================
 ao            sixteen SH coefficients of light times ambient occlusion
 table         the whole map through tables over the normal; soft shadows from the visibility
-table+sun     the same, with the sun taken out, its own highlight and a hard shadow from a depth map
+table+sun     the same without the sun, which gets its own highlight and a shadow from a depth map
 lights:K      K lights of equal luminance (median cut), each with the whole BRDF
-brute         every texel of the downsized map: what the avatar was trained with
+brute         every texel of the downsized map: the light of training
 ============  =====================================================================================
 
-All but ``table+sun`` approximate the same sum, ``shading.reference.shade_reference``.
-``table+sun`` is nearer to the truth than that sum, whose shadows and highlights blur the sun.
+All but ``table+sun`` approximate ``shading.reference.shade_reference``, whose shadows and highlights blur the sun.
 """
 
 from __future__ import annotations
@@ -39,25 +38,25 @@ Floats32 = NDArray[np.float32]
 SHADE_MODES = ("ao", "table", "table+sun", "lights:K", "brute")
 _MAX_LIGHTS = 8192
 SHADOW_RESOLUTION = 384  # texels along a body: 5 mm
-# A Gaussian's disc in the depth map, in standard deviations: neighbours of a trained avatar stand 1.4 σ apart. Discs
-# of 2 σ hide nothing more, but rise above their neighbours where normals disagree: speckled thighs.
+# Disc radius in the depth map in standard deviations: the distance of a trained avatar's neighbours. 2 σ speckles
+# limbs where normals disagree.
 DISC_SIGMAS = 1.4
-CASTING_OPACITY = 0.5  # what is more transparent casts no shadow
+CASTING_OPACITY = 0.5  # min opacity that casts a shadow
 
 
 class Shader:
-    """Shades Gaussians under one light; built once for a light, called for every frame.
+    """Shades Gaussians under one light; built once per light, called for every frame.
 
     Args:
-        light: the probe. Its yaw can change later by ``turned`` at no cost.
+        light: the probe. ``turned`` changes its yaw at no cost.
         mode: one of SHADE_MODES, with a number for K.
-        texels: (height, width) the probe is downsized to; an avatar's visibility has degree 3
-            and was trained on 32 × 64; more changes highlights below roughness 0.4 only.
+        texels: (height, width) the probe is downsized to. Visibility has degree 3 and is trained on 32 × 64; more
+            changes highlights below roughness 0.4 only.
 
     Attributes:
-        light_to_world: [3, 3], the probe's frame → that of the Gaussians that are shaded, see ``in_frame``.
-        sky: all the light but the directional lights, as the mode has it.
-        directional: lights that ``table+sun`` took out of the map, if any are bright and compact enough.
+        light_to_world: [3, 3], the probe's frame → that of the Gaussians, see ``in_frame``.
+        sky: the light without directional lights, as the mode represents it.
+        directional: lights that ``table+sun`` extracted from the map.
 
     Raises:
         InputError: the mode is none of SHADE_MODES.
@@ -79,7 +78,7 @@ class Shader:
             self.sky = DistantLights.all_texels(light, texels)
         else:
             self.sky = DistantLights.median_cut(light, _light_count(mode))
-        self._in_probe = (  # what directional_arrays returns, with directions in the light probe's frame
+        self._in_probe = (  # DirectionalArrays with directions in the light probe's frame
             np.array([light_.direction for light_ in self.directional]).reshape(-1, 3),
             np.array([light_.irradiance for light_ in self.directional], np.float32).reshape(-1, 3),
             np.array([light_.spread**2 for light_ in self.directional], np.float32),
@@ -91,17 +90,16 @@ class Shader:
         return shallow_copy(self, light=light, light_to_world=light.rotation)
 
     def in_frame(self, frame_to_world: ArrayLike) -> Shader:
-        """The same light for Gaussians in a frame that ``frame_to_world`` [3, 3] turns to the world's axes."""
+        """The same light for Gaussians in another frame; ``frame_to_world`` [3, 3] rotates it to the world's axes."""
         return shallow_copy(self, light_to_world=np.asarray(frame_to_world, np.float64).T @ self.light.rotation)
 
     def shade(
         self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None, *, shadows: bool = True
     ) -> Floats32:
-        """Linear radiance [N, 3], not negative, that each Gaussian sends to the camera at [3] m.
+        """Linear radiance [N, 3], not negative, of each Gaussian towards the camera at [3] m.
 
-        Gaussians that face away from the camera are shaded too: at a silhouette they are seen. Those that are
-        not ``seen`` [N] (by default all are) keep radiance 0 and cast shadows all the same. Without
-        ``shadows`` nothing stands in the way of the directional lights, as for models that know of no shadows.
+        Gaussians that are not ``seen`` [N] keep radiance 0 and still cast shadows; all are seen by default. Without
+        ``shadows`` directional lights are unoccluded.
         """
         light_to_world = self.light_to_world
         seen = mask(seen, len(gaussians.means))
@@ -124,7 +122,7 @@ class Shader:
         return radiance
 
     def directional_arrays(self) -> DirectionalArrays:
-        """The directional lights as kernels want them, in the frame of the Gaussians."""
+        """Directional lights as kernel arrays, in the frame of the Gaussians."""
         directions, irradiance, spreads = self._in_probe
         if not self.directional:
             return DirectionalArrays(irradiance, irradiance, spreads)
@@ -133,7 +131,7 @@ class Shader:
 
 
 def check_mode(mode: str) -> None:
-    """Raise ``InputError`` unless ``mode`` is one that a ``Shader`` knows."""
+    """Raise ``InputError`` unless ``mode`` is valid."""
     if mode not in SHADE_MODES or mode == "lights:K":
         _light_count(mode)
 
@@ -149,7 +147,7 @@ def _light_count(mode: str) -> int:
 
 
 def shadow_radii(gaussians: Gaussians) -> Floats32:
-    """Disc radius [N] m of each Gaussian in a depth map; flat ones have σ² twice in the trace."""
+    """Disc radius [N] m of each Gaussian in a depth map; a flat one's covariance trace is 2 σ²."""
     radii: Floats32 = disc_radii(floats(gaussians.covariances), floats(gaussians.opacities))
     return radii
 

@@ -1,12 +1,11 @@
-"""Which points of a body a distant light reaches: depth maps splatted from the points themselves.
+"""Visibility of directional lights: depth maps splatted from the points of a body.
 
-Any cloud of points with normals on closed surfaces will do. Per direction, every point that faces the light is rendered
-as a small disc in its tangent plane into an orthographic map that keeps what is nearest to the light. Every point then
-looks up the four texels around it (percentage-closer filtering, Reeves et al. 1987) and compares along its own tangent
-plane, so that a slope casts no shadow on itself. Visibility is a continuous function of the positions.
+For each direction, every point that faces the light is rendered as a disc in its tangent plane into an orthographic map
+of the nearest depths. Each point then compares the four texels around it (percentage-closer filtering, Reeves et al.
+1987) along its own tangent plane, against self-shadowing. Visibility is continuous in the positions.
 
-Against exact tracing 99.1 % of the points of a person made of capsules agree (256² texels). The number of threads
-changes no bit.
+99.1 % of the points of a person made of capsules agree with exact tracing (256² texels). The result does not depend on
+the number of threads, to the bit.
 """
 
 from __future__ import annotations
@@ -21,27 +20,24 @@ from rnd_runtime.core.simd import WIDTH, aligned_floats, block_x, block_y, lanes
 
 Floats32 = NDArray[np.float32]
 
-# How far a blocker must rise above a point's tangent plane, in disc radii: a disc of radius r beside it on a
-# surface of curvature 1/R rises r²/2R. 0.5 is enough for exact normals; those of a trained avatar disagree by some
-# 10° and speckled its limbs (28.9 dB instead of 29.0 on relit images). More loses shadows where limbs touch.
+# Min rise of a blocker above a point's tangent plane, in disc radii. 0.5 suffices for exact normals; a trained avatar's
+# disagree by 10°, which speckles its limbs (28.9 dB instead of 29.0 on relit images). More loses contact shadows.
 CLEARANCE = np.float32(1.0)
-# ... and no less than this many texels, which is what rounding to the map's grid costs on curved surfaces.
-CLEARANCE_TEXELS = np.float32(0.35)
-# Nothing here is a step, else the rounding of a place, or a hair's motion, would switch a texel. A plane falls by DROP
-# metres, which no body rises, over RIM_TEXELS beyond its disc; it sinks by as much while the cosine of its normal goes
-# from EDGE_ON to 0; and light fades while what rises above a point's plane does so by from 1 − SOFTNESS to 1 + SOFTNESS
-# clearances.
+CLEARANCE_TEXELS = np.float32(0.35)  # min clearance in texels, for the map's rounding on curved surfaces
+# All transitions are continuous. A plane falls by DROP metres (more than a body's depth) over RIM_TEXELS beyond its
+# disc, and sinks by as much as the cosine of its normal goes from EDGE_ON to 0. Light fades between rises of
+# 1 − SOFTNESS and 1 + SOFTNESS clearances.
 DROP, RIM_TEXELS = np.float32(2), np.float32(0.5)
 EDGE_ON = np.float32(0.02)
 SOFTNESS = np.float32(0.25)
-SLOPE_FLOOR = np.float32(0.1)  # steeper tangent planes are treated as 84°: their depth tells nothing
+SLOPE_FLOOR = np.float32(0.1)  # min cosine of a tangent plane: 84°
 _FAR = np.float32(np.inf)
 _EMPTY = -_FAR
-_NOWHERE = (_FAR, _FAR, -_FAR, -_FAR)  # the least and the greatest x and y of no points
+_NOWHERE = (_FAR, _FAR, -_FAR, -_FAR)  # empty bounds
 _ZERO, _ONE, _TWO = np.float32(0), np.float32(1), np.float32(2)
 BLOCK_SHIFT = 2
 BLOCK = 1 << BLOCK_SHIFT  # texels; a block is one value of sixteen lanes
-_CHUNK = 1024  # points turned at a time
+_CHUNK = 1024  # points per unit of parallel work
 
 
 def directional_visibility(
@@ -53,21 +49,18 @@ def directional_visibility(
     resolution: int = 256,
     receivers: ArrayLike | None = None,
 ) -> Floats32:
-    """How much of a distant light in each direction reaches each point past all other points, in [0, 1].
+    """Share [N, K] in [0, 1] of a distant light in each direction that reaches each point.
+
+    0 where the point faces away from the light, is no receiver or is not finite; non-finite points cast no shadow.
 
     Args:
         points: [N, 3] m, on closed surfaces.
         normals: [N, 3] unit, outward, in the frame of the points.
         directions: [K, 3] unit, **towards** the lights, in the same frame.
-        radii: [N] m or one for all: the distance between neighbours on a lattice, 1.25 times the mean spacing
-            where points are scattered at random (1.0 leaves 4 % of the surface open). A point of radius 0
-            casts no shadow and still receives them.
-        resolution: texels along the longer side of a depth map, which is cut to the points' bounds.
-        receivers: [N] the points whose visibility is wanted; all cast shadows. By default all.
-
-    Returns:
-        [N, K]; 0 where the point faces away from the light or is no receiver. Points that are not finite get 0 and
-        cast nothing.
+        radii: [N] m or one for all: the distance between neighbours on a lattice, 1.25 times the mean spacing of
+            random points (1.0 leaves 4 % of the surface open). A point of radius 0 casts no shadow and receives them.
+        resolution: texels along the longer side of a depth map, which is cropped to the points' bounds.
+        receivers: [N] points whose visibility is wanted; all by default. All points cast shadows.
     """
     points, normals, directions = floats(points), floats(normals), floats(directions)
     if not (points.ndim == 2 and points.shape[1] == 3 and normals.shape == points.shape):
@@ -108,10 +101,9 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
         left, bottom = min(left, bounds[chunk, 0]), min(bottom, bounds[chunk, 1])
         right, top = max(right, bounds[chunk, 2]), max(top, bounds[chunk, 3])
     extent = max(right - left, top - bottom)
-    if not extent > 0:  # a single point, or none: nothing to cast
+    if not extent > 0:  # a single point, or none
         extent = np.float32(1)
-    # texel centres lie at integers; empty rows around serve the lookup of the outermost points, a last one in case that
-    # rounding puts them on the next integer
+    # texel centres are at integers; padding serves look-ups of the outermost points, with a row for rounding
     texel = extent / np.float32(resolution - 3)
     width = int((right - left) / texel) + 4 if right >= left else 4
     height = int((top - bottom) / texel) + 4 if right >= left else 4
@@ -122,7 +114,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
         if normal[i, 2] > 0:
             position[i, 0] = (position[i, 0] - left) / texel + 1
             position[i, 1] = (position[i, 1] - bottom) / texel + 1
-    # each thread draws rows of its own, and about as many discs as the others
+    # threads render separate rows with about equally many discs
     edges = _bands(position, normal, down, threads)
     for band in numba.prange(len(edges) - 1):
         for i in range(count):
@@ -135,14 +127,14 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
 
 @numba.njit(error_model="numpy")
 def _to_map(arrays, frame, first, last, position, normal, bounds):  # type: ignore[no-untyped-def]
-    """Rows first … last − 1 in the axes of ``frame``, and the least and greatest x and y among them."""
+    """Rotate rows first … last − 1 to the axes of ``frame``; ``bounds`` are their min x, y and max x, y."""
     points, normals, radii, _ = arrays
     left, bottom, right, top = _NOWHERE
     for i in range(first, last):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         if not np.isfinite(px + py + pz + nx + ny + nz + radii[i]):
-            normal[i, 2] = -1  # faces away: neither casts nor receives
+            normal[i, 2] = -1  # neither casts nor receives
             continue
         for axis in range(3):
             fx, fy, fz = frame[axis, 0], frame[axis, 1], frame[axis, 2]
@@ -155,7 +147,7 @@ def _to_map(arrays, frame, first, last, position, normal, bounds):  # type: igno
 
 @numba.njit(error_model="numpy")
 def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
-    """Rows of blocks [bands + 1] that cut a map into bands with about equally many points that face the light."""
+    """Rows of blocks [bands + 1] that split a map into bands with about equally many points that face the light."""
     points = np.zeros(height + 1, np.int64)
     for i in range(len(position)):
         if normal[i, 2] > 0:
@@ -171,7 +163,7 @@ def _bands(position, normal, height, bands):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def axes_towards(direction):  # type: ignore[no-untyped-def]
-    """Rows: two axes across ``direction`` and the direction itself, a right-handed orthonormal frame."""
+    """Right-handed orthonormal frame [3, 3] by rows: two axes across ``direction``, and the direction."""
     frame = np.zeros((3, 3), np.float32)
     x, y, z = frame[0], frame[1], frame[2]
     _normalized(direction, z)
@@ -201,14 +193,14 @@ def _cross(a, b, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(error_model="numpy")
 def _slopes(normal, i, texel):  # type: ignore[no-untyped-def]
-    """Rise of point i's tangent plane towards the light, in metres a texel, along x and y."""
+    """Rise of point i's tangent plane towards the light, m per texel, along x and y."""
     scale = -texel / max(normal[i, 2], SLOPE_FLOOR)
     return normal[i, 0] * scale, normal[i, 1] * scale
 
 
 @numba.njit(error_model="numpy")
 def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  # type: ignore[no-untyped-def]
-    """Keep the disc's plane, and its fall around, where nearer to the light, in rows of blocks ``low`` … ``high``."""
+    """Max-blend the disc's plane and its fall-off into rows of blocks ``low`` … ``high`` − 1."""
     x, y = position[i, 0], position[i, 1]
     z = position[i, 2] - DROP * max(_ONE - normal[i, 2] / EDGE_ON, _ZERO)
     slope_x, slope_y = _slopes(normal, i, texel)
@@ -222,7 +214,7 @@ def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  #
         for column in range(left, right):
             dx = block_x() + (np.float32(column * BLOCK) - x)
             rise = slope_x * dx + slope_y * dy
-            # beyond the circle, and beyond the ellipse that one sees of it
+            # beyond the circle, and beyond its projected ellipse
             beyond = (dx * dx + dy * dy) * (texel * texel) - square
             outside = maximum(beyond, lanes(_ZERO)) + cosine * maximum(beyond + rise * rise, lanes(_ZERO))
             plane = z + rise - fall * outside
@@ -232,19 +224,19 @@ def _draw_disc(depth, across, position, normal, i, radius, texel, low, high):  #
 
 @numba.njit(inline="always")
 def _texel_index(row, column, across):  # type: ignore[no-untyped-def]
-    """Of a texel in a map that is kept as rows of ``across`` blocks of 4×4."""
+    """Index of a texel in a map of rows of ``across`` blocks of 4×4."""
     block = (row >> BLOCK_SHIFT) * across + (column >> BLOCK_SHIFT)
     return block * WIDTH + (row & BLOCK - 1) * BLOCK + (column & BLOCK - 1)
 
 
 @numba.njit(error_model="numpy")
 def _lit_share(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
-    """Bilinear share of the four texels around a point that lies open: what rises above its plane hides it."""
+    """Bilinear share of the four texels around a point that are lit: no blocker above its plane."""
     x, y, z = position[i, 0], position[i, 1], position[i, 2]
     slope_x, slope_y = _slopes(normal, i, texel)
     clearance = max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
     top, span = (_ONE + SOFTNESS) * clearance, _ONE / (_TWO * SOFTNESS * clearance)
-    column, row = int(x), int(y)  # positive, and one texel short of the far edge
+    column, row = int(x), int(y)  # positive, one texel from the far edge
     lit = np.float32(0)
     for corner in range(4):
         c, r = column + (corner & 1), row + (corner >> 1)

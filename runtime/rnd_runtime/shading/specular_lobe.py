@@ -1,14 +1,13 @@
-"""What a specular lobe looks like to a light map: how strong, where to, how wide.
+"""Specular lobes for prefiltered light maps: energy, mean direction, width.
 
 The lobe L(l) = D·F·G/(4 n·l n·v) · max(n·l, 0) of a view at n·v with roughness γ is replaced by
 
     energy · k_a(mean · l),   k_a(x) ∝ 1/(a − x)²,   ∫ k_a = 1,
 
-which has the same energy ∫ L and the same first moment ∫ L l (direction and length). k_a is GGX's own shape
-around the mirrored direction, with a = (1 + α²)/(1 − α²), so it keeps the long tails; matching the moment puts
-in what a plain split sum (Karis 2013: a lobe about the mirrored direction as if n = v) leaves out: the horizon
-cuts the lobe, and grazing views pull it off the mirrored direction. On a posed body under four measured maps
-that is worth up to 10 dB (36 → 46 dB against the sum over 2 048 texels).
+with the same energy ∫ L and first moment ∫ L l. k_a is GGX's own shape around the mirrored direction, with
+a = (1 + α²)/(1 − α²). A split sum (Karis 2013, n = v) ignores that the horizon cuts the lobe and that grazing views
+shift it. On a posed body under four measured maps matching moments gains up to 10 dB (36 → 46 dB against the sum over
+2 048 texels).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from .brdf import ROUGHNESS_RANGE, roughness_to_alpha, specular
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-# Widths a − 1 of the prefiltered maps, narrowest first: 3.6° (a 64 × 32 map resolves no less) to 60°.
+# Widths a − 1 of the prefiltered maps, ascending: 3.6° (resolution of a 64 × 32 map) to 60°
 LOBE_WIDTHS = 2e-3 * 2.5 ** np.arange(7)
 ROUGHNESS_COUNT, COSINE_COUNT = 16, 49
 _FILE = Path(__file__).with_suffix(".npy")
@@ -33,7 +32,7 @@ _SAMPLES = 24  # along each axis of either half of the quadrature
 
 
 class LobeMoments(NamedTuple):
-    """Energy [...] and first moment over the energy [...], split along the normal and the mirrored tangent."""
+    """Energy [...] and normalised first moment [...], along the mirrored tangent and the normal."""
 
     energy: Floats
     tangent: Floats
@@ -42,19 +41,19 @@ class LobeMoments(NamedTuple):
 
 @cache
 def lobe_table() -> Floats32:
-    """What ``make_table`` makes, read from beside this module: making it takes a tenth of a start.
+    """The result of ``make_table``, stored beside this module, as making it takes 1/10 of a start.
 
-    After a change of anything here, ``python -m rnd_runtime.shading.specular_lobe`` writes it anew.
+    ``python -m rnd_runtime.shading.specular_lobe`` rewrites it.
     """
     table: Floats32 = np.load(_FILE)
     return table
 
 
 def make_table() -> Floats32:
-    """[16, 49, 7]: energy, mean direction along the mirrored tangent and along the normal (a unit vector),
-    place among LOBE_WIDTHS, and the lobe's attenuation of spherical harmonics of degree 1, 2, 3.
+    """Lobe table [16, 49, 7].
 
-    Rows: roughness evenly over its range. Columns: n·v from −1 to 1, evenly in its signed square root.
+    Energy, mean direction along mirrored tangent and normal (unit), level in LOBE_WIDTHS, attenuation of SH degrees
+    1, 2, 3. Rows: roughness evenly over its range. Columns: n·v from −1 to 1, evenly in its signed square root.
     """
     cosines = np.linspace(-1, 1, COSINE_COUNT)
     cosines = np.sign(cosines) * cosines**2
@@ -70,16 +69,16 @@ def make_table() -> Floats32:
 
 @cache
 def lobe_rows() -> Floats32:
-    """``lobe_table`` with zeros up to sixteen columns, whole registers: [16, 49, 16]."""
+    """``lobe_table`` padded with zeros to sixteen columns: [16, 49, 16]."""
     table = lobe_table()
     return np.pad(table, ((0, 0), (0, 0), (0, 16 - table.shape[2])))
 
 
 def lobe_moments(roughness: float, cosines: Floats, samples: int = _SAMPLES) -> LobeMoments:
-    """Moments of the lobe seen at each n·v of ``cosines`` [M].
+    """Moments of the lobe at each n·v of ``cosines`` [M].
 
-    Half the samples follow D's half vectors, half the cosine of l, weighted by the balance heuristic (Veach
-    1997, eq. 9.8): seen from behind, where only the lobe's tail rises above the horizon, D alone finds nothing.
+    Half the samples follow D's half vectors, half the cosine of l, weighted by the balance heuristic (Veach 1997,
+    eq. 9.8): at n·v < 0 samples of D alone miss the lobe.
     """
     alpha = float(roughness_to_alpha(np.float64(roughness)))
     # x along the tangent towards the camera, z along the normal; y is symmetric
@@ -109,13 +108,13 @@ def mean_cosine(width: Floats) -> Floats:
 
 
 def width_of_mean(mean: Floats) -> Floats:
-    """The inverse of ``mean_cosine``, for means between 0.1 and 1 − 1e-7."""
+    """The inverse of ``mean_cosine`` for means between 0.1 and 1 − 1e-7."""
     widths = np.geomspace(1e-8, 4, 4096)
     return np.asarray(np.exp(np.interp(-mean, -mean_cosine(widths), np.log(widths))))
 
 
 def attenuation(width: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean Legendre polynomials P1, P2, P3 under 1/(a − x)²: what the lobe leaves of each degree.
+    """Mean Legendre polynomials P1, P2, P3 under 1/(a − x)²: the lobe's factor for each degree.
 
     Powers follow from x^m = a x^(m−1) − (a − x) x^(m−1).
     """

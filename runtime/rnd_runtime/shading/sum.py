@@ -1,7 +1,7 @@
-"""The sum over distant lights, each with the whole BRDF and the spherical-harmonic visibility.
+"""The sum over distant lights, each with the whole BRDF and the SH visibility.
 
-With every texel of a 64 × 32 map this is ``shade_reference`` in float32, 145 dB apart, in 84 ms for 30 000
-Gaussians on two cores. With K lights out of a median cut it is the cheap kind of relighting it is compared with.
+With every texel of a 64 × 32 map this is ``shade_reference`` in float32 (145 dB), in 84 ms for 30 000 Gaussians on two
+cores. With K lights of a median cut it is an approximation.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-_EXPONENT = np.int32(0x7F800000)  # of a float32: all ones in what is infinite or no number
+_EXPONENT = np.int32(0x7F800000)  # exponent bits of a float32, all set in inf and NaN
 _ZERO, _NAN = np.float32(0), np.float32(np.nan)
 _ONE_OVER_PI = np.float32(1 / np.pi)
-HALF_FLOOR = np.float32(1e-8)  # |l + v|² where light and camera are opposite
-_CUT_TEXELS = (128, 256)  # the grid a median cut works on
+HALF_FLOOR = np.float32(1e-8)  # min |l + v|², where light and camera are opposite
+_CUT_TEXELS = (128, 256)  # grid of the median cut
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class DistantLights:
 
     Attributes:
         directions: [K, 3] unit, towards the lights, in the light probe's frame.
-        flux: [K, 3] linear radiance × solid angle: the irradiance each lays on a surface that faces it.
+        flux: [K, 3] linear radiance × solid angle: the irradiance on a surface that faces the light.
     """
 
     directions: Floats
@@ -44,16 +44,15 @@ class DistantLights:
 
     @classmethod
     def all_texels(cls, light: Light, texels: tuple[int, int]) -> DistantLights:
-        """One for each texel of the light downsized to ``texels`` (height, width)."""
+        """One light per texel of ``light`` downsized to ``texels`` (height, width)."""
         flux = light.resized(*texels).radiance * texel_solid_angles(*texels)[..., None]
         return cls(texel_directions(*texels).reshape(-1, 3), flux.reshape(-1, 3))
 
     @classmethod
     def median_cut(cls, light: Light, count: int) -> DistantLights:
-        """``count`` lights of about equal luminance (Debevec 2005, "A Median Cut Algorithm").
+        """At most ``count`` lights of about equal luminance, each at its region's centroid; conserves energy.
 
-        The brightest region is cut in two halves of equal luminance across its longer side, until there are
-        enough, or nothing is left to cut; each becomes a light at its centroid. Nothing of the energy is lost.
+        Source: Debevec 2005, "A Median Cut Algorithm".
         """
         height, width = _CUT_TEXELS
         texel_flux = light.resized(height, width).radiance * texel_solid_angles(height, width)[..., None]
@@ -80,10 +79,7 @@ class DistantLights:
     def shade(
         self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
     ) -> Floats32:
-        """Linear radiance [N, 3] towards the camera, as ``shade_reference`` defines it over these lights.
-
-        0 where not ``seen``.
-        """
+        """Linear radiance [N, 3] towards the camera, as ``shade_reference`` over these lights; 0 where not ``seen``."""
         directions = self.directions @ light_to_world.T
         basis = sh_basis(directions @ np.asarray(gaussians.root_rotation, np.float64))  # rows times R: root's frame
         radiance = np.zeros((len(gaussians.means), 3), np.float32)
@@ -111,7 +107,7 @@ def _summed_area(luminance: Floats) -> Floats:
 
 
 def _cut(total: Floats, top: int, bottom: int, left: int, right: int) -> list[tuple[float, int, int, int, int]]:
-    """Two halves of a region, each with its negated luminance, cut across the side that is longer on the sphere."""
+    """Two halves of a region, each with its negated luminance, cut across its longer side on the sphere."""
     height, width = total.shape[0] - 1, total.shape[1] - 1
     middle = (top + bottom) / 2 / height * np.pi
     wide = (right - left) / width * 2 * np.sin(middle) > (bottom - top) / height
@@ -127,7 +123,7 @@ def _cut(total: Floats, top: int, bottom: int, left: int, right: int) -> list[tu
 
 
 def _median(along: Floats) -> int:
-    """Where a running sum over a region comes nearest to its half; at least one step from either end."""
+    """Index where a running sum over a region is nearest to its half; at least one step from either end."""
     return int(np.argmin(np.abs(along[1:-1] - (along[0] + along[-1]) / 2))) + 1
 
 
@@ -137,7 +133,7 @@ def _sum(total: Floats, top: int, bottom: int, left: int, right: int) -> float:
 
 @numba.njit(error_model="numpy")
 def _is_finite(bits, i):  # type: ignore[no-untyped-def]
-    """Whether all of Gaussian ``i`` is a number, by its bits: ``fastmath`` takes for granted that it is."""
+    """Whether all numbers of Gaussian ``i`` are finite, by their bits: ``fastmath`` assumes they are."""
     means, normals, albedo, roughness, visibility = bits
     broken = (roughness[i] & _EXPONENT) == _EXPONENT
     for k in range(3):
@@ -153,9 +149,9 @@ def _is_finite(bits, i):  # type: ignore[no-untyped-def]
 def _sum_lights(  # type: ignore[no-untyped-def]
     means, normals, albedo, alpha, visibility, bits, camera, directions, basis, flux, seen, radiance
 ):
-    """Arrays of lights come transposed, [3, K] and [16, K], so that the inner loop runs in vector registers.
+    """Fill ``radiance`` [N, 3]; arrays of lights are transposed, [3, K] and [16, K], for vectorisation.
 
-    ``bits``: of a Gaussian's numbers, see ``_is_finite``.
+    ``bits``: see ``_is_finite``.
     """
     for i in numba.prange(len(means)):
         if not seen[i]:

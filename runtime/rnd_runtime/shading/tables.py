@@ -4,10 +4,9 @@ With linear visibility v(ω) = Σ_j v_j Y_j(ω) the diffuse irradiance is Σ_j v
 
     M_j(n) = Σ_k L_k Δω_k Y_j(ω_k) max(n·ω_k, 0),
 
-sixteen colours over the normal: exact in the light's frequency, one fetch and a dot product per Gaussian. The
-specular part is E · L̄(mean, width) · v̄(mean, width): the lobe's energy, the light prefiltered by the lobe of
-``specular_lobe`` and the visibility averaged over the same lobe, which for spherical harmonics is one factor a
-degree. Tables live in the light probe's frame on octahedral grids; turning the light turns normals instead.
+sixteen colours over the normal. The specular part is E · L̄(mean, width) · v̄(mean, width): the lobe's energy, the
+light prefiltered by the lobe of ``specular_lobe``, and the visibility averaged over it, one factor per SH degree.
+Tables are octahedral grids in the light probe's frame; rotating the light rotates normals instead.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 class TableArrays(NamedTuple):
-    """What ``shade_by_tables`` looks up, see ``SkyTables``, ``lobe_rows`` and ``sh_quadrature``."""
+    """Input of ``shade_by_tables``, see ``SkyTables``, ``lobe_rows`` and ``sh_quadrature``."""
 
     diffuse: Floats32  # [33·33, 3·16]
     specular: Floats32  # [49·49, 7, 16]
@@ -47,7 +46,7 @@ class TableArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SkyTables:
-    """What a light probe does to diffuse and to specular surfaces, ready to be looked up.
+    """Diffuse and specular tables of a light probe.
 
     Attributes:
         diffuse: [33·33, 3·16] M_j(n) at the nodes of an octahedral grid over n.
@@ -59,7 +58,7 @@ class SkyTables:
 
     @classmethod
     def build(cls, light: Light, texels: tuple[int, int]) -> SkyTables:
-        """For ``light`` downsized to ``texels`` (height, width)."""
+        """Tables of ``light`` downsized to ``texels`` (height, width)."""
         directions = texel_directions(*texels).reshape(-1, 3).astype(np.float32)
         solid_angles = texel_solid_angles(*texels).reshape(-1, 1).astype(np.float32)
         radiance = light.resized(*texels).radiance.reshape(-1, 3)
@@ -94,15 +93,12 @@ class SkyTables:
 
     @cached_property
     def arrays(self) -> TableArrays:
-        """As the kernel wants them."""
+        """Kernel arrays."""
         return TableArrays(self.diffuse, self.specular_cells, lobe_rows(), *sh_quadrature())
 
     @cached_property
     def specular_cells(self) -> Floats32:
-        """[49·49, 7, 16]: RGB and nothing of a cell's corners (0, 0), (1, 0), (0, 1) and (1, 1), by its first.
-
-        The levels of a cell, of which a look-up takes two, lie side by side.
-        """
+        """[49·49, 7, 16]: RGB and 0 of a cell's corners (0, 0), (1, 0), (0, 1), (1, 1), by its first corner."""
         nodes = self.specular.reshape(len(self.specular), SPECULAR_SIZE, SPECULAR_SIZE, 3)
         cells = np.zeros((SPECULAR_SIZE, SPECULAR_SIZE, len(nodes), 4, 4), np.float32)
         for corner in range(4):
@@ -132,8 +128,8 @@ def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, see
 def octahedral_nodes(size: int) -> Floats32:
     """Unit directions [size², 3] of the nodes of a square grid folded into an octahedron.
 
-    Nodes lie on the square's edges too, so a bilinear lookup never leaves it and no border is needed
-    (Cigolle et al. 2014, "A Survey of Efficient Representations for Independent Unit Vectors").
+    Nodes are on the square's edges too, so a bilinear look-up needs no border (Cigolle et al. 2014, "A Survey of
+    Efficient Representations for Independent Unit Vectors").
     """
     line = np.linspace(-1, 1, size)
     b, a = np.meshgrid(line, line, indexing="ij")
@@ -145,8 +141,7 @@ def octahedral_nodes(size: int) -> Floats32:
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _sum_diffuse(nodes, directions, weighted, sums):  # type: ignore[no-untyped-def]
-    """Σ_k weighted [K, 48] max(n·ω_k, 0) at every node, texel by texel: a product of matrices would add in an order of
-    its threads."""
+    """Σ_k weighted [K, 48] max(n·ω_k, 0) at every node; unlike a BLAS product the order of addition is fixed."""
     for i in numba.prange(len(nodes)):
         x, y, z = nodes[i, 0], nodes[i, 1], nodes[i, 2]
         first, second, third = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
@@ -164,7 +159,7 @@ def _sum_diffuse(nodes, directions, weighted, sums):  # type: ignore[no-untyped-
 
 @numba.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _prefilter(nodes, texels, widths, specular):  # type: ignore[no-untyped-def]
-    """Mean radiance under 1/(1 + width − cos)²; ``texels`` [7, K]: direction, solid angle, flux; K in sixteens."""
+    """Mean radiance under 1/(1 + width − cos)²; ``texels`` [7, K]: direction, solid angle, flux; K a multiple of 16."""
     count = texels.shape[1]
     for i in numba.prange(len(nodes)):
         x, y, z = nodes[i, 0], nodes[i, 1], nodes[i, 2]

@@ -13,7 +13,7 @@ from rnd_runtime.core.files import existing_file
 
 from .tree import Floats, MocapTree, about_axis, check_size
 
-_ROUNDED_FPS = 2e-4  # share by which 1 / 0.0083333 may miss a whole number: less than 29.97 misses 30
+_ROUNDED_FPS = 2e-4  # relative distance to a whole number: more than of 1 / 0.0083333, less than of 29.97
 
 
 @dataclass
@@ -25,10 +25,10 @@ class _Joint:
 
 
 def read_bvh(path: str | Path) -> MocapTree:
-    """Read a Biovision file: rotations in degrees, multiplied in the order of their channels.
+    """Read a BVH file: rotations in degrees, multiplied in the order of their channels.
 
     Raises:
-        InputError: when it is not one, is cut short, or holds numbers that are not finite or beyond any use.
+        InputError: it is not one, is truncated, or has non-finite or too large numbers.
     """
     path = existing_file(path, what="motion")
     try:
@@ -69,10 +69,10 @@ def _read(words: Iterator[str]) -> MocapTree:
 
 
 def _root_path(joints: list[_Joint], rotations: Floats, positions: Floats) -> tuple[Floats, list[int]]:
-    """The root's path [F, 3] plus that of only children below it; and the indices of these joints.
+    """The root's path [F, 3] plus that of only children below it, and the indices of these joints.
 
-    Many tools write the moving hips below a root that stands still. ``positions`` [F, J, 3] are in the parent's
-    frame and replace the offset.
+    Many tools animate the hips below a fixed root. ``positions`` [F, J, 3] are in the parent's frame and replace the
+    offset.
     """
     joint, trunk, path, global_rotation = 0, [0], positions[:, 0], rotations[:, 0]
     while len(children := [k for k, child in enumerate(joints) if child.parent == joint]) == 1:

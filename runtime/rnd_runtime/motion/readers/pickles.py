@@ -1,4 +1,4 @@
-"""Motions that come as pickles or folders: AIST++, WHAM, GVHMR, PHALP, MDM, EasyMocap, a dict of arrays."""
+"""Motions as pickles or folders: AIST++, WHAM, GVHMR, PHALP, MDM, EasyMocap, a dict of arrays."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from .video_fits import PHALP_FOCAL, VideoFits, in_order, is_phalp, read_easymoc
 Floats = NDArray[np.float64]
 
 _AIST_FPS, _VIDEO_FPS, _MDM_FPS = 60.0, 30.0, 20.0
-_PHONE_FOCAL = 1.2  # of the image's longer side: 45°. PHALP's lens of 3° puts people a hundred metres away
-_MAX_FILLED = 18_000  # frames, ten minutes: larger gaps are wrong frame numbers
+_PHONE_FOCAL = 1.2  # of the image's longer side: 45°. PHALP's 3° puts people 100 m away
+_MAX_FILLED = 18_000  # frames, 10 minutes
 _SCALINGS = (1e-6, 1e6)  # AIST++'s are near 94
-_MIN_ROW = 1e-6  # length of a rotation's row, or of what the first leaves of the second
+_MIN_ROW = 1e-6  # length of a rotation's row, the second orthogonalised
 _LEVEL = np.array([1.0, -1.0, -1.0])  # from a camera's right, down, forward to right, up, backward
 _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assumed, as most videos have"
 
@@ -34,8 +34,8 @@ _VIDEO_NOTE = f"no frame rate in the file: {_VIDEO_FPS:g} frames per second assu
 class Track:
     """One person's motion as ``members`` of an .npz (``arrays.read_motion_file``).
 
-    ``rest_root`` [3] m: the pelvis' rest position that translations are relative to; None for the avatar's own.
-    ``notes``: what was assumed or left out.
+    ``rest_root`` [3] m: the pelvis' rest position that translations refer to; None for the avatar's own.
+    ``notes``: assumptions and omissions.
     """
 
     members: Members
@@ -157,7 +157,7 @@ def _phalp(fits: VideoFits, path: str | Path) -> Track:
 
 
 def _easymocap(fits: VideoFits, path: str | Path) -> Track:
-    """As SMPL's, about the pelvis, which is what gaps interpolate."""
+    """EasyMocap's fits as SMPL's: rotation about the pelvis, whose path gaps interpolate."""
     assert fits.turns is not None
     rest_root = SMPLX_REST_ROOT if fits.family == "SMPL-X" else SMPL_REST_ROOT
     rotations, poses = axis_angle_to_matrix(fits.turns), fits.axis_angles.copy()
@@ -176,7 +176,7 @@ def _left_out(person: Any, others: tuple[Any, ...]) -> tuple[str, ...]:
 def _without_gaps(
     frames: NDArray[np.int64], poses: Floats, positions: Floats, path: str | Path
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Axis-angle ``poses`` [F, 3J] and ``positions`` [F, 3] of ascending ``frames`` at every frame between the ends."""
+    """Axis-angle ``poses`` [F, 3J] and ``positions`` [F, 3] of ascending ``frames``, with gaps interpolated."""
     late = np.flatnonzero(np.diff(frames) <= 0)
     if len(late):
         got = "{1} after {0}".format(*frames[late[0] : late[0] + 2])

@@ -1,4 +1,4 @@
-"""A motion recorded on a skeleton of its own, as BVH and AMC files have it."""
+"""A motion recorded on its own skeleton, as in BVH and AMC files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 
 Floats = NDArray[np.float64]
 
-_MAX_NUMBER = 1e6  # degrees, or lengths in whatever unit: larger ones overflow further on
+_MAX_NUMBER = 1e6  # degrees, or lengths in any unit, against overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,13 +21,13 @@ class MocapTree:
     """A recorded skeleton and its motion, in its file's units and axes.
 
     Attributes:
-        names: J joint names, each once, the root first.
-        parents: [J], −1 for the root, a parent before its children.
-        offsets: [J, 3] from the parent in the zero pose, in which every rotation is the identity.
+        names: J unique joint names, the root first.
+        parents: [J], −1 for the root; parents come first.
+        offsets: [J, 3] from the parent in the zero pose (identity rotations).
         rotations: [F, J, 3, 3] local, relative to the zero pose.
         root_positions: [F, 3].
         fps: frames per second.
-        notes: what was assumed or left out.
+        notes: assumptions and omissions.
 
     Raises:
         InputError: names or parents are not those of one tree.

@@ -1,4 +1,4 @@
-"""One person's body fits in a video, as EasyMocap (a JSON file a frame) and PHALP (a pickle) leave them."""
+"""Body fits of one person in a video: EasyMocap (a JSON file per frame) and PHALP (a pickle)."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from rnd_runtime.core.rotations import matrix_to_axis_angle
 Floats = NDArray[np.float64]
 
 PHALP_FOCAL = 5000 / 256
-"""of the image's longer side: its EXTRA.FOCAL_LENGTH over render.res, to which it scales every image"""
+"""of the image's longer side: EXTRA.FOCAL_LENGTH / render.res"""
 
 _HAND_COEFFICIENTS = {78: "SMPL", 87: "SMPL-X"}
-"""columns of EasyMocap's SMPL-H and SMPL-X poses: after 22 joints come coefficients of hands and face, not angles"""
+"""columns of EasyMocap's SMPL-H and SMPL-X poses: 22 joints, then coefficients of hands and face"""
 
 
 @dataclass(frozen=True, eq=False)
 class VideoFits:
-    """What was fitted to one person.
+    """Fits of one person.
 
     Attributes:
-        person: their number; ``others`` are in the file too.
+        person: id; ``others`` are in the file too.
         frames: [F] ascending image numbers.
         axis_angles: [F, 3J] rad, the root first.
         translations: [F, 3] m.
         betas: [F, B].
-        turns: [F, 3] rad, EasyMocap's Rh: x = R(Rh) X + translation, about the origin; None where, as in SMPL, the
-            root rotates about its rest position.
+        turns: [F, 3] rad, EasyMocap's Rh: x = R(Rh) X + translation, about the origin; None for rotations about the
+            root's rest position.
         family: "SMPL" or "SMPL-X".
     """
 
@@ -51,7 +51,8 @@ class VideoFits:
 def read_easymocap_folder(folder: Path, person: int | None = None) -> VideoFits:
     """Read ``folder`` of files such as ``000012.json``: a list of {``id``, ``Rh``, ``Th``, ``poses``, ``shapes``}.
 
-    ``person`` is an id; the one with most frames when None.
+    Args:
+        person: id; by default the one in most frames.
     """
     files = easymocap_files(folder)
     if not files:
@@ -90,10 +91,12 @@ def is_phalp(content: Mapping[Any, Any]) -> bool:
 
 
 def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None) -> VideoFits:
-    """Read what ``is_phalp`` recognises: rotation matrices, and positions before a lens of ``PHALP_FOCAL``.
+    """Read PHALP's content (``is_phalp``): rotation matrices, and positions at the focal length ``PHALP_FOCAL``.
 
-    ``person`` is a track number; the one with most frames when None. Images without the track (its last detection
-    is repeated, ``tracked_time`` frames old) are left out.
+    Images without a new detection of the track (``tracked_time`` > 0) are left out.
+
+    Args:
+        person: a track number; by default the one in most images.
     """
     moments = sorted(_moments(content), key=lambda moment: int(moment.get("time", 0)))
     tracks = [_phalp_tracks(moment) for moment in moments]
@@ -115,7 +118,7 @@ def read_phalp(content: Mapping[Any, Any], path: Path, person: int | None = None
 
 
 def _moments(content: Mapping[Any, Any]) -> list[Mapping[str, Any]]:
-    """The entries of images: some versions store other things too."""
+    """The entries of images; some versions store others too."""
     return [value for value in content.values() if isinstance(value, Mapping)]
 
 
@@ -127,7 +130,7 @@ def _phalp_tracks(moment: Mapping[str, Any]) -> dict[int, int]:
 
 
 def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tuple[int, ...]]:
-    """(chosen, others): ``person``, or the most frequent of ``seen`` (a number for each detection)."""
+    """The chosen id, ``person`` or the most frequent in ``seen`` (one entry per detection), and the others."""
     numbers = tuple(dict.fromkeys(seen))
     if not numbers:
         raise InputError("people", expected="at least one", got="none", file=path)
@@ -138,10 +141,10 @@ def one_of(seen: Sequence[int], person: int | None, path: Path) -> tuple[int, tu
 
 
 def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], list[Floats]]:
-    """A track's frame numbers [F], ascending, and its ``values`` [F, …]; of a number that repeats the first counts.
+    """A track's ascending frame numbers [F] and its ``values`` [F, …]; the first of repeated numbers.
 
     Raises:
-        InputError: there are not as many of each.
+        InputError: their lengths differ.
     """
     numbers = np.asarray(frames, np.int64).reshape(-1)
     arrays = [np.asarray(value, np.float64) for value in values]
@@ -154,20 +157,20 @@ def in_order(frames: ArrayLike, *values: ArrayLike) -> tuple[NDArray[np.int64], 
 
 
 def with_root(poses: Floats) -> Floats:
-    """Poses [F, 3J] with a zero root before those that leave it out (63 and 69 columns)."""
+    """Poses [F, 3J] with a zero root prepended where it is missing (63 and 69 columns)."""
     if poses.shape[1] in (63, 69):
         return np.concatenate([np.zeros((len(poses), 3)), poses], 1)
     return poses
 
 
 def trailing_number(stem: str, otherwise: int) -> int:
-    """The number that ``stem`` ends in."""
+    """The number at the end of ``stem``, or ``otherwise``."""
     digits = stem[len(stem.rstrip("0123456789")) :]
     return int(digits) if digits else otherwise
 
 
 def _people(file: Path) -> dict[int, Any]:
-    """By id, the people in one file."""
+    """People in one file, by id."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
