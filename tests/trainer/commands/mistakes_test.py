@@ -128,7 +128,7 @@ def test_json_has_no_nan(tmp_path) -> None:
 
 
 def test_pictures_too_small_for_the_losses_are_refused(tiny_capture) -> None:
-    with pytest.raises(InputError, match=r"training pictures: expected at least 11 pixels wide and high, got \d+ x"):
+    with pytest.raises(InputError, match=r"training images: expected at least 11 pixels wide and high, got \d+ x"):
         load_views(tiny_capture, "train", 0.1)
 
 

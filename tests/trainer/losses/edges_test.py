@@ -19,11 +19,11 @@ from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.training.data import pose_input
 from rnd_trainer.training.sampled_poses import (
-    NUDGE,
-    NUDGED_SPEED,
-    TURNED_JOINTS,
-    WIDEST_SHAKE,
-    WIDEST_TURN,
+    JITTER,
+    MAX_PERTURBATION,
+    MAX_ROTATION,
+    ROTATED_JOINTS,
+    VELOCITY_JITTER,
     jittered_pose,
     perturbed_pose,
     sampled_pose,
@@ -68,9 +68,9 @@ def test_a_drawn_pose_turns_a_few_joints_within_bounds_and_comes_there_from_less
     for seed in range(8):
         pose = sampled_pose(skeleton, CONFIG, np.random.default_rng(seed))
         turned = (pose.window[-1] - pose.window.new_tensor([1, 0, 0, 0, 1, 0])).abs().amax(-1) > 1e-4
-        assert 1 <= int(turned.sum()) <= TURNED_JOINTS
+        assert 1 <= int(turned.sum()) <= ROTATED_JOINTS
         assert pose.velocity[~turned].abs().max() < 1e-4
-        assert pose.velocity.norm(dim=-1).max() < WIDEST_TURN / CONFIG.window_seconds
+        assert pose.velocity.norm(dim=-1).max() < MAX_ROTATION / CONFIG.window_seconds
         assert torch.allclose(pose.bones[0, :, :3], torch.eye(3), atol=1e-6)  # the root stays
 
 
@@ -89,7 +89,7 @@ def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
         moved = shaken.bones[1:, :, :3] - filmed.bones[1:, :, :3]
         assert float(moved.abs().max()) > 0
         own = (shaken.window - filmed.window).abs().amax(-1)
-        assert float(own.mean()) < 2 * WIDEST_SHAKE
+        assert float(own.mean()) < 2 * MAX_PERTURBATION
     twice = [perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(1)).window for _ in range(2)]
     assert torch.equal(*twice)
 
@@ -99,8 +99,8 @@ def test_a_nudged_pose_is_hardly_another(model) -> None:
     nudged = jittered_pose(pose, np.random.default_rng(0))
     moved, faster = nudged.window - pose.window, nudged.velocity - pose.velocity
     assert torch.allclose(moved, moved[:1].expand_as(moved), atol=1e-6)  # the window as a whole
-    assert float(moved[0].std()) == pytest.approx(NUDGE, rel=0.3)
-    assert float(faster.std()) == pytest.approx(NUDGED_SPEED, rel=0.3)
+    assert float(moved[0].std()) == pytest.approx(JITTER, rel=0.3)
+    assert float(faster.std()) == pytest.approx(VELOCITY_JITTER, rel=0.3)
     assert torch.equal(nudged.bones, pose.bones)
 
 

@@ -1,4 +1,4 @@
-"""The first light: a sun that is there is found, one that is not is not invented."""
+"""The light search finds a directional light that is there, and adds none that is not."""
 
 from __future__ import annotations
 
@@ -10,47 +10,49 @@ import torch
 
 from rnd_runtime.shading.light import texel_directions, texel_solid_angles
 from rnd_trainer.training import light_search
-from rnd_trainer.training.light_search import Sightings, start_light
+from rnd_trainer.training.light_search import Observations, start_light
 
-COUNT, PICTURES = 700, 24
+COUNT, IMAGES = 700, 24
 WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide
 ENERGY = 0.25  # of the sun's share of the light, relative: the albedo is unknown and may take some of it
 ROBUST = 0.15  # the same where the colours err too
-SHADOWS = 0.05  # the ball's own, as they are traced: those of 700 splats are a little too wide
+SHADOWS = 0.05  # the ball's own shadows: those of 700 splats are too wide
 
 
-def _turning_ball(sun: np.ndarray, strength: float) -> Sightings:
-    """A ball of random albedo that turns about Y under a white sky and one sun, seen from +Z."""
+def _rotating_ball(sun: np.ndarray, strength: float) -> Observations:
+    """A ball of random albedo rotating about Y under a white sky and one sun, seen from +Z."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=generator), dim=-1)
     albedo = 0.2 + 0.5 * torch.rand(COUNT, 3, generator=generator)
-    who, colour, picture, posed = [], [], [], []
-    for k in range(PICTURES):
-        angle = 2 * math.pi * k / PICTURES
-        turn = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-        normals = points @ turn.T
+    point, colour, image, posed = [], [], [], []
+    for k in range(IMAGES):
+        angle = 2 * math.pi * k / IMAGES
+        rotation = torch.tensor(
+            [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+        )
+        normals = points @ rotation.T
         seen = (normals[:, 2] > light_search.FACING).nonzero()[:, 0]
         arriving = 1 + strength / math.pi * (normals[seen] @ torch.as_tensor(sun).float()).clamp(min=0)
-        who.append(seen.numpy())
+        point.append(seen.numpy())
         colour.append((albedo[seen] * arriving[:, None]).double().numpy())
-        picture.append(np.full(len(seen), k))
+        image.append(np.full(len(seen), k))
         posed.append((normals, normals))
-    return Sightings(*(np.concatenate(x) for x in (who, colour, picture)), posed, 0.1)
+    return Observations(*(np.concatenate(x) for x in (point, colour, image)), posed, 0.1)
 
 
 @pytest.mark.parametrize("strength", [0.0, 6.0])
 def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
     sun /= np.linalg.norm(sun)
-    ball = _turning_ball(sun, strength)
-    monkeypatch.setattr(light_search, "_sightings", lambda *_: ball)
-    found = start_light(None, [], [])  # type: ignore[arg-type]  # the sightings are given
+    ball = _rotating_ball(sun, strength)
+    monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
+    found = start_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
     assert found is not None
     light, exposure = found.radiance, found.exposure
     assert light.shape == (32, 64, 3) and (light > 0).all() and (exposure >= 0).all()
     solid_angles = texel_solid_angles(32, 64)
     grey = light.mean(-1)
-    normals = np.concatenate([n[ball.who[ball.picture == k]] for k, (_, n) in enumerate(ball.posed)])
+    normals = np.concatenate([n[ball.point[ball.image == k]] for k, (_, n) in enumerate(ball.posed)])
     cosines = np.maximum(normals @ texel_directions(32, 64).reshape(-1, 3).T, 0)
     arriving = (cosines @ (grey * solid_angles).reshape(-1) / math.pi).mean()
     assert ball.colour.mean() / arriving == pytest.approx(light_search.REFLECTANCE, rel=SHADOWS)
@@ -66,18 +68,15 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
 
 
 def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch) -> None:
-    """Colours off by 30 %, as of texture seen a little beside its point; a quarter of the shade twice as bright.
-
-    Least squares alone would leave the sun 23 % too weak.
-    """
+    """Noise of 30 % on colours, a quarter of the shade twice as bright; least squares alone lose 23 % of the sun."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])
-    ball = _turning_ball(sun, 6.0)
-    normals = np.concatenate([n[ball.who[ball.picture == k]] for k, (_, n) in enumerate(ball.posed)])
+    ball = _rotating_ball(sun, 6.0)
+    normals = np.concatenate([n[ball.point[ball.image == k]] for k, (_, n) in enumerate(ball.posed)])
     shade = np.flatnonzero(normals @ sun < 0)
-    draw = np.random.default_rng(0)
-    ball.colour *= np.exp(0.3 * draw.normal(size=(len(ball.colour), 1)))
-    ball.colour[shade[draw.random(len(shade)) < 1 / 4]] *= 2
-    monkeypatch.setattr(light_search, "_sightings", lambda *_: ball)
+    rng = np.random.default_rng(0)
+    ball.colour *= np.exp(0.3 * rng.normal(size=(len(ball.colour), 1)))
+    ball.colour[shade[rng.random(len(shade)) < 1 / 4]] *= 2
+    monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
     found = start_light(None, [], [])  # type: ignore[arg-type]
     assert found is not None
     energy = found.radiance.mean(-1) * texel_solid_angles(32, 64)
@@ -85,35 +84,35 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
     assert energy[near].sum() / energy.sum() == pytest.approx(6 / (6 + 4 * math.pi), rel=ROBUST)
 
 
-def test_pictures_that_are_all_alike_give_none(monkeypatch) -> None:
-    """Any light explains them: each point's irradiance is parallel to its colours whatever it is."""
-    ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 6.0)
-    first = ball.picture == 0
+def test_equal_images_give_none(monkeypatch) -> None:
+    """Any light explains equal images: each point's irradiance is parallel to its colours."""
+    ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 6.0)
+    first = ball.image == 0
     count = int(first.sum())
-    alike = Sightings(
-        np.tile(ball.who[first], 3),
+    alike = Observations(
+        np.tile(ball.point[first], 3),
         np.tile(ball.colour[first], (3, 1)),
         np.repeat([0, 1, 2], count),
         [ball.posed[0]] * 3,
         ball.spacing,
     )
-    once = Sightings(ball.who[first], ball.colour[first], ball.picture[first], ball.posed[:1], ball.spacing)
+    once = Observations(ball.point[first], ball.colour[first], ball.image[first], ball.posed[:1], ball.spacing)
     for seen in (alike, once):
-        monkeypatch.setattr(light_search, "_sightings", lambda *_, seen=seen: seen)
+        monkeypatch.setattr(light_search, "_observe", lambda *_, seen=seen: seen)
         assert start_light(None, [], []) is None  # type: ignore[arg-type]
 
 
-def test_too_few_sightings_give_none(monkeypatch) -> None:
-    ball = _turning_ball(np.array([0.0, 1.0, 0.0]), 0.0)
-    few = Sightings(ball.who[:20], ball.colour[:20], ball.picture[:20], ball.posed, 0.1)
-    monkeypatch.setattr(light_search, "_sightings", lambda *_: few)
+def test_too_few_observations_give_none(monkeypatch) -> None:
+    ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 0.0)
+    few = Observations(ball.point[:20], ball.colour[:20], ball.image[:20], ball.posed, 0.1)
+    monkeypatch.setattr(light_search, "_observe", lambda *_: few)
     assert start_light(None, [], []) is None  # type: ignore[arg-type]
 
 
-def test_what_is_seen_once_or_twice_invents_no_sun(monkeypatch) -> None:
-    """Three pictures from three sides: each point is in one or two of them, and its albedo could explain any sun."""
-    ball = _turning_ball(np.array([0.7, 0.5, 0.51]), 6.0)
-    few = np.isin(ball.picture, (0, 8, 16))
-    seen = Sightings(ball.who[few], ball.colour[few], ball.picture[few] // 8, ball.posed[::8], ball.spacing)
-    monkeypatch.setattr(light_search, "_sightings", lambda *_: seen)
+def test_points_observed_once_or_twice_give_no_sun(monkeypatch) -> None:
+    """In three images from three sides each point is observed once or twice; its albedo explains any sun."""
+    ball = _rotating_ball(np.array([0.7, 0.5, 0.51]), 6.0)
+    few = np.isin(ball.image, (0, 8, 16))
+    seen = Observations(ball.point[few], ball.colour[few], ball.image[few] // 8, ball.posed[::8], ball.spacing)
+    monkeypatch.setattr(light_search, "_observe", lambda *_: seen)
     assert start_light(None, [], []) is None  # type: ignore[arg-type]

@@ -449,7 +449,7 @@ def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, m
             raw += 0.3
     training.step_index, given = tiny_config.steps, []
     monkeypatch.setattr(rnd_trainer.training.training, "PERTURBED_SHARE", 0)
-    monkeypatch.setattr(training, "_unseen", lambda: lambda model, pose, step: given.append(pose) or {})
+    monkeypatch.setattr(training, "unseen", lambda model, pose, step: given.append(pose) or {})
     training._unseen_terms(training.views[0], training.poses[0])
     expected = training.refinement.bones(training.views[0].frame.frame)
     assert torch.equal(given[0].bones, expected) and not given[0].bones.requires_grad

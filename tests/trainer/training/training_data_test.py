@@ -84,7 +84,7 @@ def test_shrinking_keeps_light_and_view(tiny_capture) -> None:
 
 def test_true_normals_that_are_not_there_are_refused(tiny_capture) -> None:
     without = tuple(replace(frame, normal_gt=None) for frame in tiny_capture.frames)
-    with pytest.raises(InputError, match="--normals true: expected normal_gt of every training picture, got none"):
+    with pytest.raises(InputError, match="--normals true: expected normal_gt of every training image, got none"):
         load_views(dataclasses.replace(tiny_capture, frames=without), "train", true_normals=True)
 
 

@@ -1,4 +1,4 @@
-"""Training pictures, cropped to the person, and the pose that goes with each."""
+"""Training images, cropped to the person, and the network input of their poses."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from rnd_trainer.losses.metrics import SSIM_WINDOW, mask_box, widened
 from rnd_trainer.model.model import PoseInput
 
 CROP_MARGIN = 16
-"""pixels around the mask's box: what spills over the silhouette must be seen to be punished"""
+"""pixels around the mask's box: the loss must cover Gaussians outside the silhouette"""
 MASK_COVERAGE = (0.001, 0.95)
-"""share of the picture that a usable mask covers"""
+"""range of the share of an image that a usable mask covers"""
 MAX_BAD_MASKS = 0.2
 """share of empty or full masks above which training stops"""
 
@@ -36,10 +36,12 @@ _TO_LINEAR = torch.as_tensor(srgb_to_linear(np.arange(256) / 255), dtype=torch.f
 
 @dataclass
 class TrainingView:
-    """One training picture: a crop, kept in 8 bits until it is used.
+    """One training image, cropped, in 8 bits.
 
-    image [h, w, 3] sRGB premultiplied on black, mask [h, w], normal [h, w, 3] as (n + 1)/2, or black where the
-    estimate has no data inside the mask, or None.
+    Attributes:
+        image: [h, w, 3] sRGB, premultiplied on black.
+        mask: [h, w].
+        normal: [h, w, 3] in camera axes as (n + 1)/2, black where it is unknown inside the mask; None without normals.
     """
 
     frame: Frame
@@ -54,10 +56,7 @@ class TrainingView:
         return _TO_LINEAR[torch.from_numpy(self.image).int()] + (1 - mask[..., None]) * background, mask
 
     def normals(self) -> tuple[Tensor, Tensor] | None:
-        """Estimated normals [h, w, 3], camera axes, zero outside the mask, and where they are known [h, w, 1].
-
-        Outside the mask they are, by being none. None where the view has no estimate at all.
-        """
+        """Normals [h, w, 3] in camera axes, zero outside the mask, and where the loss counts [h, w, 1]; or None."""
         if self.normal is None:
             return None
         covered = torch.from_numpy(_covered(self.mask))[..., None]
@@ -68,11 +67,14 @@ class TrainingView:
 def load_views(
     capture: Capture, split: Split, scale: float = 1.0, true_normals: bool = False
 ) -> tuple[list[TrainingView], list[int]]:
-    """The usable views of a split, and the motion frames whose masks were empty or full.
+    """Usable views of a split, and the motion frames whose masks are empty or full.
 
-    ``true_normals`` takes the capture's exact normals instead of the estimated ones (an oracle, for studies).
+    Args:
+        scale: of the images.
+        true_normals: take the capture's exact normals instead of the estimated ones.
 
-    Raises ``InputError`` when the split is empty or more than a fifth of its masks are unusable.
+    Raises:
+        InputError: an empty split, an image too small for SSIM, or more than ``MAX_BAD_MASKS`` unusable masks.
     """
     frames = _frames(capture, split)
     if true_normals:
@@ -87,7 +89,7 @@ def load_views(
         camera = capture.cameras[frame.camera]
         if min(camera.width, camera.height) * scale < SSIM_WINDOW:
             raise InputError(
-                "training pictures",
+                "training images",
                 expected=f"at least {SSIM_WINDOW} pixels wide and high",
                 got=f"{camera.width} x {camera.height}, times {scale:g}",
                 file=capture.folder,
@@ -113,27 +115,25 @@ def _frames(capture: Capture, split: Split) -> list[Frame]:
 
 
 def check_true_normals(capture: Capture, frames: Iterable[Frame], what: str = "--normals true") -> None:
-    """Raise ``InputError`` where one of ``frames`` has no exact normals, which ``what`` asks for."""
+    """Raise ``InputError``, naming the option ``what``, if one of ``frames`` has no exact normals."""
     for frame in frames:
         if frame.normal_gt is None:
-            expected = "normal_gt of every training picture"
+            expected = "normal_gt of every training image"
             raise InputError(what, expected=expected, got="none", file=capture.folder, frame=frame.frame)
 
 
 def training_light(capture: Capture, what: str = "--light capture") -> tuple[str, Light]:
-    """The light that all training pictures were taken under, and its name; ``what`` asks for it.
+    """Name and map of the one light of all training images.
 
-    Raises ``InputError`` where there are several, or the capture does not have it.
+    Raises:
+        InputError: several lights, or none in the capture; the message names the option ``what``.
     """
     name = training_light_name(capture, what)
     return name, capture.load_light(name)
 
 
 def training_light_name(capture: Capture, what: str) -> str:
-    """The name of the one light that all training pictures were taken under, "unknown" where it has none.
-
-    Raises ``InputError`` where there are several, or no training pictures.
-    """
+    """Name of the one light of all training images, "unknown" if it has none; see ``training_light``."""
     names = light_names(_frames(capture, "train"))
     if len(names) != 1:
         got = ", ".join(names)
@@ -142,12 +142,12 @@ def training_light_name(capture: Capture, what: str) -> str:
 
 
 def light_names(frames: Iterable[Frame]) -> list[str]:
-    """Names of the lights that ``frames`` were taken under, each once, "unknown" where one has none."""
+    """Sorted unique names of the lights of ``frames``; "unknown" stands for none."""
     return sorted({frame.light or "unknown" for frame in frames})
 
 
 def usable(mask: NDArray[np.floating[Any]]) -> bool:
-    """Whether a picture with ``mask`` [H, W] shows a person, whole or in part."""
+    """Whether ``mask`` [H, W] is neither empty nor full."""
     low, high = MASK_COVERAGE
     return low < float(mask.mean()) < high
 
@@ -165,7 +165,7 @@ def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> Tr
     if normal is not None:
         unknown = _covered(coverage) & ~normal[rows, columns].any(-1)
         normal = np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8)
-        normal[unknown] = 0  # which is nobody's normal
+        normal[unknown] = 0  # no unit normal
     return TrainingView(frame, crop, np.round(image[rows, columns] * 255).astype(np.uint8), coverage, normal)
 
 
@@ -174,7 +174,7 @@ def _covered(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def _shrink(image, mask, normal, camera: Camera, scale: float):
-    """Area-averaged to ``scale``; colours are averaged as light, not as sRGB."""
+    """Area averages at ``scale``; colours are averaged in linear space."""
     import cv2
 
     from rnd_runtime.core.images import linear_to_srgb
@@ -190,7 +190,7 @@ def _shrink(image, mask, normal, camera: Camera, scale: float):
 
 
 def pose_input(motion: Motion, skeleton: Skeleton, time: float, config: ModelConfig) -> PoseInput:
-    """Window, velocities and bone transforms of ``motion`` at ``time`` seconds, as tensors."""
+    """Network input of ``motion`` at ``time`` seconds."""
     window, velocity = motion_window(motion, time, poses=config.window_poses, seconds=config.window_seconds)
     now = motion.at(np.array([time]))
     bones = skinning_bones(skeleton, now.rotations[0], now.translations[0])

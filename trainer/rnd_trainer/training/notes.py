@@ -1,4 +1,4 @@
-"""Notes on a capture for whoever trains or evaluates with it."""
+"""Notes on a capture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rnd_runtime.shading.light import light_notes
 
 
 def capture_notes(capture: Capture, splits: Iterable[Split] = ()) -> list[str]:
-    """Notes on a capture's motion, and on the lights of the images in ``splits``."""
+    """Notes on the motion, and on the lights of the images in ``splits``."""
     names = {frame.light for split in splits for frame in capture.split(split) if frame.light}
     lights = (f"{name}: {note}" for name in sorted(names) for note in light_notes(capture.load_light(name)))
     return [*capture.motion.notes, *lights]

@@ -1,4 +1,4 @@
-"""What a training step minimises: the weighted loss terms of one image."""
+"""Objective of a training step: the weighted loss terms of one image."""
 
 from __future__ import annotations
 
@@ -30,20 +30,19 @@ from rnd_trainer.render.shading import sh_basis, traced_visibility
 from .data import TrainingView
 
 MIN_MATCHES = 16
-"""points that two views must share for the consistency term to mean anything"""
+"""points that two views must share for the consistency term"""
 
 
 class Objective:
-    """The loss of one image in either stage.
+    """The loss of one image in the first and second stage.
 
     Args:
         config: weights and schedule.
         probe: the learned light.
-        fixed_light: [32, 64, 3] a known light to use instead, or None.
-        perceptual: network of the LPIPS term; without one that is off, and the structural term looks at several
-            scales instead.
-        consistency: network whose features L_gc compares; without one that is off.
-        generator: of all random draws.
+        fixed_light: [32, 64, 3] linear radiance that replaces the probe's, or None.
+        perceptual: network of the LPIPS term; None: multi-scale DSSIM instead.
+        consistency: network whose features L_gc compares; None leaves the term out.
+        generator: of all random numbers.
     """
 
     def __init__(
@@ -59,41 +58,41 @@ class Objective:
         self.perceptual, self.consistency, self.generator = perceptual, consistency, generator
 
     def light(self) -> Tensor:
-        """The light [32, 64, 3] of the training pictures: learned, or the one that was given."""
+        """Light [32, 64, 3] of the training images: learned or fixed."""
         return self.probe.radiance() if self.fixed_light is None else self.fixed_light
 
     def __call__(
         self, model: AvatarModel, view: TrainingView, pose: PoseInput, step: int, stage: int
     ) -> dict[str, Tensor]:
-        """Weighted loss terms of one picture by name; their sum is minimised."""
+        """Weighted loss terms of one image by name; their sum is minimised."""
         config = self.config
         posed = model(pose)
-        like_template = config.weight_skinning * 0.1 ** (step / config.steps)
+        weight_skinning = config.weight_skinning * 0.1 ** (step / config.steps)
         terms = {
-            "skinning": like_template * skinning_divergence(posed.weights, model.log_weights),
+            "skinning": weight_skinning * skinning_divergence(posed.weights, model.log_weights),
             "geometry": geometry_prior(posed, config.weight_offset, config.weight_residual),
         }
         if _due(step, config.weight_repulsion, config.repulsion_every):
             terms["repulsion"] = config.repulsion_every * config.weight_repulsion * self._repulsion(model, posed)
-        if config.model.visibility == "pose" and config.light != "none":  # which is never shaded
+        if config.model.visibility == "pose" and config.light != "none":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
         texels = None if stage == 1 else self._texels(step)
         if stage == 2 and self.fixed_light is None:
             light, probe = self.light(), self.probe
             terms["grey"] = config.weight_light_grey * grey_prior(light, probe.solid_angles)
             terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
-        picture = self._picture(model, posed, pose, texels, view.camera)
+        rendered = self._render(model, posed, pose, texels, view.camera)
         device = posed.means.device
         background = self._background()
         target, mask = (x.to(device) for x in view.target(background))
         background = background.to(device)
-        image_srgb, target_srgb = _over(picture, background), linear_to_srgb(target)
+        image_srgb, target_srgb = _over(rendered, background), linear_to_srgb(target)
         terms |= self._image_terms(image_srgb, target_srgb, step)
-        terms["mask"] = config.weight_mask * (picture.alpha - mask).abs().mean()
+        terms["mask"] = config.weight_mask * (rendered.alpha - mask).abs().mean()
         estimate = view.normals()
         if estimate is not None:
             normals, known = (x.to(device) for x in estimate)
-            terms["normal"] = config.weight_normal * ((picture.normals - normals).abs() * known).mean()
+            terms["normal"] = config.weight_normal * ((rendered.normals - normals).abs() * known).mean()
         due = _due(step, config.weight_consistency, config.consistency_every)
         network = _if_large(self.consistency, target)
         if due and texels is not None and network is not None:
@@ -104,29 +103,29 @@ class Objective:
         return terms
 
     def _background(self) -> Tensor:
-        """Linear [3]: black, as pictures are judged, or any colour that sRGB codes, each as likely as the others."""
-        drawn = torch.rand(4, generator=self.generator)
-        if drawn[3] < self.config.black_backgrounds:
+        """Linear background [3]: black, as in evaluation, or uniform in sRGB."""
+        sample = torch.rand(4, generator=self.generator)
+        if sample[3] < self.config.black_backgrounds:
             return torch.zeros(3)
-        return torch.from_numpy(srgb_to_linear(drawn[:3].numpy()))
+        return torch.from_numpy(srgb_to_linear(sample[:3].numpy()))
 
-    def _picture(
+    def _render(
         self, model: AvatarModel, posed: PosedGaussians, pose: PoseInput, texels: Texels | None, camera: Camera
     ) -> Splat:
-        """The posed avatar from ``camera``: plain colours, or shaded under ``texels``."""
+        """Posed avatar seen by ``camera``, shaded under ``texels`` or in plain colours."""
         if texels is None:
             return splat(posed, posed.attributes.colour, camera)
         traced = self.config.traced_texels
         return splat(posed, shade_visible(posed, pose, texels, camera, model, traced), camera)
 
     def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
-        """L1 with a structural term; LPIPS where there is a network and the picture is large enough for it."""
+        """L1 and DSSIM; LPIPS if there is a network and the image is large enough for it."""
         config = self.config
-        seen = _if_large(self.perceptual, target_srgb)
-        scales = 1 if seen is not None else config.dssim_scales
+        network = _if_large(self.perceptual, target_srgb)
+        scales = 1 if network is not None else config.dssim_scales
         terms = {"image": image_loss(image_srgb, target_srgb, config.weight_dssim, scales)}
-        if seen is not None and _due(step, config.weight_lpips, config.lpips_every):
-            distance = seen(image_srgb.clamp(max=1), target_srgb)
+        if network is not None and _due(step, config.weight_lpips, config.lpips_every):
+            distance = network(image_srgb.clamp(max=1), target_srgb)
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance
         return terms
 
@@ -148,57 +147,56 @@ class Objective:
         image_srgb: Tensor,
         background: Tensor,
     ) -> Tensor | None:
-        """L_gc between this picture and one from a virtual camera nearby; None where they share too little."""
+        """L_gc between this image and one of a nearby virtual camera; None below ``MIN_MATCHES`` shared points."""
         nodes = self.config.model.nodes
         centre = posed.means[:nodes].detach().mean(dim=0)
         virtual = virtual_camera(camera, centre, self.generator)
         shared = covisible(posed, camera, virtual, nodes)
         if len(shared) < MIN_MATCHES:
             return None
-        drawn = shared[torch.randperm(len(shared), generator=self.generator)[:POINTS].to(shared.device)]
-        second = _over(self._picture(model, posed, pose, texels, virtual), background)
-        points = posed.means[drawn].detach()
+        sampled = shared[torch.randperm(len(shared), generator=self.generator)[:POINTS].to(shared.device)]
+        second = _over(self._render(model, posed, pose, texels, virtual), background)
+        points = posed.means[sampled].detach()
         pixels = project(points, camera), project(points, virtual)
         return consistency_loss(image_srgb.clamp(max=1), second.clamp(max=1), *pixels, network)
 
     def _repulsion(self, model: AvatarModel, posed: PosedGaussians) -> Tensor:
-        """Repulsion of the points, with gradient by their residual offsets alone: through the shared network it costs
-        0.1 to 0.2 dB on held-out images."""
+        """Repulsion with gradient by the residual offsets alone; through the network it costs 0.1 to 0.2 dB."""
         residual_offset = model.residual_offset()
         points = posed.attributes.points.detach() + residual_offset - residual_offset.detach()
         return repulsion(points, self.config.least_distance * float(model.spacing))
 
     def _visibility_loss(self, model: AvatarModel, posed: PosedGaussians, pose: PoseInput) -> Tensor:
-        """Square error of the SH visibility against shadow maps at the nodes, in random directions."""
+        """Square error of the SH visibility at the nodes against shadow maps, in random directions."""
         nodes = self.config.model.nodes
         directions = torch.randn(self.config.visibility_directions, 3, generator=self.generator)
         directions = torch.nn.functional.normalize(directions, dim=-1).to(posed.means.device)
         spacing = float(model.spacing) * math.sqrt(self.config.model.gaussians / nodes)
         means, normals = posed.means[:nodes], posed.normals[:nodes]
         truth = traced_visibility(means, normals, directions, spacing)
-        above = (normals.detach() @ directions.T).clamp(min=0)  # what is below the horizon is never asked for
+        above = (normals.detach() @ directions.T).clamp(min=0)  # below the horizon visibility is unused
         predicted = posed.visibility[:nodes] @ sh_basis(directions @ pose.bones[0, :, :3].detach()).T
         return (above * (predicted - truth).square()).mean()
 
 
 def _if_large(network: Perceptual | None, image: Tensor) -> Perceptual | None:
-    """``network``, where there is one and ``image`` [h, w, 3] is large enough for it."""
+    """``network`` if ``image`` [h, w, 3] is large enough for it, else None."""
     large = network is not None and min(image.shape[:2]) >= network.smallest
     return network if large else None
 
 
 def _due(step: int, weight: float, every: int) -> bool:
-    """Whether a term that is computed every so many steps is due; it then counts that many times."""
+    """Whether a term with an interval of ``every`` steps is due; its weight is then multiplied by ``every``."""
     return weight > 0 and step % every == 0
 
 
 def noisy(pose: PoseInput, sigma: float, generator: torch.Generator) -> PoseInput:
-    """The encoders' input with noise of ``sigma`` radians; the bones, which place the picture, stay as they are."""
+    """``pose`` with noise of ``sigma`` radians on the encoders' input; the bones stay exact."""
     noise = (sigma * torch.randn(pose.window.shape[1:], generator=generator)).to(pose.window)
-    shake = (10 * sigma * torch.randn(pose.velocity.shape, generator=generator)).to(pose.velocity)
-    return dataclasses.replace(pose, window=pose.window + noise, velocity=pose.velocity + shake)
+    velocity_noise = (10 * sigma * torch.randn(pose.velocity.shape, generator=generator)).to(pose.velocity)
+    return dataclasses.replace(pose, window=pose.window + noise, velocity=pose.velocity + velocity_noise)
 
 
-def _over(picture: Splat, background: Tensor) -> Tensor:
-    """sRGB picture [H, W, 3] over a linear background [3]."""
-    return linear_to_srgb(picture.image + (1 - picture.alpha[..., None]) * background)
+def _over(splat: Splat, background: Tensor) -> Tensor:
+    """sRGB image [H, W, 3] over a linear background [3]."""
+    return linear_to_srgb(splat.image + (1 - splat.alpha[..., None]) * background)

@@ -1,8 +1,6 @@
-"""Corrections of estimated body poses, learned with the avatar: bounded, delayed, one row a picture.
+"""Bounded corrections of estimated body poses, learned with the avatar.
 
-What is corrected in training is where the bones are; windows and velocities are those of the estimate there, and in
-playback those of the motion that is played, corrected or not. Poses between the training frames are corrected as their
-neighbours are, so that the motion stays as smooth as it was.
+Training corrects the bone transforms; motion windows and velocities remain those of the estimate.
 """
 
 from __future__ import annotations
@@ -20,22 +18,22 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.posing.forearm import twist_angles
 
 ROTATION_BOUND = 0.12
-"""radians that a joint may be corrected by about each axis, 7°: estimators err by one to three"""
+"""bound of a joint's correction about each axis, rad (7°); estimators err by 1° to 3°"""
 TRANSLATION_BOUND = 0.05
-"""metres that the root may be moved along each axis"""
+"""bound of the root's correction along each axis, m"""
 FADE_SECONDS = 0.5
-"""time in which the correction of the first and of the last training frame fades out beyond them"""
+"""time over which corrections fade out before the first and after the last training frame, s"""
 
 
 class PoseRefinement(nn.Module):
     """Local rotations R_k exp(δ_k) and root translations of the training frames.
 
-    Each frame is a parameter of its own: Adam then steps only the frame that was looked at.
+    Each frame is a parameter of its own, so that Adam updates only the frame of the step.
 
     Args:
         motion: the estimated poses.
-        skeleton: whose rest joints place the bones.
-        frames: motion frames of the training pictures; a frame seen twice is corrected once.
+        skeleton: of the motion.
+        frames: motion frames of the training images, repeats allowed.
     """
 
     rotations: Tensor
@@ -59,17 +57,16 @@ class PoseRefinement(nn.Module):
         self.raw = nn.ParameterList(torch.zeros(joints + 1, 3) for _ in self.frames)
 
     def bounded(self, frame: int) -> tuple[Tensor, Tensor]:
-        """δ [J, 3] as rotation vectors, radians, and the root's shift [3] m, of a motion frame."""
+        """δ [J, 3] as rotation vectors (rad) and the root's shift [3] m, of a motion frame."""
         raw = self.raw[self.row[frame]]
-        turn = ROTATION_BOUND * torch.tanh(raw[:-1] / ROTATION_BOUND)
-        return turn, TRANSLATION_BOUND * torch.tanh(raw[-1] / TRANSLATION_BOUND)
+        rotation = ROTATION_BOUND * torch.tanh(raw[:-1] / ROTATION_BOUND)
+        return rotation, TRANSLATION_BOUND * torch.tanh(raw[-1] / TRANSLATION_BOUND)
 
     def bones(self, frame: int) -> Tensor:
         """Bone transforms [J, 3, 4] of a motion frame, corrected; differentiable in the correction."""
-        turn, shift = self.bounded(frame)
+        delta, shift = self.bounded(frame)
         row = self.row[frame]
-        local = self.rotations[row] @ torch.linalg.matrix_exp(_cross_matrices(turn))
-        local = self._shared(local)
+        local = self._share_twists(self.rotations[row] @ torch.linalg.matrix_exp(_cross_matrices(delta)))
         rotation: list[Tensor] = []
         position: list[Tensor] = []
         for k, parent in enumerate(self.parents):
@@ -80,43 +77,42 @@ class PoseRefinement(nn.Module):
                 rotation.append(rotation[parent] @ local[k])
                 lever = self.rest_joints[k] - self.rest_joints[parent]
                 position.append(position[parent] + rotation[parent] @ lever)
-        turned, moved = torch.stack(rotation), torch.stack(position)
-        return torch.cat([turned, (moved - (turned @ self.rest_joints[..., None])[..., 0])[..., None]], dim=2)
+        rotations, positions = torch.stack(rotation), torch.stack(position)
+        return torch.cat([rotations, (positions - (rotations @ self.rest_joints[..., None])[..., 0])[..., None]], dim=2)
 
-    def _shared(self, local: Tensor) -> Tensor:
-        """Local rotations [J, 3, 3] as ``.forearm.share_twists`` has them; by how much is taken as given."""
+    def _share_twists(self, local: Tensor) -> Tensor:
+        """``rnd_runtime.posing.forearm.share_twists`` of local rotations [J, 3, 3]; no gradient by the twist angle."""
         shared = list(local)
-        given = local.detach().double().cpu().numpy()
-        for elbow, wrist, axis, angle in twist_angles(self.skeleton, given):
-            turn = torch.as_tensor(axis_angle_to_matrix(angle * axis)).to(local)
-            shared[elbow], shared[wrist] = shared[elbow] @ turn.T, turn @ shared[wrist]
+        values = local.detach().double().cpu().numpy()
+        for elbow, wrist, axis, angle in twist_angles(self.skeleton, values):
+            twist = torch.as_tensor(axis_angle_to_matrix(angle * axis)).to(local)
+            shared[elbow], shared[wrist] = shared[elbow] @ twist.T, twist @ shared[wrist]
         return torch.stack(shared)
 
     def prior(self, frame: int) -> Tensor:
         """Mean square of a frame's correction in units of its bounds."""
-        turn, shift = self.bounded(frame)
-        return (turn / ROTATION_BOUND).square().mean() + (shift / TRANSLATION_BOUND).square().mean()
+        rotation, shift = self.bounded(frame)
+        return (rotation / ROTATION_BOUND).square().mean() + (shift / TRANSLATION_BOUND).square().mean()
 
     @torch.no_grad()
     def apply_to(self, motion: Motion) -> Motion:
         """``motion`` with its training frames corrected.
 
-        Frames in between get what lies between the corrections of their neighbours, linear in time; what was learned
-        at the first and at the last training frame fades out beyond them.
+        Corrections are interpolated linearly in time between training frames, and fade out beyond them.
         """
-        learned = np.stack(
+        at_frames = np.stack(
             [
-                torch.cat([turn.flatten(), shift]).double().cpu().numpy()
-                for turn, shift in map(self.bounded, self.frames)
+                torch.cat([rotation.flatten(), shift]).double().cpu().numpy()
+                for rotation, shift in map(self.bounded, self.frames)
             ]
         )
         every = np.arange(motion.frame_count)
-        between = np.stack([np.interp(every, self.frames, column) for column in learned.T], axis=1)
+        correction = np.stack([np.interp(every, self.frames, column) for column in at_frames.T], axis=1)
         beyond = np.maximum(np.maximum(self.frames[0] - every, every - self.frames[-1]), 0) / motion.fps
-        between *= np.maximum(1 - beyond / FADE_SECONDS, 0)[:, None]
-        turns = between[:, :-3].reshape(len(every), -1, 3)
-        rotations = motion.rotations @ axis_angle_to_matrix(turns)
-        return replace(motion, rotations=rotations, translations=motion.translations + between[:, -3:])
+        correction *= np.maximum(1 - beyond / FADE_SECONDS, 0)[:, None]
+        rotation_vectors = correction[:, :-3].reshape(len(every), -1, 3)
+        rotations = motion.rotations @ axis_angle_to_matrix(rotation_vectors)
+        return replace(motion, rotations=rotations, translations=motion.translations + correction[:, -3:])
 
 
 def joint_error_degrees(motion: Motion, truth: Motion, frames: Sequence[int]) -> float:

@@ -1,4 +1,4 @@
-"""The schedule of a training: stages, learning rates, and the cost of its steps."""
+"""Schedule of a training: stages, learning rates and cost."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from rnd_trainer.config import TrainConfig
 
 UNSEEN_COST = 1 / 8
-"""of a step without an image, in steps with one: 25 of 200 ms"""
+"""cost of a step without an image relative to one with an image (25 of 200 ms)"""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """Of the steps that ``config`` plans."""
+    """Schedule of ``config``."""
 
     config: TrainConfig
 
@@ -25,21 +25,18 @@ class Schedule:
 
     @property
     def total(self) -> int:
-        """Of all stages; ``config.steps`` are those with an image."""
+        """Steps of all stages; ``config.steps`` have an image."""
         unseen = self.config.unseen_fraction if self.config.model.dynamic_skinning else 0
         return self.config.steps + round(unseen * self.config.steps)
 
     def stage(self, step: int) -> int:
-        """1 geometry under plain colours, 2 the light, 3 skinning in unseen poses."""
+        """1: geometry with plain colours, 2: albedo and light, 3: skinning in unseen poses."""
         if step >= self.config.steps:
             return 3
         return 1 if step < self.first_stage else 2
 
     def decay(self, step: int) -> float:
-        """Of the rates: 1 at the start, then falling slowly, and fast in the last steps with an image.
-
-        In the third stage from 1 to a tenth, exponentially.
-        """
+        """Factor on the learning rates: exponential with a final cooling; in the third stage from 1 to 0.1."""
         config, steps = self.config, self.config.steps
         if step >= steps:
             return float(0.1 ** ((step - steps) / (self.total - steps)))
@@ -48,10 +45,10 @@ class Schedule:
         return float(config.rate_final**done * config.rate_cooled**cooled)
 
     def refines(self, step: int) -> bool:
-        """Whether body poses may move by then."""
+        """Whether ``step`` corrects body poses."""
         return step >= self.config.refine_after * self.config.steps
 
     def cost(self, steps: int) -> float:
-        """Of the first ``steps``, in steps with an image: the unit of progress and time left."""
+        """Cost of the first ``steps`` in steps with an image, the unit of progress."""
         with_image = min(steps, self.config.steps)
         return with_image + UNSEEN_COST * (steps - with_image)

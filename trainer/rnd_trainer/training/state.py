@@ -1,4 +1,4 @@
-"""A training that was saved: which one it is, and its tensors by part."""
+"""Saved state of a training: identity and tensors."""
 
 from __future__ import annotations
 
@@ -23,66 +23,71 @@ from .data import TrainingView
 STATE_SCHEMA = "rnd-training/1"
 STATE_FILE = "training.state"
 """in a run's folder"""
-_OF_THE_THIRD_STAGE = {"unseen_fraction", "weight_edges", "weight_smooth"}
+_THIRD_STAGE_FIELDS = {"unseen_fraction", "weight_edges", "weight_smooth"}
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """What ``training.training.Training.save`` wrote: ``tensors`` by dotted name, the first word their part."""
+    """State written by ``Training.save``; the first word of a tensor's dotted name is its part."""
 
     path: Path
     tensors: dict[str, Tensor]
     header: dict[str, Any]
 
     def part(self, name: str) -> dict[str, Tensor]:
-        """Tensors of one part, by the rest of their names."""
+        """Tensors of one part by the rest of their names."""
         prefix = f"{name}."
         return {k.removeprefix(prefix): v for k, v in self.tensors.items() if k.startswith(prefix)}
 
     def refuse_other(
         self, config: TrainConfig, networks: dict[str, str | None], *, what: str = "--resume", hint: str | None = None
     ) -> None:
-        """Raise ``InputError`` where another configuration, or other perceptual weights, began this training.
+        """Refuse to resume with another configuration or other perceptual weights.
 
-        What concerns the third stage alone may differ before that has begun. ``networks`` as of
-        ``losses.perceptual.networks_by_role``; ``what`` and ``hint`` as of the error.
+        Fields of the third stage may differ before it begins.
+
+        Args:
+            networks: as of ``losses.perceptual.networks_by_role``.
+            what, hint: of the error.
+
+        Raises:
+            InputError: they differ.
         """
         try:
             before = to_dict(from_dict(self.header["config"]))
         except (KeyError, TypeError, InputError) as error:
             got = str(error)
             raise InputError("not a training state of this version", got=got, file=self.path) from error
-        free = {"save_every", "preview_every"} | (set() if self.part("teacher") else _OF_THE_THIRD_STAGE)
+        free = {"save_every", "preview_every"} | (set() if self.part("teacher") else _THIRD_STAGE_FIELDS)
         now = _flat(to_dict(config))
         wrong = sorted(name for name, value in _flat(before).items() if now[name] != value and name not in free)
         if wrong:
             expected = "the configuration it was started with"
             raise InputError(what, expected=expected, got=f"other {wrong}", file=self.path, hint=hint)
-        begun, given = _in_words(self.header["networks"]), _in_words(networks)
+        begun, given = _describe(self.header["networks"]), _describe(networks)
         if begun != given:
             expected = f"the perceptual weights {begun}"
             raise InputError(what, expected=expected, got=given, file=self.path, hint=hint)
 
 
 def _flat(config: dict[str, Any]) -> dict[str, Any]:
-    """The model's fields among the others: no two have one name."""
+    """All fields in one level; names are unique."""
     return {**{name: value for name, value in config.items() if name != "model"}, **config["model"]}
 
 
-def _in_words(networks: dict[str, str | None]) -> str:
+def _describe(networks: dict[str, str | None]) -> str:
     return ", ".join(f"{digest} for {role}" for role, digest in sorted(networks.items()) if digest) or "none"
 
 
 def read_state(path: Path) -> TrainingState:
-    """The state in ``path``. Raises ``InputError`` where it is none."""
+    """Read the state in ``path``; raises ``InputError`` if it is not one."""
     return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
 
 
 def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, light: tuple[str, Light] | None) -> str:
-    """Of all that a capture teaches: pictures, cameras, which pose is whose, poses, body, and a ``light`` if given.
+    """Digest of the training data: images, cameras, frames, poses, body, and ``light`` if given.
 
-    The same on every CPU: what was computed is rounded, since a sine may differ in its last bit, and of pictures that
-    were shrunk to ``scale`` it is their files.
+    Equal on every CPU: computed values are rounded, and of images with ``scale`` ≠ 1 the files are hashed.
     """
     digest = hashlib.sha256()
 
@@ -112,5 +117,5 @@ def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, li
 
 
 def _rounded(values: ArrayLike) -> NDArray[np.float32]:
-    """To a millionth, in float32, without −0: what a last bit of a sum near zero makes is gone."""
+    """``values`` rounded to 1e-6 in float32, without −0."""
     return np.asarray(np.round(np.asarray(values, np.float64), 6) + 0.0, np.float32)

@@ -1,4 +1,4 @@
-"""The training: two stages of one image a step, and a short third without images. Read it top to bottom."""
+"""Training: geometry, then albedo and light, one image per step; then unseen poses without images."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from .state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
 from .unseen import UnseenPoses
 
 REFINED_MOTION = "refined_motion.npz"
-"""beside the checkpoint: the capture's motion with corrected training frames"""
+"""in a run's folder: the capture's motion with corrected training frames"""
 MAX_BAD_STEPS = 10
-"""non-finite steps in a row after which training stops"""
+"""consecutive non-finite steps after which training stops"""
 PERTURBED_SHARE = 0.5
-"""of the third stage's distillation steps in a perturbed training pose; the rest are in the training pose itself"""
+"""share of the distillation steps in a perturbed training pose; the rest use the training pose"""
 
 
 @dataclass
@@ -59,17 +59,17 @@ class StepResult:
 
 
 class Training:
-    """The state of a training, its step, and how it is saved and resumed.
+    """The state of a training, with its step, saving and resuming.
 
     Args:
         capture: images, poses and body to learn from.
         config: schedule and weights.
         perceptual: network of the LPIPS loss; None leaves it out.
-        consistency: network whose features the consistency loss compares, by default ``perceptual``.
-        device: where the tensors are; random numbers come from the CPU on every device.
+        consistency: network of the consistency loss, by default ``perceptual``.
+        device: of the tensors; random numbers come from the CPU on every device.
 
     Attributes:
-        on_light_search: called with done and total while the light is searched.
+        on_light_search: called with done and total during the light search.
     """
 
     def __init__(
@@ -89,138 +89,137 @@ class Training:
         self.device = torch.device(device)
         self.perceptual = None if perceptual is None else perceptual.to(device=self.device)
         self.consistency = self.perceptual if consistency is None else consistency.to(device=self.device)
-        true_normals = config.normals == "true"
-        self.views, self.bad_masks = load_views(capture, "train", config.image_scale, true_normals)
+
+        # data
+        self.views, self.bad_masks = load_views(capture, "train", config.image_scale, config.normals == "true")
+        self.poses = [self.pose(view) for view in self.views]
+
+        # model, light, pose corrections
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
         self.model = AvatarModel(config.model, template).to(self.device)
         self.probe = LightProbe(config.probe_channels).to(self.device)
-        fixed_light = self._capture_light() if config.light == "capture" else None
-        networks = (self.perceptual, self.consistency)
-        self.objective = Objective(config, self.probe, fixed_light, *networks, self.generator)
-        self.poses = [self.pose(view) for view in self.views]
-        self.refinement = self._refinement() if config.refine_poses else None
-        self.unseen: UnseenPoses | None = None  # from the third stage on
-        self.optimizer = self._optimizer()
+        fixed_light = None
+        if config.light == "capture":
+            light = training_light(capture)[1].resized(*PROBE_SHAPE)  # before rotating, which keeps a sun in one texel
+            fixed_light = as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
+        self.refinement: PoseRefinement | None = None
+        if config.refine_poses:
+            frames = [view.frame.frame for view in self.views]
+            self.refinement = PoseRefinement(capture.motion, capture.body.skeleton, frames).to(self.device)
+
+        # objectives: of an image, and from the third stage on of unseen poses
+        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.consistency, self.generator)
+        self.unseen: UnseenPoses | None = None
+
+        # optimizer
+        residuals = [self.model.geometry_residual, self.model.appearance_residual]
+        networks = [p for p in self.model.parameters() if all(p is not r for r in residuals)]
+        rates = [
+            (networks, config.rate_networks),
+            (residuals, config.rate_residuals),
+            ([self.probe.raw], config.rate_light),
+        ]
+        if self.refinement is not None:
+            rates.append((list(self.refinement.raw), config.rate_poses))
+        groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in rates]
+        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+
+        # progress
         self.step_index = 0
         self.bad_steps = 0
         self.lit = False  # whether the second stage has begun
-        self.light_found: bool | None = None  # in the search that it begins with, once that is done
+        self.light_found: bool | None = None  # result of the light search, once done
         self.seconds = 0.0
         self.on_light_search: Callable[[int, int], None] = lambda done, total: None
 
     # -- one step ------------------------------------------------------------------------------------------
 
     def warm_up(self) -> None:
-        """Take the most expensive kind of step without effect: compile its kernels, ask for its memory."""
+        """Compile kernels and allocate memory by the most expensive kind of step, without effect."""
         started = time.perf_counter()
-        draws = self.generator.get_state()
+        random_state = self.generator.get_state()
         config = self.config
         period = math.lcm(config.lpips_every, config.consistency_every, config.repulsion_every)
-        costliest = (config.steps - 1) // period * period  # all its terms are due
+        step = (config.steps - 1) // period * period  # all its terms are due
         stage = 1 if config.light == "none" else 2
-        terms = self.objective(self.model, self.views[0], self.poses[0], costliest, stage)
+        terms = self.objective(self.model, self.views[0], self.poses[0], step, stage)
         torch.stack(list(terms.values())).sum().backward()
         self.optimizer.zero_grad(set_to_none=True)
-        self.generator.set_state(draws)
+        self.generator.set_state(random_state)
         if self._searches_light:
             light_search.warm_up()
         gc.collect()
         self.seconds += time.perf_counter() - started
 
     def step(self) -> StepResult:
-        """Optimise on the next image. Raises ``InputError`` after ten non-finite steps in a row."""
+        """Optimise on the next view. Raises ``InputError`` after ``MAX_BAD_STEPS`` non-finite steps in a row."""
         started = time.perf_counter()
-        self._light_up()
+        self._start_second_stage()
         stage = self.stage
-        self._set_rates()
-        view_index = self._next_view()
-        view, pose = self.views[view_index], self.poses[view_index]
-        pose = noisy(pose, self.config.pose_noise, self.generator)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
+
+        # next view, each once per epoch
+        epoch, position = divmod(self.step_index, len(self.views))
+        index = int(np.random.default_rng((self.config.seed, epoch)).permutation(len(self.views))[position])
+        view, pose = self.views[index], noisy(self.poses[index], self.config.pose_noise, self.generator)
+
+        # loss
         terms = self._image_terms(view, pose, stage) if stage < 3 else self._unseen_terms(view, pose)
         values = torch.stack(list(terms.values()))
         total = values.sum()
+
+        # gradient and update
         self.optimizer.zero_grad(set_to_none=True)
         finite = bool(torch.isfinite(total))
         if finite:
             total.backward()
-            grads = [p.grad for p in self._parameters() if p.grad is not None]
-            finite = bool(torch.isfinite(get_total_norm(grads)))  # asked once: a GPU must be waited for
+            parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+            norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
+            finite = bool(torch.isfinite(norm))  # one test of all gradients: each synchronises a GPU
         if finite:
             self.optimizer.step()
+
         self.bad_steps = 0 if finite else self.bad_steps + 1
         if self.bad_steps >= MAX_BAD_STEPS:
             raise InputError(f"training: {MAX_BAD_STEPS} steps in a row were not finite", frame=view.frame.frame)
         done = StepResult(self.step_index, stage, dict(zip(terms, values.tolist())), not finite)
         self.step_index += 1
-        self._light_up()  # now, so that what is saved and shown after the first stage is lit
+        self._start_second_stage()  # before a state or preview at the end of the first stage
         self.seconds += time.perf_counter() - started
         return done
 
-    def _light_up(self) -> None:
-        """Begin the second stage, once: albedo from the first stage's colours, and a light."""
-        if self.stage == 2 and not self.lit:
-            self._start_albedo_from_colour()
-            self._start_light()
-            self.lit = True
-
     def _image_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
+        """Loss terms of the first and second stage."""
+        frame = view.frame.frame
         refinement = self.refinement if self.schedule.refines(self.step_index) else None
         if refinement is not None:
-            pose = dataclasses.replace(pose, bones=refinement.bones(view.frame.frame))
+            pose = dataclasses.replace(pose, bones=refinement.bones(frame))
         terms = self.objective(self.model, view, pose, self.step_index, stage)
         if refinement is not None:
-            terms["poses"] = self.config.weight_poses * refinement.prior(view.frame.frame)
+            terms["poses"] = self.config.weight_poses * refinement.prior(frame)
         return terms
 
     def _unseen_terms(self, view: TrainingView, pose: PoseInput) -> dict[str, Tensor]:
+        """Loss terms of the third stage."""
         if self.unseen is None:
-            self.unseen = self._unseen()
+            self.unseen = UnseenPoses(self.model, self.capture.body.skeleton, self.config)
         if self.refinement is not None:
             pose = dataclasses.replace(pose, bones=self.refinement.bones(view.frame.frame).detach())
         rng = np.random.default_rng((self.config.seed, self.step_index, 1))
         if rng.random() < PERTURBED_SHARE:
-            pose = self._perturbed(view, rng)
+            motion, skeleton = self.capture.motion, self.capture.body.skeleton
+            time_s = view.frame.frame / motion.fps
+            pose = perturbed_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
         return self.unseen(self.model, pose, self.step_index)
 
-    # -- schedule ------------------------------------------------------------------------------------------
+    # -- the second stage ----------------------------------------------------------------------------------
 
-    @property
-    def stage(self) -> int:
-        """Of the next step; see ``Schedule``."""
-        return self.schedule.stage(self.step_index)
-
-    def light(self) -> Tensor:
-        """The light [32, 64, 3] of the training images: learned, or the capture's own."""
-        return self.objective.light()
-
-    def motion(self) -> Motion:
-        """The capture's motion; with ``refine_poses`` its training frames are corrected."""
-        return self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
-
-    def _set_rates(self) -> None:
-        for group in self.optimizer.param_groups:
-            group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
-
-    def _next_view(self) -> int:
-        """Index of the next view: each once an epoch, in an order given by seed and epoch."""
-        epoch, position = divmod(self.step_index, len(self.views))
-        order = np.random.default_rng((self.config.seed, epoch)).permutation(len(self.views))
-        return int(order[position])
-
-    def _start_albedo_from_colour(self) -> None:
-        """Copy the first stage's colour to the albedo, network and residual."""
-        columns = list(APPEARANCE_COLUMNS)
-        sizes = list(APPEARANCE_COLUMNS.values())
-        start = [sum(sizes[:k]) for k in range(len(sizes))]
-        colour, albedo = (slice(start[k], start[k] + 3) for k in map(columns.index, ("colour", "albedo")))
-        last = self.model.appearance.out
-        with torch.no_grad():
-            last.weight[albedo] = last.weight[colour]
-            last.bias[albedo] = last.bias[colour] + 1.0  # undoes the −1 of the albedo's activation
-            self.model.appearance_residual[:, albedo] = self.model.appearance_residual[:, colour]
-
-    def _start_light(self) -> None:
-        """Search the images for a sky and directional lights."""
+    def _start_second_stage(self) -> None:
+        """Initialise albedo and light at the first step of the second stage."""
+        if self.stage != 2 or self.lit:
+            return
+        self._copy_colour_to_albedo()
         if self._searches_light:
             motion = self.motion()
             poses = [self.pose(view, motion) for view in self.views]
@@ -228,63 +227,61 @@ class Training:
             self.light_found = found is not None
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
+        self.lit = True
+
+    def _copy_colour_to_albedo(self) -> None:
+        """Start the albedo, network and residual, from the first stage's colour."""
+        columns = list(APPEARANCE_COLUMNS)
+        sizes = list(APPEARANCE_COLUMNS.values())
+        start = [sum(sizes[:k]) for k in range(len(sizes))]
+        colour, albedo = (slice(start[k], start[k] + 3) for k in map(columns.index, ("colour", "albedo")))
+        last = self.model.appearance.out
+        with torch.no_grad():
+            last.weight[albedo] = last.weight[colour]
+            last.bias[albedo] = last.bias[colour] + 1.0  # cancels the −1 in the albedo's activation
+            self.model.appearance_residual[:, albedo] = self.model.appearance_residual[:, colour]
 
     @property
     def _searches_light(self) -> bool:
         return self.config.light == "learn" and self.config.light_search
 
-    def _parameters(self) -> list[Tensor]:
-        return [p for group in self.optimizer.param_groups for p in group["params"]]
+    # -- current values ------------------------------------------------------------------------------------
 
-    def _optimizer(self) -> torch.optim.Adam:
-        residuals = [self.model.geometry_residual, self.model.appearance_residual]
-        networks = [p for p in self.model.parameters() if all(p is not r for r in residuals)]
-        config = self.config
-        parts = [
-            (networks, config.rate_networks),
-            (residuals, config.rate_residuals),
-            ([self.probe.raw], config.rate_light),
-        ]
-        if self.refinement is not None:
-            parts.append((list(self.refinement.raw), config.rate_poses))
-        groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in parts]
-        return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+    @property
+    def stage(self) -> int:
+        """Stage of the next step; see ``Schedule``."""
+        return self.schedule.stage(self.step_index)
+
+    def light(self) -> Tensor:
+        """Light [32, 64, 3] of the training images: learned, or the capture's own."""
+        return self.objective.light()
+
+    def motion(self) -> Motion:
+        """The capture's motion; with ``refine_poses`` its training frames are corrected."""
+        return self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
 
     def pose(self, view: TrainingView, motion: Motion | None = None) -> PoseInput:
-        """The networks' input for ``view``, in the capture's motion or another."""
+        """Network input for ``view``, in ``motion`` or by default the capture's."""
         motion = self.capture.motion if motion is None else motion
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
 
-    def _perturbed(self, view: TrainingView, rng: np.random.Generator) -> PoseInput:
-        motion, skeleton = self.capture.motion, self.capture.body.skeleton
-        time_s = view.frame.frame / motion.fps
-        return perturbed_pose(motion, skeleton, time_s, self.config.model, rng).to(self.device)
-
-    def _refinement(self) -> PoseRefinement:
-        frames = [view.frame.frame for view in self.views]
-        return PoseRefinement(self.capture.motion, self.capture.body.skeleton, frames).to(self.device)
-
-    def _unseen(self) -> UnseenPoses:
-        return UnseenPoses(self.model, self.capture.body.skeleton, self.config)
-
-    def _capture_light(self) -> Tensor:
-        light = training_light(self.capture)[1].resized(*PROBE_SHAPE)  # before rotating, which keeps a sun in one texel
-        return as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
-
     # -- saving and resuming -------------------------------------------------------------------------------
 
     def save(self, folder: Path) -> None:
-        """Write the resumable state, the checkpoint, and the refined motion if there is one."""
-        tensors = {f"model.{k}": v.cpu().contiguous() for k, v in self.model.state_dict().items()}
-        tensors |= {f"probe.{k}": v.cpu().contiguous() for k, v in self.probe.state_dict().items()}
+        """Write the state, the checkpoint, and the refined motion if there is one."""
+        parts: dict[str, dict[str, Any]] = {"model": self.model.state_dict(), "probe": self.probe.state_dict()}
         if self.refinement is not None:
-            tensors |= {f"poses.{k}": v.cpu().contiguous() for k, v in self.refinement.state_dict().items()}
+            parts["poses"] = self.refinement.state_dict()
         if self.unseen is not None:
-            teacher = self.unseen.teacher.state_dict()
-            tensors |= {f"teacher.{k}": v.cpu().contiguous() for k, v in teacher.items()}
+            parts["teacher"] = self.unseen.teacher.state_dict()
         for index, values in self.optimizer.state_dict()["state"].items():
-            tensors |= {f"adam.{index}.{k}": torch.as_tensor(v).cpu().contiguous() for k, v in values.items()}
+            parts[f"adam.{index}"] = values
+        tensors = {
+            f"{part}.{name}": torch.as_tensor(value).cpu().contiguous()
+            for part, values in parts.items()
+            for name, value in values.items()
+        }
         tensors["generator"] = self.generator.get_state()
         header = {
             "schema": STATE_SCHEMA,
@@ -299,9 +296,8 @@ class Training:
             "learned_from_sha256": self._learned_from_sha256,
         }
         write_tensors(folder / STATE_FILE, tensors, header)
-        save_checkpoint(
-            folder / "avatar.ckpt", self.model, self.light(), self.capture.body.skeleton, self.config, self.info()
-        )
+        skeleton = self.capture.body.skeleton
+        save_checkpoint(folder / "avatar.ckpt", self.model, self.light(), skeleton, self.config, self.info())
         if self.refinement is not None:
             save_motion(folder / REFINED_MOTION, self.motion())
 
@@ -309,8 +305,8 @@ class Training:
         """Continue from a saved state on the same curve.
 
         Raises:
-            InputError: another configuration, capture or network, or no state. Settings of the third stage may
-                differ before it has begun.
+            InputError: another configuration, capture or network, or not a state. Settings of the third stage may
+                differ before it begins.
         """
         saved = read_state(path)
         saved.refuse_other(self.config, networks_by_role(self.perceptual, self.consistency))
@@ -323,7 +319,7 @@ class Training:
             if self.refinement is not None:
                 self.refinement.load_state_dict(saved.part("poses"))
             if teacher:
-                self.unseen = self._unseen()
+                self.unseen = UnseenPoses(self.model, self.capture.body.skeleton, self.config)
                 self.unseen.teacher.load_state_dict(teacher)
             moments: dict[int, dict[str, Tensor]] = {}
             for name, value in saved.part("adam").items():
@@ -342,17 +338,14 @@ class Training:
         light = training_light(self.capture) if self.config.light == "capture" else None
         return learned_sha256(self.views, self.capture, self.config.image_scale, light)
 
-    def _lights(self) -> list[str]:
-        """Names of the lights in the training images."""
-        return sorted({view.frame.light for view in self.views if view.frame.light})
-
     def info(self) -> dict[str, Any]:
         """Provenance for the checkpoint."""
+        lights = sorted({view.frame.light for view in self.views if view.frame.light})
         return {
             "capture": self.capture.folder.resolve().name,
             "capture_sha256": sha256_of(self.capture.file),
             "motion": Path(self.capture.motion.source).name,
-            "lights": {name: self.capture.light_sha256(name) for name in self._lights()},
+            "lights": {name: self.capture.light_sha256(name) for name in lights},
             "body_license": self.capture.body.license,
             "step": self.step_index,
             "steps_planned": self.schedule.total,

@@ -1,7 +1,6 @@
-"""The third stage, without images: the skinning network learns unseen poses.
+"""Third stage, without images: skinning in unseen poses.
 
-In a training pose, or a perturbed one, points stay where the network after the second stage puts them
-(self-distillation). In a random pose edges keep their lengths, and weights change smoothly with the pose.
+Self-distillation in training poses and perturbed ones; edge lengths and smooth skinning weights in random poses.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ from .sampled_poses import jittered_pose, sampled_pose
 MM2 = 1e6
 """mm² of a square metre"""
 NODE_STRIDE = 3
-"""every third node is looked at in a filmed pose, by turns: all of them would take half of a step"""
+"""distillation evaluates every third node, in rotation; all of them would take half of a step"""
 
 
 class UnseenPoses:
     """The terms of the third stage.
 
     Args:
-        model: as the pictures have left it. Its skinning network is copied, and the rest taken as fixed.
-        skeleton: whose joints are turned in sampled poses.
-        config: weights, and the seed that with the step gives what is sampled.
+        model: after the second stage; all but its skinning network is taken as fixed.
+        skeleton: of the sampled poses.
+        config: weights, and the seed of the sampled poses.
 
     Attributes:
         teacher: the skinning network after the second stage.
@@ -51,22 +50,22 @@ class UnseenPoses:
         self._nodes = encoded, model.log_weights[:nodes], self._points[:nodes]
 
     def __call__(self, model: AvatarModel, pose: PoseInput, step: int) -> dict[str, Tensor]:
-        """Weighted terms by name: distillation in ``pose``; stretch and smoothness in the random pose of ``step``."""
+        """Weighted terms by name: distillation in ``pose``, edges and smoothness in the random pose of ``step``."""
         rng = np.random.default_rng((self._config.seed, step))
         sampled = sampled_pose(self._skeleton, self._config.model, rng).to(self._points.device)
-        weights, near = (self._edges.weights(model, p) for p in (sampled, jittered_pose(sampled, rng)))
+        weights, jittered = (self._edges.weights(model, p) for p in (sampled, jittered_pose(sampled, rng)))
         stretch = self._edges.stretch(weights, self._points, sampled)
         return {
-            "distillation": MM2 * self._moved(model, pose, step % NODE_STRIDE).square().sum(-1).mean(),
+            "distillation": MM2 * self._distillation_offsets(model, pose, step % NODE_STRIDE).square().sum(-1).mean(),
             "edges": self._config.weight_edges * stretch_penalty(stretch),
-            "smoothness": self._config.weight_smooth * (weights - near).square().sum(-1).mean(),
+            "smoothness": self._config.weight_smooth * (weights - jittered).square().sum(-1).mean(),
         }
 
-    def _moved(self, model: AvatarModel, pose: PoseInput, first: int) -> Tensor:
-        """How far every third node from ``first`` on is [M / 3, 3] m from where the teacher puts it."""
+    def _distillation_offsets(self, model: AvatarModel, pose: PoseInput, first: int) -> Tensor:
+        """Offsets [M / 3, 3] m of every third node, from ``first`` on, from its position by the teacher."""
         encoded, log_template, points = (values[first::NODE_STRIDE] for values in self._nodes)
-        placed = []
+        positions = []
         for network in (model.skinning, self.teacher):
             weights = torch.softmax(log_template + network(encoded, pose.window, pose.velocity), dim=-1)
-            placed.append(transform_points(blend_transforms(weights, pose.bones), points))
-        return placed[0] - placed[1]
+            positions.append(transform_points(blend_transforms(weights, pose.bones), points))
+        return positions[0] - positions[1]
