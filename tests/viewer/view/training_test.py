@@ -70,20 +70,22 @@ def test_a_folder_without_a_training_is_refused(tmp_path):
         Training(ViewOptions(tmp_path))
 
 
+def _read(url: str, path: str) -> bytes:
+    with urllib.request.urlopen(url.replace("/?", f"/{path}?"), timeout=10) as answer:
+        return answer.read()
+
+
 def test_the_page_and_previews_are_served_and_nothing_else(run):
-    with serve(Training(ViewOptions(run)), "127.0.0.1", 0, None) as (server, url):
+    with serve(Training(ViewOptions(run)), "127.0.0.1", 0, "s3cret") as (server, url):
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
-            assert b"training.js" in urllib.request.urlopen(url, timeout=10).read()
-            assert json.load(urllib.request.urlopen(url + "training.json", timeout=10))["previews"] == [
-                "step_000005.png"
-            ]
-            preview = urllib.request.urlopen(url + "previews/step_000005.png", timeout=10).read()
-            assert preview == (run / "previews/step_000005.png").read_bytes()
+            assert b"training.js" in _read(url, "")
+            assert json.loads(_read(url, "training.json"))["previews"] == ["step_000005.png"]
+            assert _read(url, "previews/step_000005.png") == (run / "previews/step_000005.png").read_bytes()
             for path in ("previews/../config.json", "previews/config.json", "config.json", "previews/step_1.png"):
                 with pytest.raises(urllib.error.HTTPError, match="404"):
-                    urllib.request.urlopen(url + path, timeout=10)
+                    _read(url, path)
         finally:
             server.shutdown()
             thread.join()
@@ -93,7 +95,7 @@ def test_the_page_and_previews_are_served_and_nothing_else(run):
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_it_grows_in_a_browser_and_the_avatar_opens_once_it_is_there(run, tmp_path):
     training = Training(ViewOptions(run, size=(64, None), raster="cpu"))
-    with serve(training, "127.0.0.1", 0, None) as (server, url), chromium(tmp_path / "profile") as page:
+    with serve(training, "127.0.0.1", 0, "s3cret") as (server, url), chromium(tmp_path / "profile") as page:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

@@ -56,8 +56,8 @@ def scene(motion):
 
 
 @contextmanager
-def _serving(scene: Scene, token: str | None = None) -> Iterator[str]:
-    with serve(scene, "127.0.0.1", 0, token) as (server, url):
+def _serving(scene: Scene) -> Iterator[str]:
+    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url):
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield url
@@ -258,7 +258,7 @@ def test_screenshot_and_clip_are_downloads(page, tmp_path):
 def test_with_a_token_and_in_jpeg(page, scene):
     exact = _frame(page, f"width: {SIZE}, height: {SIZE}, time: 0.5").astype(int)
     back = page.run("location.href")
-    with _serving(scene, token="s3cret") as url:
+    with _serving(scene) as url:
         page.open(f"{url}&encoding=jpeg")
         page.wait("location.search.includes('s3cret') && window.rnd && rnd.scene()")
         page.run("Object.assign(rnd.state, {time: 0.5}); rnd.frame(false).then(() => 1)")

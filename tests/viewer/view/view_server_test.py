@@ -18,6 +18,7 @@ from io import BytesIO
 from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any
+from urllib.parse import urlsplit
 
 import av
 import numba
@@ -39,14 +40,16 @@ from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.shading.light import load_light
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.options import MotionOptions
+from rnd_viewer.view.access import Access, is_loopback
 from rnd_viewer.view.cli import main
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
-from rnd_viewer.view.server import Access, serve
+from rnd_viewer.view.server import serve
 from support.play_fakes import FakeAvatar, fake_motion
 from support.tiny import ASSETS
 from support.view_process import running
 
+TOKEN = "s3cret"
 SIZE = 64
 FRAMES = 6
 STALLING = 1536  # pixels square: two such pictures are more than the system's buffers hold
@@ -84,21 +87,21 @@ def options(tmp_path, monkeypatch) -> ViewOptions:
 
 
 @contextmanager
-def _running(shown: Scene, token: str | None = None, fps_floor: float | None = None) -> Iterator[int]:
-    with serve(shown, "127.0.0.1", 0, token, fps_floor) as (server, url):
+def _running(shown: Scene, fps_floor: float | None = None) -> Iterator[int]:
+    with serve(shown, "127.0.0.1", 0, TOKEN, fps_floor) as (server, _):
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
-            yield int(url.split(":")[2].split("/")[0])
+            yield server.port
         finally:
             server.shutdown()
             thread.join()
 
 
 @contextmanager
-def _serving(options: ViewOptions, token: str | None = None) -> Iterator[tuple[int, Scene]]:
+def _serving(options: ViewOptions) -> Iterator[tuple[int, Scene]]:
     scene = Scene(options)
-    with _running(scene, token) as port:
+    with _running(scene) as port:
         yield port, scene
     scene.close()
 
@@ -130,8 +133,8 @@ class Visitor:
 
 
 @contextmanager
-def _visiting(port: int, **headers: Any) -> Iterator[Visitor]:
-    url = f"ws://127.0.0.1:{port}/socket"
+def _visiting(port: int, token: str = TOKEN, **headers: Any) -> Iterator[Visitor]:
+    url = f"ws://127.0.0.1:{port}/socket?token={token}"
     with connect(url, max_size=None, compression=None, **headers) as socket:
         yield Visitor(socket)
 
@@ -256,9 +259,9 @@ def _knock(port: int, **headers: Any) -> None:
         pass
 
 
-def _get(port: int, path: str, **headers: str) -> tuple[int, bytes, dict[str, str]]:
+def _get(port: int, path: str, token: str = TOKEN, **headers: str) -> tuple[int, bytes, dict[str, str]]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+    connection.request("GET", path, headers={"Cookie": f"rnd_view_token_{port}={token}"} | headers)
     response = connection.getresponse()
     result = response.status, response.read(), dict(response.getheaders())
     connection.close()
@@ -288,19 +291,19 @@ def test_on_loopback_other_names_and_other_sites_are_refused(options):
 
 
 def test_what_is_no_request_is_answered_as_such(options):
-    for token in (None, "s3cret"):
-        with _serving(options, token=token) as (port, _):
-            assert _get(port, "//[")[0] == 400
-            assert _get(port, "/", Origin="http://[")[0] == 400
-            with socket.create_connection(("127.0.0.1", port), timeout=10) as knocking:
-                knocking.sendall(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n")
-                assert knocking.recv(1000).startswith(b"HTTP/1.1 400 ")
+    with _serving(options) as (port, _):
+        assert _get(port, "//[")[0] == 400
+        assert _get(port, "/", Origin="http://[")[0] == 400
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as knocking:
+            knocking.sendall(b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n")
+            assert knocking.recv(1000).startswith(b"HTTP/1.1 400 ")
 
 
 def test_on_the_port_of_http_browsers_name_no_port():
+    access = Access.of("127.0.0.1", 80, TOKEN)
     for host in ("127.0.0.1", "localhost", "127.0.0.1:80"):
-        assert Access.local("127.0.0.1", 80).refusal("/", {"Host": host}) is None
-    assert Access.local("127.0.0.1", 80).refusal("/", {"Host": "evil.example"}) is not None
+        assert access.refusal(f"/?token={TOKEN}", {"Host": host}) is None
+    assert access.refusal(f"/?token={TOKEN}", {"Host": "evil.example"}) is not None
 
 
 def test_what_fails_before_anything_is_served_ends_it(options):
@@ -308,7 +311,7 @@ def test_what_fails_before_anything_is_served_ends_it(options):
     ended = []
 
     def failing() -> None:
-        with pytest.raises(BrokenPipeError), serve(Scene(options), "127.0.0.1", 0, None):
+        with pytest.raises(BrokenPipeError), serve(Scene(options), "127.0.0.1", 0, TOKEN):
             raise BrokenPipeError
         ended.append(True)
 
@@ -321,9 +324,9 @@ def test_what_fails_before_anything_is_served_ends_it(options):
 def test_ctrl_c_ends_it_though_a_page_reads_no_more_and_another_never_asked():
     with ExitStack() as pages:
         with running(str(ASSETS / "avatar.onnx"), "--size", "64") as address:
-            port = int(address.split(":")[2].strip("/"))
-            pages.enter_context(socket.create_connection(("127.0.0.1", port)))
-            url = f"ws://127.0.0.1:{port}/socket"
+            place = urlsplit(address)
+            pages.enter_context(socket.create_connection((place.hostname, place.port)))
+            url = place._replace(scheme="ws", path="/socket").geturl()
             frozen = pages.enter_context(connect(url, max_size=None, max_queue=1, close_timeout=1))
             state = Visitor(frozen).state(light=0, width=STALLING, height=STALLING, output="albedo")
             for number in range(4):
@@ -335,7 +338,7 @@ def test_ctrl_c_ends_it_though_a_page_reads_no_more_and_another_never_asked():
 
 @pytest.mark.skipif(not has_ipv6_loopback(), reason="this machine has no ::1")
 def test_an_ipv6_address_serves(options):
-    with serve(Scene(options), "::1", 0, None) as (server, url):
+    with serve(Scene(options), "::1", 0, TOKEN) as (server, url):
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:
@@ -361,29 +364,37 @@ def test_threads_hold_for_every_visitor(options, monkeypatch):
 
 
 def test_a_token_is_asked_for_everywhere(options):
-    with _serving(options, token="s3cret") as (port, _):
+    with _serving(options) as (port, _):
         for path in ("/", "/app.js", "/?token=wrong", "/?token=", "/socket"):
-            assert _get(port, path)[0] == 401, path
+            assert _get(port, path, token="")[0] == 401, path
         with pytest.raises(InvalidStatus, match="401"):
-            _knock(port)
-        status, _, headers = _get(port, "/?token=s3cret")
+            _knock(port, token="wrong")
+        status, _, headers = _get(port, f"/?token={TOKEN}", token="")
         cookie = headers["Set-Cookie"]
         assert status == 200 and "HttpOnly" in cookie and "SameSite=Strict" in cookie
         given = {"Cookie": f'a b=1; json={{"x": [1]}}; {cookie.split(";")[0]}; other=2'}  # beside other programs'
         assert _get(port, "/app.js", **given)[0] == 200
-        with _visiting(port, additional_headers=given) as visitor:
+        with _visiting(port, token="", additional_headers=given) as visitor:
             assert visitor.frame().any()
         with pytest.raises(InvalidStatus, match="403"):
             _knock(port, additional_headers=given, origin="http://evil.example")
 
 
-def test_any_other_address_asks_for_the_token_that_is_printed():
-    with running(str(ASSETS / "avatar.onnx"), "--host", "0.0.0.0", "--size", "64") as address:
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_the_address_that_is_printed_holds_the_token(host):
+    with running(str(ASSETS / "avatar.onnx"), "--host", host, "--size", "64") as address:
         name, port, token = re.fullmatch(r"http://(.+):(\d+)/\?token=(.+)", address).groups()
         assert name != "0.0.0.0" and len(token) > 20  # which no other machine can open
         for path in ("/", "/app.js", "/socket", f"/?token={token[:-1]}"):
             assert _get(int(port), path)[0] == 401, path
         assert _get(int(port), f"/?token={token}")[0] == 200
+
+
+def test_two_viewers_of_one_machine_do_not_share_their_cookie():
+    first, second = (Access.of("127.0.0.1", port, TOKEN) for port in (8008, 8009))
+    assert first.set_cookie().split("=")[0] != second.set_cookie().split("=")[0]
+    given = {"Host": "127.0.0.1:8009", "Cookie": first.set_cookie().split(";")[0]}
+    assert second.refusal("/", given) is not None
 
 
 def test_without_motion_or_light_the_avatar_stands_in_its_own(options):
@@ -447,8 +458,7 @@ def test_options_that_do_nothing_or_make_no_sense_are_refused(changes, line):
 
 
 def test_refusals_of_the_command(options, capsys, tmp_path, monkeypatch):
-    assert ViewOptions(Path("a")).local and ViewOptions(Path("a"), host="::1").local
-    assert not ViewOptions(Path("a"), host="0.0.0.0").local
+    assert is_loopback(ViewOptions(Path("a")).host) and is_loopback("::1") and not is_loopback("0.0.0.0")
     assert main(["avatar.onnx", "--motion", str(tmp_path / "none.npz")]) == 2
     monkeypatch.setattr(rnd_viewer.view.cli, "kernels_are_cold", lambda: True)
     with _serving(options) as (port, _):

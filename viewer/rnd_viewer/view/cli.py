@@ -14,6 +14,7 @@ from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.playback.start import load_ahead
 
+from .access import is_loopback
 from .options import ViewOptions
 
 
@@ -47,10 +48,10 @@ def view(options: ViewOptions) -> int:
                 log(COMPILING)
             shown.warm_up()
     try:
-        token = None if options.local else secrets.token_urlsafe(16)
+        token = secrets.token_urlsafe(16)
         with serve(shown, options.host, options.port, token, options.fps_floor) as (server, url):
             print(f"rnd-view: {url}", flush=True)  # noqa: T201
-            if options.browser and options.local:
+            if options.browser and is_loopback(options.host):
                 Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
             server.serve_forever()
     finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -43,11 +42,11 @@ class ViewOptions:
     """A capture: its images can be shown beside the avatar, from their cameras and under their lights."""
 
     host: Annotated[str, option("ADDRESS")] = "127.0.0.1"
-    """Address to listen on. Anything but this machine's own asks every visitor for a token, which is printed."""
+    """Address to listen on. Every visitor needs the token in the address that is printed."""
     port: Annotated[int, option("N")] = 8008
     """Port to listen on; 0 takes any that is free."""
     browser: bool = True
-    """Open the page in this machine's browser."""
+    """Open the page in this machine's browser, whose command line then shows the token."""
 
     size: Size = (512, None)
     """Size of a frame in pixels to begin with."""
@@ -78,11 +77,3 @@ class ViewOptions:
         """Of a frame, px."""
         width, height = self.size
         return width, height or width
-
-    @property
-    def local(self) -> bool:
-        """Whether nobody but this machine can reach ``host``."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"

@@ -1,32 +1,23 @@
-"""The page and its websocket on one port, for this machine alone unless told otherwise.
-
-A page in the same browser must not be able to reach the viewer behind its user's back, so on a loopback address
-only requests that name that address as their host are answered (against DNS rebinding), and a websocket only when
-its origin is the very host it connects to. On any other address everything asks for a token, given once in the
-page's URL and kept in a cookie.
-"""
+"""The page and its websocket on one port, for this machine alone by default."""
 
 from __future__ import annotations
 
-import hmac
 import json
 import logging
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from errno import EACCES, EADDRINUSE
 from http import HTTPStatus
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from socket import AF_INET, AF_INET6, SHUT_RDWR, SOCK_DGRAM, gethostname, socket
+from socket import AF_INET, AF_INET6, SOCK_DGRAM, gethostname, socket
 from tempfile import TemporaryDirectory
 from time import perf_counter
 from types import ModuleType
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
-from weakref import WeakSet
+from urllib.parse import urlsplit
 
 import numpy as np
 from msgspec.structs import replace
@@ -35,18 +26,21 @@ from rnd_runtime.core.errors import InputError, withheld
 from rnd_runtime.core.threads import set_threads
 from rnd_viewer.play.video import clip_writer
 
+from .access import HTTP_PORT, Access
 from .governor import Governor
+from .listener import Listener, connection_limit
 from .options import SIZES
 from .scene import Bytes, Scene
 from .state import MAX_CLIP_FRAMES, ClipRequest, RenderRequest, Request, parse_request
 from .training import Training
 
 INSTALL = "pip install 'rnd-avatar[view]'"
-COOKIE = "rnd_view_token"
 JPEG_QUALITY = 90
-HTTP_PORT = 80  # which browsers leave out of the host's name
 _ALL_ADDRESSES = {"0.0.0.0": "192.0.2.1", "::": "2001:db8::1"}  # and one of another network
-MAX_BYTES_IN = 1 << 16  # a request is a few hundred
+MAX_BYTES_IN = 1 << 14  # a request is a few hundred
+MAX_WAITING = 256  # requests of one page; it sends the next after an answer
+HANDSHAKE_S = 5  # from connecting to the last header
+CLOSE_S = 10  # from the first byte of a file, or of a goodbye, to the end of the connection
 GOODBYE_S = 1.0  # in which a page that still reads hears that the viewer ends
 CONTENT_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -65,51 +59,6 @@ HEADERS = {
 }
 
 
-@dataclass(frozen=True)
-class Access:
-    """Who may talk to the server.
-
-    Attributes:
-        token: what every request must bring; None on a loopback address.
-        hosts: names by which a browser on this machine may call it; None for any, with the token.
-    """
-
-    token: str | None
-    hosts: frozenset[str] | None
-
-    @classmethod
-    def local(cls, host: str, port: int) -> Access:
-        """For a loopback ``host``: no token, but nobody else's name for it."""
-        names = {"localhost", "127.0.0.1", "[::1]", f"[{host}]" if ":" in host else host}
-        called = {f"{name}:{port}" for name in names}
-        return cls(None, frozenset(called | names if port == HTTP_PORT else called))
-
-    def refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
-        """Why a request is not answered, or None if it is."""
-        try:
-            return self._refusal(path, headers)
-        except (ValueError, LookupError):  # an address that is none, a header that is there twice
-            return HTTPStatus.BAD_REQUEST, "not a request that rnd-view understands\n"
-
-    def _refusal(self, path: str, headers: Any) -> tuple[HTTPStatus, str] | None:
-        query = urlsplit(path).query
-        host, origin = headers.get("Host", "").lower(), headers.get("Origin")
-        if self.hosts is not None and host not in self.hosts:
-            return HTTPStatus.FORBIDDEN, "rnd-view answers to this machine's own address only\n"
-        if origin is not None and urlsplit(origin).netloc.lower() != host:
-            return HTTPStatus.FORBIDDEN, "another site's page may not use rnd-view\n"
-        if self.token is not None and not self._has_token(query, headers):
-            return HTTPStatus.UNAUTHORIZED, "open the address that rnd-view printed, token included\n"
-        return None
-
-    def _has_token(self, query: str, headers: Any) -> bool:
-        assert self.token is not None
-        # By hand: Python's own parser stops at the first cookie, of whatever other program, that it does not like.
-        cookies = (cookie.strip().partition("=") for cookie in headers.get("Cookie", "").split(";"))
-        given = parse_qs(query).get("token", []) + [value for name, _, value in cookies if name == COOKIE]
-        return any(hmac.compare_digest(text.encode(), self.token.encode()) for text in given)
-
-
 def load_websockets() -> ModuleType:
     """Import websockets' server or say which extra brings it."""
     try:
@@ -121,9 +70,9 @@ def load_websockets() -> ModuleType:
 
 @contextmanager
 def serve(
-    shown: Scene | Training, host: str, port: int, token: str | None, fps_floor: float | None = None
-) -> Iterator[tuple[Any, str]]:
-    """Yield a listening server, to be run by its ``serve_forever``, and the URL to open.
+    shown: Scene | Training, host: str, port: int, token: str, fps_floor: float | None = None
+) -> Iterator[tuple[Listener, str]]:
+    """Yield a listening server, to be run by its ``serve_forever``, and the URL to open, which holds ``token``.
 
     A ``Training`` has its own page at the address; the avatar's is ``index.html`` then.
 
@@ -133,20 +82,23 @@ def serve(
     server_module = load_websockets()
     visitor = _Visitor(shown, fps_floor)
     training = shown if isinstance(shown, Training) else None
-    access: list[Access] = []  # known once the port is
-    connections: WeakSet[Any] = WeakSet()  # also those that have asked for nothing yet
 
-    def connect(*arguments: Any, **options: Any) -> Any:
-        connection = server_module.ServerConnection(*arguments, **options)
-        connections.add(connection)
-        return connection
+    class Connection(server_module.ServerConnection):  # type: ignore[name-defined, misc]
+        def process_event(self, event: Any) -> None:
+            if self.recv_messages.frames.qsize() >= MAX_WAITING:
+                raise ConnectionError("too many requests wait")  # which ends the connection
+            super().process_event(event)
 
     def answer(connection: Any, request: Any) -> Any:
-        refusal = access[0].refusal(request.path, request.headers)
+        refusal = access.refusal(request.path, request.headers)
         if refusal is not None:
             return connection.respond(*refusal)
+        listener.recognise(connection.socket)
         path = urlsplit(request.path).path
-        return None if path == "/socket" else _answer_http(connection, path, access[0], training)
+        if path != "/socket":
+            return _answer_http(connection, path, access, training)
+        full = HTTPStatus.SERVICE_UNAVAILABLE, "too many pages are open\n"
+        return None if listener.admit_page(connection.socket) else connection.respond(*full)
 
     try:
         server = server_module.serve(
@@ -155,9 +107,11 @@ def serve(
             port,
             process_request=answer,
             compression=None,
+            open_timeout=HANDSHAKE_S,
+            close_timeout=CLOSE_S,
             max_size=MAX_BYTES_IN,
             max_queue=None,  # behind a full queue pings wait too, and the page is taken for gone
-            create_connection=connect,
+            create_connection=Connection,
             server_header=None,
             logger=_quiet_logger(),
             family=AF_INET6 if ":" in host else AF_INET,
@@ -166,27 +120,15 @@ def serve(
         taken = error.errno in (EADDRINUSE, EACCES)
         hint = "--port picks another" if taken else "--host takes an address of this machine"
         raise InputError("cannot listen", got=f"{error.strerror} on {host}:{port}", hint=hint) from error
+    listener = Listener(server, connection_limit())
     try:
-        port = server.socket.getsockname()[1]
-        access.append(Access(token, None) if token else Access.local(host, port))
-        name = _name_from_elsewhere(host)
-        yield server, f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+        access = Access.of(host, listener.port, token)
+        yield listener, f"http://{_name_from_elsewhere(host)}:{listener.port}/?token={token}"
     finally:
-        server.socket.close()
-        # Where nobody has served yet, shutdown would wait for ever; with its socket closed serving ends at once.
-        if not server.socket_closed.is_set():
-            server.serve_forever()
-        hanging_up = threading.Timer(GOODBYE_S, _hang_up, [connections])
+        hanging_up = threading.Timer(GOODBYE_S, listener.hang_up)
         hanging_up.start()
-        server.shutdown()
+        listener.shutdown()
         hanging_up.cancel()
-
-
-def _hang_up(connections: Iterable[Any]) -> None:
-    """End what waits for a page that reads no more, or for one that never asked for anything."""
-    for connection in list(connections):
-        with suppress(OSError):  # closed already
-            connection.socket.shutdown(SHUT_RDWR)
 
 
 def _name_from_elsewhere(host: str) -> str:
@@ -224,8 +166,7 @@ def _answer_http(connection: Any, path: str, access: Access, training: Training 
     response.headers["Content-Type"] = CONTENT_TYPES[suffix]
     for header, value in HEADERS.items():
         response.headers[header] = value
-    if access.token:
-        response.headers["Set-Cookie"] = f"{COOKIE}={access.token}; Path=/; HttpOnly; SameSite=Strict"
+    response.headers["Set-Cookie"] = access.set_cookie()
     return response
 
 
@@ -305,7 +246,7 @@ class _Visitor:
         if frames > MAX_CLIP_FRAMES:
             raise InputError("clip", expected=f"at most {MAX_CLIP_FRAMES} frames", got=frames)
         with TemporaryDirectory() as folder:
-            file = Path(folder) / "clip.mp4"
+            file = folder / "clip.mp4"
             with clip_writer(file, fps=request.fps) as append:
                 for number in range(frames):
                     azimuth = state.azimuth + request.turn * number / frames
