@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 
+_MAX_LINE = 500  # characters of a line of which a file may have written parts
+_TAIL = 150  # of them, at its end
 _WITHHELD = {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG}
 
 
@@ -42,7 +45,7 @@ class InputError(Exception):
             line += f" ({hint})"
         self.what, self.expected, self.got, self.hint = what, expected, got, hint
         self.file, self.frame = file, frame
-        super().__init__(" ".join(filter(None, map(str.strip, line.splitlines()))))
+        super().__init__(printable(" ".join(filter(None, map(str.strip, line.splitlines())))))
 
     def at(self, *, file: str | Path | None = None, frame: int | None = None) -> InputError:
         """The same mistake with the file or the frame, where it lacks them."""
@@ -54,6 +57,21 @@ class InputError(Exception):
             frame=frame if self.frame is None else self.frame,
             hint=self.hint,
         )
+
+
+def printable(line: str, most: int = _MAX_LINE) -> str:
+    """``line`` for a terminal: control characters escaped, the middle left out beyond ``most`` characters."""
+    if len(line) > most:
+        line = f"{line[: most - _TAIL - 3]} … {line[-_TAIL:]}"
+    if line.isprintable():
+        return line
+    escaped = (c if c.isprintable() or unicodedata.category(c) == "Zs" else _escaped(c) for c in line)
+    line = "".join(escaped)
+    return line if len(line) <= most else f"{line[: most - 2]} …"
+
+
+def _escaped(character: str) -> str:
+    return character.encode("unicode_escape").decode()
 
 
 def refuse_changed(options: object, names: Iterable[str], hint: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import ArrayLike, NDArray
 
+from .budget import Budget
 from .errors import InputError
 from .files import atomic_path, existing_file
 
@@ -24,6 +25,8 @@ _MAX_COMPRESSION = 2000
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 _PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
+_PIXEL_BYTES = {"uint8": 1, "uint16": 2, "float": 4}  # as read
+_STRIP = 256  # rows: OpenEXR's DWAB decodes as many at once
 # Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
 _MAX_UNBOUNDED = 1 << 31
@@ -83,14 +86,52 @@ def read_image(path: str | Path) -> Image:
     with _opened(path) as source:
         spec = source.spec()
         _checked_header(spec, path)
-        kinds = [str(kind) for kind in (spec.format, *spec.channelformats)]
-        if other := next((kind for kind in kinds if kind not in _PIXEL_TYPES), None):
-            raise InputError("type of pixels", expected=" or ".join(_PIXEL_TYPES), got=other, file=path)
-        kind = str(spec.format)
-        pixels = source.read_image(0, 0, 0, spec.nchannels, kind if kind in ("uint8", "uint16") else "float")
+        kind = _read_type(spec, path)
+        Budget.of(path).take(spec.width * spec.height * spec.nchannels * _PIXEL_BYTES[kind], "image")
+        pixels = source.read_image(0, 0, 0, spec.nchannels, kind)
         if pixels is None:
             raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
     return np.ascontiguousarray(pixels).reshape(spec.height, spec.width, spec.nchannels)
+
+
+def read_strips(path: str | Path, channels: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """The first row and the pixels [rows, W, C] of strips of an EXR or a .hdr, from the top; never the whole image.
+
+    Args:
+        channels: indices of the C channels.
+
+    Raises:
+        InputError: as ``read_image``; or one strip expands to more than the file's budget, or all take too long.
+    """
+    budget = Budget.of(path)
+    with _opened(path) as source:
+        spec = source.spec()
+        _checked_header(spec, path)
+        _read_type(spec, path)
+        tile: int = spec.tile_height or 1
+        rows = -(-_STRIP // tile) * tile
+        budget.take(rows * spec.width * spec.nchannels * _PIXEL_BYTES["float"], "strip of the image")
+        low, high = min(channels), max(channels) + 1
+        in_order = list(channels) == list(range(low, high))
+        for top in range(0, spec.height, rows):
+            bottom = min(top + rows, spec.height)
+            if spec.tile_width:
+                pixels = source.read_tiles(0, 0, 0, spec.width, top, bottom, 0, 1, low, high, "float")
+            else:
+                pixels = source.read_scanlines(0, 0, top, bottom, 0, low, high, "float")
+            if pixels is None:
+                raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
+            budget.check_time("image")
+            strip = np.asarray(pixels, np.float32).reshape(bottom - top, spec.width, high - low)
+            yield top, strip if in_order else strip[..., [channel - low for channel in channels]]
+
+
+def _read_type(spec: Any, path: str | Path) -> str:
+    """The type as which pixels are read; raises ``InputError`` for types that would be converted."""
+    kinds = [str(kind) for kind in (spec.format, *spec.channelformats)]
+    if other := next((kind for kind in kinds if kind not in _PIXEL_TYPES), None):
+        raise InputError("type of pixels", expected=" or ".join(_PIXEL_TYPES), got=other, file=path)
+    return kinds[0] if kinds[0] in ("uint8", "uint16") else "float"
 
 
 def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str, ...] | None = None) -> None:

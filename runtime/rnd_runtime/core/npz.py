@@ -3,26 +3,64 @@
 from __future__ import annotations
 
 import lzma
+import math
 import struct
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .budget import Budget
 from .errors import InputError
 from .files import atomic_path, existing_file
 
 # What numpy and zipfile raise for archives that are cut, scrambled, encrypted or hold Python objects.
 _UNREADABLE = (
-    *(ValueError, OSError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError),
+    *(ValueError, OSError, EOFError, KeyError, RuntimeError, OverflowError, NotImplementedError),
     *(zlib.error, lzma.LZMAError, zipfile.BadZipFile, struct.error),
     *(tokenize.TokenError, SyntaxError, TypeError),
 )
+
+
+_NUMBER_BYTES, _TEXT_BYTES = 8, 64  # of an element as ``Members`` hands it over
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy and torch write; zipfile expands these by pieces
+
+
+def array_header(stream: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and dtype of the .npy that begins here; nothing of its data is read.
+
+    Raises:
+        ValueError: damaged, or of a version that only structured types need.
+    """
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"version {version} of .npy")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    try:
+        shape, _, dtype = read(stream)
+    except MemoryError as error:  # Python's parser on nested brackets
+        raise ValueError("nested header") from error
+    if any(size < 0 for size in shape):
+        raise ValueError("negative shape")
+    return shape, dtype
+
+
+def array_bytes(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Bytes of an array of these as ``Members`` hands it over: float64, or strings."""
+    return math.prod(shape) * max(dtype.itemsize, _TEXT_BYTES if dtype.kind in "SU" else _NUMBER_BYTES)
+
+
+def check_member(archive: zipfile.ZipFile, name: str, budget: Budget) -> None:
+    """Count the bytes that the member ``name`` declares; raise ``InputError`` where they are too many."""
+    info = archive.getinfo(name)
+    if info.compress_type not in _METHODS:
+        raise InputError(f"compression of {name}", expected="none or deflate", got=f"method {info.compress_type}")
+    budget.take(info.file_size, name)
 
 
 class Members:
@@ -113,7 +151,8 @@ class Npz(Members):
         if not isinstance(archive, np.lib.npyio.NpzFile):
             self._stream.close()
             raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
-        self._archive = archive
+        self._archive, self._budget = archive, Budget.of(path)
+        self._counted: set[str] = set()
         super().__init__(archive, path)
 
     def __enter__(self) -> Self:
@@ -125,17 +164,31 @@ class Npz(Members):
 
     def _read(self, name: str) -> NDArray[np.generic]:
         try:
+            self._count(name)
             array: NDArray[np.generic] = self._archive[name]
             if not isinstance(array, np.ndarray):  # numpy hands over the bytes of what is no array
                 raise ValueError("not an array")
         except _UNREADABLE as error:
             got = "data that is cut short or damaged"
-            if isinstance(error, MemoryError):
-                got = "more numbers than memory holds"
-            elif "allow_pickle" in str(error):
+            if "allow_pickle" in str(error):
                 got = "Python objects"
             raise InputError(name, expected="an array", got=got, file=self.path) from error
+        except InputError as error:
+            raise error.at(file=self.path) from error
         return array
+
+    def _count(self, name: str) -> None:
+        """Take the member's bytes from the budget, once."""
+        if name in self._counted:
+            return
+        self._counted.add(name)
+        archive = self._archive.zip
+        assert archive is not None
+        member = name if name in archive.namelist() else f"{name}.npy"
+        check_member(archive, member, self._budget)
+        with archive.open(member) as stream:
+            shape, dtype = array_header(stream)  # type: ignore[arg-type]  # reads as one
+        self._budget.take(max(array_bytes(shape, dtype) - archive.getinfo(member).file_size, 0), name)
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:

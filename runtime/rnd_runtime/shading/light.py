@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.copies import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
-from rnd_runtime.core.images import read_header, read_image
+from rnd_runtime.core.images import ImageHeader, read_header, read_image, read_strips
 from rnd_runtime.core.kinds import explained
 
 Floats = NDArray[np.float64]
@@ -28,6 +28,9 @@ _SAME_COLOUR = 2e-3  # by which x and y may miss them: D65 has more digits
 _MAX_STOPS = 64  # beyond it radiance leaves float32
 _MAX_EXPOSURE = 1e30  # a .hdr file's EXPOSURE, or one over it
 _LONGEST_LINE = 4096  # bytes of its header
+_MAX_ROWS = 2048  # a map of more is averaged down to as many while it is read
+_ROWS_AT_ONCE = 16  # rows or columns that are averaged by one product
+_LARGEST_HALF = 65504.0
 _DIM = 1e-3  # largest radiance below which every 8-bit pixel of a body would be black or next to it
 
 _TO_Y_UP: dict[str, Floats] = {
@@ -134,7 +137,9 @@ def _check_yaw(yaw: float) -> None:
 def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: float = 0.0) -> Light:
     """Read a lat-long .exr or .hdr as a ``Light``.
 
-    NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them. Pixels of a
+    NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them. In a HALF map
+    +inf is 65 504, the largest HALF number, as a sun that did not fit. A map of more than 2048 rows is averaged to
+    2048 × 4096 texels while it is read, weighted by solid angle, so that memory does not grow with it. Pixels of a
     Radiance file are divided by each EXPOSURE that its header states ("Radiance image format", Ward).
 
     Args:
@@ -154,20 +159,95 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
     header = read_header(path)
     channels = _colour_channels(header.channels, path)
-    radiance = read_image(path)[..., channels].astype(np.float32)
-    height, width = radiance.shape[:2]
-    if width != 2 * height:
-        raise InputError("light probe", expected="a 2:1 lat-long map", got=f"{width} x {height}", file=path)
+    if header.width != 2 * header.height:
+        got = f"{header.width} x {header.height}"
+        raise InputError("light probe", expected="a 2:1 lat-long map", got=got, file=path)
     try:
-        radiance, repaired = repair(radiance)
+        read = _read_reduced if header.height > _MAX_ROWS else _read_whole
+        radiance, repaired, cut = read(path, header, channels)
     except InputError as error:
         raise error.at(file=path) from error
     stated, chromaticities = 1.0, header.chromaticities
     if suffix == ".hdr":
         stated, chromaticities = _radiance_header(path)
     radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure) / stated)
-    notes = _exposure_notes(stated) + _colour_notes(chromaticities)
+    notes = _exposure_notes(stated) + _colour_notes(chromaticities) + _cut_notes(cut)
     return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=notes)
+
+
+def _read_whole(path: str | Path, header: ImageHeader, channels: list[int]) -> tuple[Floats32, int, int]:
+    """Radiance of the map, how many texels were repaired, and in how many a sun was cut."""
+    radiance = read_image(path)[..., channels].astype(np.float32)
+    cut = _limit_half(radiance, header)
+    radiance, repaired = repair(radiance)
+    return radiance, repaired, cut
+
+
+def _read_reduced(path: str | Path, header: ImageHeader, channels: list[int]) -> tuple[Floats32, int, int]:
+    """As ``_read_whole``, averaged to ``_MAX_ROWS`` rows strip by strip; texels that need repair have no weight."""
+    mean, lost = np.zeros((_MAX_ROWS, 2 * _MAX_ROWS, 3)), None
+    repaired = cut = 0
+    for top, strip in read_strips(path, channels):
+        if not (strip.min() >= 0 and strip.max() < np.inf):  # false for NaN
+            cut += _limit_half(strip, header)
+            valid = np.isfinite(strip) & (strip >= 0)
+            repaired += int((~valid.all(-1)).sum())
+            strip[~valid] = 0
+            lost = np.zeros(mean.shape, np.float32) if lost is None else lost
+            _add_mean(lost, (~valid).astype(np.float32), top, header.height)
+        _add_mean(mean, strip, top, header.height)
+    if lost is None:
+        return mean.astype(np.float32), 0, cut
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean[lost > 0] /= 1 - lost[lost > 0]
+    mean[lost > 1 - _LEAST_WEIGHT] = np.nan
+    return repair(mean.astype(np.float32))[0], repaired, cut
+
+
+_LEAST_WEIGHT = 1e-3  # of a texel's area, from which its radiance is known
+
+
+def _add_mean(mean: NDArray[Any], strip: Floats32, top: int, height: int) -> None:
+    """Add to the ``mean`` [H, W, C] what the rows of ``strip`` from ``top`` on contribute, of a map of ``height``."""
+    count, width = strip.shape[:2]
+    columns = mean.shape[1]
+    source, target = 1 - _heights(height), 1 - _heights(len(mean))
+
+    def rows(low: int, high: int) -> slice:
+        """The target's rows that these source rows overlap."""
+        first = int(np.searchsorted(target, source[low], "right")) - 1
+        return slice(max(first, 0), min(int(np.searchsorted(target, source[high], "left")), len(mean)))
+
+    touched = rows(top, top + count)
+    tall = np.zeros((touched.stop - touched.start, width * strip.shape[2]))
+    for low in range(top, top + count, _ROWS_AT_ONCE):
+        high = min(low + _ROWS_AT_ONCE, top + count)
+        here = rows(low, high)
+        weights = _overlaps(source[low : high + 1], target[here.start : here.stop + 1])
+        part = strip[low - top : high - top].reshape(high - low, -1).astype(np.float64)
+        tall[here.start - touched.start : here.stop - touched.start] += weights @ part
+    tall = np.ascontiguousarray(tall.reshape(len(tall), width, -1).swapaxes(0, 1)).reshape(width, -1)
+    for left in range(0, columns, _ROWS_AT_ONCE):
+        right = min(left + _ROWS_AT_ONCE, columns)
+        low, high = left * width // columns, -(-right * width // columns)
+        weights = _overlaps(np.arange(low, high + 1) / width, np.arange(left, right + 1) / columns)
+        wide = (weights @ tall[low:high]).reshape(right - left, -1, mean.shape[2])
+        mean[touched, left:right] += wide.swapaxes(0, 1)
+
+
+def _limit_half(radiance: Floats32, header: ImageHeader) -> int:
+    """Replace +inf in HALF ``radiance`` by the largest HALF number; in how many texels."""
+    if header.pixel_type != "half":
+        return 0
+    infinite = np.isposinf(radiance)
+    radiance[infinite] = _LARGEST_HALF
+    return int(infinite.any(-1).sum())
+
+
+def _cut_notes(cut: int) -> tuple[str, ...]:
+    if not cut:
+        return ()
+    return (f"{cut} texels of the light were infinite and are taken as 65504, HALF's largest number: a sun was cut",)
 
 
 def light_notes(light: Light) -> list[str]:

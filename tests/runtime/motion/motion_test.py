@@ -153,7 +153,10 @@ def test_members_damaged_in_any_compression_are_refused(tmp_path, method):
     data = bytearray((tmp_path / "a.npz").read_bytes())
     data[60:90] = bytes(30)
     (tmp_path / "a.npz").write_bytes(data)
-    with pytest.raises(InputError, match=r"a\.npz: poses: expected an array, got data that is cut short or damaged"):
+    reason = "expected an array, got data that is cut short or damaged"
+    if method != zipfile.ZIP_DEFLATED:  # numpy writes no other, and zipfile expands them without a bound
+        reason = "expected none or deflate, got"
+    with pytest.raises(InputError, match=rf"a\.npz: .*poses.*: {reason}"):
         load_motion(tmp_path / "a.npz", _skeleton())
 
 

@@ -241,10 +241,13 @@ def test_cut_and_foreign_npy_files_are_refused(tmp_path, held):
             read_pickle(_file(tmp_path, damaged))
 
 
-def test_shared_parts_are_read_once(tmp_path):
-    """Thirty doublings: a reader that follows every path would need a thousand million steps."""
+def test_shared_parts_are_read_once_and_count_as_often_as_they_are_referred_to(tmp_path):
+    """After thirty doublings a reader that follows every path needs a thousand million steps."""
     value: list = [1]
-    for _ in range(30):
+    for count in range(30):
         value = [value, value]
-    read = read_pickle(_file(tmp_path, pickle.dumps(value)))
-    assert read[0] is read[1]
+        if count == 10:
+            read = read_pickle(_file(tmp_path, pickle.dumps(value)))
+            assert read[0] is read[1]
+    with pytest.raises(InputError, match="data that repeats its parts: expected at most 256 MB of copies"):
+        read_pickle(_file(tmp_path, pickle.dumps(value)))
