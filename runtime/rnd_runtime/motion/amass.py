@@ -13,21 +13,21 @@ from .motion import STAND_INS, Z_UP_TO_Y_UP, Motion
 from .skeleton import Skeleton, moving_joints
 from .smpl import SMPL_REST_ROOT, SMPLH_NAMES
 
-# SMPL's one joint a hand rotates all fingers that do not rotate themselves; SMPL-H has their bases instead.
+# SMPL-H's finger bases, which SMPL's single joint per hand drives
 FINGER_BASES = ("index1", "middle1", "pinky1", "ring1", "thumb1")
 
 
 def write_amass(path: Path, motion: Motion, skeleton: Skeleton) -> tuple[str, ...]:
     """Write ``motion`` of ``skeleton``; return the moving joints that SMPL-H lacks, which are left out.
 
-    ``poses`` [F, 156] axis-angle rad, ``trans`` [F, 3] m for SMPL-H's mean body, ``betas`` [16] zero,
-    ``gender`` neutral, ``mocap_framerate``; Z up. The pelvis is where it was in ``motion``.
+    ``poses`` [F, 156] axis-angle rad, ``trans`` [F, 3] m for SMPL-H's mean body, ``betas`` [16] zero, ``gender``
+    neutral, ``mocap_framerate``; Z up. The pelvis keeps its position.
     """
     axis_angles = matrix_to_axis_angle(motion.rotations)
     columns = {name: k for k, name in enumerate(SMPLH_NAMES)}
     poses = np.zeros((motion.frame_count, len(SMPLH_NAMES), 3))
-    turning = {name for name, moves in zip(motion.joint_names, moving_joints(motion.rotations)) if moves}
-    sides_with_fingers = {name.split("_")[0] for name in turning.intersection(SMPLH_NAMES[22:])}
+    moving = {name for name, moves in zip(motion.joint_names, moving_joints(motion.rotations)) if moves}
+    sides_with_fingers = {name.split("_")[0] for name in moving.intersection(SMPLH_NAMES[22:])}
     lost = []
     for joint, name in enumerate(motion.joint_names):
         side = name.removesuffix("_hand")
@@ -38,7 +38,7 @@ def write_amass(path: Path, motion: Motion, skeleton: Skeleton) -> tuple[str, ..
         elif side in {"left", "right"} - sides_with_fingers:
             for base in FINGER_BASES:
                 poses[:, columns[f"{side}_{base}"]] = axis_angles[:, joint]
-        elif name in turning and not _stands_in(name, motion):
+        elif name in moving and not _stands_in(name, motion):
             lost.append(name)
     pelvis = (skeleton.rest_joints[0] + motion.translations) @ Z_UP_TO_Y_UP
     save_npz(

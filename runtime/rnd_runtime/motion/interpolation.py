@@ -5,7 +5,7 @@ Between frames k and k + 1 the path is R(t) = R_k exp(φ(t)), φ a cubic in the 
 with J_r⁻¹ the inverse right Jacobian of SO(3) (Solà et al. 2018, "A micro Lie theory", eq. 144). As in a Catmull-Rom
 spline, v is the mean of the steps before and after a frame; curvature is zero at the first and last frame.
 
-Error between frames at a foot, for a walk of one stride per second at 25 frames per second: 0.15 mm (slerp: 5 mm).
+Error at a foot between frames, walking one stride per second at 25 frames per second: 0.15 mm (slerp: 5 mm).
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Arrays are copied number by number: ``a[:] = b`` takes numba ten seconds more to compile.
+# Arrays are copied by element: ``a[:] = b`` compiles 10 s longer.
 
 LARGEST_STEP = 1.0
-"""rad: past such a turn within one frame, a cut or a broken pose, the path is the geodesic (slerp)"""
+"""rad: for a larger rotation within one frame (a cut) the path is the geodesic (slerp)"""
 LARGEST_MOVE = 1.0
-"""m: past such a move within one frame the path is straight"""
+"""m: for a larger move within one frame the path is straight"""
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -47,13 +47,13 @@ def interpolate_rotations(rotations: Floats, position: Floats) -> Floats:
                 step_between(rotations[before - 1, joint], a, previous)
             if before + 2 < frames:
                 step_between(b, rotations[before + 2, joint], following)
-            turned(a, _hermite(previous, step, following, before > 0, before + 2 < frames, t), result[time, joint])
+            rotated_by(a, _hermite(previous, step, following, before > 0, before + 2 < frames, t), result[time, joint])
     return result
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def interpolate_points(points: Floats, position: Floats) -> Floats:
-    """Points [T, 3] m at ``position`` [T], in frames from 0 to F − 1, of ``points`` [F, 3]: the same cubic."""
+    """Points [T, 3] m at ``position`` [T], in frames from 0 to F − 1, of ``points`` [F, 3], by the same cubic."""
     frames = points.shape[0]
     result = np.empty((position.size, 3), np.float64)
     for time in range(position.size):
@@ -89,7 +89,7 @@ def _cubic(step, start, end, t):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _end_slopes(step, start, end, inner_start, inner_end):  # type: ignore[no-untyped-def]
-    """Slopes with those of the recording's own ends chosen so that the curvature there vanishes."""
+    """Slopes; those at the motion's own ends make the curvature vanish there."""
     if inner_end and not inner_start:
         start = 1.5 * step - 0.5 * end
     if inner_start and not inner_end:
@@ -129,7 +129,7 @@ def _cross(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def step_between(a, b, out):  # type: ignore[no-untyped-def]
-    """log(aᵀ b) [3] rad, through the quaternion; see ``.rotations.matrix_to_axis_angle``."""
+    """Fill ``out`` with log(aᵀ b) [3] rad, through the quaternion; see ``core.rotations.matrix_to_axis_angle``."""
     m00 = a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
     m01 = a[0, 0] * b[0, 1] + a[1, 0] * b[1, 1] + a[2, 0] * b[2, 1]
     m02 = a[0, 0] * b[0, 2] + a[1, 0] * b[1, 2] + a[2, 0] * b[2, 2]
@@ -154,9 +154,9 @@ def step_between(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def turned(a, turn, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` with a · exp(turn) [3, 3]; turn: three numbers, rad."""
-    x, y, z = turn
+def rotated_by(a, omega, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` with a · exp(ω) [3, 3] for a rotation vector ω [3] rad."""
+    x, y, z = omega
     angle = np.sqrt(x * x + y * y + z * z)
     half = 0.5 * angle
     sine = 1.0 - angle * angle / 6 if angle < 1e-4 else np.sin(angle) / angle

@@ -1,4 +1,4 @@
-"""Retargeting: a motion recorded on one skeleton, played by another."""
+"""Retargeting of a motion from its own skeleton to the avatar's."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .skeleton import Skeleton, moving_joints
 
 Floats = NDArray[np.float64]
 
-# Limbs whose bones point the same way after retargeting. Skeletons disagree about the joints of a back, and a straight
-# back must stay straight; hands and feet follow their parents' bones.
+# Joints whose bones keep their direction. Not the back, whose joints differ between skeletons; hands and feet follow
+# their parents.
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
-_STANDS = np.cos(np.radians(30))  # a zero pose that leans less stands
-_LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # legs above the floor that hips are
-_UP_CLEAR = 0.3  # the mean cosine with which the trunk must keep to the zero pose's up
-_FLOOR_PERCENTILE = 5  # of the lowest foot's height over time: steps touch the floor, noise goes below it
-_ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, the mean of the bodies at hand, which are 3 mm apart
-_STANDS_AT_ZERO = 0.05  # m by which the sole of a template that stands on y = 0 may be off
+_STANDS = np.cos(np.radians(30))  # max lean of a standing zero pose
+_LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # height of hips above the floor, leg lengths
+_UP_CLEAR = 0.3  # min mean cosine of the trunk and the zero pose's up
+_FLOOR_PERCENTILE = 5  # of the lowest foot's height over time, against noise
+_ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, mean of bodies within 3 mm
+_STANDS_AT_ZERO = 0.05  # m, tolerance for the sole of a template that stands on y = 0
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
@@ -34,7 +34,7 @@ _T_POSE_LEAP = np.radians(20)
 class Retargeted:
     """Motion of the avatar's skeleton, Y up: local ``rotations`` [F, J, 3, 3], ``translations`` [F, 3] m from rest.
 
-    ``left_out``: recorded joints that move and drive nothing.
+    ``left_out``: unused moving joints of the recorded skeleton.
     """
 
     rotations: Floats
@@ -44,19 +44,19 @@ class Retargeted:
 
 
 def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up: str = "auto") -> Retargeted:
-    """The motion of ``tree`` on ``skeleton``.
+    """Retarget the motion of ``tree`` to ``skeleton``.
 
-    A joint's world rotation is ``G_k = W Q_k Bᵀ A_k``: Q_k the recorded one, B and W the rotations from the zero
-    pose's and the world's axes to ours, A_k the smallest rotation from our bone's direction to theirs. Lengths scale
-    with the legs, and the feet come down to y = 0. The recording is rotated by quarters to begin facing the front
-    (+Z). A reference T-pose before the motion is left out.
+    A joint's world rotation is ``G_k = W Q_k Bᵀ A_k``: Q_k the recorded one, B and W the rotations from the zero pose's
+    and the world's axes to the avatar's, A_k the smallest rotation from the avatar's bone direction to the file's.
+    Lengths scale with the legs, and the feet stand on y = 0. The motion is rotated by quarters to begin facing +Z. A
+    leading reference T-pose is left out.
 
     Args:
-        matched: for our joints the index of theirs; the rest stay at rest.
-        up: "y" or "z", the file's up axis; "auto" infers it from the trunk.
+        matched: index in ``tree`` of each of the avatar's joints; the others stay at rest.
+        up: the file's up axis, "y" or "z"; "auto" infers it from the trunk.
 
     Raises:
-        InputError: hips and knees, which give the person's size, are not among ``matched``.
+        InputError: ``matched`` lacks hips or knees, which give the person's size.
     """
     needed = ("left_hip", "right_hip", "left_knee", "right_knee")
     if missing := [name for name in needed if name not in matched]:
@@ -79,9 +79,9 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
     first = _reference_frames(rotations[:, limbs])
     quarters = _quarters_to_front(rotations_world[first, 0])
-    turn = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
-    rotations, world = rotations[first:], turn @ world
-    rotations[:, 0] = turn @ rotations[:, 0]
+    heading = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
+    rotations, world = rotations[first:], heading @ world
+    rotations[:, 0] = heading @ rotations[:, 0]
 
     scale = _leg(ours) / _leg(theirs)
     hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
@@ -102,7 +102,7 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
 
 
 def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
-    """Moving joints of ``tree`` with none of those ``matched`` below them."""
+    """Moving joints of ``tree`` without any of ``matched`` below them."""
     carry = {0, *matched}
     for joint in reversed(range(len(tree.names))):
         if joint in carry and joint:
@@ -113,7 +113,7 @@ def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
 def _world_rotations(
     tree: MocapTree, recorded: Floats, world: Floats, to_ours: Floats, skeleton: Skeleton, matched: Mapping[str, int]
 ) -> Floats:
-    """G [F, J, 3, 3] of our joints, from theirs ``recorded`` [F, ·, 3, 3]."""
+    """World rotations G [F, J, 3, 3] of the avatar's joints from ``recorded`` [F, ·, 3, 3]."""
     aligned = _alignments(skeleton, matched, tree, to_ours)
     rotations: Floats = np.empty((len(recorded), len(skeleton), 3, 3))
     for joint, name in enumerate(skeleton.names):
@@ -133,7 +133,7 @@ def _local_rotations(rotations: Floats, skeleton: Skeleton) -> Floats:
 
 
 def _body_frame(joints: Mapping[str, Floats]) -> Floats:
-    """[3, 3] whose columns point left (from the hips), up (the axis nearest to the trunk) and forward of the body."""
+    """[3, 3] whose columns are left (from the hips), up (the axis nearest to the trunk) and forward of the body."""
     left = joints["left_hip"] - joints["right_hip"]
     hips = (joints["left_hip"] + joints["right_hip"]) / 2
     high = [joints[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in joints]
@@ -152,9 +152,9 @@ def _body_frame(joints: Mapping[str, Floats]) -> Floats:
 
 
 def _upright(root: Floats, path: Floats, to_ours: Floats, up: str) -> tuple[Floats, tuple[str, ...]]:
-    """The rotation [3, 3] from the file's up axis to ours, and a note where the trunk stands along another.
+    """Rotation [3, 3] from the file's up axis to Y, and a note where the trunk stands along another axis.
 
-    ``path`` [F, 3] is the root's, in leg lengths: hips half a leg above the floor mean that the person lies or crawls.
+    ``path`` [F, 3] is the root's in leg lengths: a person lies or crawls with hips half a leg above the floor.
     """
     trunk = to_ours.T[:, 1]  # up in the zero pose
     stands = (root @ trunk).mean(0)
@@ -185,14 +185,14 @@ def _overrules(axis: str) -> str:
 
 
 def _quarters_to_front(root: Floats) -> int:
-    """Quarters about Y, −1 to 2, that rotate a root with rotation ``root`` [3, 3] nearest to facing +Z."""
+    """Quarter rotations about Y, −1 to 2, that bring a root rotation [3, 3] nearest to facing +Z."""
     x, _, z = root[:, 2]
-    quarters = -round(np.arctan2(x, z) / (np.pi / 2)) if np.hypot(x, z) > 0.5 else 0  # else the person lies
+    quarters = -round(np.arctan2(x, z) / (np.pi / 2)) if np.hypot(x, z) > 0.5 else 0  # 0 for a lying person
     return 2 if quarters == -2 else quarters
 
 
 def _alignments(skeleton: Skeleton, matched: Mapping[str, int], tree: MocapTree, to_ours: Floats) -> dict[int, Floats]:
-    """For each joint the rotation [3, 3] from our rest pose to their zero pose, in our axes."""
+    """Rotation [3, 3] of each joint from the avatar's rest pose to the file's zero pose, in the avatar's axes."""
     rest = tree.zero_positions()
     aligned: dict[int, Floats] = {}
     for joint, name in enumerate(skeleton.names):
@@ -225,7 +225,7 @@ def _swing(a: Floats, b: Floats) -> Floats:
 
 
 def _leg(joints: Mapping[str, Floats]) -> float:
-    """Mean length from hip to knee, and on to the ankle where known."""
+    """Mean length from hip to knee, and to the ankle where known."""
     lengths = []
     for side in ("left", "right"):
         chain = [joints[f"{side}_{joint}"] for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" in joints]
@@ -245,7 +245,7 @@ def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float
 
 
 def sole(skeleton: Skeleton) -> float:
-    """Height in m of the soles at rest; 0 without feet, or for a template that about stands on y = 0."""
+    """Height in m of the soles at rest; 0 without feet, or for a template that stands on y = 0."""
     heights = [
         float(joint[1]) - above
         for name, joint in zip(skeleton.names, skeleton.rest_joints)
@@ -257,14 +257,14 @@ def sole(skeleton: Skeleton) -> float:
 
 
 def _reference_frames(rotations: Floats) -> int:
-    """1 where limbs' ``rotations`` [F, ·, 3, 3] begin with a T-pose apart from the motion, else 0."""
+    """1 where limbs' ``rotations`` [F, ·, 3, 3] begin with a separate T-pose, else 0."""
     if len(rotations) < 3:
         return 0
     local = rotations[:2]
     leap = np.swapaxes(local[0], -1, -2) @ local[1]
 
-    def angle(turn: Floats) -> float:
-        cosines = (np.trace(turn, axis1=-2, axis2=-1) - 1) / 2
+    def angle(rotation: Floats) -> float:
+        cosines = (np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2
         return float(np.arccos(np.clip(cosines, -1, 1)).max())
 
     return int(angle(local[0]) < _T_POSE and angle(leap) > _T_POSE_LEAP)

@@ -1,15 +1,14 @@
-"""How a forearm shares a twist between its two ends before it is skinned, as skin and the two bones beneath it do.
+"""Distribution of a forearm's twist over its two ends before skinning.
 
-A hand that is rotated by 120° pinches the wrist ("candy wrapper") where two bones share the skin. The forearm is
-therefore rotated about its own axis, which moves neither elbow nor wrist and leaves the hand as it was::
+A hand twisted by 120° pinches the wrist ("candy wrapper"). The forearm is therefore rotated about its own axis, which
+leaves elbow, wrist and hand where they were::
 
     τ = atan2(a · u, tr R − uᵀRu)              twist of R about u, a = (R₃₂ − R₂₃, R₁₃ − R₃₁, R₂₁ − R₁₂)
-    s = min(1, 2 (1 + uᵀRu))                   1 but where R bends by more than 120°, 0 at 180°, where τ is nobody's
+    s = min(1, 2 (1 + uᵀRu))                   1 up to a bend of 120°, 0 at 180°, where τ is undefined
     h = s · sign(τ) · 60° · sin² π (|τ| − 60°)/120°      beyond 60°, else 0
     δ = h(elbow) − h(wrist),   R_elbow ← R_elbow exp(−δ u),   R_wrist ← exp(δ u) R_wrist
 
-Up to 60° nothing changes, to the bit; a twist of 120° comes to 60° at each end. h falls back to 0 at 180°, where τ
-jumps to −180°.
+Twists up to 60° stay to the bit; 120° becomes 60° at each end. h is 0 at 180°, where τ jumps to −180°.
 """
 
 from __future__ import annotations
@@ -21,26 +20,26 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.motion.interpolation import turned
+from rnd_runtime.motion.interpolation import rotated_by
 from rnd_runtime.motion.skeleton import Skeleton, bone_transforms
 
 Floats = NDArray[np.float64]
 
 FREE = np.pi / 3
-"""radians that an end is twisted by before it hands anything on; dancers' forearms in AIST++ keep to a fifth of it"""
+"""rad of twist at one end that stay there; forearms in AIST++ reach a fifth of it"""
 MAX_SHARE = np.pi / 3
-"""radians that an end hands on at most, of a twist of (π + FREE)/2"""
+"""rad, max twist moved to the other end, at a twist of (π + FREE)/2"""
 
 
 def skinning_bones(skeleton: Skeleton, rotations: ArrayLike, translation: ArrayLike) -> NDArray[np.float32]:
-    """``.skeleton.bone_transforms`` [..., J, 3, 4] of a pose whose forearms share their twists."""
+    """``.skeleton.bone_transforms`` [..., J, 3, 4] of a pose with shared forearm twists."""
     return bone_transforms(skeleton, share_twists(skeleton, rotations), translation)
 
 
 def share_twists(skeleton: Skeleton, rotations: ArrayLike) -> Floats:
-    """Local ``rotations`` [..., J, 3, 3] with forearms turned so that no end bears a twist alone.
+    """Local ``rotations`` [..., J, 3, 3] with shared forearm twists.
 
-    The same array where no forearm is twisted by more than FREE, or the skeleton has none by SMPL's names.
+    Returns the same array where no twist exceeds FREE or the skeleton has no forearms by SMPL's names.
     """
     rotations = shared = np.asarray(rotations, np.float64)
     for elbow, wrist, axis, angles in twist_angles(skeleton, rotations):
@@ -51,7 +50,7 @@ def share_twists(skeleton: Skeleton, rotations: ArrayLike) -> Floats:
 
 
 def twist_angles(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, int, Floats, Floats]]:
-    """Of each forearm that shares a twist its elbow, its wrist, u [3] and δ [...] radians; rotations [..., J, 3, 3]."""
+    """Yield elbow, wrist, axis u [3] and δ [...] rad of each forearm that shares a twist; rotations [..., J, 3, 3]."""
     for elbow, wrist, axis in forearms(skeleton):
         angles = np.empty(rotations.shape[:-3])
         _shares(rotations.reshape(-1, *rotations.shape[-3:]), elbow, wrist, axis, angles.reshape(-1))
@@ -61,7 +60,7 @@ def twist_angles(skeleton: Skeleton, rotations: Floats) -> Iterator[tuple[int, i
 
 @lru_cache(maxsize=16)
 def forearms(skeleton: Skeleton) -> tuple[tuple[int, int, Floats], ...]:
-    """Of each forearm its elbow, its wrist and its axis [3], unit, from one to the other at rest."""
+    """Elbow, wrist and unit axis [3] (elbow to wrist, rest pose) of each forearm."""
     found = []
     for side in ("left", "right"):
         ends = [f"{side}_{end}" for end in ("elbow", "wrist")]
@@ -76,7 +75,7 @@ def forearms(skeleton: Skeleton) -> tuple[tuple[int, int, Floats], ...]:
 
 
 @njit(inline="always")
-def _handed_on(rotation, axis):  # type: ignore[no-untyped-def]
+def _moved_twist(rotation, axis):  # type: ignore[no-untyped-def]
     """h of one rotation [3, 3] about ``axis`` [3]."""
     along = 0.0
     for row in range(3):
@@ -105,25 +104,25 @@ def _shares(rotations, elbow, wrist, axis, angles):  # type: ignore[no-untyped-d
 @njit(error_model="numpy")
 def share(rotations, elbow, wrist, axis):  # type: ignore[no-untyped-def]
     """δ of one pose [J, 3, 3]."""
-    return _handed_on(rotations[elbow], axis) - _handed_on(rotations[wrist], axis)
+    return _moved_twist(rotations[elbow], axis) - _moved_twist(rotations[wrist], axis)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _rotate_all(rotations, elbow, wrist, axis, angles):  # type: ignore[no-untyped-def]
     for pose in range(len(rotations)):
-        hand_on(rotations[pose], elbow, wrist, axis, angles[pose])
+        rotate_forearm(rotations[pose], elbow, wrist, axis, angles[pose])
 
 
 @njit(error_model="numpy")
-def hand_on(rotations, elbow, wrist, axis, angle):  # type: ignore[no-untyped-def]
-    """Turn the forearm of one pose [J, 3, 3] by δ, and the hand back."""
+def rotate_forearm(rotations, elbow, wrist, axis, angle):  # type: ignore[no-untyped-def]
+    """Rotate the forearm of one pose [J, 3, 3] by −δ, and the hand back."""
     back = -angle * axis[0], -angle * axis[1], -angle * axis[2]
     before, after = rotations[elbow].copy(), np.empty((3, 3))
-    turned(before, back, rotations[elbow])
+    rotated_by(before, back, rotations[elbow])
     for row in range(3):
         for column in range(3):
             before[column, row] = rotations[wrist, row, column]
-    turned(before, back, after)
+    rotated_by(before, back, after)
     for row in range(3):
         for column in range(3):
             rotations[wrist, row, column] = after[column, row]

@@ -1,4 +1,4 @@
-"""What an avatar is told of one moment of a motion: the stretch of motion its skinning looks at, and its bones."""
+"""An avatar's input at one moment: a window of recent poses, and bones."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rnd_runtime.motion.interpolation import interpolate_points, interpolate_rot
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, bones_of, chain
 
-from .forearm import forearms, hand_on, share
+from .forearm import forearms, rotate_forearm, share
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -23,21 +23,20 @@ Floats32 = NDArray[np.float32]
 class Moment(NamedTuple):
     """A moment of a motion, in the root's frame.
 
-    The window is the last poses before and at that time, evenly spaced over so many seconds, without the root: a motion
-    at 120 frames per second and its copy at 30 give the same window, and turning or moving the body changes nothing.
+    The window holds the last poses, evenly spaced in seconds, without the root. It depends on neither frame rate nor
+    the body's position and heading.
     """
 
     window: Floats32  # [poses, J − 1, 6] rotation_6d of the local rotations, oldest first
-    velocity: Floats32  # [J − 1, 3] rad/s, log(R_{t−δ}ᵀ R_t) / δ: continuous where axis-angles jump at π
-    bones: Floats32  # [J, 3, 4] m, rest pose → the root's frame; forearms share their twists
-    root: Floats  # [4, 4] m, the root's frame → world
+    velocity: Floats32  # [J − 1, 3] rad/s, log(R_{t−δ}ᵀ R_t) / δ
+    bones: Floats32  # [J, 3, 4] m, rest pose → root frame; forearm twists are shared
+    root: Floats  # [4, 4] m, root frame → world
 
 
 def moment(motion: Motion, time_s: float, skeleton: Skeleton, *, poses: int, seconds: float) -> Moment:
     """``motion`` (of ``skeleton``) at ``time_s``.
 
-    δ is the spacing of the window, ``seconds`` itself where ``poses`` is 1. Before a motion starts its first pose is
-    held.
+    δ is the window's spacing, ``seconds`` where ``poses`` is 1. Before its start a motion keeps its first pose.
 
     Raises:
         InputError: the motion has other joints than the skeleton; ``motion.motion.load_motion`` maps them.
@@ -56,7 +55,7 @@ def motion_window(motion: Motion, time_s: float, *, poses: int, seconds: float) 
 
 
 def _recent(motion: Motion, time_s: float, poses: int, seconds: float) -> tuple[tuple[Floats, Floats, Floats], float]:
-    """Where ``motion``'s last ``poses`` poses lie, see ``Motion.path_at``; two where it is 1. And their spacing."""
+    """``Motion.path_at`` of the last ``poses`` poses (at least two), and their spacing in s."""
     assert poses >= 1 and seconds > 0, (poses, seconds)
     spacing, count = seconds / max(poses - 1, 1), max(poses, 2)
     return motion.path_at(time_s - spacing * np.arange(count - 1, -1, -1)), spacing
@@ -82,7 +81,7 @@ def _tree(skeleton: Skeleton) -> _Tree:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _moment(path, spacing, poses, tree):  # type: ignore[no-untyped-def]
-    """In numba: forty small steps of numpy's take 0.4 ms of a frame."""
+    """``moment`` compiled: numpy takes 0.4 ms per frame."""
     rotations, translations, position = path
     recent, moved = interpolate_rotations(rotations, position), interpolate_points(translations, position)
     window, velocity = _window(recent, spacing, poses)
@@ -109,7 +108,7 @@ def _window(recent, spacing, poses):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _bones(rotations, translation, tree, root):  # type: ignore[no-untyped-def]
-    """Bones of a pose [J, 3, 3], which is changed, and its translation [3]; fills ``root``."""
+    """Bones of a pose [J, 3, 3] (modified in place) and its translation [3]; fills ``root``."""
     position = tree.rest_joints[0]
     root[3, 3] = 1.0
     for row in range(3):
@@ -122,6 +121,6 @@ def _bones(rotations, translation, tree, root):  # type: ignore[no-untyped-def]
         elbow, wrist, axis = tree.ends[arm, 0], tree.ends[arm, 1], tree.axes[arm]
         angle = share(rotations, elbow, wrist, axis)
         if angle != 0.0:
-            hand_on(rotations, elbow, wrist, axis, angle)
+            rotate_forearm(rotations, elbow, wrist, axis, angle)
     posed = chain(np.expand_dims(rotations, 0), np.zeros((1, 3)), tree.parents, tree.rest_joints)
     return bones_of(posed, tree.rest_joints)[0]

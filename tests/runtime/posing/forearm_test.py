@@ -44,7 +44,7 @@ def _axes(side: str) -> tuple[np.ndarray, np.ndarray]:
     return axis, across / np.linalg.norm(across)
 
 
-def _handed_on(rotation: np.ndarray, axis: np.ndarray) -> float:
+def _moved_twist(rotation: np.ndarray, axis: np.ndarray) -> float:
     """By the quaternion's swing and twist."""
     x, y, z, w = Rotation.from_matrix(rotation).as_quat()
     along = np.array([x, y, z]) @ axis
@@ -60,7 +60,7 @@ def test_it_turns_by_what_quaternions_say() -> None:
         for side in ("left", "right"):
             elbow, wrist = (NAMES.index(f"{side}_{end}") for end in ("elbow", "wrist"))
             axis, _ = _axes(side)
-            angle = _handed_on(pose[elbow], axis) - _handed_on(pose[wrist], axis)
+            angle = _moved_twist(pose[elbow], axis) - _moved_twist(pose[wrist], axis)
             turn = Rotation.from_rotvec(angle * axis).as_matrix()
             pose[elbow], pose[wrist] = pose[elbow] @ turn.T, turn @ pose[wrist]
             turned += angle != 0

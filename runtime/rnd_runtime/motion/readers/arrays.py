@@ -1,4 +1,4 @@
-"""Motions as named arrays of known layouts, read into one record in the file's axes."""
+"""Motions as named arrays of known layouts."""
 
 from __future__ import annotations
 
@@ -18,27 +18,26 @@ Floats = NDArray[np.float64]
 
 # Members of AMASS' SMPL-X files alone, beside the split poses
 _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length")
-_MAX_ANGLE = 100.0  # rad: fits hold a few revolutions at most, degrees and garbage more
-# In degrees half of all rotations are; a root that spins is one joint of 22.
-_MANY_BEYOND_A_TURN = 0.2
-_MAX_DISTANCE = 1000.0  # m: farther means millimetres or garbage
+_MAX_ANGLE = 100.0  # rad, beyond what fits contain
+_MANY_BEYOND_A_TURN = 0.2  # share of rotations; half of all in degrees, 1/22 with a spinning root
+_MAX_DISTANCE = 1000.0  # m; more suggests millimetres
 _DEFAULT_FPS = 60.0
 PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
-FPS_LIMITS = (1e-3, 1e4)  # of a recording, least and most frames per second
+FPS_LIMITS = (1e-3, 1e4)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionRecord:
-    """The content of a motion file, in its axes.
+    """Content of a motion file, in its axes.
 
     Attributes:
         rotations: [F, J, 3, 3] local rotations, the root first.
         translations: [F, 3] m, added to the root's rest position.
-        rest_root: [3] m, the rest position that ``translations`` was made for; None for the avatar's own.
+        rest_root: [3] m, the rest position that ``translations`` refers to; None for the avatar's own.
         joint_names: J names.
         fps: frames per second.
-        up: the axis that points up, "y" or "z".
-        notes: what had to be assumed or left out.
+        up: the up axis, "y" or "z".
+        notes: assumptions and omissions.
     """
 
     rotations: Floats
@@ -101,10 +100,10 @@ def _read(
     smpl_x = len(names) == 55 or (split and amass)
     smpl_root = SMPLX_REST_ROOT if smpl_x else SMPL_REST_ROOT
     if easymocap:
-        turn = axis_angle_to_matrix(_per_frame(members, "Rh", "Rh_all", frames=len(rotations)))
-        rotations[:, 0] = turn @ rotations[:, 0]
-        # Rh turns about the origin: transl = Th + R·J0 − J0
-        shift = turn @ smpl_root - smpl_root
+        heading = axis_angle_to_matrix(_per_frame(members, "Rh", "Rh_all", frames=len(rotations)))
+        rotations[:, 0] = heading @ rotations[:, 0]
+        # Rh rotates about the origin: transl = Th + R·J0 − J0
+        shift = heading @ smpl_root - smpl_root
         translations = _per_frame(members, "Th", "Th_all", frames=len(rotations)) + shift
     elif members.first_of("trans", "transl") is not None:
         translations = _per_frame(members, "trans", "transl", frames=len(rotations))
@@ -156,7 +155,7 @@ def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...
 
 
 def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
-    """Thirty finger joints [F, 30, 3] of a split ``body`` of 21 joints [F, 21, 3], if the file has them."""
+    """Thirty finger joints [F, 30, 3] of a split ``body`` of 21 joints [F, 21, 3], if present."""
     if body.shape[1] != 21 or ("pose_hand" not in archive.names and "left_hand_pose" not in archive.names):
         return []
     sides = ("pose_hand",) if "pose_hand" in archive.names else ("left_hand_pose", "right_hand_pose")
@@ -168,10 +167,10 @@ def _fingers(archive: Members, body: Floats, notes: list[str]) -> list[Floats]:
 
 
 def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """Names of ``count`` joints: the file's, else as ``given``, else in the SMPL family's order.
+    """Names of ``count`` joints: the file's, else ``given``, else in the SMPL family's order.
 
     Raises:
-        InputError: there are no joints or names, another number of names, or a name occurs twice.
+        InputError: no joints or names, another number of names, or a repeated name.
     """
     names = archive.strings("joint_names") if "joint_names" in archive.names else given
     if names is None:
@@ -191,7 +190,7 @@ def names_of_joints(archive: Members, count: int, given: tuple[str, ...] | None 
 
 
 def _per_frame(archive: Members, *members: str, frames: int) -> Floats:
-    """[F, 3] of the first member present; (F, 1, 3) is how EasyMocap's users store it."""
+    """[F, 3] of the first member present; (F, 1, 3) is accepted too."""
     member = archive.first_of(*members)
     if member is None:
         raise InputError(f"{members[0]} is missing", got=", ".join(archive.names), file=archive.path)
@@ -224,7 +223,7 @@ def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path,
 
 
 def check_translations(translations: Floats, path: str | Path, first: int = 0) -> None:
-    """Raise ``InputError`` for a root far away; ``first``: the file's frame of ``translations[0]``."""
+    """Raise ``InputError`` for a distant root; ``first``: the file's frame of ``translations[0]``."""
     distances = np.abs(translations).max(-1)
     if distances.max() > _MAX_DISTANCE:
         frame = int(np.argmax(distances > _MAX_DISTANCE))
@@ -239,7 +238,7 @@ def check_translations(translations: Floats, path: str | Path, first: int = 0) -
 
 
 def frame_rate(archive: Members) -> float | None:
-    """Frames per second, within ``FPS_LIMITS``; None where the file has none.
+    """Frames per second, within ``FPS_LIMITS``; None where absent.
 
     Raises:
         InputError: another number, or several.

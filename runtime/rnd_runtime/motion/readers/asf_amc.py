@@ -18,12 +18,10 @@ _FREEDOMS = {"rx", "ry", "rz", "tx", "ty", "tz", "l"}
 
 
 def read_amc(path: str | Path) -> MocapTree:
-    """Read an AMC motion with the ASF skeleton beside it.
-
-    A bone here is a joint at the bone's start.
+    """Read an AMC motion with the ASF skeleton beside it; a joint is at a bone's start.
 
     Raises:
-        InputError: when there is no such skeleton (``asf_beside``), or the files do not fit together.
+        InputError: there is no skeleton (``asf_beside``), or the files do not match.
     """
     path = existing_file(path, what="motion")
     skeleton = asf_beside(path)
@@ -40,17 +38,17 @@ def read_amc(path: str | Path) -> MocapTree:
     names = [bone.name for bone in bones]
     for number, bone in enumerate(bones):
         values = np.array([frame.get(bone.name, [0.0] * len(bone.freedoms)) for frame in frames])
-        turn = np.tile(np.eye(3), (len(frames), 1, 1))
+        rotation = np.tile(np.eye(3), (len(frames), 1, 1))
         for column, freedom in enumerate(bone.freedoms):
             if freedom == "l":  # bones keep their lengths
                 continue
             axis = "xyz".index(freedom[1])
             if freedom[0] == "r":
                 angle = np.radians(values[:, column]) if degrees else values[:, column]
-                turn = about_axis(axis, angle) @ turn
+                rotation = about_axis(axis, angle) @ rotation
             elif number == 0:
                 positions[:, axis] = values[:, column]
-        rotations[:, number] = bone.axes @ turn @ bone.axes.T
+        rotations[:, number] = bone.axes @ rotation @ bone.axes.T
     notes = [f"no frame rate in the file: {_FPS:g} frames per second assumed, as CMU records"]
     if silent := [bone.name for bone in bones if bone.freedoms and bone.name not in frames[0]]:
         notes.append(f"bones that no frame has stay as the skeleton has them: {', '.join(silent)}")
@@ -74,16 +72,14 @@ class _Bone:
 
 
 def asf_beside(path: Path) -> Path:
-    """The skeleton of the AMC ``path``: ``NAME.asf``, else ``SUBJECT.asf`` of a CMU name ``SUBJECT_TRIAL.amc``, else
-    the folder's only one.
-    """
+    """The AMC's skeleton: ``NAME.asf``, ``SUBJECT.asf`` of CMU's ``SUBJECT_TRIAL.amc``, or the folder's only one."""
     others = sorted(path.parent.glob("*.[aA][sS][fF]"))
     for stem in (path.stem, path.stem.rsplit("_", 1)[0]):
         if own := [candidate for candidate in others if candidate.stem == stem]:
             return own[0]
     if len(others) == 1:
         return others[0]
-    existing_file(path, what="motion")  # of one that is not there, no skeleton is missing
+    existing_file(path, what="motion")  # refuses a missing motion first
     got = f"{len(others)} of other names" if others else "none"
     raise InputError("skeleton of the AMC", expected=f"{path.stem}.asf beside it", got=got, file=path)
 
@@ -148,10 +144,10 @@ def _finite(words: Sequence[str], what: str = "skeleton") -> list[float]:
 
 def _axes(angles: Sequence[float], order: str, degrees: bool) -> Floats:
     """Rotations about fixed axes, the first of ``order`` first."""
-    turn = np.eye(3)
+    rotation = np.eye(3)
     for angle, axis in zip(angles, order.lower()):
-        turn = about_axis("xyz".index(axis), np.radians(angle) if degrees else angle) @ turn
-    return turn
+        rotation = about_axis("xyz".index(axis), np.radians(angle) if degrees else angle) @ rotation
+    return rotation
 
 
 def _amc_frames(path: Path, bones: list[_Bone]) -> list[dict[str, list[float]]]:
@@ -184,7 +180,7 @@ def _amc_frames(path: Path, bones: list[_Bone]) -> list[dict[str, list[float]]]:
 
 
 def _check_whole(frames: list[dict[str, list[float]]], path: Path) -> None:
-    """Refuse a frame without a bone that others have: a file that was cut short."""
+    """Refuse a truncated file: a frame without a bone that others have."""
     named = dict.fromkeys(bone for frame in frames for bone in frame)
     for number, frame in enumerate(frames):
         if lacking := [bone for bone in named if bone not in frame]:
