@@ -1,3 +1,3 @@
 """Learns an avatar from a monocular capture: the paper's networks, losses and two training stages, in torch."""
 
-import rnd_runtime  # noqa: F401  (before torch and numba: how OpenMP's threads wait, where kernels are kept)
+import rnd_runtime.core  # noqa: F401  (handles signals while the rest of a command is imported)

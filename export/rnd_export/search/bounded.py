@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import numpy as np
@@ -16,6 +15,7 @@ from rnd_export.export import export
 from rnd_export.reduce.views import views_of
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.files import atomic_path, earlier_rows, write_json
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.doctor import machine
 from rnd_runtime.shading.light import Light, Up, light_notes, load_light
@@ -58,8 +58,8 @@ def export_bounded(
     rows = [] if what.json is None else earlier_rows(what.json, what="rows of an earlier search", names=("bound",))
     started = perf_counter()
     scene = _scene(checkpoint, what, warn)
-    with TemporaryDirectory() as folder:  # the reference of the search has to agree with torch
-        export(checkpoint, Path(folder) / "avatar.onnx", what.motion, cull=-1)
+    with temporary_folder() as folder:  # the reference of the search has to agree with torch
+        export(checkpoint, folder / "avatar.onnx", what.motion, cull=-1)
     bench, steps = Workbench(checkpoint, scene), []
 
     def on_step(found: Found) -> None:

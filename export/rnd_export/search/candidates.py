@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +24,7 @@ from rnd_runtime.avatar.file import Precision
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.raster.cpu import rasterize
@@ -197,7 +196,7 @@ def _albedo_image(gaussians: Gaussians, camera: Camera) -> NDArray[np.float32]:
 
 
 def _loaded(model: onnx.ModelProto) -> Avatar:
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "avatar.onnx"
+    with temporary_folder() as folder:
+        file = folder / "avatar.onnx"
         onnx.save_model(model, str(file))
         return Avatar.load(file)

@@ -1,1 +1,5 @@
 """Errors, files, arrays, cameras and kernels that everything else stands on."""
+
+from .signals import install_in_command
+
+install_in_command()

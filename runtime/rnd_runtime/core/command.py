@@ -18,24 +18,27 @@ import os
 import re
 import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, TypeVar
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from .errors import InputError, withheld
+from .budget import set_max_expanded
+from .errors import InputError, printable, withheld
 from .kernels import prepare_process
 from .parsing import names, refusal, refuse_unknown, registry
+from .signals import handled, received
 
 Options = TypeVar("Options")
 MAX_SIDE = 16384
 """pixels of a frame's side: OpenGL's usual limit; a larger one is a typo that would fill the memory"""
 _SIZES = {"480p": (854, 480), "720p": (1280, 720), "1080p": (1920, 1080), "1440p": (2560, 1440), "2160p": (3840, 2160)}
+
+
+_MAX_LOG = 2000  # characters of a line on stderr
 
 
 # --- running -------------------------------------------------------------------------------------------------------
@@ -50,16 +53,14 @@ class _Running:
 
 
 _running = _Running()
-# Signals of queues, systems and terminals that end a program.
-_ENDINGS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 def run_command(name: str, main: Callable[[], int | None]) -> int:
     """Prepare the process, run ``main`` as the command ``name`` and return its exit code.
 
-    2 for an ``InputError`` and for a file that the machine withholds (one line on stderr); 130 for Ctrl-C, SIGTERM and
-    SIGHUP; 141, silently, where the reader of stdout has gone (``rnd-play --help | head``); otherwise what ``main``
-    returns. A letter that the terminal lacks becomes ``?``.
+    2 for an ``InputError`` and for a file that the machine withholds (one line on stderr); 130 for Ctrl-C, 143 for
+    SIGTERM, 129 for SIGHUP (``core.signals``); 141, silently, where the reader of stdout has gone
+    (``rnd-play --help | head``); otherwise what ``main`` returns. A letter that the terminal lacks becomes ``?``.
     """
     prepare_process()
     _running.name, _running.quiet = name, False
@@ -70,7 +71,7 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
         sys.stdout.reconfigure(errors="replace")
     try:
         try:
-            with _signals_interrupt():
+            with handled(name):
                 return main() or 0
         finally:
             sys.stdout.flush()  # at exit Python would complain of a closed pipe
@@ -79,7 +80,10 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
         return 2
     except KeyboardInterrupt:
         _error("interrupted")
-        return 130
+        return 128 + (received() or signal.SIGINT)
+    except MemoryError as error:
+        _error("memory is full" + (f": {error}" if str(error) else ""))
+        return 1
     except BrokenPipeError:
         with contextlib.suppress(io.UnsupportedOperation):  # a test's stdout is no file
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what is left in it
@@ -89,28 +93,6 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
             raise
         _error(reason)
         return 2
-
-
-@contextlib.contextmanager
-def _signals_interrupt() -> Iterator[None]:
-    """Treat other ending signals, unless ignored (``nohup``), as Ctrl-C: half-written files are removed."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        on_interrupt = signal.getsignal(signal.SIGINT)
-        if not callable(on_interrupt):  # Ctrl-C is ignored, as in the background of a shell
-            raise KeyboardInterrupt
-        on_interrupt(signal.SIGINT, frame)
-
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield
-        return
-    endings = [number for number in _ENDINGS if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, interrupt) for number in endings}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def is_quiet() -> bool:
@@ -143,7 +125,7 @@ def finish(result: object, summary: str = "", *, then: str | None = None) -> Non
 
 
 def _error(line: str) -> None:
-    print(f"{_running.name}: {line}", file=sys.stderr, flush=True)  # noqa: T201
+    print(f"{_running.name}: {printable(line, _MAX_LOG)}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 # --- types of options ----------------------------------------------------------------------------------------------
@@ -210,6 +192,8 @@ class _General:
     """Print errors and the result's path only."""
     version: Flag = False
     """Print the version and exit."""
+    max_expand_mb: OptionalCount = None
+    """MB that a file may expand to while it is read (default: 256, or 16 times its size)."""
 
 
 def parse(
@@ -286,4 +270,5 @@ def _parsed(parser: Callable[[], Any]) -> Any:
         raise refusal(page.getvalue()) from None
     sys.stderr.write(page.getvalue())
     _running.quiet = parsed.general.quiet
+    set_max_expanded(parsed.general.max_expand_mb)
     return parsed.options

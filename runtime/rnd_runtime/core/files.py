@@ -6,13 +6,15 @@ import hashlib
 import json
 import math
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from .errors import InputError
+from .signals import at_end
 
 _NAMED = 40  # letters of the final name in a temporary's: all of them may be too long
 
@@ -22,20 +24,30 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path``; rename it to ``path`` when the block succeeds.
 
     The temporary keeps the suffix (writers choose a format by it) and starts with a dot. When the block
-    raises, the temporary is removed and what stood under ``path`` before stays.
+    raises or a signal ends the process, the temporary is removed and what stood under ``path`` before stays. The
+    mode is the umask's.
     """
     path = output_file(path)
-    begin = path.stem[:_NAMED]
-    handle, name = tempfile.mkstemp(prefix=f".{begin}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o644)  # mkstemp makes 0600; results are meant to be shared
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    temporary = path.with_name(f".{path.stem[:_NAMED]}.{secrets.token_hex(4)}{path.suffix}")
+    with at_end(partial(temporary.unlink, missing_ok=True)):  # before it is there
+        try:
+            os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+            yield temporary
+            _sync(temporary)
+            temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+def _sync(path: Path) -> None:
+    """Wait until the content is on the disk: after a crash of the machine the name holds the old file or the new."""
+    with suppress(OSError):  # a file system without it
+        handle = os.open(path, os.O_RDWR)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def sha256_of(path: str | Path) -> str:

@@ -33,7 +33,30 @@ def test_a_file_appears_whole_under_its_name(tmp_path):
         assert not (tmp_path / "new" / "a.png").exists()
     assert (tmp_path / "new" / "a.png").read_text() == "whole"
     assert _names(tmp_path / "new") == ["a.png"]
-    assert stat.S_IMODE((tmp_path / "new" / "a.png").stat().st_mode) == 0o644
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_the_mode_is_the_umasks(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        write_json(tmp_path / "a.json", [])
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == mode
+
+
+def test_the_content_is_on_the_disk_before_it_gets_its_name(tmp_path, monkeypatch):
+    synced = []
+    sync = os.fsync
+
+    def fsync(handle: int) -> None:
+        assert not (tmp_path / "a.json").exists()
+        synced.append(os.fstat(handle).st_size)
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_json(tmp_path / "a.json", [])
+    assert synced == [3] == [(tmp_path / "a.json").stat().st_size]
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, InputError])

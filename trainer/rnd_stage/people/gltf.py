@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import struct
-import tempfile
 import urllib.parse
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_image
 from rnd_runtime.core.rotations import quaternion_to_matrix
+from rnd_runtime.core.signals import temporary_folder
 
 from .character import Character, Floats, sample_texture
 
@@ -172,8 +172,8 @@ class _Gltf:
             start = view.get("byteOffset", 0)
             content = self.buffers[view["buffer"]][start : start + view["byteLength"]]
         suffix = ".png" if content[:4] == b"\x89PNG" else ".jpg"
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / f"texture{suffix}"
+        with temporary_folder() as folder:
+            file = folder / f"texture{suffix}"
             file.write_bytes(content)
             return read_image(file)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ import numpy as np
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import Npz
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.readers.arrays import frame_rate, names_of_joints
 from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_runtime.motion.readers.video_fits import (
@@ -230,7 +230,7 @@ def _romp_content(file: Path) -> dict[str, Any]:
     with Npz(file, what="ROMP results") as archive:
         if "results" not in archive.names:
             return {key: archive.numbers(key) for key in ("smpl_thetas", "cam_trans", "smpl_betas")}
-    with zipfile.ZipFile(file) as members, tempfile.TemporaryDirectory() as folder:
+    with zipfile.ZipFile(file) as members, temporary_folder() as folder:
         content = read_pickle(members.extract("results.npy", folder), what="ROMP results")
     if content is None:
         return {}

@@ -1,24 +1,23 @@
-"""A training from where it stands to its last step: log, status, states, previews, and Ctrl-C."""
+"""Training loop: steps, log, status, states, previews and Ctrl-C."""
 
 from __future__ import annotations
 
 import json
-import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path, write_json
+from rnd_runtime.core.signals import at_end, on_signal
 
 from .training import StepResult, Training
 
 METRICS_FILE, STATUS_FILE = "metrics.jsonl", "status.json"
-"""in a run's folder: a row for each step; what the training is doing now"""
+"""in a run's folder: one row per step; current progress"""
 PHASES = {1: "geometry", 2: "albedo and light", 3: "unseen poses"}
 """names of the stages"""
 WARM_UP, LIGHT_SEARCH = "warming up", "searching the light"
@@ -38,18 +37,18 @@ def run(
 ) -> bool:
     """Train to the last step, saving every ``save_every`` steps and at the end.
 
-    Ctrl-C finishes the current step and saves; resuming continues the same curve.
+    The first Ctrl-C, SIGTERM or SIGHUP finishes the current step and saves; resuming continues the same curve.
 
     Args:
         folder: gets ``metrics.jsonl``, ``status.json``, the states and the checkpoint.
         on_phase: called with name, done and total as a phase begins, and as the light's search advances.
 
     Returns:
-        Whether Ctrl-C left steps to do.
+        Whether a signal left steps to do.
     """
     config, total = training.config, training.schedule.total
     status = _Status(training, folder / STATUS_FILE)
-    stage = 0
+    stage, interrupted = 0, False
 
     def begin(name: str, done: float, of: float) -> None:
         status.write(name)
@@ -57,34 +56,42 @@ def run(
 
     def search(done: int, of: int) -> None:
         nonlocal stage
-        stage = 0  # its phase begins anew afterwards
+        stage = 0  # the stage's phase begins afterwards
         begin(LIGHT_SEARCH, done, of)
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+
+    def stop() -> None:
+        with suppress(OSError, InputError):  # e.g. of a full disk
+            status.end("stopped")
 
     training.on_light_search = search
     try:
-        if training.step_index < config.steps:
-            begin(WARM_UP, 0, 1)
-            training.warm_up()
-        with _log_up_to(folder / METRICS_FILE, training.step_index) as log, _deferred_interrupt() as interrupted:
-            while training.step_index < total and not interrupted():
-                if training.stage != stage:
-                    stage = training.stage
-                    cost = training.schedule.cost
-                    begin(PHASES[stage], cost(training.step_index), cost(total))
-                step = training.step()
-                row = {"step": step.index, "stage": step.stage, "seconds": round(training.seconds, 3), **step.terms}
-                log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
-                status.write(PHASES[step.stage])
-                on_step(step)
-                if training.step_index % config.save_every == 0:
-                    log.flush()
-                    training.save(folder)
-                if training.step_index % config.preview_every == 0 or training.step_index == total:
-                    on_preview()
-            training.save(folder)
+        with at_end(stop):
+            if training.step_index < config.steps:
+                begin(WARM_UP, 0, 1)
+                training.warm_up()
+            with _log_up_to(folder / METRICS_FILE, training.step_index) as log, on_signal(interrupt):
+                while training.step_index < total and not interrupted:
+                    if training.stage != stage:
+                        stage = training.stage
+                        cost = training.schedule.cost
+                        begin(PHASES[stage], cost(training.step_index), cost(total))
+                    step = training.step()
+                    row = {"step": step.index, "stage": step.stage, "seconds": round(training.seconds, 3), **step.terms}
+                    log.write(json.dumps(row | ({"skipped": True} if step.skipped else {})) + "\n")
+                    status.write(PHASES[step.stage])
+                    on_step(step)
+                    if training.step_index % config.save_every == 0:
+                        log.flush()
+                        training.save(folder)
+                    if training.step_index % config.preview_every == 0 or training.step_index == total:
+                        on_preview()
+                training.save(folder)
     except BaseException:
-        with suppress(OSError, InputError):  # of a full disk, say
-            status.end("stopped")
+        stop()
         raise
     stopped = training.step_index < total
     status.end("stopped" if stopped else "finished")
@@ -92,23 +99,23 @@ def run(
 
 
 class _Status:
-    """``status.json``: phase, step, steps, seconds so far, seconds left, and how the training ended."""
+    """Writer of ``status.json``: phase, step, steps, seconds, seconds left, and how the training ended."""
 
     def __init__(self, training: Training, path: Path) -> None:
         self._training, self._path = training, path
         self._phase, self._written = "", 0.0
-        self._seen: deque[tuple[float, float]] = deque(maxlen=RECENT)  # seconds and cost after each of the last steps
+        self._recent: deque[tuple[float, float]] = deque(maxlen=RECENT)  # seconds and cost after each step
 
     def write(self, phase: str) -> None:
-        """Note the step just done; write the file where the phase is new or the last write is a second old."""
+        """Record a step; write the file if the phase is new or the last write older than ``STATUS_S``."""
         training = self._training
-        self._seen.append((training.seconds, training.schedule.cost(training.step_index)))
+        self._recent.append((training.seconds, training.schedule.cost(training.step_index)))
         if phase != self._phase or time.monotonic() - self._written > STATUS_S:
             self._phase = phase
             self._write(None)
 
     def end(self, how: str) -> None:
-        """Say that the training has ``finished`` or was ``stopped``."""
+        """Write the final status, ``finished`` or ``stopped``."""
         self._write(how)
 
     def _write(self, ended: str | None) -> None:
@@ -125,20 +132,20 @@ class _Status:
         write_json(self._path, values)
 
     def _seconds_left(self) -> float | None:
-        if not self._seen:
+        if not self._recent:
             return None
-        (before, first), (now, done) = self._seen[0], self._seen[-1]
+        (before, first), (now, done) = self._recent[0], self._recent[-1]
         left = self._training.schedule.cost(self._training.schedule.total) - done
         return round(left * (now - before) / (done - first), 1) if done > first else None
 
 
 def _log_up_to(path: Path, step: int) -> TextIO:
-    """The metrics log, without damaged rows and those from ``step`` on, which will be done again."""
+    """Open the metrics log for appending, without damaged rows and rows from ``step`` on."""
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
     valid = [line for line in lines if (row := _row(line)) is not None and row["step"] < step]
     with atomic_path(path) as temporary:
         temporary.write_text("".join(line + "\n" for line in valid), encoding="utf-8")
-    return path.open("a", encoding="utf-8", buffering=1)  # line by line: rnd-view reads along
+    return path.open("a", encoding="utf-8", buffering=1)  # line-buffered for rnd-view
 
 
 def _row(line: str) -> dict[str, Any] | None:
@@ -147,24 +154,3 @@ def _row(line: str) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return row if isinstance(row, dict) and isinstance(row.get("step"), int) else None
-
-
-@contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C into a flag; a second one interrupts at once."""
-    pressed = False
-
-    def handle(number: int, frame: object) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
-
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
-        yield lambda: False
-        return
-    before = signal.signal(signal.SIGINT, handle)
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import existing_file, output_folder, refuse_input
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.progress import track
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.amass import write_amass
 from rnd_runtime.motion.edit import resampled
 from rnd_runtime.motion.motion import Motion, motion_inputs
@@ -121,8 +121,8 @@ def _sh(
 
 
 def _transform(program: str, stem: Path, splats: Splats, formats: tuple[str, ...]) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        ply = Path(folder) / "splats.ply"
+    with temporary_folder() as folder:
+        ply = folder / "splats.ply"
         write_ply(ply, splats)
         for suffix in ("spz", "sog"):
             if suffix in formats:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import base64
 import math
-import tempfile
 from collections.abc import Collection, Sequence
 from html import escape
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.images import write_image
+from rnd_runtime.core.signals import temporary_folder
 
 WIDTH, HEIGHT = 320, 150  # of a curve, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 42, 8, 8, 16  # margins for ticks
@@ -43,8 +42,8 @@ def number(value: object) -> str:
 
 def png(pixels: NDArray[np.uint8], alt: str) -> str:
     """An ``img`` of [H, W, 3 or 4] pixels, lossless."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.png"
+    with temporary_folder() as folder:
+        path = folder / "a.png"
         write_image(path, pixels)
         return f'<img alt="{escape(alt)}" src="{data_uri(path.read_bytes(), "image/png")}">'
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.aov import aov_image
@@ -50,8 +50,8 @@ class AvatarRenders:
 
     def turntable(self) -> bytes:
         """An mp4 of one orbit while the motion plays, under the learned light. Needs PyAV (else InputError)."""
-        with tempfile.TemporaryDirectory() as folder, self._renderer(MODE) as renderer:
-            path = Path(folder) / "turntable.mp4"
+        with temporary_folder() as folder, self._renderer(MODE) as renderer:
+            path = folder / "turntable.mp4"
             with clip_writer(path, fps=FPS) as append:
                 for number in range(round(SECONDS * FPS)):
                     time_s = number / FPS

@@ -6,11 +6,13 @@ import secrets
 import webbrowser
 from collections.abc import Sequence
 from threading import Thread
+from typing import NoReturn
 
 from rich.console import Console
 
 from rnd_runtime.core.command import is_quiet, log, parse, run_command
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
+from rnd_runtime.core.signals import on_signal
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.playback.start import load_ahead
 
@@ -23,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command("rnd-view", lambda: view(parse(ViewOptions, "rnd-view", arguments)))
 
 
-def view(options: ViewOptions) -> int:
+def view(options: ViewOptions) -> NoReturn:
     """Serve the avatar or the training that ``options`` name until the process is interrupted.
 
     Raises:
@@ -53,7 +55,8 @@ def view(options: ViewOptions) -> int:
             print(f"rnd-view: {url}", flush=True)  # noqa: T201
             if options.browser and is_loopback(options.host):
                 Thread(target=webbrowser.open, args=(url,), daemon=True).start()  # some wait for their page
-            server.serve_forever()
+            with on_signal(server.stop):
+                server.serve_forever()
+        raise KeyboardInterrupt  # by which alone serving ends; the pages are told
     finally:
         shown.close()
-    return 0

@@ -13,7 +13,6 @@ from importlib import resources
 from io import BytesIO
 from pathlib import Path
 from socket import AF_INET, AF_INET6, SOCK_DGRAM, gethostname, socket
-from tempfile import TemporaryDirectory
 from time import perf_counter
 from types import ModuleType
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from rnd_runtime.core.errors import InputError, withheld
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.core.threads import set_threads
 from rnd_viewer.play.video import clip_writer
 
@@ -245,7 +245,7 @@ class _Visitor:
         frames = motion.frames_at(request.fps)
         if frames > MAX_CLIP_FRAMES:
             raise InputError("clip", expected=f"at most {MAX_CLIP_FRAMES} frames", got=frames)
-        with TemporaryDirectory() as folder:
+        with temporary_folder() as folder:
             file = folder / "clip.mp4"
             with clip_writer(file, fps=request.fps) as append:
                 for number in range(frames):
