@@ -1,4 +1,4 @@
-"""Checkpoints in safetensors: tensors and one JSON string, nothing that could be executed."""
+"""Checkpoints in safetensors: tensors and a JSON header."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _KEY = "rnd_checkpoint"
 
 @dataclass
 class Checkpoint:
-    """A trained avatar: the model, the probe it was lit by, its skeleton, and where it came from.
+    """A trained avatar.
 
     Attributes:
         probe: [32, 64, 3] linear radiance.
-        info: what the training says of itself, see ``training.training.Training.info``.
-        file, sha256: what it was read from.
+        info: provenance, see ``Training.info``.
+        file, sha256: of the checkpoint.
     """
 
     model: AvatarModel
@@ -47,16 +47,16 @@ class Checkpoint:
     sha256: str
 
     def learned_from(self, capture: Path) -> bool:
-        """Whether this is the capture.json that the avatar was trained on."""
+        """Whether the avatar was trained on this capture.json."""
         return bool(self.info.get("capture_sha256") == sha256_of(capture))
 
     def learned_under(self, capture: Capture) -> set[str | None]:
-        """Names of the lights of ``capture`` whose maps the avatar was trained under."""
+        """Names of the lights of ``capture`` that the avatar was trained under."""
         lights = self.info.get("lights", {})
         return {name for name, digest in lights.items() if capture.light_sha256(name) == digest}
 
     def note(self) -> str | None:
-        """What a user should know of an avatar whose training was stopped before there was a light; else None."""
+        """Note for the user if the training stopped before the second stage, else None."""
         if self.config.light == "none" or self.info.get("lit", True):
             return None
         stopped = f"step {self.info.get('step')} of {self.info.get('steps_planned')}"
@@ -66,7 +66,7 @@ class Checkpoint:
 def save_checkpoint(
     path: Path, model: AvatarModel, probe: Tensor, skeleton: Skeleton, config: TrainConfig, info: dict[str, Any]
 ) -> None:
-    """Write ``avatar.ckpt`` atomically: ``probe`` [32, 64, 3]; ``info``: step, capture and such, JSON values."""
+    """Write ``avatar.ckpt`` atomically; ``probe`` [32, 64, 3] linear, ``info`` of JSON values."""
     tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
     tensors["probe"] = probe.detach().cpu().contiguous()
     tensors["skeleton.rest_joints"] = torch.as_tensor(np.asarray(skeleton.rest_joints), dtype=torch.float64)
@@ -80,7 +80,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
-    """Read ``avatar.ckpt``; anything missing, cut short, unknown or of a newer schema is an InputError."""
+    """Read ``avatar.ckpt``; raises ``InputError`` if it is not a complete checkpoint of this schema."""
     try:
         tensors, header = read_tensors(path, SCHEMA)
     except InputError as error:
@@ -102,7 +102,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
 
 
 def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:
-    """A model of ``config`` with the tensors of ``state``."""
+    """Model of ``config`` with the tensors of ``state``, in evaluation mode."""
     neighbours = state["interpolate.neighbours"]
     if int(neighbours.min()) < 0 or int(neighbours.max()) >= config.model.nodes:
         raise ValueError("interpolation neighbours out of range")
@@ -124,16 +124,16 @@ def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skele
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], header: dict[str, Any]) -> None:
-    """One safetensors file with ``header`` as JSON, under a temporary name until it is whole."""
+    """Write a safetensors file with ``header`` as JSON, atomically."""
     with atomic_path(path) as temporary:
         try:
             save_file(tensors, temporary, metadata={_KEY: json.dumps(header, sort_keys=True)})
-        except SafetensorError as error:  # which a full disk is
+        except SafetensorError as error:  # e.g. of a full disk
             raise InputError("cannot be written", got=str(error).splitlines()[0], file=path) from error
 
 
 def read_tensors(path: str | Path, schema: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and JSON header of one of our safetensors files, its schema checked."""
+    """Tensors and JSON header of a safetensors file of ``schema``; raises ``InputError`` otherwise."""
     path = existing_file(path, what="checkpoint")
     try:
         with safe_open(path, framework="pt") as file:

@@ -1,7 +1,6 @@
 """The paper's networks: attribute encoders D_g and D_a, dynamic skinning D_W, offsets Δx and Δr, visibility.
 
-All are evaluated at M nodes of the template. The position side of each network depends on the node alone, so
-the exporter bakes it; what is left at playback is a handful of small matrix products.
+All are evaluated at M nodes of the template. The exporter bakes their position branches.
 """
 
 from __future__ import annotations
@@ -12,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 VELOCITY_SCALE = 0.1
-"""joint velocities (rad/s) enter as tanh(v / 10): linear for human motion, bounded for broken files"""
+"""scale of joint velocities (rad/s) in tanh: linear for human motion"""
 SH_DC_OF_ONE = 2.0 * math.sqrt(math.pi)
-"""coefficient of Y_00 whose function is 1 everywhere"""
+"""SH coefficient of Y_00 of the constant 1"""
 
 
 def positional_encoding(x: Tensor, frequencies: int) -> Tensor:
@@ -42,7 +41,7 @@ class PositionEncoder(nn.Module):
 
 
 class AttributeEncoder(nn.Module):
-    """D_g or D_a: encoded positions [M, E] → raw attributes [M, outputs]; zero at the start."""
+    """D_g or D_a: encoded positions [M, E] → raw attributes [M, outputs]; initially zero."""
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
         super().__init__()
@@ -88,11 +87,10 @@ class JointAttention(nn.Module):
 
 
 class DynamicSkinning(nn.Module):
-    """D_W: change of the skinning weights' logits, from a motion window; zero at the start.
+    """D_W: offsets of the skinning weights' logits from a motion window; initially zero.
 
-    ``forward(encoded [M, E], window [d, J−1, 6], velocity [J−1, 3] rad/s) → [M, J]``. The temporal branch
-    reads each joint's d poses as one token, the spatial branch the joints' velocities (paper, section 3.2).
-    Without ``temporal`` only the second is there, the paper's ablation.
+    ``forward(encoded [M, E], window [d, J−1, 6], velocity [J−1, 3] rad/s) → [M, J]``. Tokens of the temporal branch are
+    each joint's d poses, of the spatial branch its velocity (paper, section 3.2). ``temporal=False`` is an ablation.
     """
 
     def __init__(self, inputs: int, joints: int, poses: int, width: int, heads: int, temporal: bool = True) -> None:
@@ -116,10 +114,10 @@ class DynamicSkinning(nn.Module):
 
 
 class PoseConditioned(nn.Module):
-    """An MLP of position and of the present pose; the parent of offsets and visibility.
+    """MLP of position, current pose and extra input, for offsets and visibility; initially zero.
 
     ``forward(encoded [M, E], pose [6·(J−1)], extra [M, extras] | None) → [M, outputs]``. The first layer is a
-    sum of a position part (baked at export), a pose part (one vector for all nodes) and an extra part.
+    sum of a position part, a pose part and an extra part.
     """
 
     def __init__(self, inputs: int, joints: int, width: int, outputs: int, extras: int = 0) -> None:
@@ -142,9 +140,9 @@ class PoseConditioned(nn.Module):
 
 
 class Visibility(PoseConditioned):
-    """v: 16 spherical harmonics of visibility in the root's frame, from x_c, the posed normal and the pose.
+    """v: 16 SH coefficients of visibility in the root's frame, from x_c, the posed normal and the pose.
 
-    Starts at 1 in all directions. Paper: x_c and the normal only; the pose lets it see an arm move.
+    Initially 1 in all directions. The paper's network has no pose input.
     """
 
     def __init__(self, inputs: int, joints: int, width: int) -> None:

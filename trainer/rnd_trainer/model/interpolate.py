@@ -1,4 +1,4 @@
-"""Values at the nodes → values at the Gaussians, with a backward pass that gathers instead of scattering."""
+"""Interpolation from nodes to Gaussians, with a backward pass that gathers instead of scattering."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 class NodeInterpolation(nn.Module):
     """values [M, C] → Σ_k weights[n, k] · values[neighbours[n, k]], [N, C].
 
-    Torch's own backward of ``values[neighbours]`` scatters element by element and would cost more than the
-    networks; here the transpose is laid out once and both directions are gathers (same bits every run).
+    The transpose is built once, so that both directions are deterministic gathers. Torch's backward of
+    ``values[neighbours]`` scatters by element and costs more than the networks.
 
     Args:
         neighbours: [N, K] int64 node indices below ``nodes``.
@@ -51,7 +51,7 @@ class _Interpolate(torch.autograd.Function):
 
 
 def _transpose(neighbours: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each node, the flat positions (n·K + k) that read it: starts [M + 1], order [N·K]."""
+    """Flat indices n·K + k that read each node, in CSR form: starts [M + 1], order [N·K]."""
     flat = neighbours.reshape(-1)
     order = np.argsort(flat, kind="stable")
     return np.searchsorted(flat[order], np.arange(nodes + 1)), order

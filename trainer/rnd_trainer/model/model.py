@@ -1,4 +1,4 @@
-"""The avatar as a torch module: everything between a pose and posed Gaussians with their material."""
+"""The avatar as a torch module: from a pose to posed Gaussians with their material."""
 
 from __future__ import annotations
 
@@ -18,25 +18,24 @@ from .template import WEIGHT_FLOOR, Template
 from .twist import TwistFrames
 
 ALBEDO_RANGE = (0.03, 0.80)
-"""of natural diffuse materials; holds the albedo–light scale in a plausible place"""
+"""of natural diffuse materials; bounds the albedo–light ambiguity"""
 TANGENT_SCALE = (0.25, 2.0)
-"""standard deviations along the surface, in units of the spacing: neither gaps nor needles"""
+"""range of the standard deviations along the surface, in units of the spacing"""
 NORMAL_SCALE = (0.05, 0.5)
-"""and across it: a disc"""
+"""range of the standard deviation across the surface, in units of the spacing"""
 START_OPACITY = 2.2
-"""raw opacity at the start; sigmoid gives 0.90"""
+"""initial raw opacity; its sigmoid is 0.90"""
 
 GEOMETRY_COLUMNS = {"opacity": 1, "rotation": 3, "scale": 3, "normal": 3, "offset": 3}
 LIMB_BUFFERS = ("limb_axes", "limb_levers", "limb_shares")
 APPEARANCE_COLUMNS = {"colour": 3, "albedo": 3, "roughness": 1}
 GLOSSIEST_RESIDUAL = -0.6
-"""how much glossier than the networks say a Gaussian may be played, before the sigmoid: where no picture shows the
-light's reflection, nothing keeps gloss from drifting. Bounded in training as well it is worth less (docs/tried.md)"""
+"""lower bound, in evaluation mode, of the raw roughness residual"""
 
 
 @dataclass
 class PoseInput:
-    """What the networks need to know of a moment: motion window [d, J−1, 6], velocity [J−1, 3], bones [J, 3, 4]."""
+    """Network input: motion window [d, J−1, 6], joint velocities [J−1, 3] rad/s, bone transforms [J, 3, 4]."""
 
     window: Tensor
     velocity: Tensor
@@ -49,10 +48,16 @@ class PoseInput:
 
 @dataclass
 class Attributes:
-    """Activated attributes in the rest pose: valid for any weights of the networks.
+    """Activated attributes in the rest pose.
 
-    opacity [N], rotation [N, 3] (R as a rotation vector in the tangent frame), scales [N, 3] m, normals [N, 3]
-    unit, points [N, 3] m with the static offset, colour / albedo [N, 3] linear, roughness [N].
+    Attributes:
+        opacity: [N].
+        rotation: [N, 3] rotation vectors in the tangent frame.
+        scales: [N, 3] m.
+        normals: [N, 3] unit.
+        points: [N, 3] m, with the static offset.
+        colour, albedo: [N, 3] linear.
+        roughness: [N].
     """
 
     opacity: Tensor
@@ -68,10 +73,15 @@ class Attributes:
 
 @dataclass
 class PosedGaussians:
-    """Posed Gaussians, world frame: means [N, 3] m, covariances [N, 6] m², normals [N, 3] unit.
+    """Posed Gaussians in the world frame.
 
-    visibility [N, 16] in the root's frame; skinning weights [N, J] and the pose's offset [N, 3] m feed the
-    regularisers.
+    Attributes:
+        means: [N, 3] m.
+        covariances: [N, 6] m².
+        normals: [N, 3] unit.
+        visibility: [N, 16] SH coefficients in the root's frame.
+        weights: [N, J] skinning weights.
+        offset: [N, 3] pose-dependent offset in units of its bound.
     """
 
     means: Tensor
@@ -86,9 +96,7 @@ class PosedGaussians:
 class AvatarModel(nn.Module):
     """N Gaussians on a template, driven by networks at M nodes.
 
-    A Gaussian's raw attribute is the nodes' value interpolated at it plus a residual of its own, zero at the
-    start: the networks carry what is smooth and reach places that no picture shows, the residuals carry
-    texture at the Gaussians' full resolution.
+    A Gaussian's raw attribute is the interpolated value of the nodes plus a residual of its own, initially zero.
     """
 
     points: Tensor
@@ -115,7 +123,7 @@ class AvatarModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32))
-        for name, value in zip(LIMB_BUFFERS, template.limbs):  # follow from what is saved
+        for name, value in zip(LIMB_BUFFERS, template.limbs):  # derived from the saved buffers
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
         self.interpolate = NodeInterpolation(
             torch.as_tensor(template.neighbours),
@@ -141,9 +149,8 @@ class AvatarModel(nn.Module):
     def attributes(self, encoded: Tensor) -> Attributes:
         """D_g and D_a with residuals, activated.
 
-        The surface as a whole may leave the template by ``max_static_offset``; a Gaussian may stray from that
-        surface by one spacing and no more: farther ones would show as spikes and as speckled shadows.
-        In evaluation mode the residual of roughness, the last column, is ``GLOSSIEST_RESIDUAL`` at least.
+        ``max_static_offset`` bounds the surface's offset from the template, one spacing a Gaussian's from the surface.
+        In evaluation mode ``GLOSSIEST_RESIDUAL`` bounds the residual of roughness, the last column.
         """
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
         smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
@@ -151,12 +158,12 @@ class AvatarModel(nn.Module):
         if not self.training:
             residual = torch.cat([residual[:, :-1], residual[:, -1:].clamp(min=GLOSSIEST_RESIDUAL)], dim=-1)
         part = _by_name(smooth + residual, columns)
-        place = _by_name(smooth, columns)["offset"]
+        surface_offset = _by_name(smooth, columns)["offset"]
         tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0
         normals = nn.functional.normalize(self.rest_normals + tilt, dim=-1)
         tangents, across = part["scale"].split([2, 1], dim=-1)
-        scales = torch.cat([_between(tangents, TANGENT_SCALE), _between(across, NORMAL_SCALE)], dim=-1)
-        offset = self.config.max_static_offset * torch.tanh(place) + self.residual_offset()
+        scales = torch.cat([_log_uniform(tangents, TANGENT_SCALE), _log_uniform(across, NORMAL_SCALE)], dim=-1)
+        offset = self.config.max_static_offset * torch.tanh(surface_offset) + self.residual_offset()
         low, high = ALBEDO_RANGE
         glossy, rough = ROUGHNESS_RANGE
         return Attributes(
@@ -166,30 +173,32 @@ class AvatarModel(nn.Module):
             normals=normals,
             points=self.points + offset,
             colour=torch.sigmoid(part["colour"]),
-            albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # 0.24 at the start
+            albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # initially 0.24
             roughness=glossy + (rough - glossy) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
             raw_geometry_residual=self.geometry_residual,
         )
 
     def residual_offset(self) -> Tensor:
-        """How far each Gaussian's own residual takes it from the surface [N, 3] m."""
+        """Offset [N, 3] m of each Gaussian from the surface, by its residual."""
         return self.spacing * torch.tanh(_by_name(self.geometry_residual, GEOMETRY_COLUMNS)["offset"])
 
     def forward(self, pose: PoseInput) -> PosedGaussians:
-        """Pose the avatar; see ``PosedGaussians``."""
+        """Pose the avatar."""
         encoded = self.encoded_nodes()
         nodes = len(encoded)
         static = self.attributes(encoded)
-        flat = pose.window[-1].flatten()
+        current = pose.window[-1].flatten()
         logits = (
             self.skinning(encoded, pose.window, pose.velocity)
             if self.config.dynamic_skinning
             else torch.zeros_like(self.log_weights[:nodes])
         )
         node_normals = self._node_normals(static.normals[:nodes].detach(), pose.bones.detach())
-        seen = flat if self.config.visibility == "pose" else torch.zeros_like(flat)
-        fields = torch.cat([logits, self.offsets(encoded, flat), self.visibility(encoded, seen, node_normals)], dim=-1)
-        logits, offset, turn, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
+        visibility_pose = current if self.config.visibility == "pose" else torch.zeros_like(current)
+        fields = torch.cat(
+            [logits, self.offsets(encoded, current), self.visibility(encoded, visibility_pose, node_normals)], dim=-1
+        )
+        logits, offset, rotation, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
 
         weights = torch.softmax(self.log_weights + logits, dim=-1)
         offset = torch.tanh(offset)
@@ -197,7 +206,7 @@ class AvatarModel(nn.Module):
             weights,
             pose.bones,
             static.points + self.config.max_offset * offset,
-            torch.tanh(turn),
+            torch.tanh(rotation),
             self.tangents,
             static.rotation,
             static.scales,
@@ -221,7 +230,7 @@ class AvatarModel(nn.Module):
 
 
 def _by_name(values: Tensor, columns: dict[str, int]) -> dict[str, Tensor]:
-    """[N, C] cut into named columns."""
+    """[N, C] split into named columns."""
     return dict(zip(columns, values.split(list(columns.values()), dim=-1)))
 
 
@@ -230,7 +239,7 @@ def _log_weights(weights) -> Tensor:
     return torch.log(floored / floored.sum(dim=-1, keepdim=True))
 
 
-def _between(raw: Tensor, bounds: tuple[float, float]) -> Tensor:
-    """Log-uniform between ``bounds``: the geometric mean at raw = 0."""
+def _log_uniform(raw: Tensor, bounds: tuple[float, float]) -> Tensor:
+    """Log-uniform within ``bounds``; the geometric mean at raw = 0."""
     low, high = bounds
     return low * (high / low) ** torch.sigmoid(raw)

@@ -1,7 +1,6 @@
-"""Posing of all Gaussians in one pass, forward and backward: the compiled twin of ``model.skinning``.
+"""Compiled posing of all Gaussians in one pass, forward and backward; see ``model.skinning``.
 
-Written with tuples of nine scalars for 3×3 matrices: they live in registers, where torch would move dozens of
-[N, 3, 3] arrays through memory.
+3×3 matrices are row-major tuples of nine scalars, which stay in registers.
 """
 
 from __future__ import annotations
@@ -17,16 +16,14 @@ from .skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 from .twist import SMALLEST_SQUARE, STEPS
 
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
-_inline = numba.njit(fastmath=_FAST, error_model="numpy")  # LLVM inlines these; numba's own inlining chokes on tuples
+_inline = numba.njit(fastmath=_FAST, error_model="numpy")  # inlined by LLVM; numba's inlining fails on tuples
 
 
 class PoseGaussians(torch.autograd.Function):
     """Means [N, 3], covariances [N, 6] and unit normals [N, 3] of posed Gaussians.
 
-    Arguments: weights [N, J], bones [J, 3, 4], points [N, 3] with all offsets, turn [N, 3] (Δr as
-    a rotation vector), tangents [N, 3, 3] (no gradient), rotation [N, 3] (r_c in the tangent frame, a rotation
-    vector), scales [N, 3], normals [N, 3]; then axes [N, 3], levers [N, 3] and shares [N] of
-    ``model.twist.TwistFrames`` (no gradient).
+    Arguments as ``model.posing.pose_gaussians``, with the axes, levers and shares of ``TwistFrames`` last.
+    No gradient by tangents, axes, levers and shares.
     """
 
     @staticmethod
@@ -38,11 +35,11 @@ class PoseGaussians(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, ...]:
         grads = _pose_backward(*ctx.arrays, *(np.ascontiguousarray(g.numpy()) for g in incoming))
-        weights, blend, points, turn, rotation, scales, normals = (torch.from_numpy(g) for g in grads)
+        weights, blend, points, delta_rotation, rotation, scales, normals = (torch.from_numpy(g) for g in grads)
         bones = None
         if ctx.needs_input_grad[1]:
             bones = (torch.from_numpy(ctx.arrays[0]).T @ blend).view(ctx.arrays[1].shape)
-        return weights, bones, points, turn, None, rotation, scales, normals, None, None, None
+        return weights, bones, points, delta_rotation, None, rotation, scales, normals, None, None, None
 
 
 @_inline
@@ -76,7 +73,7 @@ def _cross(a, b):
 
 @_inline
 def _quaternion(x, y, z):
-    """normalize(1, v/2) and the length before normalising."""
+    """normalize(1, v/2) and its length before normalisation."""
     half = np.float32(0.5)
     x, y, z = half * x, half * y, half * z
     length = np.sqrt(np.float32(1) + x * x + y * y + z * z)
@@ -187,16 +184,16 @@ def _excess(linear, axes, shares, n):
     first, second, third = (linear[0], linear[1], linear[2]), (linear[3], linear[4], linear[5]), linear[6:]
     p, q, r = _cross(second, third), _cross(third, first), _cross(first, second)
     a, b, c = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
-    kept = min(np.sqrt(a * a + b * b + c * c) / length_squared, np.float32(1))
+    ratio = min(np.sqrt(a * a + b * b + c * c) / length_squared, np.float32(1))
     factor = np.float32(1)
     for _ in range(STEPS):
-        step = np.float32(0.5) * (np.float32(3) - kept)
-        factor, kept = factor * step, kept * step * step
+        step = np.float32(0.5) * (np.float32(3) - ratio)
+        factor, ratio = factor * step, ratio * step * step
     return shares[n] * (factor - np.float32(1))
 
 
 @_inline
-def _widened(m, axes, kappa, n):
+def _widen(m, axes, kappa, n):
     """C M with C = (1 + κ) I − κ u uᵀ."""
     x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
     k = np.float32(1) + kappa
@@ -217,7 +214,7 @@ def _widened(m, axes, kappa, n):
 
 
 @_inline
-def _steepened(x, y, z, axes, kappa, n):
+def _widen_normal(x, y, z, axes, kappa, n):
     """n + κ u (u·n)."""
     along = kappa * (axes[n, 0] * x + axes[n, 1] * y + axes[n, 2] * z)
     return (x + axes[n, 0] * along, y + axes[n, 1] * along, z + axes[n, 2] * along)
@@ -230,14 +227,14 @@ def _load(matrices, n):
 
 
 @_inline
-def _scaled(m, scales, n):
+def _scale_columns(m, scales, n):
     """M diag(s)."""
     s, t, u = scales[n, 0], scales[n, 1], scales[n, 2]
     return (m[0] * s, m[1] * t, m[2] * u, m[3] * s, m[4] * t, m[5] * u, m[6] * s, m[7] * t, m[8] * u)
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
-def _pose(weights, bones, points, turn, tangents, rotation, scales, normals, axes, levers, shares):
+def _pose(weights, bones, points, delta_rotation, tangents, rotation, scales, normals, axes, levers, shares):
     count = len(points)
     means = np.empty((count, 3), np.float32)
     covariances = np.empty((count, 6), np.float32)
@@ -255,9 +252,9 @@ def _pose(weights, bones, points, turn, tangents, rotation, scales, normals, axe
         means[n, 0], means[n, 1], means[n, 2] = x + shift[0], y + shift[1], z + shift[2]
 
         own, _ = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
-        added, _ = _quaternion(turn[n, 0], turn[n, 1], turn[n, 2])
-        frame = _scaled(_multiply(_load(tangents, n), _rotation(own)), scales, n)
-        g = _multiply(linear, _widened(_multiply(_rotation(added), frame), axes, kappa, n))
+        added, _ = _quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
+        frame = _scale_columns(_multiply(_load(tangents, n), _rotation(own)), scales, n)
+        g = _multiply(linear, _widen(_multiply(_rotation(added), frame), axes, kappa, n))
         covariances[n, 0] = g[0] * g[0] + g[1] * g[1] + g[2] * g[2] + floor
         covariances[n, 1] = g[0] * g[3] + g[1] * g[4] + g[2] * g[5]
         covariances[n, 2] = g[0] * g[6] + g[1] * g[7] + g[2] * g[8]
@@ -265,7 +262,7 @@ def _pose(weights, bones, points, turn, tangents, rotation, scales, normals, axe
         covariances[n, 4] = g[3] * g[6] + g[4] * g[7] + g[5] * g[8]
         covariances[n, 5] = g[6] * g[6] + g[7] * g[7] + g[8] * g[8] + floor
 
-        x, y, z = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
+        x, y, z = _widen_normal(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
         x, y, z = _apply(_normal_matrix(linear), x, y, z)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         posed_normals[n, 0], posed_normals[n, 1], posed_normals[n, 2] = x / length, y / length, z / length
@@ -277,7 +274,7 @@ def _pose_backward(
     weights,
     bones,
     points,
-    turn,
+    delta_rotation,
     tangents,
     rotation,
     scales,
@@ -291,13 +288,13 @@ def _pose_backward(
 ):
     count, joints = weights.shape
     by_weights, by_blend = np.empty((count, joints), np.float32), np.empty((count, 12), np.float32)
-    by_points, by_turn = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    by_points, by_delta_rotation = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     by_rotation, by_scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     by_rest_normals = np.empty((count, 3), np.float32)
     two = np.float32(2)
     for n in numba.prange(count):
         linear, _ = _blend(weights, bones, n)
-        upright = _transpose(linear)
+        transposed = _transpose(linear)
         mx, my, mz = by_mean[n, 0], by_mean[n, 1], by_mean[n, 2]
         kappa = _excess(linear, axes, shares, n)
         px, py, pz = (
@@ -305,15 +302,15 @@ def _pose_backward(
             points[n, 1] + kappa * levers[n, 1],
             points[n, 2] + kappa * levers[n, 2],
         )
-        by_points[n, 0], by_points[n, 1], by_points[n, 2] = _apply(upright, mx, my, mz)
+        by_points[n, 0], by_points[n, 1], by_points[n, 2] = _apply(transposed, mx, my, mz)
 
         own, own_length = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
-        added, added_length = _quaternion(turn[n, 0], turn[n, 1], turn[n, 2])
+        added, added_length = _quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
         added_matrix = _rotation(added)
         frame = _multiply(_load(tangents, n), _rotation(own))
-        scaled = _scaled(frame, scales, n)
-        turned = _widened(_multiply(added_matrix, scaled), axes, kappa, n)
-        g = _multiply(linear, turned)
+        scaled = _scale_columns(frame, scales, n)
+        rotated = _widen(_multiply(added_matrix, scaled), axes, kappa, n)
+        g = _multiply(linear, rotated)
         c = by_covariance[n]
         symmetric = (
             two * c[0],
@@ -325,24 +322,24 @@ def _pose_backward(
             c[2],
             c[4],
             two * c[5],
-        )  # twice the gradient by the full matrix, whose off-diagonal entries share one number
+        )  # twice the gradient by the symmetric matrix
         by_g = _multiply(symmetric, g)
-        by_linear = _multiply(by_g, _transpose(turned))
-        by_turned = _widened(_multiply(upright, by_g), axes, kappa, n)
-        by_added = _multiply(by_turned, _transpose(scaled))
+        by_linear = _multiply(by_g, _transpose(rotated))
+        by_rotated = _widen(_multiply(transposed, by_g), axes, kappa, n)
+        by_added = _multiply(by_rotated, _transpose(scaled))
         u = _rotation_backward(added, added_length, by_added)
-        by_turn[n, 0], by_turn[n, 1], by_turn[n, 2] = u
-        by_scaled = _multiply(_transpose(added_matrix), by_turned)
+        by_delta_rotation[n, 0], by_delta_rotation[n, 1], by_delta_rotation[n, 2] = u
+        by_scaled = _multiply(_transpose(added_matrix), by_rotated)
         by_scales[n, 0] = frame[0] * by_scaled[0] + frame[3] * by_scaled[3] + frame[6] * by_scaled[6]
         by_scales[n, 1] = frame[1] * by_scaled[1] + frame[4] * by_scaled[4] + frame[7] * by_scaled[7]
         by_scales[n, 2] = frame[2] * by_scaled[2] + frame[5] * by_scaled[5] + frame[8] * by_scaled[8]
-        by_frame = _scaled(by_scaled, scales, n)
+        by_frame = _scale_columns(by_scaled, scales, n)
         by_own = _multiply(_transpose(_load(tangents, n)), by_frame)
         r = _rotation_backward(own, own_length, by_own)
         by_rotation[n, 0], by_rotation[n, 1], by_rotation[n, 2] = r
 
         matrix = _normal_matrix(linear)
-        nx, ny, nz = _steepened(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
+        nx, ny, nz = _widen_normal(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
         x, y, z = _apply(matrix, nx, ny, nz)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         x, y, z = x / length, y / length, z / length
@@ -350,7 +347,7 @@ def _pose_backward(
         along = x * gx + y * gy + z * gz
         gx, gy, gz = (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
         x, y, z = _apply(_transpose(matrix), gx, gy, gz)
-        x, y, z = _steepened(x, y, z, axes, kappa, n)
+        x, y, z = _widen_normal(x, y, z, axes, kappa, n)
         by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = x, y, z
         outer = (gx * nx, gx * ny, gx * nz, gy * nx, gy * ny, gy * nz, gz * nx, gz * ny, gz * nz)
         k = _normal_matrix_backward(linear, outer)
@@ -386,4 +383,4 @@ def _pose_backward(
                 + a[8] * b[2, 2]
                 + mz * b[2, 3]
             )
-    return by_weights, by_blend, by_points, by_turn, by_rotation, by_scales, by_rest_normals
+    return by_weights, by_blend, by_points, by_delta_rotation, by_rotation, by_scales, by_rest_normals

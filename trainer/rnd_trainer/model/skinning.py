@@ -1,4 +1,4 @@
-"""From attributes and bone transforms to posed Gaussians: blend skinning, covariances and normals."""
+"""Blend skinning of points, normals and covariances."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 NORMAL_FALLBACK = 1e-3
-"""share of A_R n in a posed normal: decides only where the cofactor matrix of A_R vanishes (a 180° twist)"""
+"""share of A_R n in a posed normal, for a vanishing cofactor matrix (a 180° twist)"""
 THICKNESS_FLOOR = 1e-4
-"""standard deviation in metres that every posed Gaussian keeps: a collapsed blend stays a valid Gaussian"""
+"""smallest standard deviation of a posed Gaussian, m"""
 
 
 def blend_transforms(weights: Tensor, bones: Tensor) -> Tensor:
@@ -52,10 +52,7 @@ def covariances(factors: Tensor) -> Tensor:
 
 
 def small_rotation(w: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of the quaternions normalize(1, w/2), w [N, 3]: axis-angle to second order.
-
-    Multiplies a rotation, so q and −q give the same result; the paper's sum r_c + Δr does not.
-    """
+    """Rotation matrices [N, 3, 3] of the quaternions normalize(1, w/2), w [N, 3]: axis-angle to second order."""
     q = torch.nn.functional.normalize(torch.cat([torch.ones_like(w[:, :1]), 0.5 * w], dim=-1), dim=-1)
     s, x, y, z = q.unbind(-1)
     rows = [

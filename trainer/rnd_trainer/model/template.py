@@ -1,4 +1,4 @@
-"""Gaussians' places on the body template: even samples, nodes among them, interpolation between the nodes."""
+"""Body template: evenly spaced surface points, nodes among them, interpolation between nodes."""
 
 from __future__ import annotations
 
@@ -19,36 +19,35 @@ from .twist import twist_frames
 Floats = NDArray[np.float64]
 
 NEIGHBOURS = 4
-"""nodes that a Gaussian interpolates between; more only smooths"""
+"""nodes that a Gaussian interpolates between"""
 OVERSAMPLING = 6
-"""candidates per sample for farthest point sampling: spacing within 10 % of the best at 6, no better at 12"""
+"""candidates per point of farthest point sampling: spacing within 10 % of the best at 6, no better at 12"""
 WEIGHT_FLOOR = 1e-6
-"""smallest template weight before the logarithm: moves a point by less than 0.1 mm, yet lets Δ raise a bone"""
+"""smallest template weight before the logarithm; moves a point by less than 0.1 mm"""
 BUCKET = 128
-"""candidates that are passed over together; 64 and 512 take a third longer"""
+"""candidates per bounding box; 64 and 512 take a third longer"""
 CURVE_BITS = 10
-"""of a cell's place along an axis: 2 mm of a person"""
+"""bits of a cell's index along an axis: cells of 2 mm"""
 SPREAD = {
     "left_hip": (0, 0, 0.35),
     "right_hip": (0, 0, -0.35),
     "left_shoulder": (0, 0, -0.35),
     "right_shoulder": (0, 0, 0.35),
 }
-"""the pose in which points are *encoded* (axis-angle, radians): legs apart, arms off the torso"""
+"""pose of the encoded positions (axis-angle, rad): legs apart, arms off the torso"""
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """N surface points of a body in its rest pose, farthest first; the first M of them are the nodes.
+    """N surface points of a body in its rest pose; the first M are the nodes.
 
     Attributes:
         points: [N, 3] m, rest pose.
         normals: [N, 3] unit, rest pose.
-        codes: [N, 3] m, the points in the spread pose, where armpit and crotch neighbours are apart: the
-            networks see these, the skinning starts from ``points`` so that it is exactly the template's.
+        codes: [N, 3] m, encoded positions: the points in the spread pose, which separates armpit and crotch neighbours.
         weights: [N, J] the template's skinning weights.
-        spacing: mean distance between neighbouring Gaussians, m.
-        neighbours, neighbour_weights: [N, 4] nodes that a Gaussian interpolates between, rows sum to 1.
+        spacing: mean distance of neighbouring Gaussians, m.
+        neighbours, neighbour_weights: [N, 4] nodes and weights of the interpolation; rows sum to 1.
         limbs: axes [N, 3], levers [N, 3] and shares [N] of ``model.twist.TwistFrames``.
         nodes: M.
     """
@@ -65,9 +64,9 @@ class Template:
 
 
 def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
-    """Spread ``count`` points evenly over the surface of ``body``.
+    """Sample ``count`` evenly spaced points of the surface of ``body``.
 
-    Farthest point sampling (Eldar et al. 1997) of uniform candidates, so that any prefix covers the body too.
+    Farthest point sampling (Eldar et al. 1997) of uniform candidates: every prefix covers the body.
 
     Raises:
         InputError: too few or too many ``nodes``, or the body has no surface.
@@ -95,7 +94,7 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
     candidates = interpolate(vertices)
     spread = np.zeros((len(body.skeleton.names), 3))
     for joint, rotation in SPREAD.items():
-        if joint in body.skeleton.names:  # another skeleton is encoded in its rest pose
+        if joint in body.skeleton.names:  # other skeletons: the rest pose
             spread[body.skeleton.names.index(joint)] = rotation
     bones = bone_transforms(body.skeleton, axis_angle_to_matrix(spread), np.zeros(3)).astype(np.float64)
     codes = skin(candidates, weights, bones)
@@ -121,9 +120,9 @@ def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:
 
 
 def node_interpolation(codes: Floats, nodes: Floats, area: float) -> tuple[NDArray[np.int64], Floats]:
-    """The nearest of ``nodes`` [M, 3] to ``codes`` [N, 3] m, and their weights: both [N, 4], rows sum to 1.
+    """Nearest ``nodes`` [M, 3] m of ``codes`` [N, 3] m and their weights, both [N, 4]; rows sum to 1.
 
-    ``area`` [m²] of the surface gives the nodes' spacing, at which the kernel softens.
+    ``area`` [m²] of the surface gives the spacing of the nodes, which scales the kernel.
     """
     distances, neighbours = cKDTree(nodes).query(codes, k=min(NEIGHBOURS, len(nodes)))
     kernel = 1.0 / (distances**2 + (0.3 * float(np.sqrt(area / len(nodes)))) ** 2)
@@ -131,10 +130,7 @@ def node_interpolation(codes: Floats, nodes: Floats, area: float) -> tuple[NDArr
 
 
 def along_curve(points: Floats) -> NDArray[np.int64]:
-    """Indices [N] of ``points`` [N, 3] m along a Z-curve (Morton 1966), in one cell as they came.
-
-    So the Gaussians of an exported file are ordered, neighbours on the body side by side.
-    """
+    """Indices [N] of ``points`` [N, 3] m along a Z-curve (Morton 1966), stable within a cell."""
     low = points.min(axis=0, initial=np.inf)
     extent = max(float((points - low).max(initial=0)), 1e-9)
     cells = ((points - low) * ((1 << CURVE_BITS) - 1) / extent).astype(np.int64)
@@ -156,9 +152,8 @@ def _vertex_normals(vertices: Floats, faces: NDArray[np.int32], crosses: Floats)
 def farthest_points(points: NDArray[np.float32], count: int, first: int) -> NDArray[np.int64]:
     """Indices [count] of a farthest point ordering of ``points`` [C, 3] that starts with ``first``.
 
-    Each next point is the farthest from all before it, of several the one of the lowest index. What is far from the
-    newest point is passed over a bucket at a time, as in QuickFPS (Han et al. 2023); the ordering is that of the plain
-    search, to the bit.
+    Ties go to the lowest index. Bounding boxes of buckets skip points far from the newest one, as in QuickFPS (Han et
+    al. 2023); the ordering is that of exhaustive search.
     """
     curve = along_curve(points.astype(np.float64))
     return _farthest_along(points[curve], curve, count, int(np.flatnonzero(curve == first)[0]))
@@ -166,7 +161,7 @@ def farthest_points(points: NDArray[np.float32], count: int, first: int) -> NDAr
 
 @numba.njit(cache=True)
 def _farthest_along(points, indices, count, first):
-    """The ordering of ``points`` [C, 3], neighbours side by side, told by ``indices`` [C]; ``first`` is a place."""
+    """``farthest_points`` of ``points`` [C, 3] sorted along a curve; ``indices`` [C] are the original ones."""
     candidates = points.shape[0]
     buckets = (candidates + BUCKET - 1) // BUCKET
     x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
@@ -176,7 +171,7 @@ def _farthest_along(points, indices, count, first):
             inside = points[b * BUCKET : (b + 1) * BUCKET, axis]
             low[axis, b], high[axis, b] = inside.min(), inside.max()
     nearest = np.full(candidates, np.float32(np.inf))  # m², to the points chosen so far
-    reach = np.full(buckets, np.float32(np.inf))  # m², the largest of a bucket's `nearest`, and where it is
+    reach = np.full(buckets, np.float32(np.inf))  # m², maximum of `nearest` in a bucket, at index `at`
     at = np.zeros(buckets, np.int64)
     bound = np.empty(buckets, np.float32)
     zero = np.float32(0)
@@ -185,7 +180,7 @@ def _farthest_along(points, indices, count, first):
     for k in range(count):
         order[k] = indices[current]
         cx, cy, cz = x[current], y[current], z[current]
-        for b in range(buckets):  # rounding is monotone: no point of the box is nearer than this in float32
+        for b in range(buckets):  # rounding is monotone: a lower bound for all points of the box in float32
             dx = max(max(low[0, b] - cx, cx - high[0, b]), zero)
             dy = max(max(low[1, b] - cy, cy - high[1, b]), zero)
             dz = max(max(low[2, b] - cz, cz - high[2, b]), zero)
@@ -209,5 +204,5 @@ def _farthest_along(points, indices, count, first):
 
 @numba.njit(cache=True, inline="always")
 def _beyond(distance, index, other, other_index):
-    """Whether a point is chosen before another: the farther one, of two alike the one of the lower index."""
+    """Whether a point precedes another: the farther one, or of equals the one with the lower index."""
     return distance > other or (distance == other and index < other_index)

@@ -1,15 +1,13 @@
-"""Keeping limbs round under twists, where blend skinning pinches them to a point (the "candy wrapper").
+"""Widening of twisted limbs, which blend skinning shrinks (the "candy wrapper" artefact).
 
-Two bones that share a point half and half and differ by a twist of θ about the limb shrink its cross-section by
-cos θ/2: to a quarter at 150°. Here the cross-section is widened again by a factor that depends on how much of it
-the blend has lost beyond what bending explains. With u the limb's axis and A the 3×3 part of the blend,
+Two bones that share a point equally and differ by a twist θ shrink the limb's cross-section by cos θ/2. With u the
+limb's axis and A the 3×3 part of the blend,
 
-    t = |cof(A) u| / |A u|²  (area kept across the axis, over the square of the length kept along it; at most 1)
+    t = |cof(A) u| / |A u|²  (area across the axis over the squared length along it, at most 1)
 
-is 1 for every rigid motion and every bend in a plane through u, and cos² θ/2 under a twist. The factor is three
-Newton–Schulz steps s → s (3 − s²)/2 on s = √t, divided by s: 2.8 at 150°, bounded by 27/8, smooth through
-180°, where a blend that tries to decide for one side (a quaternion's) jumps. In the rest pose it stretches a point's
-distance from the axis, a Gaussian's extent across it, and shrinks a normal's part across it.
+is 1 for rigid motion and bends in a plane through u, and cos² θ/2 under a twist. The factor is three Newton–Schulz
+steps s → s (3 − s²)/2 on s = √t, divided by s: 2.8 at 150°, bounded by 27/8, smooth through 180°. In the rest pose it
+scales a point's distance from the axis and a Gaussian's extent across it, and divides a normal's part across it.
 """
 
 from __future__ import annotations
@@ -30,13 +28,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TwistFrames:
-    """The limb around each of N points of the rest pose.
+    """Limb around each of N points of the rest pose.
 
     Attributes:
-        axes: [N, 3] unit, along the limb; the sign means nothing.
+        axes: [N, 3] unit, along the limb, of either sign.
         levers: [N, 3] m, from the limb's axis to the point, times ``shares``.
-        shares: [N] 0…1, how much of a limb it is: 1 where the bones that hold the point are in line, 0 where
-            none of their directions prevails.
+        shares: [N] 0…1: 1 where the point's bones are collinear, 0 where no direction prevails.
     """
 
     axes: Tensor
@@ -58,10 +55,9 @@ def twist_frames(points: Floats, weights: Floats, skeleton: Skeleton) -> tuple[F
 
 
 def bone_axes(skeleton: Skeleton) -> Floats:
-    """Unit directions [J, 3] in which the joints' bones run in the rest pose.
+    """Unit directions [J, 3] of the joints' bones in the rest pose.
 
-    Towards the child; of several, the one straight ahead (from the root: the one that most joints hang on). A last
-    joint goes on as its parent does.
+    Towards the child; of several, the straightest one (root: with most descendants). Leaves continue their parent.
     """
     joints, count = skeleton.rest_joints, len(skeleton)
     children: list[list[int]] = [[] for _ in range(count)]
@@ -72,30 +68,27 @@ def bone_axes(skeleton: Skeleton) -> Floats:
     axes = np.tile([0.0, 1.0, 0.0], (count, 1))
     for joint in range(count):
         before = axes[skeleton.parents[joint]] if joint else None
-        ways = [_unit(joints[child] - joints[joint]) for child in children[joint]]
+        directions = [_unit(joints[child] - joints[joint]) for child in children[joint]]
         if before is not None:
-            ways = [*sorted(ways, key=lambda way: -float(way @ before)), before]
+            directions = [*sorted(directions, key=lambda d: -float(d @ before)), before]
         else:
-            ways = [way for _, way in sorted(zip(-size[children[joint]], ways), key=lambda pair: pair[0])]
-        axes[joint] = next((way for way in ways if way.any()), axes[joint])
+            directions = [d for _, d in sorted(zip(-size[children[joint]], directions), key=lambda pair: pair[0])]
+        axes[joint] = next((d for d in directions if d.any()), axes[joint])
     return axes
 
 
 def widening(area: Tensor, length_squared: Tensor) -> Tensor:
     """Factor [N] ≥ 1 for the cross-section, from |cof(A) u| [N] and |A u|² [N]."""
-    kept = (area / length_squared.clamp(min=float(SMALLEST_SQUARE))).clamp(max=1)
-    factor = torch.ones_like(kept)
+    ratio = (area / length_squared.clamp(min=float(SMALLEST_SQUARE))).clamp(max=1)
+    factor = torch.ones_like(ratio)
     for _ in range(STEPS):
-        step = 0.5 * (3 - kept)
-        factor, kept = factor * step, kept * step * step
+        step = 0.5 * (3 - ratio)
+        factor, ratio = factor * step, ratio * step * step
     return factor
 
 
 def excess(linear: Tensor, cofactors: Tensor, frames: TwistFrames) -> Tensor:
-    """κ [N] ≥ 0, by how much the rest pose is to be widened; A and cof(A) are [N, 3, 3].
-
-    Without gradient: it repairs a pose, and must not be used to explain a picture.
-    """
+    """κ [N] ≥ 0, the widening of the rest pose minus 1, without gradient; A and cof(A) are [N, 3, 3]."""
     axes = frames.axes[:, None, :]
     with torch.no_grad():
         area = (cofactors * axes).sum(-1).norm(dim=-1)
