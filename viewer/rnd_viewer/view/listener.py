@@ -67,7 +67,7 @@ class Listener:
         self._server, self._limit = server, limit
         self._per_address, self._pages = int(SHARE_OF_ADDRESS * limit), int(SHARE_OF_PAGES * limit)
         self._clients: dict[socket, _Client] = {}  # the oldest first
-        self._changed, self._started = Condition(), Event()
+        self._changed, self._started, self._stopped = Condition(), Event(), False
         server.socket.setblocking(False)  # the client may be gone between poll and accept
 
     @property
@@ -75,7 +75,7 @@ class Listener:
         return self._server.socket.getsockname()[1]
 
     def serve_forever(self) -> None:
-        """Accept connections until ``shutdown``, or until the listening socket is closed."""
+        """Accept connections until ``stop`` or ``shutdown``."""
         server = self._server
         self._started.set()
         try:
@@ -83,12 +83,18 @@ class Listener:
                 with suppress(ValueError, OSError):  # closed already
                     poll.register(server.shutdown_watcher, selectors.EVENT_READ)
                     poll.register(server.socket, selectors.EVENT_READ)
-                while server.socket.fileno() >= 0:
+                while not self._stopped and server.socket.fileno() >= 0:
                     poll.select()
                     self._accept()
         finally:
             server.socket_closed.set()
             server.shutdown_watcher.close()
+
+    def stop(self) -> None:
+        """Let ``serve_forever`` return; a signal's handler may call it at any moment."""
+        self._stopped = True
+        with suppress(OSError):  # ended already
+            self._server.shutdown_notifier.send(b"x")
 
     def shutdown(self) -> None:
         """Close the listening socket and say goodbye to all pages; wait until they are gone."""
