@@ -1,4 +1,4 @@
-"""Checks of a capture against itself, before any training."""
+"""Consistency checks of a capture before training."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ Floats = NDArray[np.float64]
 
 HYPOTHESIS_FRAMES = 8
 MIN_IOU = 0.70
-"""mean IoU below which something is wrong: a dressed person over the bare template reaches 0.82 to 0.90"""
+"""mean IoU below which something is wrong; a dressed person reaches 0.82 to 0.90"""
 MAX_BACKGROUND = 0.02
-"""mean sRGB value outside the mask, above which an image is not on black"""
+"""mean sRGB value outside the mask above which an image is not on black"""
 DISTORTIONS = tuple(np.linspace(-0.4, 0.4, 9).round(1).tolist())
 DISTORTION_GAIN = 0.015
-"""IoU that a radial distortion must win over the best zoom, which clothes and hair can imitate"""
+"""IoU that a radial distortion must gain over the best zoom"""
 MIN_SHIFT = 0.5
-"""pixels that a distortion must move the mask's edge: less is below the masks' own resolution"""
+"""displacement of the mask's edge below which a distortion is ignored, pixels"""
 ZOOMS = (0.96, 1.0, 1.04, 1.08)
 
 
@@ -50,7 +50,7 @@ class FrameIoU:
 
 @dataclass(frozen=True, eq=False)
 class CheckReport:
-    """Findings of ``check_capture`` in the order of their dependence, and IoU and view of every usable frame."""
+    """Findings of ``check_capture``, and IoU and view of every usable frame."""
 
     capture: Capture
     findings: tuple[Finding, ...]
@@ -67,23 +67,20 @@ class CheckReport:
 
 
 def check_capture(path: str | Path, *, on_frame: Callable[[int, int], None] = lambda done, total: None) -> CheckReport:
-    """Check a capture against itself.
-
-    Reading checks files, sizes, channels and indices. Then follow splits, lights, units, cameras, frame rate, masks,
-    backgrounds, silhouettes, timing, lens distortion and normal axes.
+    """Check files, splits, lights, units, cameras, frame rate, masks, silhouettes, timing, lens and normals.
 
     Args:
-        on_frame: called with (frames done, frames in all).
+        on_frame: called with done and total.
 
     Raises:
-        InputError: the capture cannot be read at all.
+        InputError: the capture cannot be read.
     """
     capture = load_capture(path)
     findings = [Finding("ok", "files", f"{len(capture.frames)} images of {len(capture.cameras)} cameras")]
     findings += [*_training(capture), *_lights(capture), *check_geometry(capture)]
     views, ious, normal_pairs, bad_masks, bright = [], [], [], [], []
     for done, frame in enumerate(capture.frames):
-        bare = msgspec.structs.replace(frame, normal=None, normal_gt=None)  # reading would refuse flipped normals
+        bare = msgspec.structs.replace(frame, normal=None, normal_gt=None)  # load_frame refuses flipped normals
         images = capture.load_frame(bare)
         if usable(images.mask):
             view = mask_view(capture, bare, images.mask)
@@ -165,7 +162,7 @@ def _fit(capture: Capture, views: list[MaskView], ious: list[FrameIoU]) -> list[
 
 
 def _distortion(capture: Capture, few: list[MaskView]) -> list[Finding]:
-    """Finding where the silhouettes fit better through a distorted lens, each at its best zoom."""
+    """Finding if silhouettes fit better with radial distortion, each at its best zoom."""
     zoomed = [[view.zoomed(zoom) for view in few] for zoom in ZOOMS]
     scores = {k1: max(mean_iou(views, k1) for views in zoomed) for k1 in DISTORTIONS}
     k1 = max(scores, key=lambda k: scores[k])
@@ -180,7 +177,7 @@ def _distortion(capture: Capture, few: list[MaskView]) -> list[Finding]:
 
 
 def _edge_shift(few: list[MaskView], k1: float) -> float:
-    """Pixels by which ``k1`` moves the mask's point farthest from the principal point."""
+    """Largest displacement in pixels of a mask's point by ``k1``."""
     farthest = 0.0
     for view in few:
         rows, columns = np.nonzero(view.mask)
@@ -191,13 +188,13 @@ def _edge_shift(few: list[MaskView], k1: float) -> float:
 
 
 def _import_notes(capture: Capture) -> dict[str, Any]:
-    """What ``rnd-data import`` noted in capture.json; empty for other captures."""
+    """Notes of ``rnd-data import`` in capture.json; empty for other captures."""
     notes = msgspec.json.decode(capture.file.read_bytes()).get("import")
     return notes if isinstance(notes, dict) else {}
 
 
 def _undone_k1(capture: Capture) -> float:
-    """k1 of the first lens whose distortion an import undid; 0 where there is none."""
+    """k1 of the first lens that the import undistorted, or 0."""
     noted = _import_notes(capture).get("distortion")
     first = next(iter(noted.values()), None) if isinstance(noted, dict) else None
     k1 = first[0] if isinstance(first, list) and first else 0.0
@@ -205,7 +202,7 @@ def _undone_k1(capture: Capture) -> float:
 
 
 def _matrix(noted: object) -> Floats | None:
-    """A noted [3, 3] matrix; None for anything else, as the notes in capture.json are free text."""
+    """A noted [3, 3] matrix, or None: notes in capture.json are free text."""
     try:
         matrix = np.array(noted, np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -11,10 +11,10 @@ from rnd_runtime.capture.capture import Capture
 
 BODY_SIZE = (0.4, 2.6)  # m
 DISTANCE = (0.3, 300.0)
-"""m: PHALP's lens puts a person of a third of the image's height a hundred metres away"""
+"""range of the distance to the person, m; PHALP's lens gives a hundred metres"""
 FIELD_OF_VIEW = (2.0, 150.0)  # degrees; PHALP's is 2.9
 MAX_JOINT_SPEED = 20.0
-"""m/s: a boxer's fist reaches 12"""
+"""m/s; a boxer's fist reaches 12"""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Explanations of a template that misses its masks: each usual mistake undone, and the IoU compared."""
+"""Explanations of a misaligned template: the IoU with each usual mistake undone."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .views import MaskView, mean_iou, with_pose
 Floats = NDArray[np.float64]
 
 GAIN = 0.04
-"""IoU that an explanation must win; on a sound capture the best of them loses 0.06"""
+"""IoU that an explanation must gain; on a correct capture the best one loses 0.06"""
 TIME_GAIN = 0.02
-"""IoU that another timing must win; a pose one frame off costs a walker at 30 fps about 0.03"""
+"""IoU that another timing must gain; one frame off costs a walker at 30 fps about 0.03"""
 SHIFTS = (-3, -2, -1, 1, 2, 3)
 STRIDES = (0.5, 0.8, 5 / 6, 1.2, 1.25, 2.0)
 
@@ -28,18 +28,18 @@ _QUARTER = axis_angle_to_matrix([np.pi / 2, 0, 0])
 
 @dataclass(frozen=True)
 class Explanation:
-    """A sentence and the mean IoU it would bring."""
+    """A mistake in words, and the mean IoU without it."""
 
     sentence: str
     iou: float
 
 
 def _candidates(rest: Floats, world: Floats) -> list[tuple[str, Callable[[MaskView], MaskView]]]:
-    """(sentence, change) of every known mistake.
+    """Known mistakes as (sentence, correction).
 
     Args:
         rest: [3] m, the root's rest position.
-        world: [3, 3] the rotation that an import applied to the source's world.
+        world: [3, 3] rotation of the source's world by the import.
     """
     offset = world @ rest
 
@@ -98,7 +98,7 @@ def _candidates(rest: Floats, world: Floats) -> list[tuple[str, Callable[[MaskVi
 
 
 def explain(rest: Floats, world: Floats, views: list[MaskView]) -> Explanation | None:
-    """The best explanation of a poor fit, or None where nothing known improves it; arguments as ``_candidates``."""
+    """Best explanation of a poor fit, or None; arguments as ``_candidates``."""
     current = mean_iou(views)
     found = [Explanation(s, mean_iou([change(view) for view in views])) for s, change in _candidates(rest, world)]
     best = max(found, key=lambda explanation: explanation.iou)

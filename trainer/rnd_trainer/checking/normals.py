@@ -13,7 +13,7 @@ from .silhouette import RenderedMesh
 Floats = NDArray[np.float64]
 
 GAIN = 0.15
-"""mean cosine that other axes must win; our own estimated normals are about 10° (0.015) off"""
+"""mean cosine that other axes must gain; estimated normals err by about 10° (0.015)"""
 _AXES = "xyz"
 
 
@@ -23,7 +23,7 @@ class AxesAgreement(NamedTuple):
     Attributes:
         cosine: mean cosine to the template's normals, as they are.
         facing: share of normals that face the camera (z < 0).
-        best_cosine, best_axes: of the best signed permutation, as "x,-y,-z": our x is their x, our y their −y, …
+        best_cosine, best_axes: of the best signed permutation, such as "x,-y,-z".
     """
 
     cosine: float
@@ -37,7 +37,7 @@ class AxesAgreement(NamedTuple):
 
 
 def parse_axes(text: str) -> Floats:
-    """The signed permutation [3, 3] of "x,-y,-z". ValueError for anything else."""
+    """Signed permutation [3, 3] of a text such as "x,-y,-z"; raises ``ValueError`` otherwise."""
     matrix = np.zeros((3, 3))
     for row, part in enumerate(text.replace(" ", "").split(",")):
         sign, axis = part[:-1], part[-1:]
@@ -58,19 +58,18 @@ def format_axes(matrix: Floats) -> str:
 def compare_axes(pairs: list[tuple[Floats, Floats]], applied: Floats | None = None) -> AxesAgreement:
     """Agreement of (map's normals [n, 3], template's normals [n, 3]) at the same pixels, in OpenCV camera axes.
 
-    ``applied`` [3, 3] is the permutation that an import applied to the maps; ``best_axes`` is relative to the
-    source's maps.
+    ``applied`` [3, 3] is the import's permutation of the maps; ``best_axes`` refers to the source's maps.
     """
-    ours = np.concatenate([a for a, _ in pairs])
+    maps = np.concatenate([a for a, _ in pairs])
     template = np.concatenate([b for _, b in pairs])
-    products = template.T @ ours / len(ours)
+    products = template.T @ maps / len(maps)
     best, cosine = best_permutation(products)
     axes = format_axes(best @ (np.eye(3) if applied is None else applied))
-    return AxesAgreement(float(np.trace(products)), float((ours[:, 2] < 0).mean()), cosine, axes)
+    return AxesAgreement(float(np.trace(products)), float((maps[:, 2] < 0).mean()), cosine, axes)
 
 
 def best_permutation(products: Floats) -> tuple[Floats, float]:
-    """The signed permutation [3, 3] of a map's axes that agrees best with the template, and its mean cosine.
+    """Signed permutation [3, 3] of a map's axes that agrees best with the template, and its mean cosine.
 
     ``products`` [3, 3] is the mean of template_i · map_j over the pixels; of equals the least changed wins.
     """

@@ -1,4 +1,4 @@
-"""Overlay image of mask and template, frame by frame."""
+"""Overlay image of masks and template."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .views import MaskView
 
 TILE, COLUMNS, MAX_TILES = 256, 4, 12
 MARGIN = 0.05
-"""share of the extent of mask and template that is left around them"""
+"""margin around mask and template, relative to their extent"""
 MASK_ONLY, TEMPLATE_ONLY = (255, 80, 60), (60, 140, 255)
 CAPTION = 18
 
 
 def save_overlay(path: str | Path, report: CheckReport) -> None:
-    """Write a sheet of up to 12 crops: the four frames that fit worst, then evenly spaced ones.
+    """Write a sheet of up to 12 crops: the four worst frames, then evenly spaced ones.
 
     Red: mask only. Blue: template only. White line: the template's outline.
     """

@@ -14,13 +14,13 @@ from .overlay import save_overlay
 
 
 def check_and_report(capture: Path, out: Path) -> int:
-    """Check ``capture``, print the findings, write ``check.json`` and ``check.png`` into ``out``; 1 when wrong."""
+    """Check ``capture``, print the findings and write them into ``out``; returns the exit code."""
     with Progress() as progress:
         progress.phase("checking")
         report = check_capture(capture, on_frame=lambda done, total: progress.update(done, step=f"{done}/{total}"))
     try:
         save_report(report, out)
-    finally:  # shown even where they cannot be saved
+    finally:  # even if they cannot be saved
         for finding in report.findings:
             show(f"{finding.level:>5} {finding.subject}: {finding.sentence}")
     then = None if report.wrong else f"rnd-train {capture} --out runs/{report.capture.folder.resolve().name}"

@@ -13,7 +13,7 @@ from rnd_runtime.core.camera import Camera
 Floats = NDArray[np.float64]
 
 NEAR = 0.05
-"""m: triangles with a corner nearer than this, or behind the camera, are left out"""
+"""near plane, m: triangles with a vertex in front of it are culled"""
 
 
 class RenderedMesh(NamedTuple):
@@ -33,12 +33,12 @@ def render_mesh(vertices: Floats, faces: NDArray[np.int32], camera: Camera, k1: 
 
     ``k1`` is a radial distortion in normalised coordinates: x (1 + k1 r²).
     """
-    local, kept, nearest = _nearest_faces(vertices, faces, camera, k1)
+    local, visible, nearest = _nearest_faces(vertices, faces, camera, k1)
     mask = nearest >= 0
-    corners = local[kept]
+    corners = local[visible]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cross /= np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-15)
-    cross *= np.where((cross * corners[:, 0]).sum(1, keepdims=True) > 0, -1, 1)  # either winding order
+    cross *= np.where((cross * corners[:, 0]).sum(1, keepdims=True) > 0, -1, 1)  # for either winding order
     normals = np.zeros((*mask.shape, 3))
     normals[mask] = cross[nearest[mask]]
     return RenderedMesh(mask, normals)
@@ -67,16 +67,16 @@ def _nearest_faces(
         flat = flat * (1 + k1 * (flat**2).sum(1, keepdims=True))
         pixels = flat @ camera.K[:2, :2].T + camera.K[:2, 2]
     usable = (depth > NEAR) & np.isfinite(pixels).all(1) & (np.abs(pixels) < 1e6).all(1)
-    kept = faces[usable[faces].all(1)]
-    nearest = _z_buffer(pixels, 1 / np.where(usable, depth, 1), kept, camera.width, camera.height)
-    return local, kept, nearest
+    visible = faces[usable[faces].all(1)]
+    nearest = _z_buffer(pixels, 1 / np.where(usable, depth, 1), visible, camera.width, camera.height)
+    return local, visible, nearest
 
 
 @numba.njit(cache=True)
 def _z_buffer(pixels, inverse_depth, faces, width, height):
-    """Index [H, W] of the nearest of ``faces`` at every pixel centre; −1 where there is none."""
+    """Index [H, W] of the nearest face at each pixel centre, −1 without one."""
     nearest = np.full((height, width), -1, np.int64)
-    depth = np.zeros((height, width))  # 1/z is linear in the image: larger is nearer
+    depth = np.zeros((height, width))  # 1/z, linear in the image
     for f in range(faces.shape[0]):
         a, b, c = faces[f]
         ax, ay = pixels[a]

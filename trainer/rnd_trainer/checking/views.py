@@ -1,4 +1,4 @@
-"""Small views of a capture's frames: the mask, and the template in front of the same camera."""
+"""Downscaled masks of a capture's frames, with the template in the same camera."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .silhouette import RenderedMesh, mask_iou, render_mesh, silhouette
 Floats = NDArray[np.float64]
 
 SIZE = 192
-"""pixels, the longer side of a view: IoU changes by less than 0.005 above it, time quadruples"""
+"""longer side of a view, pixels; IoU changes by less than 0.005 above it"""
 
 
 @dataclass(frozen=True, eq=False)
