@@ -108,16 +108,9 @@ def _open_egl(version: int) -> Loader:
     return loader
 
 
-def _open_osmesa(version: int) -> Loader:
-    return OSMesa(version)
-
-
 def _open_window(version: int) -> Loader:
     loader: Loader = glcontext.default_backend()(mode="standalone", glversion=version)
     return loader
-
-
-_LOADERS: dict[str, Callable[[int], Loader]] = {"egl": _open_egl, "osmesa": _open_osmesa, "window": _open_window}
 
 
 class OSMesa:
@@ -171,3 +164,6 @@ def _first_library(*names: str) -> ctypes.CDLL:
         except OSError:
             continue
     raise OSError(f"{names[0]} not found")
+
+
+_LOADERS: dict[str, Callable[[int], Loader]] = {"egl": _open_egl, "osmesa": OSMesa, "window": _open_window}

@@ -1,7 +1,6 @@
-"""Posing by OpenGL: ``posing.skinning``'s formulas in a fragment for each Gaussian.
+"""Posing by OpenGL: ``posing.skinning``'s formulas in a fragment per Gaussian.
 
-Only what the networks say at the nodes and the bones go up for a frame; what does not depend on the pose lies on the
-device since the first one.
+Pose-independent data is uploaded once; node outputs and bones for each frame.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from .surfaces import Surfaces
 
 _REST_TEXELS = 6  # points 3, factors 9, normals 3, limbs 7, opacity, floor of the template
 _SH_TEXELS = 4
-_FIELD_TEXELS = 12  # of a node before its joints': four for the floor's blend, four each for offsets and SH
+_FIELD_TEXELS = 12  # of a node before its joints: four each for the floor's blend, offsets and SH
 
 
 class GlPosing:
-    """Poses one avatar after the other; the context must be current."""
+    """Poses one avatar at a time; the context must be current."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -33,7 +32,7 @@ class GlPosing:
         self._visibility = GaussianTargets(context, (4,), texels=_SH_TEXELS)
 
     def pose(self, unposed: Unposed) -> Surfaces:
-        """All Gaussians of ``unposed``, posed."""
+        """Pose all Gaussians of ``unposed``."""
         if self._avatar is None or self._avatar.rest is not unposed.rest:
             if self._avatar is not None:
                 self._avatar.release()
@@ -57,7 +56,7 @@ class GlPosing:
 
 
 class _OnDevice:
-    """An avatar's constants, and the programs for its numbers of Gaussians, joints and neighbours."""
+    """An avatar's constants, and programs for its numbers of Gaussians, joints and neighbours."""
 
     def __init__(self, context: moderngl.Context, unposed: Unposed) -> None:
         self.rest: RestPose = unposed.rest
@@ -85,7 +84,7 @@ class _OnDevice:
         self.materials = self._constants["materials"]
 
     def write(self, unposed: Unposed) -> None:
-        """What changes from frame to frame, to both programs."""
+        """Upload a frame's data and bind it to both programs."""
         bones = np.zeros((self._bones.height, 12), np.float32)
         bones[: len(unposed.bones)] = unposed.bones.reshape(-1, 12)
         self._bones.write(bones)
@@ -114,20 +113,20 @@ class _OnDevice:
     def _upload(self, unposed: Unposed, template: Floats32) -> dict[str, moderngl.Texture]:
         rest = self.rest
         mixing = np.stack([rest.neighbours.astype(np.float32), rest.neighbour_weights], axis=-1)
-        own = np.zeros((len(rest.points), 4 * _REST_TEXELS), np.float32)
+        rest_rows = np.zeros((len(rest.points), 4 * _REST_TEXELS), np.float32)
         ends = np.stack([unposed.opacities, rest.template.floors], axis=1)
-        own[:] = np.concatenate([rest.points, rest.factors, rest.normals, rest.limbs, ends], axis=1)
+        rest_rows[:] = np.concatenate([rest.points, rest.factors, rest.normals, rest.limbs, ends], axis=1)
         materials = np.concatenate([unposed.albedo, unposed.roughness[:, None]], axis=1)
         return {
             "mixing": self._mixing.write(np.ascontiguousarray(mixing, np.float32)),
             "log_template": self._template.write(template),
-            "rest": self._rest.write(own),
+            "rest": self._rest.write(rest_rows),
             "materials": self._materials.write(np.ascontiguousarray(materials, np.float32)),
         }
 
 
 def _padded_template(rest: RestPose) -> Floats32:
-    """Log weights above the floor [N, C] with both up to multiples of sixteen."""
+    """Log weights above the floor [N, C], both padded to multiples of sixteen."""
     count, joints = rest.log_template.shape
     padded = np.full((-(-count // WIDTH) * WIDTH, -(-joints // WIDTH) * WIDTH), NEVER, np.float32)
     padded[rest.template.gaussians, rest.template.joints] = rest.template.logs

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from time import perf_counter
-from types import TracebackType
 from typing import NamedTuple
 
 import moderngl
@@ -101,9 +100,7 @@ class GlRasterizer:
     def __enter__(self) -> GlRasterizer:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def check_limits(self, count: int, camera: Camera) -> None:

@@ -1,7 +1,7 @@
-"""Depth maps of directional lights on an OpenGL device, as ``shading.shadow`` makes them; read by ``direct.glsl``.
+"""Depth maps of directional lights on an OpenGL device, as in ``shading.shadow``; read by ``direct.glsl``.
 
-The maps keep the nearest depth by blending with the maximum, in float32 as the CPU's, and nothing is read back: the
-bounds that the maps are cut to are themselves found on the device, as points blended by maximum onto one texel a light.
+Maps keep the nearest depth by max blending in float32. Their bounds are found on the device, by max blending onto one
+texel per light.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from .passes import Pass
 
 Floats32 = NDArray[np.float32]
 
-_BLOCK = 32  # Gaussians whose bounds one vertex finds
-_FARTHEST = -1e30  # m; nothing
+_BLOCK = 32  # Gaussians per vertex that finds bounds
+_FARTHEST = -1e30  # m, empty texel
 
 
 class DepthMaps(NamedTuple):
-    """What the shading pass needs of S lights."""
+    """Input of the shading pass for S lights."""
 
     depths: moderngl.Texture  # [S · SHADOW_RESOLUTION, SHADOW_RESOLUTION] m towards the light
     bounds: moderngl.Texture  # [1, S, 4]
-    axes: Floats32  # [S, 3, 3] world → map, transposed as uniforms are
+    axes: Floats32  # [S, 3, 3] world → map, by column
 
 
 class ShadowMaps:
-    """Draws the depth maps of up to a few lights; the context must be current."""
+    """Renders depth maps of a few lights; the context must be current."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self._made: dict[int, _Made] = {}  # by the number of lights
+        self._made: dict[int, _LightTargets] = {}  # by the number of lights
 
     def draw(self, points: moderngl.Texture, normals: moderngl.Texture, count: int, axes: Floats32) -> DepthMaps:
-        """Maps of all ``count`` Gaussians of two ``gl.passes.GaussianTexture``.
+        """Maps of ``count`` Gaussians in ``gl.passes.GaussianTexture``s.
 
         Args:
-            points: mean m, world, and the radius m of its disc; a Gaussian of radius 0 casts no shadow.
+            points: mean m, world, and disc radius m (0 casts no shadow).
             normals: unit, world.
             axes: [S, 3, 3] of ``shading.shadow.axes_towards`` each light, world.
         """
         lights = len(axes)
         if lights not in self._made:
-            self._made[lights] = _Made(self._context, lights)
+            self._made[lights] = _LightTargets(self._context, lights)
         made = self._made[lights]
         axes_by_column = np.ascontiguousarray(axes.swapaxes(1, 2), np.float32)
         self._context.enable_only(moderngl.BLEND)
@@ -71,7 +71,7 @@ class ShadowMaps:
         self._made = {}
 
 
-class _Made:
+class _LightTargets:
     """Programs and targets for a number of lights."""
 
     def __init__(self, context: moderngl.Context, lights: int) -> None:

@@ -1,8 +1,9 @@
-"""Depth order of Gaussians by compute shaders: nothing of them leaves the device.
+"""Depth order of Gaussians by compute shaders.
 
-A stable radix sort (least digit first, eight bits at a time) of the very keys of ``raster.tiles``, made of float64
-depths: the order is the CPU's, so the images are. Blocks of keys count their digits, one group turns counts into
-places, blocks scatter: Satish, Harris and Garland, "Designing efficient sorting algorithms for manycore GPUs" (2009).
+A stable radix sort (8 bits per pass) of the float64 keys of ``raster.tiles``: the order is the CPU's. Blocks count
+digits, one group scans the counts, blocks scatter.
+
+Source: Satish, Harris, Garland, "Designing efficient sorting algorithms for manycore GPUs" (2009).
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from rnd_runtime.core.errors import InputError
 from .context import COMPUTE_VERSION
 from .passes import ROW_GAUSSIANS, GaussianTexture, shader_head, shader_source
 
-_BLOCK = 1024  # keys that a group of 256 threads sorts
+_BLOCK = 1024  # keys per group of 256 threads
 _THREADS = 256
-_RANGE_THREADS = 1024  # GL promises as many in a group
+_RANGE_THREADS = 1024  # GL's guaranteed minimum per group
 _PASSES = 4  # of eight bits
 
 _RANGE, _KEYS, _GAUSSIANS, _NEW_KEYS, _NEW_GAUSSIANS, _COUNTS = range(6)  # bindings in the shaders
 
 
 class DepthSort:
-    """Orders Gaussians back to front; the context must be current whenever it is used.
+    """Orders Gaussians back to front; the context must be current.
 
     Raises:
-        InputError: the context has no compute shaders, or its driver does not compile ours.
+        InputError: the context has no compute shaders, or its driver does not compile them.
     """
 
     def __init__(self, context: moderngl.Context) -> None:
@@ -50,15 +51,15 @@ class DepthSort:
         }
         self._order = GaussianTexture(context, 1, dtype="i4")
         self._extremes = context.buffer(reserve=16)
-        self._capacity = 0  # blocks that the buffers below hold
+        self._capacity = 0  # of the buffers, blocks
         self._buffers: dict[int, moderngl.Buffer] = {}
 
     def order(self, drawn: moderngl.Texture, count: int, forward: NDArray[np.float64]) -> moderngl.Texture:
-        """Of each of ``count`` ranks the Gaussian, back to front; then −1 for each that is not drawn.
+        """Gaussian of each of ``count`` ranks, back to front; −1 for those not rendered.
 
         Args:
-            drawn: a texel for each Gaussian: mean m, and a positive number where it is rendered.
-            forward: [3] the direction along which depth is measured, in the means' frame.
+            drawn: a texel per Gaussian: mean m, and a positive number where it is rendered.
+            forward: [3] depth direction in the means' frame.
         """
         blocks = -(-count // _BLOCK)
         self._reserve(blocks)
@@ -72,11 +73,11 @@ class DepthSort:
         self._run("range", 1, **depths)
         self._run("keys", -(-count // _THREADS), **depths)
         read, write = (_KEYS, _GAUSSIANS), (_NEW_KEYS, _NEW_GAUSSIANS)
-        for turn in range(_PASSES):
+        for digit in range(_PASSES):
             self._bind(*read, *write)
-            self._run("count", blocks, count=count, shift=8 * turn)
+            self._run("count", blocks, count=count, shift=8 * digit)
             self._run("scan", 1, blocks=blocks)
-            self._run("scatter" if turn < _PASSES - 1 else "finish", blocks, count=count, shift=8 * turn)
+            self._run("scatter" if digit < _PASSES - 1 else "finish", blocks, count=count, shift=8 * digit)
             read, write = write, read
         return order
 
@@ -99,7 +100,7 @@ class DepthSort:
         self._capacity = blocks
 
     def _bind(self, *names: int) -> None:
-        """Bind buffers, the first to the first binding of a pass, and so on."""
+        """Bind buffers to consecutive bindings from ``_KEYS`` on."""
         for binding, name in enumerate(names, start=_KEYS):
             self._buffers[name].bind_to_storage_buffer(binding)
 
@@ -108,7 +109,7 @@ class DepthSort:
         for uniform, value in uniforms.items():
             program[uniform].value = value
         program.run(groups)
-        self._context.memory_barrier()  # what it wrote is there for the next
+        self._context.memory_barrier()
 
 
 def can_sort(context: moderngl.Context) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import TYPE_CHECKING, Literal, get_args
 
 from rnd_runtime.core.camera import Camera
@@ -57,9 +56,7 @@ class ChosenRasterizer:
     def __enter__(self) -> ChosenRasterizer:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
