@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 
 from .aov import aov_layers, splat_features
+from .far import fine_view
 from .rasterizer import ChosenRasterizer, Kind, make_rasterizer
 
 
@@ -40,10 +41,10 @@ class RenderedFrame:
     Attributes:
         radiance: [H, W, 3] linear Rec.709, premultiplied by alpha.
         alpha: [H, W].
-        aovs: [H, W, C] for each name, as ``playback.aov`` says.
-        stage_seconds: duration of each stage in their order; they add up to the frame.
-        background: linear radiance, [H, W, 3] or [3]; None leaves the frame transparent.
-        srgb_on_black: [H, W, 3] 8-bit sRGB without the background, where it was made with the rest.
+        aovs: [H, W, C] by name, see ``playback.aov``.
+        stage_seconds: duration of each stage, in order; they add up to the frame.
+        background: linear radiance, [H, W, 3] or [3]; None for a transparent frame.
+        srgb_on_black: [H, W, 3] 8-bit sRGB without the background, where already made.
     """
 
     radiance: Floats32
@@ -55,18 +56,18 @@ class RenderedFrame:
 
     @cached_property
     def srgb(self) -> NDArray[np.uint8]:
-        """8-bit sRGB [H, W, 3] over the background, or over black without one."""
+        """8-bit sRGB [H, W, 3] over the background, or black."""
         if self.background is None and self.srgb_on_black is not None:
             return self.srgb_on_black
         return tone_map(self.radiance, self.alpha, self.background)
 
     @cached_property
     def srgb_alpha(self) -> NDArray[np.uint8]:
-        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied, as PNG has it."""
+        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied (as in PNG)."""
         return tone_map_straight(self.radiance, self.alpha)
 
     def linear(self) -> Floats32:
-        """Linear R, G, B, A [H, W, 4], premultiplied; over a background alpha is 1."""
+        """Linear RGBA [H, W, 4], premultiplied; alpha is 1 over a background."""
         if self.background is None:
             return np.dstack([self.radiance, self.alpha])
         over = self.radiance + (1 - self.alpha)[..., None] * self.background
@@ -74,7 +75,7 @@ class RenderedFrame:
 
 
 class PosedAvatar(NamedTuple):
-    """Gaussians in their root's frame, and that frame → world [4, 4] (rigid, m)."""
+    """Gaussians in the root's frame, and root frame → world [4, 4] (rigid, m)."""
 
     gaussians: Gaussians
     root: Floats
@@ -116,7 +117,7 @@ class FrameRenderer:
 
     @property
     def draws_with(self) -> str:
-        """The rasteriser's name: ``cpu``, or one with OpenGL's backend and device."""
+        """The rasteriser's name: ``cpu``, or OpenGL's backend and device."""
         return str(getattr(self.rasterizer, "name", "custom"))
 
     def turn(self, yaw: float) -> None:
@@ -125,13 +126,13 @@ class FrameRenderer:
             self.shader = self.shader.turned(yaw)
 
     def relight(self, light: Light) -> None:
-        """Use another light from now on; its tables are built here."""
+        """Use another light; builds its tables."""
         self.shader = Shader(light, self.shader.mode)
 
     def render(
         self, motion: Motion, time: float, camera: Camera | None = None, *, aovs: Sequence[str] = ()
     ) -> RenderedFrame:
-        """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton)."""
+        """Render the avatar at ``time`` seconds of ``motion`` (mapped to its skeleton)."""
         encoded = self.avatar.encode(motion, time)
         frame = self.draw(encoded, camera, aovs=aovs)
         return replace(frame, stage_seconds={**encoded.seconds, **frame.stage_seconds})
@@ -187,8 +188,23 @@ class FrameRenderer:
         self.close()
 
     def _raster(self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool) -> Raster:
-        """On OpenGL's device where that can be, else stage by stage."""
+        """In the root's frame; a body of few pixels on a finer grid, averaged."""
         shader, camera = in_root_frame(body.root, self.shader, camera)
+        fine = fine_view(camera, self._extent(body))
+        if fine is None:
+            return self._splat(body, shader, camera, aovs, lit)
+        return fine.averaged(self._splat(body, shader, fine.camera, aovs, lit))
+
+    def _extent(self, body: Encoded | PosedAvatar) -> NDArray[np.floating[Any]]:
+        """Points [N, 3] m in the root's frame, from which no part of the body is far."""
+        if isinstance(body, PosedAvatar):
+            return body.gaussians.means
+        return np.einsum("jab,jb->ja", body.bones[:, :, :3], self.avatar.skeleton.rest_joints) + body.bones[:, :, 3]
+
+    def _splat(
+        self, body: Encoded | PosedAvatar, shader: Shader, camera: Camera, aovs: Sequence[str], lit: bool
+    ) -> Raster:
+        """On OpenGL's device where that can be, else stage by stage."""
         cull = None if self.cull is None or self.cull <= -1 else self.cull
         if isinstance(body, PosedAvatar):
             return draw_gaussians(body.gaussians, shader, camera, self.rasterizer, cull=cull, aovs=aovs, lit=lit)
@@ -204,7 +220,7 @@ class FrameRenderer:
 
 
 def in_root_frame(root: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:
-    """Light and camera in the frame that ``root`` [4, 4] (rigid, m) takes to the world."""
+    """Light and camera in the root's frame; ``root`` [4, 4] takes it to the world (rigid, m)."""
     return shader.in_frame(root[:3, :3]), camera.in_frame(root)
 
 
