@@ -1,4 +1,4 @@
-"""Anny's default person (NAVER, Apache-2.0) as a template, through its own package."""
+"""Anny's default person (NAVER, Apache-2.0) as a template, by the package ``anny``."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def anny_body() -> Body:
     """Anny's mean adult with SMPL-H's joint names, in a T-pose, Y up, facing +Z.
 
     Raises:
-        InputError: where the package ``anny`` is not installed.
+        InputError: the package ``anny`` is not installed.
     """
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Parametric bodies from the files they come in: SMPL, SMPL-H, SMPL-X, our own ``body.npz``, and Anny."""
+"""Body models: SMPL, SMPL-H, SMPL-X, ``body.npz`` and Anny."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SMPL_LICENSE = "the licence of the body model it was made from; SMPL's forbids p
 _FAMILIES = {24: ("SMPL", SMPL_NAMES), 52: ("SMPL-H", SMPLH_NAMES), 55: ("SMPL-X", SMPLX_NAMES)}
 _MEMBERS = ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs")
 _SMPLX_SHAPES = {20: 10, 400: 300}
-"""columns of SMPL-X's shapedirs (v1.0, v1.1) → how many of them are shape; the rest are expressions"""
+"""columns of SMPL-X's shapedirs (v1.0, v1.1) → number of shape parameters; the rest are expressions"""
 _NO_PARENT = 2**32 - 1  # SMPL's files hold the root's parent, −1, as an unsigned integer
 
 
@@ -34,7 +34,7 @@ class BodyModel:
     """A body whose shape depends on ``betas``.
 
     Attributes:
-        family: "SMPL", "SMPL-H", "SMPL-X"; "Anny" or "template", which have no shape parameters here.
+        family: "SMPL", "SMPL-H", "SMPL-X", or without shape parameters "Anny" or "template".
         template: the body for betas 0.
         shape_dirs: [V, 3, B] m per unit of each beta; B may be 0.
         joint_regressor: [J, V], joints from shaped vertices.
@@ -49,7 +49,7 @@ class BodyModel:
         """The body for ``betas`` [≤ B] in its rest pose: v = T + S β, joints = 𝒥 v.
 
         Raises:
-            InputError: more betas than the model has, unless the rest are zero.
+            InputError: non-zero betas beyond the model's.
         """
         if betas is None or self.joint_regressor is None:
             return self.template
@@ -70,7 +70,7 @@ def load_body_model(path: str | Path) -> BodyModel:
     ============================  =================================================================
     file                          model
     ============================  =================================================================
-    ``.npz`` with ``vertices``    our own ``body.npz``: no shape parameters
+    ``.npz`` with ``vertices``    ``body.npz``: no shape parameters
     ``.npz``, ``.pkl``            SMPL (24 joints), SMPL-H (52), SMPL-X (55) as published; a pickle
                                   is read without executing anything and without chumpy
     the word ``anny``             Anny's default person, through the package ``anny`` (Apache-2.0)
@@ -144,9 +144,9 @@ def _from_members(members: dict[str, Any]) -> BodyModel:
         "f": (None, 3),
     }
     for name, array in arrays.items():
-        wanted = shapes[name]
-        if array.ndim != len(wanted) or any(w not in (None, h) for w, h in zip(wanted, array.shape)):
-            expected = "×".join("n" if want is None else str(want) for want in wanted)
+        shape = shapes[name]
+        if array.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, array.shape)):
+            expected = "×".join("n" if want is None else str(want) for want in shape)
             raise InputError(f"shape of {name}", expected=expected, got="×".join(map(str, array.shape)))
         if not np.isfinite(array).all():
             raise InputError(name, expected="finite numbers")

@@ -1,4 +1,4 @@
-"""Data set as read from its layout: lenses, samples and body poses in the source's own world."""
+"""Data set as read from its layout: lenses, samples and body poses in the source's world."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .poses import Poses
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera as its source calibrated it.
+    """A calibrated camera of a source.
 
     Attributes:
         camera: pixel centres at +0.5, metres, in the source's world.
-        distortion: OpenCV's k1 k2 p1 p2 [k3 …]; empty for images that are undistorted.
-        undone: the coefficients that ``undistort_dataset`` undid.
+        distortion: OpenCV's k1 k2 p1 p2 [k3 …]; empty for undistorted images.
+        undone: coefficients removed by ``undistort_dataset``.
     """
 
     camera: Camera
@@ -39,7 +39,7 @@ class Sample:
         image: returns [H, W, 3] uint8 sRGB.
         mask: returns [H, W] uint8 coverage; None without a mask.
         normals: returns [H, W, 3] in OpenCV camera axes, zero where unknown; None without normals.
-        split: None to have it chosen.
+        split: None: chosen by ``select_samples``.
         name: stem of the image file, which mask files may share; empty for a video's frame.
     """
 
@@ -54,14 +54,14 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class ImportedDataset:
-    """A source, read.
+    """A source as read.
 
     Attributes:
         kind: name of the data set's format.
         lenses: by camera name.
         fps: frames per second of the images.
         notes: assumptions, one sentence each.
-        image_names: by frame, of all images of a camera where ``samples`` are a part of them; else empty.
+        image_names: by frame, of all images of a camera if ``samples`` is a subset; else empty.
     """
 
     kind: str
@@ -74,7 +74,7 @@ class ImportedDataset:
 
 
 def undistort_dataset(dataset: ImportedDataset) -> ImportedDataset:
-    """``dataset`` with the distortion of every lens undone in images, masks and normals as they are read."""
+    """``dataset`` with images, masks and normals undistorted on reading."""
 
     def undistort(read: Callable[[], NDArray] | None, lens: Lens, what: str) -> Callable[[], NDArray] | None:
         if read is None:

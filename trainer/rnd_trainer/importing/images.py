@@ -1,4 +1,4 @@
-"""Images, masks, calibration and numbered files as other programs store them."""
+"""Readers of images, masks and calibration of other programs, and numbered files."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ Bytes = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 _MAX_LABELS = 32
-"""a mask of fewer different values, none above 127, holds labels (0/1, body parts), not coverage"""
+"""a mask with at most so many values, none above 127, holds labels, not coverage"""
 _DIGITS = 20
-"""more than a number in a file's name has"""
+"""more digits than a number in a file's name"""
 
 
 def read_rgb(path: Path) -> Bytes:
-    """An image [H, W, 3] as 8-bit sRGB; grey is repeated, alpha dropped, 16 bit rounded."""
+    """Image [H, W, 3] as 8-bit sRGB; grey is repeated, alpha dropped, 16 bit rounded."""
     pixels = read_image(path)
     if pixels.dtype == np.uint16:
         pixels = np.round(pixels / 257).astype(np.uint8)
@@ -97,7 +97,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list
 
 
 def natural_key(name: str) -> tuple[str, str]:
-    """A key that sorts names by their numbers: frame2 before frame10."""
+    """Sort key of names by their numbers: frame2 before frame10."""
     return re.sub("[0-9]+", lambda digits: digits[0].zfill(_DIGITS), name), name
 
 
@@ -121,11 +121,10 @@ def numbers_of(files: Sequence[Path]) -> list[int] | None:
 
 
 def count_shift(frames: Sequence[int], numbers: Sequence[int]) -> int:
-    """Offset from the ``numbers`` of files to those of ``frames``, both ascending; 0 where they mean the same.
+    """Offset from the ``numbers`` of files to those of ``frames``, both ascending.
 
-    They mean the same where one set contains the other. Otherwise one may count from 0 and the other from 1, as
-    ffmpeg's images do, or from within a longer video. Then both are equally many in a row, or ``numbers``, some
-    missing, start at 0 and ``frames`` at 1.
+    They are equal if one set contains the other. Otherwise the offset is that of the first numbers, if both are equally
+    many and consecutive, or if ``frames`` are consecutive from 1 and ``numbers`` an incomplete range from 0.
     """
     if set(frames) <= set(numbers) or set(numbers) <= set(frames):
         return 0
@@ -168,7 +167,7 @@ def camera_of(K: ArrayLike, R: ArrayLike, T: ArrayLike, size: tuple[int, int], *
     """A camera of world-to-camera R, T (m).
 
     ``corner`` is added to the principal point: 0.5 for sources with pixel centres at whole numbers, as in OpenCV's
-    calibration; 0 for those with pixel centres at +0.5, as in ours and COLMAP's.
+    calibration; 0 for those with pixel centres at +0.5, as in COLMAP's.
     """
     intrinsics = np.array(K, np.float64).reshape(3, 3).copy()
     intrinsics[:2, 2] += corner
@@ -179,7 +178,7 @@ def camera_of(K: ArrayLike, R: ArrayLike, T: ArrayLike, size: tuple[int, int], *
 
 
 def nearest_rotation(matrix: Floats) -> Floats:
-    """The rotation nearest to a rounded one [3, 3]; ``matrix`` itself where none is near."""
+    """Rotation nearest to ``matrix`` [3, 3]; ``matrix`` itself if none is near."""
     u, _, v = np.linalg.svd(matrix)
     rotation: Floats = u @ v
     return rotation if np.abs(rotation - matrix).max() < 1e-2 else matrix
@@ -211,7 +210,7 @@ def read_sized(read: Callable[[Path], NDArray[Any]], file: Path, camera: Camera,
 
 
 def undistort_image(pixels: NDArray[Any], camera: Camera, distortion: tuple[float, ...]) -> NDArray[Any]:
-    """``pixels`` [H, W, …] as a lens without ``distortion`` sees them, K unchanged; zero outside."""
+    """``pixels`` [H, W, …] without ``distortion``, K unchanged; zero outside."""
     if not any(distortion):
         return pixels
     K = camera.K.copy()

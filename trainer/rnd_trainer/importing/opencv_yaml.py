@@ -16,19 +16,19 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
 MAX_BYTES = 1 << 22
-"""of a calibration file: ten thousand cameras"""
+"""largest calibration file, ten thousand cameras"""
 MATRIX_TAG = "tag:yaml.org,2002:opencv-matrix"
 
 
 class _Loader(yaml.SafeLoader):
-    """Plain YAML 1.1 with OpenCV's matrices, as mappings."""
+    """YAML 1.1 with OpenCV's matrices as mappings."""
 
 
 _Loader.add_constructor(MATRIX_TAG, lambda loader, node: loader.construct_mapping(node, deep=True))  # type: ignore[arg-type]
 
 
 class Calibration:
-    """The top-level entries of one file. Every failure is an ``InputError`` that names file and key."""
+    """Top-level entries of one file; failures are ``InputError`` with file and key."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = existing_file(path, what="calibration")
@@ -40,7 +40,7 @@ class Calibration:
         try:
             first, _, rest = self.path.read_text(encoding="utf-8").partition("\n")
             text = rest if first.startswith("%YAML") else f"{first}\n{rest}"
-            if "&" in text:  # an anchor: OpenCV writes none, and aliases of aliases grow without end
+            if "&" in text:  # anchors: nested aliases grow exponentially
                 raise ValueError("anchor")
             entries = yaml.load(text, _Loader)  # a SafeLoader
         except (yaml.YAMLError, ValueError, OverflowError, RecursionError, TypeError, AttributeError) as error:
@@ -50,7 +50,7 @@ class Calibration:
         return entries
 
     def strings(self, key: str) -> list[str]:
-        """The list of strings under ``key``; empty where there is none."""
+        """List of strings under ``key``, or empty."""
         value = self._entries.get(key)
         return [str(item) for item in value if isinstance(item, str | int)] if isinstance(value, list) else []
 
@@ -64,7 +64,7 @@ class Calibration:
         return found
 
     def optional_matrix(self, key: str) -> NDArray[np.float64] | None:
-        """As ``matrix``; None where the file has no such key."""
+        """As ``matrix``; None without ``key``."""
         if key not in self._entries:
             return None
         entry = self._entries[key]

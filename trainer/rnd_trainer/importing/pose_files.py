@@ -1,4 +1,4 @@
-"""Body poses of a video from the programs that estimate them, recognised by their keys and shapes."""
+"""Body poses from the output files of pose estimators, recognised by keys and shapes."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ class PoseFile:
 
     Attributes:
         kind: the program that wrote it.
-        poses: in the camera's frame for programs that look at a video; in the world for EasyMocap's.
+        poses: in camera axes if ``in_camera``, otherwise in the world.
         K: [3, 3] intrinsics of the file, or None.
-        focal: the focal length that the program assumed, px, as a function of width and height; or None.
+        focal: the program's assumed focal length in px as a function of width and height, or None.
         fps: frames per second of the file, or None.
         notes: assumptions, one sentence each.
-        numbered: one file a frame, numbered by its name; otherwise frames count from 0.
-        in_camera: the poses are in the axes of the camera that saw them.
+        numbered: one file per frame, numbered by name; otherwise frames count from 0.
+        in_camera: poses are in camera axes.
     """
 
     kind: str
@@ -123,10 +123,9 @@ def _from_pickle(path: Path, person: int | None) -> PoseFile:
 
 
 def pair_with_frames(found: PoseFile, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
-    """The poses by ``numbers``, the ascending ones of the frames of ``source``, and notes.
+    """Poses for the ascending frame ``numbers`` of ``source``, and notes.
 
-    Numbers of files may count from elsewhere (``images.count_shift``). Poses without numbers start at the first frame;
-    a different count is noted.
+    Numbers of pose files may have an offset (``images.count_shift``). Poses without numbers start at the first frame.
 
     Raises:
         InputError: no frame has a pose.
@@ -145,10 +144,10 @@ def pair_with_frames(found: PoseFile, numbers: Sequence[int], source: Path) -> t
 
 
 def poses_in_world(found: PoseFile, lenses: Sequence[Lens], source: Path) -> Poses:
-    """The poses in the world of ``lenses``; those in a camera's axes are transformed where there is one lens.
+    """Poses in the world of ``lenses``.
 
     Raises:
-        InputError: poses in a camera's axes for several or moving cameras, whose scale may differ.
+        InputError: poses in camera axes for several or moving cameras.
     """
     if not found.in_camera:
         return found.poses
@@ -226,7 +225,7 @@ def _romp(files: Sequence[Path]) -> PoseFile:
 
 
 def _romp_content(file: Path) -> dict[str, Any]:
-    """A results file: a pickled dict, its members, or None (empty dict) for a frame without people."""
+    """Content of a results file; empty for a frame without people."""
     with Npz(file, what="ROMP results") as archive:
         if "results" not in archive.names:
             return {key: archive.numbers(key) for key in ("smpl_thetas", "cam_trans", "smpl_betas")}
@@ -276,7 +275,7 @@ def _npz(path: Path) -> PoseFile:
 
 
 def _is_smplx(archive: Npz) -> bool:
-    """Whether the file is SMPL-X's, by AMASS' model name or by members that SMPL lacks."""
+    """Whether the file is SMPL-X's, by AMASS' model name or its members."""
     if model := _word(archive, "surface_model_type"):
         return model.startswith("smplx")
     return archive.first_of("jaw_pose", "expression", "left_hand_pose") is not None
@@ -290,7 +289,7 @@ def _gender(archive: Npz) -> tuple[str, ...]:
 
 
 def _word(archive: Npz, name: str) -> str:
-    """Text of a member; empty for none and for Python objects."""
+    """Text of a member, or empty."""
     try:
         return archive.strings(name)[0]
     except (InputError, IndexError):

@@ -68,7 +68,7 @@ def smpl_poses(
     member: str = "trans",
     joint_names: tuple[str, ...] | None = None,
 ) -> Poses:
-    """Poses in SMPL's convention: the root rotates about its rest position J0 and stands at J0 + trans.
+    """Poses in SMPL's convention: the root rotates about its rest position J0, its position is J0 + trans.
 
     Args:
         axis_angles: [F, 3J] or [F, J, 3] rad, the root first.
@@ -108,10 +108,10 @@ def easymocap_poses(
 
 
 def with_convention(poses: Poses, convention: RootConvention) -> Poses:
-    """``poses`` whose file holds the numbers of another root convention than its layout promises.
+    """``poses`` reinterpreted in another root convention.
 
     Raises:
-        InputError: the layout stores root positions, which have one meaning.
+        InputError: the layout stores root positions.
     """
     if convention == poses.convention:
         return poses
@@ -126,7 +126,7 @@ def with_convention(poses: Poses, convention: RootConvention) -> Poses:
 
 
 def transformed(poses: Poses, motion: Floats) -> Poses:
-    """``poses`` moved into another world by the rigid transform ``motion`` [4, 4]."""
+    """``poses`` in another world, by the rigid transform ``motion`` [4, 4]."""
     rotation, shift = motion[:3, :3], motion[:3, 3]
     rotations = poses.rotations.copy()
     rotations[:, 0] = rotation @ rotations[:, 0]
@@ -142,7 +142,7 @@ def rows_of_three(name: str, values: ArrayLike, count: int) -> Floats:
 
 
 def mean_betas(betas: ArrayLike | None) -> Floats | None:
-    """One shape [B] of one or many ([F, B] → their mean)."""
+    """Mean shape [B] of [B] or [F, B]."""
     if betas is None:
         return None
     array = np.atleast_1d(np.asarray(betas, np.float64))

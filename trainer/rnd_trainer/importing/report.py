@@ -13,7 +13,7 @@ from .options import ImportOptions
 
 
 def import_and_report(source: Path, out: Path, options: ImportOptions) -> int:
-    """Import, print what was found and assumed, check the result; 1 when the check finds something wrong."""
+    """Import, print findings and assumptions, check the result; returns the exit code."""
     phase = ""
     with Progress() as progress:
 

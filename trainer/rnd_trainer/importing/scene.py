@@ -1,4 +1,4 @@
-"""A data set placed in our world: Y up, one body, a pose for every frame."""
+"""Placement of a data set in the capture's world: Y up, one body, a pose for every frame."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Floats = NDArray[np.float64]
 
 UP_AXES = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1), "-z": (0, 0, -1)}
 SNAP_COSINE = np.cos(np.radians(30))
-"""a mean up direction within 30° of an axis is that axis; farther off the world is tilted"""
+"""a mean up direction within 30° of an axis is snapped to it"""
 MAX_FILLED = 100_000
-"""interpolated poses, an hour of video; numbers farther apart, such as times, count no frames"""
+"""largest number of interpolated poses: an hour of video"""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedScene:
-    """Body, motion (from the first pose on) and cameras of a data set in a world with Y up.
+    """Body, motion and cameras of a data set in a world with Y up; motion frame 0 is the first pose.
 
     Attributes:
-        rotation: [3, 3] from the source's world to ours.
+        rotation: [3, 3] from the source's world to the capture's.
         notes: assumptions, one sentence each.
     """
 
@@ -73,7 +73,7 @@ def place_scene(dataset: ImportedDataset, model: BodyModel, up: str | None = Non
 
 
 def _match_joints(poses: Poses, body: Body) -> Floats:
-    """Rotations [F, J, 3, 3] in the body's joint order; joints that the poses lack stay at rest."""
+    """Rotations [F, J, 3, 3] in the body's joint order, the identity for joints without poses."""
     rotations = np.tile(np.eye(3), (len(poses.frames), len(body.skeleton), 1, 1))
     columns = {name: k for k, name in enumerate(poses.joint_names)}
     matched = 0
@@ -89,7 +89,7 @@ def _match_joints(poses: Poses, body: Body) -> Floats:
 
 
 def _upright(root: Floats, up: str | None, notes: list[str]) -> Floats:
-    """The rotation [3, 3] from the source's up axis, or the mean up of the pelvises ``root`` [F, 3, 3], to Y."""
+    """Rotation [3, 3] to Y from the up axis ``up``, or from the mean up direction of ``root`` [F, 3, 3]."""
     if up is not None:
         direction = np.array(UP_AXES[up], np.float64)
     else:
@@ -113,16 +113,16 @@ def _upright(root: Floats, up: str | None, notes: list[str]) -> Floats:
 def _interpolated(
     frames: NDArray[np.int64], rotations: Floats, translations: Floats, body: Body, fps: float, notes: list[str]
 ) -> Motion:
-    """A pose for every frame from the first to the last, slerped where the source has none."""
+    """Motion with a pose for every frame from first to last, missing ones slerped."""
     missing = int(frames[-1]) - int(frames[0]) + 1 - len(frames)
     if missing > MAX_FILLED:
         got = f"{missing} between {frames[0]} and {frames[-1]}"
         raise InputError("frames of the poses", expected=f"at most {MAX_FILLED} missing", got=got)
-    wanted = np.arange(frames[0], frames[-1] + 1)
-    after = np.minimum(np.searchsorted(frames, wanted, side="right"), len(frames) - 1)
-    before = np.maximum(np.searchsorted(frames, wanted, side="right") - 1, 0)
-    t = ((wanted - frames[before]) / np.maximum(frames[after] - frames[before], 1))[:, None]
+    every = np.arange(frames[0], frames[-1] + 1)
+    after = np.minimum(np.searchsorted(frames, every, side="right"), len(frames) - 1)
+    before = np.maximum(np.searchsorted(frames, every, side="right") - 1, 0)
+    t = ((every - frames[before]) / np.maximum(frames[after] - frames[before], 1))[:, None]
     if missing:
-        notes.append(f"{missing} of {len(wanted)} poses are interpolated")
+        notes.append(f"{missing} of {len(every)} poses are interpolated")
     filled = slerp_matrices(rotations[before], rotations[after], t)
     return Motion(filled, (1 - t) * translations[before] + t * translations[after], fps, body.skeleton.names)

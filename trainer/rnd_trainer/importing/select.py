@@ -19,35 +19,35 @@ from .options import FrameSelection
 
 
 def select_samples(dataset: ImportedDataset, selection: FrameSelection) -> list[Sample]:
-    """The samples that ``selection`` keeps, each with its split.
+    """Samples that ``selection`` keeps, each with its split.
 
     Samples keep the split that they have. Otherwise the first 4/5 of the training camera's frames train and its last
     1/5 are novel poses; every ``held_out_every``-th frame of other cameras is a novel view, or there a novel pose.
 
     Raises:
-        InputError: nothing is kept, the training camera has no image, or ``selection`` names cameras in vain.
+        InputError: no sample left, no image of the training camera, or camera options without effect.
     """
     first, last = int(dataset.poses.frames[0]), int(dataset.poses.frames[-1])
-    kept = [sample for sample in dataset.samples if first <= sample.frame <= last and selection.keeps(sample.frame)]
-    if not kept:
+    selected = [sample for sample in dataset.samples if first <= sample.frame <= last and selection.keeps(sample.frame)]
+    if not selected:
         raise InputError("images", expected=f"some in the {last - first + 1} frames that have poses", got="none")
-    cameras = list(dict.fromkeys(sample.camera for sample in kept))
-    if all(sample.split is not None for sample in kept):
+    cameras = list(dict.fromkeys(sample.camera for sample in selected))
+    if all(sample.split is not None for sample in selected):
         refuse_cameras(selection, cameras, "the images' splits are given")
-        return kept
-    single = len({sample.frame for sample in kept}) == len(kept)  # one camera, which may move
-    camera = selection.train_camera or kept[0].camera
+        return selected
+    single = len({sample.frame for sample in selected}) == len(selected)  # one camera, which may move
+    camera = selection.train_camera or selected[0].camera
     if camera not in cameras:
         known = " or ".join(cameras[:8])
         raise InputError("--train-camera", expected=f"one with images in range: {known}", got=camera)
     if single:
         why = "there is one image a frame: the first 4/5 train, the rest are novel poses"
         refuse_cameras(selection, cameras, why)
-    train = sorted(sample.frame for sample in kept if single or sample.camera == camera)
+    train = sorted(sample.frame for sample in selected if single or sample.camera == camera)
     border = train[max(0, round(TRAIN_SHARE * len(train)) - 1)]
-    order = {frame: k for k, frame in enumerate(sorted({sample.frame for sample in kept}))}
+    order = {frame: k for k, frame in enumerate(sorted({sample.frame for sample in selected}))}
     result = []
-    for sample in kept:
+    for sample in selected:
         early = sample.frame <= border
         if single or sample.camera == camera:
             result.append(replace(sample, split="train" if early else "novel_pose"))
@@ -57,7 +57,7 @@ def select_samples(dataset: ImportedDataset, selection: FrameSelection) -> list[
 
 
 def refuse_cameras(selection: FrameSelection, cameras: Sequence[str], why: str) -> None:
-    """Refuse a choice between cameras that would change nothing; the name of the only one is allowed."""
+    """Refuse camera options without effect; the name of the only camera is allowed."""
     if [selection.train_camera] == list(cameras):
         selection = replace(selection, train_camera=None)
     refuse_changed(selection, ("train_camera", "held_out_every"), why)
@@ -66,7 +66,7 @@ def refuse_cameras(selection: FrameSelection, cameras: Sequence[str], why: str) 
 def sharpness(image: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -> float:
     """Sharpness of ``image`` [H, W, 3] on ``mask`` [H, W]; larger is sharper.
 
-    The Laplacian's mean square over the grey image's variance, which brightness and distance do not change.
+    Mean square of the Laplacian over the variance of the grey image.
 
     Source: Pertuz et al. 2013, Analysis of focus measure operators.
     """
@@ -80,7 +80,7 @@ def sharpness(image: NDArray[np.uint8], mask: NDArray[np.uint8] | None = None) -
 def select_frames(
     motion: Motion, skeleton: Skeleton, sharpnesses: NDArray[np.float64], count: int
 ) -> NDArray[np.int64]:
-    """Indices of at most ``count`` frames, ascending: the most different poses, each by its sharpest frame.
+    """Ascending indices of at most ``count`` frames: the sharpest frame of each of the most different poses.
 
     Poses are compared by joint positions about the root. Bins are the Voronoi cells of the farthest-point sample that
     starts at the first frame.

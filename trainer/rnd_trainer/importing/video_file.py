@@ -1,4 +1,4 @@
-"""Frames of a video file, by number, through PyAV."""
+"""Frames of a video file by number, decoded by PyAV."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rnd_runtime.core.files import existing_file
 
 from .images import Bytes
 
-_CACHED = 3  # latest frames kept: image and mask of one frame are read one after the other
+_CACHED = 3  # latest frames: image and mask of a frame are read in sequence
 
 
 class VideoFile:
@@ -23,7 +23,7 @@ class VideoFile:
     Attributes:
         width, height: pixels, after the file's rotation.
         fps: frames per second, on average.
-        numbers: of the frames, from 0. All are decoded once to count them, as an edit list may leave out packets.
+        numbers: of the frames, from 0; counted by decoding, as an edit list may skip packets.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -84,7 +84,7 @@ class VideoFile:
 
 
 def _upright(frame: Any) -> Bytes:
-    """Pixels after the file's rotation, by the matrix its stream names; unnamed: BT.709 from 720 lines on, else 601."""
+    """Rotated pixels, by the stream's colour matrix; by default BT.709 from 720 lines on, else BT.601."""
     named = {1: "itu709", 5: "itu601", 6: "itu601", 9: "bt2020"}.get(int(frame.colorspace))
     matrix = named or ("itu709" if frame.height >= 720 else "itu601")
     pixels: Bytes = frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()

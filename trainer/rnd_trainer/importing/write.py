@@ -31,9 +31,9 @@ def write_capture(
     *,
     normal_axes: NDArray[np.float64] | None = None,
 ) -> None:
-    """Write ``samples`` of an undistorted ``dataset``, placed as ``scene``, as a capture into ``folder``.
+    """Write ``samples`` of an undistorted ``dataset`` in ``scene`` as a capture.
 
-    ``normal_axes`` [3, 3] is the permutation that was applied to normals; ``rnd-data check`` reads it.
+    ``normal_axes`` [3, 3] is the permutation applied to the normals, for ``rnd-data check``.
     """
     output_folder(folder)
     first = int(dataset.poses.frames[0])

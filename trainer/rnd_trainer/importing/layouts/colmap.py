@@ -68,7 +68,7 @@ def _bad_line(file: Path, line: int) -> InputError:
 
 
 def _lines(file: Path) -> list[tuple[int, list[str]]]:
-    """(number, fields) of the lines that are no comments; images.txt keeps empty ones (an image without points)."""
+    """(number, fields) of lines except comments; in images.txt an empty line is an image without points."""
     text = existing_file(file, what="COLMAP model").read_text(encoding="utf-8", errors="replace")
     lines = [(k + 1, line.split()) for k, line in enumerate(text.splitlines()) if not line.startswith("#")]
     return lines if file.name == "images.txt" else [(k, fields) for k, fields in lines if fields]

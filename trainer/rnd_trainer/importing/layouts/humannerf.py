@@ -1,4 +1,4 @@
-"""HumanNeRF's layout (also GoMAvatar's): images in a row, a camera and an EasyMocap pose for each."""
+"""HumanNeRF's layout (also GoMAvatar's): a camera and an EasyMocap pose per image."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read(source: Path) -> ImportedDataset:
         raise InputError("cameras.pkl and mesh_infos.pkl", expected="dicts by image name", file=source)
     lenses: dict[str, Lens] = {}
     names: dict[bytes, str] = {}
-    samples, kept = [], []
+    samples, fits = [], []
     for frame, image in enumerate(list_files(source / "images")):
         if image.stem not in cameras or image.stem not in meshes:
             continue
@@ -51,17 +51,17 @@ def read(source: Path) -> ImportedDataset:
             lenses[name] = Lens(camera_of(K, pose[:3, :3], pose[:3, 3], image_size(image)), distortion)
         mask = mask_reader(find_beside(image, source / "masks"))
         samples.append(Sample(name, frame, partial(read_rgb, image), mask, name=image.stem))
-        kept.append((frame, _numbers(meshes[image.stem], ("poses", "Rh", "Th"), source / "mesh_infos.pkl", frame)))
-    if not kept:
+        fits.append((frame, _numbers(meshes[image.stem], ("poses", "Rh", "Th"), source / "mesh_infos.pkl", frame)))
+    if not fits:
         raise InputError("images", expected="names that cameras.pkl and mesh_infos.pkl know", file=source)
-    poses, Rh, Th = (np.stack([values[k] for _, values in kept]) for k in range(3))
+    poses, Rh, Th = (np.stack([values[k] for _, values in fits]) for k in range(3))
     notes: tuple[str, ...] = ()
     betas = None
     if (source / "avg_betas.npy").is_file():
         betas = np.asarray(read_pickle(source / "avg_betas.npy", what="betas"), np.float64)
     else:
         notes = ("no avg_betas.npy: the mean shape is used",)
-    body_poses = easymocap_poses([frame for frame, _ in kept], poses, Rh, Th, betas)
+    body_poses = easymocap_poses([frame for frame, _ in fits], poses, Rh, Th, betas)
     return ImportedDataset("HumanNeRF", lenses, samples, body_poses, FPS, notes)
 
 

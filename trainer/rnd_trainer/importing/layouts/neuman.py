@@ -1,4 +1,4 @@
-"""NeuMan: one moving camera, solved by COLMAP in a world without metres, and SMPL fits aligned to it."""
+"""NeuMan: one moving camera by COLMAP, of unknown scale, and SMPL fits aligned to it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def detect(source: Path) -> str | None:
 def read(source: Path) -> ImportedDataset:
     """Read COLMAP's cameras and the SMPL fits; COLMAP's unit becomes a metre by the fits' median scale.
 
-    A fit's own scale, where it differs from the median, moves the person along the ray: the image stays the same.
+    A fit's deviation from the median scale moves the person along the viewing ray.
     HUGS' fits (``4d_humans``) before NeuMan's optimised ones before ROMP's.
     """
     images = sorted(read_text_model(source / "sparse"), key=lambda image: image.name)
@@ -132,7 +132,7 @@ def _hugs_fits(file: Path, count: int) -> _Fits:
 
 
 def _splits(count: int) -> list[Split]:
-    """NeuMan's rule: every so many frames from half an interval on are held out."""
+    """NeuMan's splits: held-out frames at a constant interval, from half an interval on."""
     held = range(count)[max(1, count // max(1, count // 5)) // 2 :: max(1, count // max(1, count // 5))]
     return ["novel_pose" if k in held else "train" for k in range(count)]
 

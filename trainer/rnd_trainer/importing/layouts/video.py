@@ -1,4 +1,4 @@
-"""A video of one person, or a folder of its frames, with body poses from a program that estimates them."""
+"""A video of one person, or a folder of frames, with estimated body poses."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from rnd_trainer.importing.video_file import VideoFile
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 FPS = 30.0
 CAMERA = "0"
-_SMALL = 320  # pixels, the side at which sharpness is measured: motion blur shows there, sensor noise does not
+_SMALL = 320  # pixels, the side at which sharpness is measured, insensitive to sensor noise
 
 
 def detect(source: Path) -> str | None:
@@ -174,9 +174,9 @@ def _choose(
 
 
 def _stills(video: VideoFile | _FrameFolder, frames: list[int]) -> np.ndarray:
-    """The frames [n, H, W, 3] uint8 in a temporary file: masks read them in any order, a video only in its own."""
+    """Frames [n, H, W, 3] uint8 in a temporary file, for random access."""
     with tempfile.TemporaryFile() as file:
-        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and a bus error later
+        if hasattr(os, "posix_fallocate"):  # otherwise a full disk is a bus error
             os.posix_fallocate(file.fileno(), 0, len(frames) * video.height * video.width * 3)
         stills = np.memmap(file, np.uint8, "w+", shape=(len(frames), video.height, video.width, 3))
         for k, frame in enumerate(frames):

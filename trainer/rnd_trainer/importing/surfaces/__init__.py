@@ -1,1 +1,1 @@
-"""Masks and normals, made where a data set has none."""
+"""Masks and normals of a data set: from files or estimated."""

@@ -1,4 +1,4 @@
-"""Masks and normals that are estimated for samples without them."""
+"""Estimated masks and normals."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ def add_masks(
     net: Path | None,
     on_progress: OnProgress = no_progress,
 ) -> list[Sample]:
-    """``samples`` with rough masks where they have none or a network ``net`` is given, made camera by camera."""
-    wanted = [k for k, sample in enumerate(samples) if sample.mask is None or net is not None]
+    """``samples`` with estimated masks, for samples without one or by the network ``net`` for all."""
+    missing = [k for k, sample in enumerate(samples) if sample.mask is None or net is not None]
     made: dict[int, Bytes] = {}
-    for camera in dict.fromkeys(samples[k].camera for k in wanted):
-        numbers = [k for k in wanted if samples[k].camera == camera]
+    for camera in dict.fromkeys(samples[k].camera for k in missing):
+        numbers = [k for k in missing if samples[k].camera == camera]
         images = _Lazy([samples[k] for k in numbers], lambda sample: sample.image())
         silhouettes = _Lazy([samples[k] for k in numbers], lambda sample: _template(sample, scene, dataset).mask)
         for k, mask in zip(numbers, make_masks(images, silhouettes, net=net)):
             made[k] = mask
-            on_progress("making masks", len(made), len(wanted))
+            on_progress("making masks", len(made), len(missing))
     if made:
         how = "by a network" if net else "from the template and the images' colours"
         scene.notes.append(f"{len(made)} masks made {how}: rough; better ones come from SAM 2 with --masks")
@@ -76,29 +76,28 @@ def add_normals(
 ) -> tuple[list[Sample], NDArray[np.float64] | None]:
     """``samples`` with normals in OpenCV camera axes, and the signed permutation [3, 3] applied to them, or None.
 
-    ``options.normal_net`` makes them. ``options.normal_axes`` names their axes. Without it the template decides for the
-    user's maps and a network's; a layout's own are in OpenCV axes.
+    By default the template decides on the axes of the user's or a network's maps; a layout's are in OpenCV axes.
     """
     if options.normal_net is not None:
         network = normal_network(options.normal_net)
-        samples = [replace(sample, normals=partial(_predicted, sample, network)) for sample in samples]
-    to_ours: Callable[[Normals], Normals]
+        samples = [replace(sample, normals=partial(_predict, sample, network)) for sample in samples]
+    permute: Callable[[Normals], Normals]
     if options.normal_axes is not None:
-        matrix = _parsed(options.normal_axes)
+        matrix = _parse_axes(options.normal_axes)
         if all(sample.normals is None for sample in samples):
             raise InputError("--normal-axes", expected="normals to permute: --normals or --normal-net", got="none")
-        to_ours = lambda normals: (normals @ matrix.T).astype(np.float32)  # noqa: E731
+        permute = lambda normals: (normals @ matrix.T).astype(np.float32)  # noqa: E731
     elif options.normals is not None or options.normal_net is not None:
         few = [samples[round(k)] for k in np.linspace(0, len(samples) - 1, min(_AXIS_FRAMES, len(samples)))]
         axes = find_axes(_maps(few), (_template(sample, scene, dataset).normals for sample in few))
         scene.notes.append(f"normals point {axes.name}: mean cosine {axes.agreement:.2f} to the template")
-        matrix, to_ours = np.diag(np.array(axes.signs, np.float64)), partial(to_opencv, axes=axes)
+        matrix, permute = np.diag(np.array(axes.signs, np.float64)), partial(to_opencv, axes=axes)
     else:
         return samples, None
 
     def finished(read: Callable[[], Normals], sample: Sample) -> Normals:
         assert sample.mask is not None
-        return fill_holes(to_ours(read()), sample.mask())
+        return fill_holes(permute(read()), sample.mask())
 
     return [
         sample if sample.normals is None else replace(sample, normals=partial(finished, sample.normals, sample))
@@ -106,7 +105,7 @@ def add_normals(
     ], matrix
 
 
-def _parsed(axes: str) -> NDArray[np.float64]:
+def _parse_axes(axes: str) -> NDArray[np.float64]:
     try:
         return parse_axes(axes)
     except ValueError:
@@ -119,6 +118,6 @@ def _maps(samples: list[Sample]) -> Iterator[Normals]:
         yield sample.normals()
 
 
-def _predicted(sample: Sample, network: ImageNetwork) -> Normals:
+def _predict(sample: Sample, network: ImageNetwork) -> Normals:
     assert sample.mask is not None
     return normal_map(network, sample.image(), sample.mask())

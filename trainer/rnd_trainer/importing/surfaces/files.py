@@ -18,7 +18,7 @@ from .normals import read_normals
 
 
 def attach_files(dataset: ImportedDataset, masks: Path | None, normals: Path | None) -> ImportedDataset:
-    """``dataset`` with masks and normals from these folders, by the image's name or number."""
+    """``dataset`` with masks and normals of these folders, by the images' names or numbers."""
     if masks is not None:
         dataset = _attach(dataset, "mask", masks, (".png", ".npy", ".jpg"), read_mask)
     if normals is not None:
@@ -29,7 +29,7 @@ def attach_files(dataset: ImportedDataset, masks: Path | None, normals: Path | N
 def _attach(
     dataset: ImportedDataset, what: str, folder: Path, suffixes: tuple[str, ...], read: Callable[[Path], NDArray[Any]]
 ) -> ImportedDataset:
-    """``dataset`` with files of ``folder``, or of a camera's folder there, as its samples' ``what``."""
+    """``dataset`` with files of ``folder``, or of its folders per camera, as ``what``."""
     inner = {name: folder / name if (folder / name).is_dir() else folder for name in dataset.lenses}
     images: dict[Path, list[tuple[str, int]]] = {}
     for sample in dataset.samples:
@@ -50,11 +50,11 @@ def _attach(
 
 
 class _NumberedFiles:
-    """The masks or normals of one folder, found by name or number of the ``images`` (name, frame) there.
+    """Masks or normals of one folder, by name or number of ``images`` (name, frame).
 
-    A file has the image's name, followed by anything but a digit, or the number at the end of the image's name; for an
-    image without a number, such as a video's frame, the frame's number, or else the frame's position in the folder.
-    Where not all images have a file of their name, ``shift`` is added to the files' numbers (``images.count_shift``).
+    A file's name is the image's, followed by anything but a digit, or has the image's number; for images without a
+    number, the frame's, or else the frame's position in the folder. ``shift`` is the numbers' offset
+    (``images.count_shift``) if not all images have a file of their name.
     """
 
     def __init__(self, folder: Path, suffixes: tuple[str, ...], images: Sequence[tuple[str, int]]) -> None:
@@ -81,7 +81,7 @@ class _NumberedFiles:
         return numbered[number]
 
     def _named(self, name: str) -> Path | None:
-        """The one file with an image's name; with a shift, only names that continue it."""
+        """The only file with an image's name; with a shift, only longer names."""
         if name in self.stems and not self.shift:
             return self.stems[name]
         longer = [file for stem, file in self.stems.items() if _continues(stem, name)]
@@ -94,6 +94,6 @@ def _number(name: str, frame: int) -> int:
 
 
 def _continues(name: str, start: str) -> bool:
-    """Whether ``name`` is ``start`` and something that begins with no digit; nothing continues an empty name."""
+    """Whether ``name`` is ``start`` followed by a non-digit; False for an empty ``start``."""
     rest = name[len(start) :]
     return bool(start and rest) and name.startswith(start) and not rest[0].isdigit()

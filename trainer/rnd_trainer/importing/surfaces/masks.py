@@ -1,8 +1,7 @@
-"""Rough masks for images without any, best for a static camera.
+"""Rough masks for images without masks, best with a static camera.
 
-The posed template or a segmentation network seeds GrabCut, which finds the outline by colour; a guided filter refines
-it below a pixel. Of a static camera the background is learned: pixels near their median over the frames in which the
-template is elsewhere.
+The posed template or a segmentation network seeds GrabCut; a guided filter refines the outline. The background of a
+static camera is the median over the frames in which the template does not cover it.
 
 Source: Rother et al. 2004, GrabCut; He et al. 2013, Guided image filtering.
 """
@@ -40,17 +39,17 @@ _STATIC_NOISE = 12.0  # median difference above which the camera moved
 def make_masks(
     images: Sequence[Image], silhouettes: Sequence[Mask] | None = None, *, net: Path | None = None
 ) -> Iterator[Image]:
-    """Rough masks [H, W] uint8 (coverage, 255 is the person), one after the other.
+    """Yield rough masks [H, W] uint8 (coverage, 255 is the person).
 
-    Both sequences may be lazy: they are read by index, one image at a time, some of them twice.
+    Both sequences are read by index, one image at a time, some twice.
 
     Args:
-        images: [H, W, 3] uint8 sRGB, all of one size; more than one where neither of the others is given.
+        images: [H, W, 3] uint8 sRGB, of one size; more than one without silhouettes and network.
         silhouettes: [H, W] masks of the posed template.
-        net: a segmentation network in ONNX (``networks.ImageNetwork``), used instead of them.
+        net: segmentation network in ONNX (``networks.ImageNetwork``), used instead.
 
     Raises:
-        InputError: neither poses nor network are given, and nothing moves.
+        InputError: neither silhouettes nor network, and no motion.
     """
     if len(images) == 0:
         return
@@ -87,7 +86,7 @@ class _Background:
         self.colour, self.seen, self.noise = colour, seen, noise
 
     def differs(self, image: Image) -> Mask:
-        """[H, W] where ``image`` differs from the background; shadows do not count."""
+        """[H, W] where ``image`` differs from the background by more than a shadow."""
         difference = np.abs(image - self.colour).max(-1)
         ratio = (image + 1.0) / (self.colour + 1.0)
         shadow = (ratio.max(-1) < 1.05) & (ratio.min(-1) > 0.45) & (np.ptp(ratio, axis=-1) < 0.12)
@@ -96,7 +95,7 @@ class _Background:
 
 
 def _learn_background(images: Sequence[Image], silhouettes: Sequence[Mask] | None) -> _Background | None:
-    """The background, or None for a moving camera or one that never shows it."""
+    """The background, or None for a moving camera or a hidden background."""
     count = len(images)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _BACKGROUND_FRAMES)).astype(int))
     if len(chosen) < 3:
@@ -128,7 +127,7 @@ def _learn_background(images: Sequence[Image], silhouettes: Sequence[Mask] | Non
 
 
 def _seeds(person: Mask, silhouette: Mask | None, image: Image, background: _Background | None, reach: float) -> Image:
-    """GrabCut's labels [H, W]: ``person`` is probable; well inside it and the template, and by the background, sure."""
+    """GrabCut's labels [H, W]: definite well inside person and template and by the background, else probable."""
     seeds = np.full(person.shape, cv2.GC_BGD, np.uint8)
     template = person if silhouette is None else silhouette
     if not template.any():
@@ -156,7 +155,7 @@ def _moving_mask(image: Image, background: _Background) -> Mask:
 
 
 def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) -> Mask:
-    """Where a network finds the person, in a crop around the template where there is one."""
+    """The person by a network, in a crop around the template if given."""
     height, width = image.shape[:2]
     rows, columns = slice(0, height), slice(0, width)
     if silhouette is not None and silhouette.any():
@@ -173,7 +172,7 @@ def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) 
 
 
 def _refine(image: Image, seeds: Image) -> Image:
-    """Coverage [H, W]: GrabCut from ``seeds`` at working size, its outline fitted to the image's edges."""
+    """Coverage [H, W]: GrabCut from ``seeds`` at working size, refined at full size."""
     coverage = np.zeros(seeds.shape, np.uint8)
     possible = seeds != cv2.GC_BGD
     if not possible.any():
@@ -194,7 +193,7 @@ def _refine(image: Image, seeds: Image) -> Image:
 
 
 def _grabcut(image: Image, labels: Image) -> Mask:
-    """Foreground after GrabCut; of one-sided ``labels`` their own."""
+    """Foreground after GrabCut, or of ``labels`` if they have one class only."""
     person = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
     if not person.any() or person.all():
         return _large_parts(person)
@@ -205,7 +204,7 @@ def _grabcut(image: Image, labels: Image) -> Mask:
 
 
 def _large_parts(mask: NDArray[np.generic]) -> Mask:
-    """``mask`` without the islands below a twentieth of its largest one."""
+    """``mask`` without components below a twentieth of the largest one."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = statistics[1:, cv2.CC_STAT_AREA]
     large: Mask = np.isin(labels, 1 + np.flatnonzero(areas > 0.05 * areas.max())) if count > 1 else labels > 0
@@ -218,7 +217,7 @@ def _height(mask: Mask) -> int:
 
 
 def _dilated(mask: Mask, share: float) -> Mask:
-    """``mask`` grown by ``share`` of its height."""
+    """``mask`` dilated by ``share`` of its height."""
     if not mask.any():
         return mask
     outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
@@ -227,7 +226,7 @@ def _dilated(mask: Mask, share: float) -> Mask:
 
 
 def _box(mask: Mask, share: float) -> tuple[slice, slice]:
-    """Rows and columns around ``mask``, grown by ``share`` of its height."""
+    """Bounding box of ``mask``, grown by ``share`` of its height."""
     margin = int(np.ceil(share * _height(mask))) + 2
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return (

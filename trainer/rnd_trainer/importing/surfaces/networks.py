@@ -1,4 +1,4 @@
-"""Image networks in ONNX: one image in, one map of the same extent out."""
+"""Image networks in ONNX: from an image to a map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ImageNetwork:
         outputs: numbers of channels that the map may have.
 
     Raises:
-        InputError: the file is no such network.
+        InputError: not such a network.
     """
 
     def __init__(self, path: str | Path, *, outputs: tuple[int, ...]) -> None:

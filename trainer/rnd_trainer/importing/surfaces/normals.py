@@ -1,7 +1,6 @@
-"""Normal maps from files or from a network, brought to OpenCV camera axes.
+"""Normal maps from files or a network, in OpenCV camera axes.
 
-Predictors differ in the signs of their axes: Sapiens' maps point right, up and to the viewer, others right, down and
-away. The signs are chosen that agree best with the posed template; maps that agree with none are refused.
+Predictors differ in the signs of their axes; the signs that agree best with the posed template are chosen.
 """
 
 from __future__ import annotations
@@ -51,14 +50,14 @@ class NormalAxes:
 
 
 def find_axes(maps: Iterable[Normals], template: Iterable[NDArray[np.float64]]) -> NormalAxes:
-    """The signs by which ``maps`` agree best with ``template``, over all frames given.
+    """Signs by which ``maps`` agree best with ``template``.
 
     Args:
         maps: [H, W, 3] in the source's axes; zero where unknown.
         template: [H, W, 3] unit normals of the posed template in OpenCV axes; zero outside.
 
     Raises:
-        InputError: no signs make them agree, or two do equally well.
+        InputError: no signs agree, or two agree equally well.
     """
     products, pixels = np.zeros((3, 3)), 0
     for one, wanted in zip(maps, template):
@@ -87,14 +86,14 @@ def find_axes(maps: Iterable[Normals], template: Iterable[NDArray[np.float64]]) 
 
 
 def to_opencv(normals: Normals, axes: NormalAxes) -> Normals:
-    """``normals`` [H, W, 3] in OpenCV's axes; those that then face away are projected edge-on."""
+    """``normals`` [H, W, 3] in OpenCV's axes; back-facing ones are projected to z = 0."""
     flipped = normals * np.array(axes.signs, np.float32)
     flipped[..., 2] = np.minimum(flipped[..., 2], 0)
     return _unit(flipped)
 
 
 def read_normals(path: str | Path) -> Normals:
-    """A normal map [H, W, 3] in its own axes, unit or zero, from .npy (n, H×W×3 or 3×H×W) or a image of (n + 1)/2."""
+    """Normal map [H, W, 3], unit or zero, from .npy (n, H×W×3 or 3×H×W) or an image of (n + 1)/2."""
     path = existing_file(path, what="normals")
     if path.suffix.lower() == ".npy":
         normals: NDArray[Any] = load_array(path, "normals").astype(np.float32)
@@ -113,14 +112,14 @@ def read_normals(path: str | Path) -> Normals:
 
 
 def normal_network(path: Path) -> ImageNetwork:
-    """The ONNX file ``path`` as a network that gives three channels (layouts: ``networks.ImageNetwork``)."""
+    """Network of the ONNX file ``path`` with three output channels."""
     return ImageNetwork(path, outputs=(3,))
 
 
 def normal_map(network: ImageNetwork, image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> Normals:
-    """The map [H, W, 3] of ``network`` in its own axes, zero outside the mask.
+    """Map [H, W, 3] of ``network`` in its own axes, zero outside the mask.
 
-    The network sees a crop of the person on grey, as such predictors are trained.
+    Its input is a crop of the person on grey.
 
     Args:
         image: [H, W, 3] uint8 sRGB.
@@ -133,8 +132,8 @@ def normal_map(network: ImageNetwork, image: NDArray[np.uint8], mask: NDArray[np
     margin = (rows[-1] - rows[0]) // 10 + 2
     box = tuple(slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns))
     alpha = mask[box][..., None] / np.float32(255)
-    seen = np.round(image[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
-    output = network(seen)
+    crop = np.round(image[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
+    output = network(crop)
     if output.min() >= 0:  # the network returns (n + 1)/2
         output = 2 * output - 1
     normals[box] = _unit(output) * (mask[box] > 0)[..., None]
@@ -142,7 +141,7 @@ def normal_map(network: ImageNetwork, image: NDArray[np.uint8], mask: NDArray[np
 
 
 def fill_holes(normals: Normals, mask: NDArray[np.uint8]) -> Normals:
-    """``normals`` with the pixels that the mask covers and the source leaves out filled from their neighbours."""
+    """``normals`` with unknown pixels inside the mask filled from the nearest known ones."""
     known = normals.any(-1)
     holes = (mask > 0) & ~known
     if not holes.any() or not known.any():
