@@ -1,4 +1,4 @@
-"""What the commands of this package share."""
+"""Shared functions of the commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WIDTH = 140
 
 
 def need_extra() -> None:
-    """Raise ``InputError``, with the extra to install, where a package for training is missing."""
+    """Raise ``InputError``, with the extra to install, if a package for training is missing."""
     for package in ("torch", "safetensors", "scipy"):
         if importlib.util.find_spec(package) is None:
             hint = 'needs the extra: pip install "rnd-avatar[train]", in a clone ".[train]"'
@@ -31,7 +31,7 @@ def log_all(notes: Iterable[str]) -> None:
 
 
 def wide_console() -> Console:
-    """A console that wraps lines on a narrow terminal instead of cutting figures."""
+    """Console that wraps lines on a narrow terminal instead of truncating them."""
     from rich.console import Console
 
     return Console(width=max(Console().width, WIDTH), soft_wrap=True)

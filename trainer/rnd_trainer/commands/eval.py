@@ -1,4 +1,4 @@
-"""rnd-eval: figures of a trained avatar on held-out images."""
+"""rnd-eval: scores of a trained avatar on held-out images."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ COLUMNS = {
     "psnr_albedo": ("albedo", "{:.2f}"),
     "outline_px": ("outline px", "{:.2f}"),
 }
-"""columns of the terminal's table: heading and format"""
+"""columns of the table: heading and format"""
 UNKNOWN = {
     "pictures": "--strips FOLDER writes them",
     "ablate": "rnd-bench study ablations trains them",
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def evaluate_run(options: EvalOptions) -> None:
-    """Score every held-out split that the capture has; print a table, write rows and strips."""
+    """Score all held-out splits of the capture; print a table, write rows and strips."""
     need_extra()
     from rich.markup import escape
     from rich.table import Table
@@ -143,7 +143,7 @@ def _checkpoint_file(options: EvalOptions) -> Path:
 
 
 def _refined_motion(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
-    """The motion refined in this training if it was on this capture; logs it."""
+    """The motion refined in training on this capture, or None; logs it."""
     from rnd_runtime.capture.capture import capture_file
     from rnd_trainer.training.training import REFINED_MOTION
 
@@ -158,17 +158,17 @@ def _refined_motion(path: Path, checkpoint: Checkpoint, options: EvalOptions) ->
 
 
 def _is_of(exported: Path, checkpoint_sha256: str) -> bool:
-    """Whether ``exported`` exists and is of that checkpoint; warns where it is of another."""
+    """Whether ``exported`` exists and is of this checkpoint; warns if it is of another."""
     from rnd_runtime.avatar.file import metadata_of
 
     if not exported.is_file():
         return False
     try:
-        made_of = metadata_of(exported).checkpoint_sha256
+        source_sha256 = metadata_of(exported).checkpoint_sha256
     except InputError as error:
         warn(f"{error}: its size and speed are left out")
         return False
-    if made_of == checkpoint_sha256:
+    if source_sha256 == checkpoint_sha256:
         return True
     warn(f"{exported}: of another checkpoint: its size and speed are left out")
     return False
