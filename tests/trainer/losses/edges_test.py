@@ -1,4 +1,4 @@
-"""The third stage: poses that nobody filmed, the stretch of skin in them, and what is kept meanwhile."""
+"""The third stage: unseen poses, edge stretch in them, and distillation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rnd_runtime.capture.body import skin
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_trainer.config import ModelConfig, TrainConfig
-from rnd_trainer.losses.edges import BETWEEN_BONES, LEAST_LENGTH, EdgeLengths
+from rnd_trainer.losses.edges import BETWEEN_BONES, MIN_LENGTH, EdgeLengths
 from rnd_trainer.losses.losses import ALLOWED_STRETCH, stretch_penalty
 from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
@@ -57,38 +57,38 @@ def _stretch(lengths: EdgeLengths, model: AvatarModel, pose: PoseInput) -> torch
 def _squat() -> PoseInput:
     skeleton = body().skeleton
     angles = np.zeros((2, len(skeleton), 3))
-    for name, turn in EXTREMES["squat"].items():
-        angles[:, skeleton.names.index(name)] = turn
+    for name, rotation in EXTREMES["squat"].items():
+        angles[:, skeleton.names.index(name)] = rotation
     motion = Motion(axis_angle_to_matrix(angles), np.zeros((2, 3)), 30.0, skeleton.names)
     return pose_input(motion, skeleton, 0.0, CONFIG)
 
 
-def test_a_drawn_pose_turns_a_few_joints_within_bounds_and_comes_there_from_less() -> None:
+def test_a_sampled_pose_rotates_a_few_joints_within_bounds_and_grows_over_the_window() -> None:
     skeleton = body().skeleton
     for seed in range(8):
         pose = sampled_pose(skeleton, CONFIG, np.random.default_rng(seed))
-        turned = (pose.window[-1] - pose.window.new_tensor([1, 0, 0, 0, 1, 0])).abs().amax(-1) > 1e-4
-        assert 1 <= int(turned.sum()) <= ROTATED_JOINTS
-        assert pose.velocity[~turned].abs().max() < 1e-4
+        rotated = (pose.window[-1] - pose.window.new_tensor([1, 0, 0, 0, 1, 0])).abs().amax(-1) > 1e-4
+        assert 1 <= int(rotated.sum()) <= ROTATED_JOINTS
+        assert pose.velocity[~rotated].abs().max() < 1e-4
         assert pose.velocity.norm(dim=-1).max() < MAX_ROTATION / CONFIG.window_seconds
         assert torch.allclose(pose.bones[0, :, :3], torch.eye(3), atol=1e-6)  # the root stays
 
 
-def test_a_shaken_pose_is_near_the_filmed_one_its_root_and_pace_kept() -> None:
+def test_a_perturbed_pose_is_near_the_training_pose_with_its_root_and_speed() -> None:
     skeleton = body().skeleton
     rng = np.random.default_rng(3)
     angles = np.cumsum(0.03 * rng.standard_normal((40, len(skeleton), 3)), axis=0)
     motion = Motion(axis_angle_to_matrix(angles), rng.standard_normal((40, 3)), 30.0, skeleton.names)
-    filmed = pose_input(motion, skeleton, 0.9, CONFIG)
+    training_pose = pose_input(motion, skeleton, 0.9, CONFIG)
     for seed in range(8):
-        shaken = perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
+        perturbed = perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(seed))
         # where the person stands and looks
-        assert torch.allclose(shaken.bones[0], filmed.bones[0], atol=1e-5)
-        ours, theirs = (pose.velocity.norm(dim=-1) for pose in (shaken, filmed))
-        assert torch.allclose(ours, theirs, atol=1e-3)  # a window turned as a whole
-        moved = shaken.bones[1:, :, :3] - filmed.bones[1:, :, :3]
+        assert torch.allclose(perturbed.bones[0], training_pose.bones[0], atol=1e-5)
+        perturbed_speed, speed = (pose.velocity.norm(dim=-1) for pose in (perturbed, training_pose))
+        assert torch.allclose(perturbed_speed, speed, atol=1e-3)  # one rotation for the whole window
+        moved = perturbed.bones[1:, :, :3] - training_pose.bones[1:, :, :3]
         assert float(moved.abs().max()) > 0
-        own = (shaken.window - filmed.window).abs().amax(-1)
+        own = (perturbed.window - training_pose.window).abs().amax(-1)
         assert float(own.mean()) < 2 * MAX_PERTURBATION
     twice = [perturbed_pose(motion, skeleton, 0.9, CONFIG, np.random.default_rng(1)).window for _ in range(2)]
     assert torch.equal(*twice)
@@ -105,11 +105,11 @@ def test_a_nudged_pose_is_hardly_another(model) -> None:
 
 
 def test_descending_calms_weights_that_jump(model) -> None:
-    """A network that is told to change a lot by a little learns not to, in poses that were never drawn."""
+    """A network that varies fast with the pose learns not to, in poses that were never sampled."""
     with torch.no_grad():
         model.skinning.logits.weight.copy_(3 * torch.randn(model.skinning.logits.weight.shape))
     unseen = UnseenPoses(model, body().skeleton, TrainConfig(model=CONFIG))
-    lengths, far, filmed = EdgeLengths(model), _poses(12, seed=6), _poses(2, seed=5)
+    lengths, far, training_pose = EdgeLengths(model), _poses(12, seed=6), _poses(2, seed=5)
 
     @torch.no_grad()
     def jump() -> float:
@@ -123,7 +123,7 @@ def test_descending_calms_weights_that_jump(model) -> None:
     before = jump()
     optimizer = torch.optim.Adam(model.skinning.parameters(), lr=2e-3)
     for step in range(60):
-        unseen(model, filmed[step % 2], step)["smoothness"].backward()
+        unseen(model, training_pose[step % 2], step)["smoothness"].backward()
         optimizer.step()
         optimizer.zero_grad()
     assert jump() < 0.5 * before
@@ -144,23 +144,23 @@ def test_stretch_is_the_templates_before_anything_is_learned(model, template) ->
             if pair not in found and differ > BETWEEN_BONES:
                 found.add(pair)
                 rest = np.linalg.norm(template.points[i] - template.points[j])
-                expected.append(np.linalg.norm(posed[i] - posed[j]) / max(rest, LEAST_LENGTH))
+                expected.append(np.linalg.norm(posed[i] - posed[j]) / max(rest, MIN_LENGTH))
     assert abs(len(stretch) - len(expected)) <= 5  # the floor under the weights decides a few
     for share in (1, 50, 99, 99.9):
         assert np.percentile(stretch, share) == pytest.approx(np.percentile(expected, share), rel=0.01)
 
 
-def test_only_what_is_beyond_skins_own_stretch_costs() -> None:
+def test_stretch_costs_beyond_the_allowed_only() -> None:
     stretch = torch.tensor([0.2, 1.0, ALLOWED_STRETCH, ALLOWED_STRETCH + 2])
     assert float(stretch_penalty(stretch)) == pytest.approx(1.0)
     assert float(stretch_penalty(stretch[:0])) == 0
 
 
-def test_the_step_gives_what_is_drawn_and_only_the_skinning_feels_it(model) -> None:
-    filmed = _poses(4, seed=1)
+def test_the_step_determines_the_samples_and_only_the_skinning_gets_gradients(model) -> None:
+    training_pose = _poses(4, seed=1)
     unseen, same = (UnseenPoses(model, body().skeleton, TrainConfig(model=CONFIG)) for _ in range(2))
-    first, again, other = (unseen(model, filmed[0], step) for step in (8, 8, 9))
-    assert first == again == same(model, filmed[0], 8)
+    first, again, other = (unseen(model, training_pose[0], step) for step in (8, 8, 9))
+    assert first == again == same(model, training_pose[0], 8)
     assert first["edges"] != other["edges"]
     torch.stack(list(first.values())).sum().backward()
     felt = {name.split(".")[0] for name, p in model.named_parameters() if p.grad is not None}
@@ -168,7 +168,7 @@ def test_the_step_gives_what_is_drawn_and_only_the_skinning_feels_it(model) -> N
     assert all(p.grad is None for p in unseen.teacher.parameters())
 
 
-def test_what_is_kept_is_where_the_nodes_were(model) -> None:
+def test_distillation_measures_offsets_from_the_teacher(model) -> None:
     """Against skinning node by node in float64."""
     pose = _poses(1, seed=2)[0]
     unseen = UnseenPoses(model, body().skeleton, TrainConfig(model=CONFIG))
@@ -192,10 +192,10 @@ def test_what_is_kept_is_where_the_nodes_were(model) -> None:
         )
 
 
-def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_filmed(model) -> None:
-    filmed, far = _poses(6, seed=5), _poses(24, seed=6)
-    # not what is drawn
-    filmed = [dataclasses.replace(pose, window=pose.window.roll(1, 1)) for pose in filmed]
+def test_descent_improves_unsampled_poses_and_keeps_training_poses(model) -> None:
+    training_pose, far = _poses(6, seed=5), _poses(24, seed=6)
+    # poses other than the samples
+    training_pose = [dataclasses.replace(pose, window=pose.window.roll(1, 1)) for pose in training_pose]
     lengths = EdgeLengths(model)
     config = dataclasses.replace(TrainConfig(model=CONFIG), weight_edges=1e5)
     unseen = UnseenPoses(model, body().skeleton, config)
@@ -208,11 +208,11 @@ def test_descending_mends_poses_that_were_never_drawn_and_keeps_those_that_were_
     before = torn()
     optimizer = torch.optim.Adam(model.skinning.parameters(), lr=2e-3)
     for step in range(120):
-        terms = unseen(model, filmed[step % len(filmed)], step)
+        terms = unseen(model, training_pose[step % len(training_pose)], step)
         torch.stack(list(terms.values())).sum().backward()
         optimizer.step()
         optimizer.zero_grad()
     with torch.no_grad():
-        moved = np.mean([float(unseen(model, pose, 0)["distillation"]) for pose in filmed])
+        moved = np.mean([float(unseen(model, pose, 0)["distillation"]) for pose in training_pose])
     assert torn() < 0.7 * before
     assert moved < 5**2  # mm²

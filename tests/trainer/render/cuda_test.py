@@ -39,12 +39,12 @@ def test_gsplat_splats_what_the_cpu_splats() -> None:
     results = []
     for device in ("cpu", "cuda"):
         arrays = [torch.tensor(array, device=device, requires_grad=True) for array in scene]
-        pictures = raster.rasterize(*arrays, camera, depth=True)
+        images = raster.rasterize(*arrays, camera, depth=True)
         draw = torch.Generator().manual_seed(0)
-        weights = [torch.randn(picture.shape, generator=draw) for picture in pictures]
-        sum((p * w.to(p)).sum() for p, w in zip(pictures, weights)).backward()
-        results.append(([p.detach().cpu() for p in pictures], [a.grad.cpu() for a in arrays]))
-    for ours, theirs in zip(*(pictures for pictures, _ in results)):
+        weights = [torch.randn(image.shape, generator=draw) for image in images]
+        sum((p * w.to(p)).sum() for p, w in zip(images, weights)).backward()
+        results.append(([p.detach().cpu() for p in images], [a.grad.cpu() for a in arrays]))
+    for ours, theirs in zip(*(images for images, _ in results)):
         assert torch.mean((ours - theirs) ** 2) < SPLAT_MSE
     for ours, theirs in zip(*(grads for _, grads in results)):
         assert torch.linalg.vector_norm(ours - theirs) <= GRADIENT * torch.linalg.vector_norm(ours)

@@ -26,10 +26,10 @@ def incoming(shapes, seed=3):
 
 def kernel_and_reference_gradients(scene, camera, *, depth):
     ours, truth = tensors(scene, torch.float32), tensors(scene, torch.float64)
-    pictures = [p for p in raster.rasterize(*ours, camera, depth=depth) if p is not None]
-    expected = raster_reference.rasterize(*truth, camera)[: len(pictures)]
-    weights = incoming([picture.shape for picture in expected])
-    sum((p * w.float()).sum() for p, w in zip(pictures, weights)).backward()
+    images = [p for p in raster.rasterize(*ours, camera, depth=depth) if p is not None]
+    expected = raster_reference.rasterize(*truth, camera)[: len(images)]
+    weights = incoming([image.shape for image in expected])
+    sum((p * w.float()).sum() for p, w in zip(images, weights)).backward()
     sum((p * w).sum() for p, w in zip(expected, weights)).backward()
     return [t.grad.double() for t in ours], [t.grad for t in truth]
 
@@ -38,10 +38,10 @@ def kernel_and_reference_gradients(scene, camera, *, depth):
 def test_reference_equals_the_oracle(size):
     scene, camera = random_scene(1), off_centre_camera(*size)
     scene = tuple(array.astype(np.float64) for array in scene)
-    pictures, truth = raster_reference.rasterize(*tensors(scene, torch.float64), camera), None
+    images, truth = raster_reference.rasterize(*tensors(scene, torch.float64), camera), None
     truth = oracle.rasterize(*scene, camera)
-    for picture, expected in zip(pictures, (truth.image, truth.alpha, truth.depth)):
-        np.testing.assert_allclose(picture.detach(), expected, atol=SAME_SUM)
+    for image, expected in zip(images, (truth.image, truth.alpha, truth.depth)):
+        np.testing.assert_allclose(image.detach(), expected, atol=SAME_SUM)
 
 
 def test_reference_gradient_is_that_of_the_oracle():
@@ -51,14 +51,14 @@ def test_reference_gradient_is_that_of_the_oracle():
     scene = means, covariances, 0.2 + 0.4 * opacities, features
     camera = off_centre_camera(14, 10)
     parameters = tensors(scene, torch.float64)
-    pictures = raster_reference.rasterize(*parameters, camera)
-    weights = incoming([picture.shape for picture in pictures])
-    sum((p * w).sum() for p, w in zip(pictures, weights)).backward()
+    images = raster_reference.rasterize(*parameters, camera)
+    weights = incoming([image.shape for image in images])
+    sum((p * w).sum() for p, w in zip(images, weights)).backward()
 
     def loss(arrays):
         truth = oracle.rasterize(*arrays, camera)
-        pictures = truth.image, truth.alpha, truth.depth
-        return sum(float((p * w.numpy()).sum()) for p, w in zip(pictures, weights))
+        images = truth.image, truth.alpha, truth.depth
+        return sum(float((p * w.numpy()).sum()) for p, w in zip(images, weights))
 
     for k, parameter in enumerate(parameters):
         differences = np.zeros(scene[k].shape)
@@ -79,14 +79,14 @@ def test_kernel_gradient_is_that_of_the_reference(channels, depth):
 
 
 def test_kernel_gradient_from_inside_the_cloud():
-    """Clamped Jacobians, means far outside the picture, saturated pixels."""
+    """Clamped Jacobians, means far outside the image, saturated pixels."""
     scene = random_scene(5, 400, spread=0.4, size=0.1)
     camera = off_centre_camera(60, 44, eye=(0.02, 0.01, 0.03))
     points = oracle.camera_points(scene[0], camera)
     slopes = points[:, :2] / points[:, 2:]
     seen = (points[:, 2] > 0.01) & (np.abs(slopes - oracle.clamped_slopes(points, camera)) > 0).any(axis=1)
     ours, truth = kernel_and_reference_gradients(scene, camera, depth=True)
-    assert truth[0][torch.from_numpy(seen)].abs().max() > 0  # a clamped Gaussian reaches the picture
+    assert truth[0][torch.from_numpy(seen)].abs().max() > 0  # a clamped Gaussian reaches the image
     for a, b in zip(ours, truth):
         assert torch.linalg.vector_norm(a - b) <= GRADIENT * torch.linalg.vector_norm(b)
 

@@ -1,4 +1,4 @@
-"""A separable filter of images, compiled, with its transpose as backward pass."""
+"""Compiled separable filter of images."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 
 
 class SeparableFilter(torch.autograd.Function):
-    """images [C, H, W] float32, taps [T] (symmetric) → [C, H − T + 1, W − T + 1]: where the window fits.
+    """Images [C, H, W] float32 and symmetric taps [T] → [C, H − T + 1, W − T + 1], valid region.
 
-    ``torch.conv2d`` takes twenty times as long for a handful of single-channel images.
+    ``torch.conv2d`` takes twenty times as long for a few single-channel images.
     """
 
     @staticmethod

@@ -1,9 +1,7 @@
-"""L_gc: the features of a body point must agree between the training view and a virtual one (paper, eq. 12).
+"""L_gc: consistency of perceptual features between the training view and a virtual one (paper, eq. 12).
 
-A virtual camera a few degrees away shows the same Gaussians under the same light. Points that both cameras see
-are looked up in the perceptual features of both pictures; InfoNCE (van den Oord et al. 2018) asks that a point's
-two features match each other better than those of other points. As printed the formula counts the positive
-twice and has no temperature; here it is the usual cross entropy.
+InfoNCE (van den Oord et al. 2018) between features of points that both views see. The formula as printed counts the
+positive twice and has no temperature; this is the usual cross entropy.
 """
 
 from __future__ import annotations
@@ -23,36 +21,36 @@ from rnd_trainer.render.in_sight import in_sight
 from .perceptual import Perceptual
 
 YAW, PITCH = math.radians(25), math.radians(8)
-"""the virtual camera lies within these angles of the training camera, seen from the body"""
+"""largest angles between virtual and training camera, seen from the body"""
 GRAZING = math.sin(math.radians(9))
-"""least cosine between normal and view for a point to count as seen (the paper's t = 9°)"""
+"""smallest cosine between normal and view of a visible point (the paper's t = 9°)"""
 OCCLUSION = 0.02
-"""metres by which a point may lie behind the first surface of a depth map"""
+"""distance behind the first surface up to which a point is visible, m"""
 TEMPERATURE = 0.07
 """of InfoNCE, on unit features (He et al. 2020)"""
 POINTS = 192
-"""matched at a time, drawn among those that both cameras see"""
+"""points sampled among those that both cameras see"""
 LAYERS = 3
-"""of the network: deeper cells are as wide as a limb"""
+"""first layers of the network; deeper cells are as wide as a limb"""
 
 
 def virtual_camera(camera: Camera, centre: Tensor, generator: torch.Generator) -> Camera:
-    """``camera`` swung around ``centre`` [3] m by a random yaw and pitch within the stated range."""
+    """``camera`` rotated around ``centre`` [3] m by random yaw and pitch within ``YAW`` and ``PITCH``."""
     yaw, pitch = (2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1).tolist()
     yaw, pitch = YAW * yaw, PITCH * pitch
     about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
-    turn = about_x @ about_y  # in the camera's axes, about the body's centre
+    orbit = about_x @ about_y  # camera axes
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     middle = rotation @ centre.double().cpu().numpy() + translation
-    swung = np.eye(4)
-    swung[:3, :3] = turn @ rotation
-    swung[:3, 3] = turn @ (translation - middle) + middle
-    return dataclasses.replace(camera, world_to_camera=swung)
+    virtual = np.eye(4)
+    virtual[:3, :3] = orbit @ rotation
+    virtual[:3, 3] = orbit @ (translation - middle) + middle
+    return dataclasses.replace(camera, world_to_camera=virtual)
 
 
 def covisible(posed: PosedGaussians, first: Camera, second: Camera, count: int) -> Tensor:
-    """Indices of those of the first ``count`` Gaussians that both cameras see."""
+    """Indices of those among the first ``count`` Gaussians that both cameras see."""
     seen = [in_sight(posed, camera, count, facing=GRAZING, occlusion=OCCLUSION)[0] for camera in (first, second)]
     return torch.from_numpy(np.flatnonzero(seen[0] & seen[1])).to(posed.means.device)
 
@@ -60,7 +58,7 @@ def covisible(posed: PosedGaussians, first: Camera, second: Camera, count: int) 
 def consistency_loss(
     first_srgb: Tensor, second_srgb: Tensor, first_pixels: Tensor, second_pixels: Tensor, perceptual: Perceptual
 ) -> Tensor:
-    """InfoNCE between features at matched pixels of two pictures, mean over points and layers.
+    """InfoNCE between features at matched pixels of two images, mean over points and layers.
 
     Args:
         first_srgb, second_srgb: [H, W, 3] in 0…1.
@@ -77,11 +75,11 @@ def consistency_loss(
 
 def project(points: Tensor, camera: Camera) -> Tensor:
     """Pixels [P, 2] of points [P, 3] m, pixel centres at +0.5."""
-    turn, shift, K = (
+    rotation, translation, K = (
         torch.as_tensor(x, dtype=points.dtype, device=points.device)
         for x in (camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3], camera.K)
     )
-    homogeneous = (points @ turn.T + shift) @ K.T
+    homogeneous = (points @ rotation.T + translation) @ K.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 

@@ -1,4 +1,4 @@
-"""Loss terms, each a scalar; their weights live in ``config``."""
+"""Loss terms, each a scalar; weights are in ``config``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rnd_trainer.render.probe import luminance, natural_sky
 from .metrics import SSIM_WINDOW, ssim_map
 
 ALLOWED_STRETCH = 1.7
-"""ratio of lengths that costs nothing: skin does stretch"""
+"""stretch (ratio of lengths) without a penalty"""
 
 
 def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, scales: int = 1) -> Tensor:
@@ -23,7 +23,7 @@ def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, sca
 
 
 def multiscale_dssim(image_srgb: Tensor, target_srgb: Tensor, scales: int) -> Tensor:
-    """Mean of 1 − SSIM at full size, half, quarter …, as long as the 11-pixel window fits."""
+    """Mean of 1 − SSIM over ``scales`` halvings, while the 11-pixel window fits."""
     terms = []
     for scale in range(scales):
         if scale:
@@ -44,10 +44,7 @@ def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:
 
 
 def stretch_penalty(stretch: Tensor) -> Tensor:
-    """Mean of max(0, stretch − 1.7)² over edges [E] of given stretch (length over length at rest); 0 of none.
-
-    What as-isometric-as-possible deformation (Kilian et al. 2007) holds against lengths, beyond what skin does.
-    """
+    """Mean of max(0, stretch − ``ALLOWED_STRETCH``)² over edges [E]; 0 without edges (after Kilian et al. 2007)."""
     return torch.relu(stretch - ALLOWED_STRETCH).square().sum() / max(len(stretch), 1)
 
 
@@ -58,31 +55,23 @@ def geometry_prior(posed: PosedGaussians, weight_offset: float, weight_residual:
 
 
 def grey_prior(radiance: Tensor, solid_angles: Tensor) -> Tensor:
-    """Mean absolute chroma of the light of a probe [32, 64, 3] as a whole, relative to its level.
+    """Mean absolute chroma of the mean light of a probe [32, 64, 3], relative to its level.
 
-    Colour of light and albedo are known up to a factor per channel, which "white on average" chooses. Single
-    directions stay free: under a low sun the shadows are blue.
+    Fixes the factor per channel that light and albedo share.
     """
     mean = (radiance * (solid_angles / solid_angles.sum())[..., None]).sum((0, 1))
     return ((mean - mean.mean()).abs() / mean.mean()).mean()
 
 
 def sky_prior(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Tensor:
-    """Mean of d² / (1 + d²), d the logarithm of a probe [32, 64, 3] beside a natural sky of the same median.
-
-    Geman and McClure's function: a sun, which is far from any sky, is left alone, and near the level nothing holds
-    the sky back when all of it darkens beside the sun (an absolute value would).
-    """
-    off = torch.log(luminance(radiance)) - torch.log(natural_sky(directions[..., 1]))
-    square = (off - off.detach().median()).square()
+    """Mean of d² / (1 + d²) (Geman and McClure), d the log ratio of a probe [32, 64, 3] and a natural sky."""
+    log_ratio = torch.log(luminance(radiance)) - torch.log(natural_sky(directions[..., 1]))
+    square = (log_ratio - log_ratio.detach().median()).square()
     return (square / (1 + square) * solid_angles).sum() / solid_angles.sum()
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """The runtime's transfer function with a gradient everywhere: values above 1 keep a hundredth of theirs.
-
-    Pictures are clipped at 1; a highlight that is far too bright must still feel it.
-    """
+    """sRGB transfer function; above 1 the slope is 0.01, so that clipped highlights have a gradient."""
     x = linear.clamp(min=0)
     x = torch.where(x > 1, 1 + 0.01 * (x - 1), x)
     low = 12.92 * x

@@ -1,4 +1,4 @@
-"""Image and normal metrics on held-out pictures."""
+"""Metrics of images and normal maps."""
 
 from __future__ import annotations
 
@@ -14,17 +14,14 @@ SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
 
 
 def psnr(image: Tensor, target: Tensor, where: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio in dB for values in 0…1, over the pixels ``where`` [H, W] if given."""
+    """Peak signal-to-noise ratio in dB of values in 0…1, over the pixels ``where`` [H, W] if given."""
     error = (image - target).square()
     mean = float((error if where is None else error[where]).mean())
     return math.inf if mean == 0 else -10 * math.log10(mean)
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity [H', W', C] of [H, W, C] images in 0…1, where the window lies inside the image.
-
-    Wang et al. 2004, eq. 13, Gaussian window of σ 1.5. Images smaller than the window are an error of ours.
-    """
+    """Structural similarity [H', W', C] of [H, W, C] images in 0…1, valid region (Wang et al. 2004, eq. 13)."""
     assert min(image.shape[:2]) >= SSIM_WINDOW, "SSIM needs at least 11 × 11 pixels"
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)  # [C, H, W]
     stack = torch.cat([x, y, x * x, y * y, x * y])
@@ -39,7 +36,7 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 def _blur(images: Tensor, taps: Tensor) -> Tensor:
-    """[C, H, W] filtered along both axes by ``taps``, where they fit."""
+    """[C, H, W] filtered along both axes by ``taps``, valid region."""
     if not images.is_cuda and images.dtype == torch.float32:
         return SeparableFilter.apply(images, taps)
     blurred = torch.nn.functional.conv2d(images[:, None], taps[None, None, :, None])
@@ -59,7 +56,7 @@ def normal_degrees(normals: Tensor, target: Tensor, where: Tensor) -> float:
 
 
 def mask_box(mask: Tensor, margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the smallest box around a mask's [H, W] non-zero pixels, grown by ``margin``."""
+    """Rows and columns of the bounding box of a mask [H, W], grown by ``margin`` pixels."""
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
     if len(rows) == 0:
         return slice(0, mask.shape[0]), slice(0, mask.shape[1])
@@ -68,6 +65,6 @@ def mask_box(mask: Tensor, margin: int = 0) -> tuple[slice, slice]:
 
 
 def widened(span: slice, size: int) -> slice:
-    """``span`` within 0 … ``size``, and as wide as SSIM's window: of a person there may be a sliver."""
+    """``span`` clipped to 0…``size`` and widened to SSIM's window."""
     start = max(min(span.start, size - SSIM_WINDOW), 0)
     return slice(start, min(max(span.stop, start + SSIM_WINDOW), size))

@@ -20,43 +20,43 @@ from rnd_runtime.core.files import existing_file
 from .perceptual_nets import BACKBONES, Backbone, Tensors
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""ImageNet's mean and deviation as LPIPS applies them, to images in −1…1"""
+"""ImageNet's mean and standard deviation, of images in −1…1"""
 EPSILON = 1e-10
-"""LPIPS adds it to the length of a feature vector, so that a dead cell gives zero"""
+"""added to the length of a feature vector, as in LPIPS"""
 
 
 @dataclass(frozen=True, eq=False)
 class Perceptual:
-    """A distance between sRGB images; what it may be called is ``backbone`` and ``is_lpips``."""
+    """Perceptual distance between sRGB images."""
 
     network: Backbone
-    layers: int  # feature maps that the file's tensors reach; all of the network's, or its first few
+    layers: int  # feature maps, all of the network's or the first few
     weights: Tensors
-    heads: tuple[Tensor, ...]  # [1, C, 1, 1] for each layer; empty if the file has none
+    heads: tuple[Tensor, ...]  # [1, C, 1, 1] per layer, or empty
     file: Path
     sha256: str  # of the weights' file
 
     @property
     def backbone(self) -> str:
-        """``alexnet``, ``squeezenet1_1``, ``vgg16``, or such as ``vgg16[:2]`` where only two blocks are there."""
-        whole = self.layers == len(self.network.blocks)
-        return self.network.name if whole else f"{self.network.name}[:{self.layers}]"
+        """``alexnet``, ``squeezenet1_1`` or ``vgg16``; ``vgg16[:2]`` is its first two blocks."""
+        complete = self.layers == len(self.network.blocks)
+        return self.network.name if complete else f"{self.network.name}[:{self.layers}]"
 
     @property
     def is_lpips(self) -> bool:
-        """Whether the distance is LPIPS: a sum over the first few layers only is a distance, not that one."""
+        """Whether the distance is LPIPS: all layers, with heads."""
         return bool(self.heads) and self.layers == len(self.network.blocks)
 
     @property
     def smallest(self) -> int:
-        """Pixels that an image needs along each side."""
+        """Smallest image side in pixels."""
         return self.network.smallest[self.layers - 1]
 
     @property
     def grids(self) -> tuple[tuple[int, float], ...]:
-        """(stride, offset) in pixels of each feature map: cell j is centred at x = stride · j + offset, rows alike.
+        """(stride, offset) in pixels of each feature map: cell j is centred at stride · j + offset in x and y.
 
-        Pixel centres are at +0.5. Valid convolutions move the offset, so cells do not share the image's borders.
+        Pixel centres are at +0.5.
         """
         stride, offset, grids = 1, 0.5, []
         for block in self.network.blocks[: self.layers]:
@@ -70,7 +70,7 @@ class Perceptual:
         """Feature maps [C, h, w] ≥ 0 of an image [H, W, 3] in 0…1, shallow first; differentiable.
 
         Raises:
-            InputError: the image is smaller than the network's first cell at its deepest layer.
+            InputError: the image is smaller than ``smallest``.
         """
         assert image_srgb.ndim == 3 and image_srgb.shape[2] == 3, image_srgb.shape
         height, width = image_srgb.shape[:2]
@@ -90,7 +90,7 @@ class Perceptual:
         return maps
 
     def __call__(self, image_srgb: Tensor, target_srgb: Tensor) -> Tensor:
-        """The distance of two images [H, W, 3] in 0…1, a scalar; zero for equal ones; differentiable.
+        """Distance of two images [H, W, 3] in 0…1, a differentiable scalar.
 
         Unit features, squared differences weighted by the heads, mean over cells, sum over layers (eq. 1).
 
@@ -109,29 +109,29 @@ class Perceptual:
         return torch.stack([_layer_distance(a, b, head) for a, b, head in pairs]).sum()
 
     def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Perceptual:
-        """The same distance for images on ``device`` or of ``dtype``; files are read as float32 on the CPU."""
+        """Copy for images on ``device`` or of ``dtype``."""
         weights = {name: tensor.to(device=device, dtype=dtype) for name, tensor in self.weights.items()}
         heads = tuple(head.to(device=device, dtype=dtype) for head in self.heads)
         return dataclasses.replace(self, weights=weights, heads=heads)
 
 
 def networks_sha256(*networks: Perceptual | None) -> str | None:
-    """Of the files of ``networks``, each once; None where there is none."""
+    """SHA-256 of the files of ``networks``, each once; None without networks."""
     return " ".join(dict.fromkeys(network.sha256 for network in networks if network is not None)) or None
 
 
 def networks_by_role(perceptual: Perceptual | None, features: Perceptual | None) -> dict[str, str | None]:
-    """Which network LPIPS is of and whose features L_gc compares: what else they could be is another training."""
+    """SHA-256 of the networks of LPIPS and L_gc."""
     return {"lpips": networks_sha256(perceptual), "consistency": networks_sha256(features)}
 
 
 def load_features(path: Path | None) -> Perceptual | None:
-    """The network of ``--consistency-weights``, whole or its first few blocks; None where none is named."""
+    """Network of ``--consistency-weights``, or its first blocks; None without a path."""
     return None if path is None else load_perceptual(path)
 
 
 def load_lpips(path: Path | None) -> Perceptual | None:
-    """The network of ``--perceptual-weights``, which must be whole and have its heads; None where none is named."""
+    """Network of ``--perceptual-weights``, complete and with heads; None without a path."""
     if path is None:
         return None
     perceptual = load_perceptual(path)
@@ -143,14 +143,13 @@ def load_lpips(path: Path | None) -> Perceptual | None:
 
 
 def load_perceptual(path: str | Path) -> Perceptual:
-    """Read a network, and LPIPS heads if there are any, from ``.safetensors`` or torchvision's ``.pth``.
+    """Read a network, and LPIPS heads if present, from ``.safetensors`` or torchvision's ``.pth``.
 
-    The network is known by its tensors ``features.*``, which must be all of one, or of its first few blocks;
-    ``linK.weight`` [1, C, 1, 1] is the head of the K-th layer. Other tensors (``classifier.*``) are passed over.
+    The tensors ``features.*`` identify the network, or its first blocks; ``linK.weight`` [1, C, 1, 1] is the head of
+    layer K. Other tensors are ignored.
 
     Raises:
-        InputError: no file, cut short, not of weights alone, another network, some heads without the others,
-            or numbers that are not finite.
+        InputError: missing, truncated, an unknown network, incomplete heads, or numbers that are not finite.
     """
     path = existing_file(path, what="perceptual weights")
     tensors = {
@@ -162,7 +161,7 @@ def load_perceptual(path: str | Path) -> Perceptual:
         if not bool(torch.isfinite(tensor).all()):
             raise InputError(name, expected="finite numbers", got="NaN or infinity", file=path)
     weights = {name: tensor for name, tensor in tensors.items() if name.startswith("features.")}
-    network, layers = _recognised(weights, path)
+    network, layers = _identify(weights, path)
     heads = _heads(tensors, network, layers, path)
     with path.open("rb") as stream:
         sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
@@ -176,9 +175,9 @@ def _read(path: Path) -> Tensors:
     try:
         if suffix == ".safetensors":
             return load_file(path)
-        # torchvision publishes its networks as nothing else; weights_only builds tensors and runs no code
+        # torchvision's format; weights_only runs no code
         state = torch.load(path, map_location="cpu", weights_only=True)  # noqa: TID251
-    except Exception as error:  # an unpickler answers broken bytes with whatever it stumbles over
+    except Exception as error:  # unpickling broken bytes raises any exception
         raise InputError(f"not a whole {suffix} file of weights", got=first_line(error), file=path) from error
     if not isinstance(state, dict):
         raise InputError("perceptual weights", expected="a dictionary of tensors", got=type(state).__name__, file=path)
@@ -189,8 +188,8 @@ def _read(path: Path) -> Tensors:
     return {str(name): value for name, value in state.items()}
 
 
-def _recognised(weights: Tensors, path: Path) -> tuple[Backbone, int]:
-    """The network, and how many of its blocks these tensors are."""
+def _identify(weights: Tensors, path: Path) -> tuple[Backbone, int]:
+    """The network, and the number of its blocks in ``weights``."""
     found = {name: tuple(tensor.shape) for name, tensor in weights.items()}
     for network in BACKBONES:
         for layers in range(1, len(network.blocks) + 1):
@@ -208,7 +207,7 @@ def _recognised(weights: Tensors, path: Path) -> tuple[Backbone, int]:
 
 
 def _heads(tensors: Tensors, network: Backbone, layers: int, path: Path) -> tuple[Tensor, ...]:
-    """The heads of the first ``layers`` layers, or none at all if the file has none."""
+    """Heads of the first ``layers`` layers, empty if the file has none."""
     if not any(name.startswith("lin") for name in tensors):
         return ()
     heads = []
@@ -222,7 +221,7 @@ def _heads(tensors: Tensors, network: Backbone, layers: int, path: Path) -> tupl
 
 
 def _layer_distance(a: Tensor, b: Tensor, head: Tensor) -> Tensor:
-    """Weighted squared difference of the unit features of two maps [C, h, w], averaged over their cells."""
+    """Weighted squared difference of the unit features of two maps [C, h, w], mean over cells."""
     return ((_unit(a) - _unit(b)).square() * head[0]).sum(dim=0).mean()
 
 

@@ -1,7 +1,6 @@
-"""The convolutional stacks behind LPIPS: AlexNet, SqueezeNet 1.1 and VGG16, cut where it reads them.
+"""Convolutional networks of LPIPS: AlexNet, SqueezeNet 1.1 and VGG16, in blocks between its layers.
 
-Written out because torchvision, which has them, brings a second torch; the tensors keep its names. Krizhevsky
-2014 (one column), Iandola et al. 2016, Simonyan and Zisserman 2015.
+Tensors have torchvision's names. Krizhevsky 2014 (one column), Iandola et al. 2016, Simonyan and Zisserman 2015.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class Conv:
 
 @dataclass(frozen=True)
 class Fire:
-    """SqueezeNet's module: 1×1 down to ``squeezed`` channels, then 1×1 and 3×3 side by side up to ``outputs``."""
+    """SqueezeNet's module: 1×1 to ``squeezed`` channels, then 1×1 and 3×3, concatenated to ``outputs``."""
 
     name: str
     inputs: int
@@ -67,7 +66,7 @@ class Fire:
 
 @dataclass(frozen=True)
 class Pool:
-    """A maximum over ``size`` × ``size`` cells in steps of two; ``ceil`` lets the last window hang over."""
+    """Max pooling with stride 2; ``ceil`` keeps partial windows."""
 
     size: int
     ceil: bool = False
@@ -83,11 +82,11 @@ class Pool:
 
 @dataclass(frozen=True)
 class Backbone:
-    """A network as the blocks between which LPIPS reads its features."""
+    """A network as blocks, each ending in a feature map of LPIPS."""
 
     name: str
     blocks: tuple[tuple[Conv | Fire | Pool, ...], ...]
-    smallest: tuple[int, ...]  # pixels along a side from which the first k blocks give one cell
+    smallest: tuple[int, ...]  # smallest image side of the first k blocks, pixels
 
     def shapes(self, layers: int | None = None) -> Shapes:
         """Names and shapes of the tensors of all blocks, or of the first ``layers``."""
@@ -95,7 +94,7 @@ class Backbone:
         return {name: shape for step in steps for name, shape in step.shapes().items()}
 
     def channels(self, layer: int) -> int:
-        """Channels of the feature map that block ``layer`` ends in."""
+        """Channels of the feature map of block ``layer``."""
         last = self.blocks[layer][-1]
         assert not isinstance(last, Pool), "LPIPS reads after a ReLU"
         return last.outputs

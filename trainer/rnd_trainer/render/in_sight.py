@@ -1,4 +1,4 @@
-"""Which Gaussians a camera sees: in front of it, in its frame, facing it, unoccluded."""
+"""Gaussians visible to a camera: in its frame, facing it, unoccluded."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from rnd_trainer.model.model import PosedGaussians
 def in_sight(
     posed: PosedGaussians, camera: Camera, count: int, *, facing: float, occlusion: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Which of the first ``count`` Gaussians the camera sees [count], and their pixels [count, 2].
+    """Visibility [count] of the first ``count`` Gaussians, and their pixels [count, 2].
 
     Args:
-        facing: least cosine between a Gaussian's normal and its direction to the camera.
-        occlusion: metres by which it may lie behind the first surface and still be the one that is seen.
+        facing: smallest cosine between normal and direction to the camera.
+        occlusion: distance behind the first surface up to which a Gaussian is visible, m.
 
-    Pixels are x, y with centres at +0.5, 0 for what lies outside the frame.
+    Pixels are x, y with centres at +0.5; 0 outside the frame.
     """
     arrays = (posed.means, posed.covariances, posed.attributes.opacity, posed.normals)
     means, covariances, opacities, normals = (x.detach().cpu().numpy() for x in arrays)
-    nothing = np.zeros((len(means), 1), np.float32)
-    raster = rasterize(means, covariances, opacities, nothing, camera, depth=True)
+    features = np.zeros((len(means), 1), np.float32)
+    raster = rasterize(means, covariances, opacities, features, camera, depth=True)
     means, normals = means[:count], normals[:count]
     local = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -36,5 +36,5 @@ def in_sight(
     column, row = pixels.astype(int).T
     depth = raster.depth[row, column] / np.maximum(raster.alpha[row, column], 1e-6)
     towards = camera.position - means
-    turned = (normals * towards).sum(1) > facing * np.linalg.norm(towards, axis=1)
-    return inside & turned & (local[:, 2] < depth + occlusion), pixels
+    faces = (normals * towards).sum(1) > facing * np.linalg.norm(towards, axis=1)
+    return inside & faces & (local[:, 2] < depth + occlusion), pixels

@@ -1,4 +1,4 @@
-"""The rasteriser for torch: the numba kernel on the CPU, gsplat on CUDA, one signature."""
+"""Differentiable rasteriser: the numba kernel on the CPU, gsplat on CUDA."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ def rasterize(
     *,
     depth: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Splat N Gaussians: image [H, W, C], alpha [H, W] and, if asked for, depth [H, W] m, all premultiplied.
+    """Splat N Gaussians: image [H, W, C], alpha [H, W] and optionally depth [H, W] m, premultiplied float32.
 
-    Differentiable in the four tensors; results are float32. The rule is
-    ``rnd_runtime.core.gaussians.Rasterizer``'s; on CUDA it is gsplat's, which differs in three details: α is
-    clamped at 0.999, a covariance of zero is drawn as a dot, and depths are sorted as float32.
+    Differentiable in the four tensors. The rule is that of ``rnd_runtime.core.gaussians.Rasterizer``. On CUDA gsplat
+    clamps α at 0.999, renders a covariance of zero as a dot, and sorts depths as float32.
 
     Raises:
-        InputError: the tensors are on CUDA and gsplat is not installed, or a shape is wrong.
+        InputError: a wrong shape, or tensors on CUDA without gsplat.
     """
     if means.is_cuda:
         return _rasterize_cuda(means, covariances, opacities, features, camera, depth)
@@ -61,7 +60,7 @@ class _CpuRasterizer(torch.autograd.Function):
 
 
 def gsplat_rasterization() -> Any:
-    """gsplat's function of that name. Raises ``InputError`` where there is none."""
+    """gsplat's ``rasterization``; raises ``InputError`` if it cannot be imported."""
     try:
         from gsplat import rasterization
     except ImportError as error:
@@ -73,7 +72,7 @@ def gsplat_rasterization() -> Any:
 def _rasterize_cuda(
     means: Tensor, covariances: Tensor, opacities: Tensor, features: Tensor, camera: Camera, depth: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    picture, alpha, _ = gsplat_rasterization()(
+    rendered, alpha, _ = gsplat_rasterization()(
         means,
         None,
         None,
@@ -89,5 +88,5 @@ def _rasterize_cuda(
         packed=False,
         covars=covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
     )
-    image = picture[0, ..., : features.shape[1]]
-    return image, alpha[0, ..., 0], picture[0, ..., -1] if depth else None
+    image = rendered[0, ..., : features.shape[1]]
+    return image, alpha[0, ..., 0], rendered[0, ..., -1] if depth else None

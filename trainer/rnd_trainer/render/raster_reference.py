@@ -1,8 +1,7 @@
-"""The rasteriser in plain torch, to be read: 16-pixel tiles, gradients by autograd, any dtype and device.
+"""Reference rasteriser in torch: 16-pixel tiles, gradients by autograd, any dtype and device.
 
-In float64 it is the gradient oracle of the numba kernel; in float32 it is the peer that the benchmark times.
-The rule is ``rnd_runtime.core.gaussians.Rasterizer``'s; each step names the function of
-``rnd_runtime.raster.oracle`` it repeats.
+The gradient oracle of the numba kernel, and a baseline of the benchmark. The rule is that of
+``rnd_runtime.core.gaussians.Rasterizer``; comments name functions of ``rnd_runtime.raster.oracle``.
 """
 
 from __future__ import annotations
@@ -25,16 +24,16 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Image [H, W, C], alpha [H, W] and depth [H, W], premultiplied.
 
-    Gradients are zero where α is clamped at 0.99 and for what is not drawn; a clamped x/z or y/z is constant.
+    Gradients are zero where α is clamped at 0.99 and for culled Gaussians; a clamped x/z or y/z is constant.
     """
     m, c, o, f = (tensor.detach().cpu().numpy() for tensor in (means, covariances, opacities, features))
-    kept = torch.from_numpy(oracle.drawn(m, c, o, f, camera)).to(means.device)
-    points, pixels, shapes = project(means[kept], covariances[kept], camera)
+    visible = torch.from_numpy(oracle.drawn(m, c, o, f, camera)).to(means.device)
+    points, pixels, shapes = project(means[visible], covariances[visible], camera)
     order = torch.argsort(points[:, 2], stable=True)
-    opacities = opacities[kept][order]
+    opacities = opacities[visible][order]
     points, pixels, shapes = points[order], pixels[order], shapes[order]
-    attributes = torch.cat([features[kept][order], torch.ones_like(points[:, :1]), points[:, 2:]], dim=1)
-    with torch.no_grad():  # a box that surely holds the ellipse α = 1/255
+    attributes = torch.cat([features[visible][order], torch.ones_like(points[:, :1]), points[:, 2:]], dim=1)
+    with torch.no_grad():  # bounding box of the ellipse α = 1/255
         variances = torch.diagonal(shapes, dim1=1, dim2=2)
         half = torch.sqrt(2 * torch.log(opacities / oracle.ALPHA_MIN)[:, None] * variances) + 1
         low, high = pixels - half, pixels + half
@@ -50,8 +49,8 @@ def rasterize(
             tile = blend_tile((x, y), size, pixels[chosen], inverse[chosen], opacities[chosen], attributes[chosen])
             tiles.append(tile)
         rows.append(torch.cat(tiles, dim=1))
-    picture = torch.cat(rows, dim=0)
-    return picture[..., :-2], picture[..., -2], picture[..., -1]
+    rendered = torch.cat(rows, dim=0)
+    return rendered[..., :-2], rendered[..., -2], rendered[..., -1]
 
 
 def project(means: Tensor, covariances: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
@@ -86,7 +85,7 @@ def blend_tile(
     opacities: Tensor,  # [n]
     attributes: Tensor,  # [n, K]
 ) -> Tensor:
-    """One tile [h, w, K] whose top left corner is ``corner`` (x, y)."""
+    """Tile [h, w, K] with top left corner ``corner`` (x, y)."""
     rows = torch.arange(size[0], device=pixels.device) + corner[1] + 0.5
     columns = torch.arange(size[1], device=pixels.device) + corner[0] + 0.5
     grid = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1).to(pixels.dtype)
@@ -95,7 +94,7 @@ def blend_tile(
     distance = inverse[:, 0, 0] * dx * dx + 2 * inverse[:, 0, 1] * dx * dy + inverse[:, 1, 1] * dy * dy
     alpha = opacities * torch.exp(-0.5 * distance)  # alphas
     alpha = torch.where(alpha >= oracle.ALPHA_MIN, alpha.clamp(max=oracle.ALPHA_MAX), 0)
-    left = torch.cumprod(1 - alpha, dim=-1)  # blend: the transmittance behind each Gaussian
-    before = torch.cat([torch.ones_like(left[..., :1]), left[..., :-1]], dim=-1)
-    weights = torch.where(left >= oracle.TRANSMITTANCE_MIN, before * alpha, 0)
+    transmittance = torch.cumprod(1 - alpha, dim=-1)  # blend: behind each Gaussian
+    before = torch.cat([torch.ones_like(transmittance[..., :1]), transmittance[..., :-1]], dim=-1)
+    weights = torch.where(transmittance >= oracle.TRANSMITTANCE_MIN, before * alpha, 0)
     return weights @ attributes

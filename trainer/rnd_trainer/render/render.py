@@ -1,4 +1,4 @@
-"""The differentiable picture of a training step."""
+"""Differentiable image of a training step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .shading import light_visibility, shade, traced_visibility, view_visibility
 
 @dataclass
 class Splat:
-    """A differentiable picture: image [H, W, 3] linear premultiplied, normals [H, W, 3] camera axes, alpha [H, W]."""
+    """Image [H, W, 3] linear and normals [H, W, 3] in camera axes, premultiplied by alpha [H, W]."""
 
     image: Tensor
     normals: Tensor
@@ -25,7 +25,7 @@ class Splat:
 
 
 def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera) -> Splat:
-    """Rasterise linear ``radiance`` [N, 3] and the normals of posed Gaussians in one pass."""
+    """Rasterise ``radiance`` [N, 3] and the normals of posed Gaussians in one pass."""
     rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
     features = torch.cat([radiance, posed.normals @ rotation.T], dim=-1)
     image, alpha, _ = rasterize(posed.means, posed.covariances, posed.attributes.opacity, features, camera)
@@ -35,11 +35,10 @@ def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera) -> Splat:
 def shade_visible(
     posed: PosedGaussians, pose: PoseInput, texels: Texels, camera: Camera, model: AvatarModel, traced_texels: int
 ) -> Tensor:
-    """Radiance [N, 3] of the Gaussians that may be seen; zero for those facing away.
+    """Radiance [N, 3] of the Gaussians facing the camera, zero for the others.
 
-    The first ``traced_texels`` directions (the brightest) get traced shadows. No gradient flows into the
-    visibility: it is what the geometry says, and must not be bent to explain a colour. The paper's reading
-    (``visibility="paper"``) is one number a Gaussian, of the direction to the camera, that pictures do train.
+    The first ``traced_texels`` directions have traced shadows. Images do not train the visibility, except with
+    ``visibility="paper"``, where it is one factor per Gaussian, of the direction to the camera.
     """
     eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
     front, view = visible_towards(posed.normals, posed.means, eye)
@@ -48,8 +47,8 @@ def shade_visible(
     if kind == "pose":
         traced = None
         if traced_texels:
-            suns = texels.directions[:traced_texels]
-            traced = traced_visibility(posed.means, posed.normals, suns, float(model.spacing))[front]
+            brightest = texels.directions[:traced_texels]
+            traced = traced_visibility(posed.means, posed.normals, brightest, float(model.spacing))[front]
         with torch.no_grad():
             visibility = light_visibility(posed.visibility[front], texels.directions, root, traced)
     else:

@@ -1,4 +1,4 @@
-"""Physically based shading of the visible Gaussians under drawn texels, differentiable in everything but visibility."""
+"""Physically based shading of visible Gaussians under sampled texels."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .probe import Texels
 from .shading_kernel import FusedShade
 
 BACK_FACING = -0.2
-"""cosine between normal and view below which a Gaussian is not shaded: it lies behind the silhouette"""
+"""cosine between normal and view below which a Gaussian is not shaded"""
 SHADOW_RADIUS = 1.2
-"""radius of a Gaussian in a shadow map, in units of the spacing: closes the surface without thickening limbs"""
+"""radius of a Gaussian in a shadow map, in units of the spacing"""
 
 
 def sh_basis(directions: Tensor) -> Tensor:
-    """The runtime's 16 spherical harmonics [..., 16] of unit directions [..., 3]."""
+    """SH basis [..., 16] of unit directions [..., 3]."""
     return torch.stack(sh_columns(*directions.unbind(-1)), dim=-1)
 
 
 def visible_towards(normals: Tensor, means: Tensor, eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Indices of the Gaussians that may be seen from ``eye`` [3], and unit directions [n, 3] towards it."""
+    """Indices of the Gaussians facing ``eye`` [3], and unit directions [n, 3] towards it."""
     view = torch.nn.functional.normalize(eye - means.detach(), dim=-1)
     front = ((normals.detach() * view).sum(-1) > BACK_FACING).nonzero()[:, 0]
     return front, view[front]
@@ -36,9 +36,9 @@ def visible_towards(normals: Tensor, means: Tensor, eye: Tensor) -> tuple[Tensor
 def light_visibility(
     coefficients: Tensor, texels: Tensor, root_rotation: Tensor, traced: Tensor | None = None
 ) -> Tensor:
-    """v(x, ω) [n, K] at texel directions [K, 3] from root-frame harmonics [n, 16].
+    """v(x, ω) [n, K] at texel directions [K, 3] from root-frame SH coefficients [n, 16].
 
-    ``traced`` [n, T] replaces the first T columns: suns, whose shadows harmonics of degree 3 cannot hold.
+    ``traced`` [n, T] replaces the first T columns: SH of degree 3 do not resolve hard shadows.
     """
     visibility = coefficients @ sh_basis(texels @ root_rotation).T
     if traced is not None:
@@ -47,7 +47,7 @@ def light_visibility(
 
 
 def view_visibility(coefficients: Tensor, view: Tensor, root_rotation: Tensor) -> Tensor:
-    """The paper's visibility [n, 1]: root-frame harmonics [n, 16] at the direction [n, 3] to the camera, ≥ 0."""
+    """The paper's visibility [n, 1] ≥ 0: root-frame SH coefficients [n, 16] at the directions [n, 3] to the camera."""
     return (coefficients * sh_basis(view @ root_rotation)).sum(-1, keepdim=True).clamp(min=0)
 
 
@@ -56,12 +56,12 @@ def shade(
 ) -> Tensor:
     """Outgoing linear radiance [n, 3]: Σ_k v_k f(ω_k, ω_o) max(n·ω_k, 0) power_k (paper, eq. 3 and 4).
 
-    normals, view [n, 3] unit; albedo [n, 3]; roughness [n]; visibility [n, K]. Float32 on the CPU takes the
-    compiled kernel, which has no gradient by view and visibility.
+    normals, view [n, 3] unit; albedo [n, 3]; roughness [n]; visibility [n, K]. Float32 on the CPU uses the compiled
+    kernel, without gradient by view and visibility.
     """
     if not normals.is_cuda and normals.dtype == torch.float32:
         return FusedShade.apply(normals, view, albedo, roughness, visibility, texels.directions, texels.power)
-    n_dot_l = normals @ texels.directions.T  # [n, K]; nothing here is ever [n, K, 3]
+    n_dot_l = normals @ texels.directions.T  # [n, K]
     arriving = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)
     glossy = specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)

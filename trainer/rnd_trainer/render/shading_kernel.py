@@ -1,7 +1,6 @@
-"""The training step's shading sum in one pass over (Gaussian, texel) pairs, forward and backward.
+"""Compiled shading in one pass over (Gaussian, texel) pairs, forward and backward.
 
-The torch version (``render.shading.shade``) makes about forty [n, K] arrays and reads them all back;
-this one keeps every pair in registers. Same formula (``rnd_runtime.shading.brdf``), same result to float32 rounding.
+Formulas of ``rnd_runtime.shading.brdf``; equal to ``render.shading.shade`` to float32 rounding.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from torch import Tensor
 from rnd_runtime.shading.brdf import COSINE_FLOOR, F0, ROUGHNESS_RANGE
 
 CHUNKS = 16
-"""parts of the Gaussians whose sums over texels are kept apart: the same bits for any number of threads"""
+"""blocks of Gaussians with separate sums over texels: deterministic for any number of threads"""
 _FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
 
 
 class FusedShade(torch.autograd.Function):
-    """Outgoing radiance [n, 3]; arguments as ``render.shading.shade``, texels as two tensors.
+    """Outgoing radiance [n, 3]; arguments as ``render.shading.shade``.
 
     Differentiable in normals, albedo, roughness and power; view, visibility and directions are constants.
     """
@@ -41,10 +40,10 @@ class FusedShade(torch.autograd.Function):
         n, v, ctx.albedo, gamma, visible, towards, strength = (
             np.ascontiguousarray(t.detach().numpy(), np.float32) for t in tensors
         )
-        half_squared = np.maximum(2 + 2 * (v @ towards.T), np.float32(1e-8))  # light and camera may be opposite
-        ctx.scene = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
-        ctx.diffuse, glossy = _sum(*ctx.scene)
-        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + glossy
+        half_squared = np.maximum(2 + 2 * (v @ towards.T), np.float32(1e-8))  # zero where light and camera are opposite
+        ctx.inputs = (n, v, gamma, visible, towards.T.copy(), strength.T.copy(), half_squared)
+        ctx.diffuse, specular = _sum(*ctx.inputs)
+        radiance = ctx.albedo * ctx.diffuse * np.float32(1 / np.pi) + specular
         ctx.lit = radiance > 0
         return torch.from_numpy(np.maximum(radiance, 0))
 
@@ -52,7 +51,7 @@ class FusedShade(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         incoming = np.ascontiguousarray(grad.numpy() * ctx.lit)
-        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.scene, ctx.albedo, incoming)
+        grad_normals, grad_roughness, grad_power = _sum_backward(*ctx.inputs, ctx.albedo, incoming)
         grad_albedo = incoming * ctx.diffuse * np.float32(1 / np.pi)
         results = (grad_normals, None, grad_albedo, grad_roughness, None, None, grad_power)
         return tuple(None if r is None else torch.from_numpy(r) for r in results)
@@ -60,16 +59,16 @@ class FusedShade(torch.autograd.Function):
 
 @numba.njit(inline="always", error_model="numpy")
 def _specular(alpha_squared, n_dot_l, n_dot_v, half_squared):
-    """Value of the specular term, and its logarithm's derivatives by α², n·l and n·v."""
+    """Specular term, and the derivatives of its logarithm by α², n·l and n·v."""
     one, two, zero, floor = np.float32(1), np.float32(2), np.float32(0), np.float32(COSINE_FLOOR)
     n_dot_h = n_dot_l + n_dot_v
     sine_squared = max(one - n_dot_h * n_dot_h / half_squared, zero)
     lobe = sine_squared + alpha_squared * (one - sine_squared)
     light, view = max(n_dot_l, floor), max(n_dot_v, floor)
     rest = one - alpha_squared
-    root_view = np.sqrt(alpha_squared + rest * view * view)
-    root_light = np.sqrt(alpha_squared + rest * light * light)
-    shadowing, masking = light + root_light, view + root_view
+    sqrt_view = np.sqrt(alpha_squared + rest * view * view)
+    sqrt_light = np.sqrt(alpha_squared + rest * light * light)
+    shadowing, masking = light + sqrt_light, view + sqrt_view
     grazing = max(one - np.float32(0.5) * np.sqrt(half_squared), zero)
     fresnel = np.float32(F0) + np.float32(1 - F0) * grazing * grazing * grazing * grazing * grazing
     value = np.float32(1 / np.pi) * alpha_squared * fresnel / (lobe * lobe * (shadowing * masking))
@@ -79,15 +78,15 @@ def _specular(alpha_squared, n_dot_l, n_dot_v, half_squared):
     by_alpha = (
         one / alpha_squared
         - two * (one - sine_squared) / lobe
-        - np.float32(0.5) * (one - light * light) / (root_light * shadowing)
-        - np.float32(0.5) * (one - view * view) / (root_view * masking)
+        - np.float32(0.5) * (one - light * light) / (sqrt_light * shadowing)
+        - np.float32(0.5) * (one - view * view) / (sqrt_view * masking)
     )
     by_light = by_sine * sine_by_cosine
     by_view = by_light
     if n_dot_l > floor:
-        by_light -= (one + rest * light / root_light) / shadowing
+        by_light -= (one + rest * light / sqrt_light) / shadowing
     if n_dot_v > floor:
-        by_view -= (one + rest * view / root_view) / masking
+        by_view -= (one + rest * view / sqrt_view) / masking
     return value, by_alpha, by_light, by_view
 
 
@@ -106,7 +105,7 @@ def _sum(normals, view, roughness, visibility, directions, power, half_squared):
     """
     count, texels = visibility.shape
     zero = np.float32(0)
-    diffuse, glossy = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    diffuse, specular = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     for i in numba.prange(count):
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         n_dot_v = nx * view[i, 0] + ny * view[i, 1] + nz * view[i, 2]
@@ -123,8 +122,8 @@ def _sum(normals, view, roughness, visibility, directions, power, half_squared):
             s1 += arriving * value * power[1, k]
             s2 += arriving * value * power[2, k]
         diffuse[i, 0], diffuse[i, 1], diffuse[i, 2] = d0, d1, d2
-        glossy[i, 0], glossy[i, 1], glossy[i, 2] = s0, s1, s2
-    return diffuse, glossy
+        specular[i, 0], specular[i, 1], specular[i, 2] = s0, s1, s2
+    return diffuse, specular
 
 
 @numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
@@ -151,14 +150,13 @@ def _sum_backward(normals, view, roughness, visibility, directions, power, half_
                 arriving = visibility[i, k] * cosine
                 value, by_alpha, by_light, by_view = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
                 p0, p1, p2 = power[0, k], power[1, k], power[2, k]
-                gloss = g0 * p0 + g1 * p1 + g2 * p2
-                matt = a0 * p0 + a1 * p1 + a2 * p2
-                by_value = arriving * gloss * value
+                specular = g0 * p0 + g1 * p1 + g2 * p2
+                diffuse = a0 * p0 + a1 * p1 + a2 * p2
+                by_value = arriving * specular * value
                 by_alpha_sum += by_value * by_alpha
                 by_view_sum += by_value * by_view
-                # where the light is below the horizon `arriving` is zero and so is all of this
                 facing = visibility[i, k] if n_dot_l > zero else zero
-                by_cosine = by_value * by_light + facing * (matt + gloss * value)
+                by_cosine = by_value * by_light + facing * (diffuse + specular * value)
                 gx += by_cosine * lx
                 gy += by_cosine * ly
                 gz += by_cosine * lz
@@ -171,7 +169,7 @@ def _sum_backward(normals, view, roughness, visibility, directions, power, half_
             gamma = roughness[i]
             inside = low < gamma < high
             by_roughness[i] = np.float32(4) * gamma * gamma * gamma * by_alpha_sum if inside else zero
-    total = np.zeros((texels, 3), np.float32)
+    sum_power = np.zeros((texels, 3), np.float32)
     for chunk in range(CHUNKS):
-        total += by_power[chunk].T
-    return by_normal, by_roughness, total
+        sum_power += by_power[chunk].T
+    return by_normal, by_roughness, sum_power
