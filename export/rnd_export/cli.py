@@ -29,6 +29,7 @@ from rnd_runtime.core.command import (
     size_text,
 )
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed
+from rnd_runtime.core.lock import file_lock
 from rnd_runtime.shading.light import Up
 
 BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}  # options of the search, by kind of bound
@@ -129,11 +130,12 @@ def _export(options: Options) -> None:
     else:
         motion = random_motion(checkpoint.skeleton, frames=options.frames, seed=0)
     play = f"rnd-play {out} --motion FILE --out FOLDER"
-    for kind, value in bounds.items():
-        what = BoundedSearch(Bound(kind, value), flag(BOUNDS[kind]), motion, **search)  # type: ignore[arg-type]
-        finish(out, export_bounded(checkpoint, out, what, show=show, warn=_log_all), then=play)
-        return
-    parity = export(checkpoint, out, motion, Variant(**dataclasses.asdict(options.reduction)), cull=options.cull)
+    with file_lock(out, "rnd-export"):
+        for kind, value in bounds.items():
+            what = BoundedSearch(Bound(kind, value), flag(BOUNDS[kind]), motion, **search)  # type: ignore[arg-type]
+            finish(out, export_bounded(checkpoint, out, what, show=show, warn=_log_all), then=play)
+            return
+        parity = export(checkpoint, out, motion, Variant(**dataclasses.asdict(options.reduction)), cull=options.cull)
     cull = advice_of(out).cull
     summary = (
         f"{out.stat().st_size / 1e6:.2f} MB; against torch over {parity.frames} frames: "

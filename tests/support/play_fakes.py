@@ -36,6 +36,7 @@ def fake_skeleton() -> Skeleton:
 class Encoded(NamedTuple):
     motion: Motion
     time: float
+    bones: np.ndarray  # [J, 3, 4] m, rest pose → world
     root: np.ndarray  # it is posed in the world
     seconds: dict[str, float]
 
@@ -50,7 +51,10 @@ class FakeAvatar:
     advice: PlayerAdvice = field(default_factory=PlayerAdvice)
 
     def encode(self, motion: Motion, time: float) -> Encoded:
-        return Encoded(motion, time, np.eye(4), {})
+        now = motion.at([time])
+        joints = self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3]
+        joints[:, :, 3] -= np.einsum("jab,jb->ja", joints[:, :, :3], self.skeleton.rest_joints)
+        return Encoded(motion, time, joints, np.eye(4), {})
 
     def posed(self, encoded: Encoded) -> Gaussians:
         return self.pose(encoded.motion, encoded.time)

@@ -28,7 +28,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     mode is the umask's.
     """
     path = output_file(path)
-    temporary = path.with_name(f".{path.stem[:_NAMED]}.{secrets.token_hex(4)}{path.suffix}")
+    temporary = path.with_name(f"{temporary_stem(path)}{secrets.token_hex(4)}{path.suffix}")
     with at_end(partial(temporary.unlink, missing_ok=True)):  # before it is there
         try:
             os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
@@ -38,6 +38,11 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+
+
+def temporary_stem(path: Path) -> str:
+    """What the names of ``path``'s temporaries begin with; eight letters and its suffix follow."""
+    return f".{path.stem[:_NAMED]}."
 
 
 def _sync(path: Path) -> None:

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.lock import LOCK_FILE, folder_lock
+from rnd_runtime.core.lock import LOCK_FILE, file_lock, folder_lock
 
 HOLD = """
 import sys
@@ -64,3 +64,35 @@ def test_it_is_free_again_afterwards(tmp_path):
         with folder_lock(tmp_path, "x"), pytest.raises(InputError), folder_lock(tmp_path, "y"):
             pytest.fail("held twice")
     assert not (tmp_path / LOCK_FILE).exists()
+
+
+def test_a_file_is_locked_by_its_name_and_rid_of_what_killed_writers_left(tmp_path):
+    left, others = tmp_path / ".a.0123abcd.onnx", [tmp_path / ".b.0123abcd.onnx", tmp_path / "a.onnx"]
+    for file in (left, *others):
+        file.touch()
+    with file_lock(tmp_path / "a.onnx", "rnd-export"), file_lock(tmp_path / "b_long.onnx", "rnd-export"):
+        assert not left.exists()
+        with pytest.raises(InputError, match=r"a\.onnx: file is being written to: got rnd-export \(process"):
+            file_lock(tmp_path / "a.onnx", "rnd-export").__enter__()
+    assert sorted(tmp_path.iterdir()) == sorted(others)
+
+
+def test_parts_that_start_at_once_all_share(tmp_path):
+    code = """
+import sys, time
+from rnd_runtime.core.lock import folder_lock
+print("ready", flush=True)
+sys.stdin.readline()
+with folder_lock(sys.argv[1], "rnd-play", shared_by="clip"):
+    time.sleep(0.2)
+"""
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    parts = [subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    assert [part.stdout.readline() for part in parts] == ["ready\n"] * 4
+    for part in parts:
+        part.stdin.write("go\n")
+        part.stdin.flush()
+    for part in parts:
+        part.communicate(timeout=30)
+    assert [part.returncode for part in parts] == [0] * 4
+    assert not list(tmp_path.iterdir())

@@ -15,6 +15,7 @@ from PIL import Image
 import rnd_viewer.play.play
 from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.core.kernels import COMPILING
+from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.doctor import Finding
 from rnd_runtime.playback.frame import FrameRenderer
@@ -140,6 +141,15 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     assert {name for name in parts if name.startswith("frames/")} == names
     assert all(parts[name] == whole[name] for name in names)
     assert {"play_000000-000002.json", "play_000002-000006.json"} <= parts.keys()
+
+
+def test_another_run_at_the_same_time_is_told_who_holds_the_folder(files, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    with folder_lock(tmp_path / "out", "rnd-play", shared_by=".run-0123456789abcdef"):
+        assert main(_arguments(files, tmp_path / "out")) == 2
+    error = capsys.readouterr().err
+    assert "out: folder is being written to: got rnd-play (process " in error and error.count("\n") == 1
+    assert not _tree(tmp_path / "out")
 
 
 def test_parts_share_a_folder_inside_the_motions(files, tmp_path, capsys):

@@ -32,6 +32,7 @@ from rnd_runtime.core.command import (
 )
 from rnd_runtime.core.errors import InputError, check_option, refuse_changed
 from rnd_runtime.core.files import existing_file, output_folder, write_json
+from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.core.progress import Progress
 
 from .console import log_all, need_extra
@@ -146,24 +147,25 @@ def _train(options: TrainOptions) -> None:
         training = Training(capture, config, perceptual, device, consistency=features)
     if options.resume:
         training.resume(state)
-    write_json(output_folder(folder) / "config.json", to_dict(config))
-    if perceptual is None:
-        without = "" if features is not None else ", and no consistency loss"
-        log(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
-    for frame in training.bad_masks:
-        warn(f"frame {frame}: mask empty or full, skipped")
-    log(f"{folder}: {training.schedule.total} steps; rnd-view {shlex.quote(str(folder))} shows them")
-    with _memory_error_in_one_line():
-        stopped = _run_with_progress(training, folder)
-    checkpoint = folder / "avatar.ckpt"
-    summary = f"{training.step_index} steps, {training.seconds / 60:.1f} min"
-    if stopped:
-        show(f"{checkpoint}: {summary}")
-        words = [word for word in sys.argv[1:] if word != "--resume"]
-        log(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
-        raise KeyboardInterrupt
-    _score_after_training(training, folder, options)
-    finish(checkpoint, summary, then=f"rnd-export {shlex.quote(str(checkpoint))}")
+    with folder_lock(output_folder(folder), "rnd-train"):
+        write_json(folder / "config.json", to_dict(config))
+        if perceptual is None:
+            without = "" if features is not None else ", and no consistency loss"
+            log(f"no --perceptual-weights: multi-scale DSSIM instead of LPIPS{without}")
+        for frame in training.bad_masks:
+            warn(f"frame {frame}: mask empty or full, skipped")
+        log(f"{folder}: {training.schedule.total} steps; rnd-view {shlex.quote(str(folder))} shows them")
+        with _memory_error_in_one_line():
+            stopped = _run_with_progress(training, folder)
+        checkpoint = folder / "avatar.ckpt"
+        summary = f"{training.step_index} steps, {training.seconds / 60:.1f} min"
+        if stopped:
+            show(f"{checkpoint}: {summary}")
+            words = [word for word in sys.argv[1:] if word != "--resume"]
+            log(f"stopped; to continue: {shlex.join(['rnd-train', *words, '--resume'])}")
+            raise KeyboardInterrupt
+        _score_after_training(training, folder, options)
+        finish(checkpoint, summary, then=f"rnd-export {shlex.quote(str(checkpoint))}")
 
 
 def _config(options: TrainOptions) -> TrainConfig:

@@ -1,4 +1,4 @@
-"""Import of a source as a capture: detect its layout, read it, add what is missing, write it."""
+"""Import of a source as a capture."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 from rnd_runtime.core.errors import InputError, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.core.files import output_folder
+from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
 from rnd_trainer.importing.layouts import (
     arah,
@@ -50,17 +51,17 @@ LAYOUTS: dict[str, Any] = {
     "easymocap": easymocap,
     "video": video,
 }
-"""modules with ``detect`` and ``read``, the particular before the general: a folder of images may be anything"""
+"""modules with ``detect`` and ``read``, in order of detection: specific layouts first"""
 _COEFFICIENTS = (0, 4, 5, 8, 12, 14)
-"""numbers that OpenCV takes as a lens's distortion"""
+"""possible numbers of OpenCV's distortion coefficients"""
 _EXTERNAL_POSES = ("video", "nerfstudio", "easymocap")
 
 
 def find_layout(source: Path, name: str | None = None) -> tuple[str, str]:
-    """(layout, what was found) of ``source``; ``name`` forces the layout.
+    """Layout and description of ``source``; ``name`` forces the layout.
 
     Raises:
-        InputError: nothing known is there, or not what ``name`` says.
+        InputError: no known layout, or not ``name``.
     """
     if not source.exists():
         raise InputError("source not found", file=source)
@@ -98,7 +99,7 @@ def import_source(
         on_found: called with the layout, then with a summary of the content.
 
     Raises:
-        InputError: with the file and, where there is one, the frame.
+        InputError: with file and frame.
     """
     _check_numbers(options)
     layout, found = find_layout(source, options.layout)
@@ -124,7 +125,9 @@ def import_source(
     samples = select_samples(dataset, options.selection)
     samples = add_masks(samples, scene, dataset, options.mask_net, on_progress)
     samples, axes = add_normals(samples, scene, dataset, options)
-    write_capture(out, dataset, scene, samples, on_progress, normal_axes=axes)
+    with folder_lock(output_folder(out), "rnd-data import"):
+        _refuse_occupied(out, source, options)  # by another import meanwhile
+        write_capture(out, dataset, scene, samples, on_progress, normal_axes=axes)
     return scene
 
 
@@ -171,11 +174,11 @@ def _refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
 
 
 def _refuse_unwritable(out: Path) -> None:
-    """Refuse a folder ``out`` that cannot be made or written, before the long work; a folder made to try is removed."""
+    """Refuse a folder ``out`` that cannot be created or written; leaves no new folder behind."""
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     output_folder(out)
     for folder in missing:
-        with contextlib.suppress(OSError):  # another program put a file there
+        with contextlib.suppress(OSError):  # another program's file in it
             folder.rmdir()
 
 
@@ -196,7 +199,7 @@ def _check_numbers(options: ImportOptions) -> None:
 
 
 def _refuse_unused(layout: str, options: ImportOptions) -> None:
-    """Refuse options that would change nothing."""
+    """Refuse options without effect."""
     for one, other in (("masks", "mask_net"), ("normals", "normal_net")):
         if getattr(options, one) and getattr(options, other):
             raise InputError(f"{flag(one)} and {flag(other)}", expected="one of them", got="both")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -21,6 +23,7 @@ from rnd_runtime.core.command import finish, is_quiet, log, size_text, warn
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
+from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.core.progress import track
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
@@ -58,11 +61,12 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
     playing = _Run.of(options, ahead)
     for note in playing.notes:
         warn(note)
-    seconds = playing.render()
-    if not playing.in_view:
-        playing.notes.append("nothing of the avatar is in view in any of these frames")
-        warn(playing.notes[-1])
-    playing.report(seconds)
+    with _claimed(playing.mark):
+        seconds = playing.render()
+        if not playing.in_view:
+            playing.notes.append("nothing of the avatar is in view in any of these frames")
+            warn(playing.notes[-1])
+        playing.report(seconds)
     return 0
 
 
@@ -128,7 +132,8 @@ class _Run:
                 if is_of_a_run(path, out):
                     raise InputError("cannot be an input: runs write such files into --out", file=path)
             mark = mark_of(out, _common(options), inputs)
-            refuse_others(mark)
+            with _claimed(mark):
+                pass  # before what takes long
             if kernels_are_cold():
                 log(COMPILING)
             renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
@@ -223,6 +228,14 @@ class _Run:
         rate = len(self.frames) / seconds
         made = f"{len(self.frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
         finish(self.out, f"{made} ({raster}, {self.options.rendering.shade})")
+
+
+@contextmanager
+def _claimed(mark: Path) -> Iterator[None]:
+    """Hold the folder of ``mark``, together with other parts of its run; refuse one with files of another run."""
+    with folder_lock(mark.parent, "rnd-play", shared_by=mark.name):
+        refuse_others(mark)
+        yield
 
 
 def _print_times(summary: dict[str, dict[str, float]]) -> None:
