@@ -1,9 +1,7 @@
-"""Avatars to measure: a trained one, or untrained ones of any size at the same cost.
+"""Avatars to measure: a trained one, or a seeded, untrained one of any size at the same cost.
 
-**The seeded avatar** stands on a given body. Its networks are random, their highest frequencies damped and their
-outputs scaled as in trained ones: weights that move a few per cent, offsets of millimetres, visibility around 1. Its
-albedo is a formula of position. Frames cost what a trained avatar's cost, and err alike by shading and rasteriser; by
-encoder they err less (the static one by 1 mm, the trained dancer's by 17 mm).
+A seeded avatar has random networks with outputs scaled as in trained ones, and an albedo by formula. Its errors by
+shading and rasteriser equal a trained avatar's; by encoder they are less (static: 1 mm, the trained dancer 17 mm).
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ SEED = 7
 LOGITS, OFFSETS, VISIBILITY = 4.0, 0.6, 1.2
 OPACITY = 2.5  # raw: 0.99 after the sigmoid, as of trained avatars
 STORED = ("seeded_*.ckpt", "exported_*.onnx", "reference_*.npz", "squat_*.npz", "sun_*.exr")
-"""what rnd-bench stores between runs; the key of its inputs (``content_key``) is in every name"""
+"""files stored between runs; each name contains the ``content_key`` of its inputs"""
 
 
 @dataclass(frozen=True)
@@ -41,13 +39,12 @@ class Encoders:
     window: int | None = None
 
     def words(self) -> list[str]:
-        """As on the command line."""
         words = ["--encoder", self.encoder, "--precision", self.precision]
         return words + (["--window-poses", str(self.window)] if self.window is not None else [])
 
 
 def content_key(*parts: Path | str) -> str:
-    """16 hexadecimal digits for the content of files, for strings, their order and the package's version."""
+    """Digest of files' contents, of strings, their order and the package's version: 16 hexadecimal digits."""
     digest = hashlib.sha256(__version__.encode())
     for part in parts:
         content = part.read_bytes() if isinstance(part, Path) else part.encode()
@@ -56,14 +53,14 @@ def content_key(*parts: Path | str) -> str:
 
 
 def forget(folder: Path) -> None:
-    """Delete what rnd-bench stores in ``folder``, and nothing of the user's."""
+    """Delete the files stored in ``folder``, and no others."""
     for pattern in STORED:
         for file in folder.glob(pattern):
             file.unlink()
 
 
 def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
-    """The avatar.onnx of ``checkpoint`` in ``folder``, made by ``rnd-export`` unless it is there."""
+    """The avatar.onnx of ``checkpoint`` in ``folder``, by ``rnd-export`` unless it exists."""
     key = content_key(checkpoint, *sources("rnd_export"))
     words = encoders.words()
     name = "_".join(["exported", key, *(w for w in words if not w.startswith("--"))])
@@ -78,7 +75,7 @@ def exported(checkpoint: Path, encoders: Encoders, folder: Path) -> Path:
 
 
 def checkpoint_model(checkpoint: Path) -> dict[str, Any]:
-    """The fields of its ``rnd_trainer.config.ModelConfig``, by name."""
+    """The fields of its ``ModelConfig``."""
     from rnd_trainer.model.checkpoint import SCHEMA, read_tensors
 
     model: dict[str, Any] = read_tensors(checkpoint, SCHEMA)[1]["config"]["model"]
@@ -86,14 +83,14 @@ def checkpoint_model(checkpoint: Path) -> dict[str, Any]:
 
 
 def sources(package: str) -> list[Path]:
-    """The source files of ``package``, found without importing it; none where it is not installed."""
+    """Source files of ``package``, found without importing it."""
     found = importlib.util.find_spec(package)
     folders = () if found is None else found.submodule_search_locations or ()
     return sorted(file for folder in folders for file in Path(folder).rglob("*.py"))
 
 
 def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
-    """avatar.ckpt of the seeded avatar with ``count`` Gaussians on the body of ``body_file``, made once."""
+    """avatar.ckpt of a seeded avatar of ``count`` Gaussians on the body of ``body_file``, made once."""
     config = resized(TrainConfig(), count, None)
     out = folder / f"seeded_{count}_{content_key(body_file, repr(config.model))}.ckpt"
     if out.exists():
@@ -119,7 +116,7 @@ def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
 
 
 def _activate(model: object) -> None:
-    """Give outputs to networks whose output is zero at the start of a training."""
+    """Random output layers for the networks whose output is initially zero."""
     import torch
 
     frequencies = model.config.frequencies  # type: ignore[attr-defined]

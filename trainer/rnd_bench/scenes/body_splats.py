@@ -1,7 +1,7 @@
-"""N Gaussians spread evenly over a person 1.75 m tall in an A pose, a union of capsules.
+"""N Gaussians on a person 1.75 m tall in an A pose, a union of capsules.
 
-They are discs: their standard deviation is the spacing of the points in the surface's plane (8 mm for 30 000) and a
-tenth of it along the normal. Opacities are in 0.7–0.95, features are random colours.
+They are discs: σ is the points' spacing in the surface's plane (8 mm for 30 000) and a tenth of it along the normal.
+Opacities are in 0.7–0.95, features are random colours.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LIMBS = (
 
 
 class Splats(NamedTuple):
-    """What a rasteriser takes, float32."""
+    """Inputs of a rasteriser, float32."""
 
     means: NDArray[np.float32]
     covariances: NDArray[np.float32]

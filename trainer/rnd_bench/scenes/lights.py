@@ -7,11 +7,11 @@ from numpy.typing import ArrayLike
 
 from rnd_runtime.shading.light import Light, texel_directions
 
-SUN_RADIUS = 0.02  # rad; four times the sun's, so that a map of 128 rows holds it in some texels
+SUN_RADIUS = 0.02  # rad; four times the sun's, so that it covers texels of a map of 128 rows
 
 
 def sun_and_sky(height: int = 128, *, sun: ArrayLike = (0.8, 0.5, 0.33), radiance: float = 900.0) -> Light:
-    """A bluish sky, a dark ground and a sun towards ``sun`` that lays about π on what faces it."""
+    """A bluish sky, a dark ground and a sun towards ``sun`` with a normal irradiance of about π."""
     directions = texel_directions(height, 2 * height)
     up = 0.5 + 0.5 * directions[..., 1:2]
     colours = 0.05 + up * np.array([0.25, 0.3, 0.4])
@@ -19,7 +19,7 @@ def sun_and_sky(height: int = 128, *, sun: ArrayLike = (0.8, 0.5, 0.33), radianc
 
 
 def sun_disc(height: int, towards: ArrayLike, radiance: float, radius: float = SUN_RADIUS) -> np.ndarray:
-    """[H, 2H, 1] of a disc of ``radiance``; a texel holds the share of it that is covered (8 × 8 samples)."""
+    """A disc of ``radiance`` as a map [H, 2H, 1], each texel weighted by its covered share (8 × 8 samples)."""
     fine = 8
     way = np.asarray(towards, np.float64) / np.linalg.norm(towards)
     rows = np.arange(height)

@@ -12,16 +12,16 @@ from rnd_runtime.core.images import linear_to_srgb
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-IDENTICAL_DB = 200.0  # PSNR of equal images: JSON has no infinity
+IDENTICAL_DB = 200.0  # PSNR of equal images; JSON has no infinity
 
 
 def srgb(linear: ArrayLike) -> Floats:
-    """Linear radiance as sRGB in 0…1, not rounded, so that differences below a byte are seen."""
+    """Linear radiance as sRGB in 0…1, not rounded."""
     return np.asarray(np.clip(linear_to_srgb(np.asarray(linear, np.float64)), 0, 1))
 
 
 def decibels(ours: ArrayLike, theirs: ArrayLike) -> float:
-    """PSNR of values in 0…1; NaN where any of them is, which no limit lets pass."""
+    """PSNR of values in 0…1; NaN if any of them is."""
     return decibels_of(float(np.mean((np.asarray(ours, np.float64) - np.asarray(theirs, np.float64)) ** 2)))
 
 

@@ -1,12 +1,7 @@
-"""What the points of the grid render: a walk under a sky, or one of the hardest scenes.
-
-The hardest are the worst camera, in the neck and looking down into the body, the worst pose, a squat, and the worst
-light, a sun of 10⁶.
-"""
+"""Scenes of the grid: a walk under a sky; a camera in the neck looking down, a squat, a sun of 10⁶."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, get_args
@@ -30,7 +25,7 @@ NECK, FEET = (0.0, 1.5, 0.0), (0.0, 0.3, 0.1)  # m, of the body that stands at t
 
 
 class BenchScene(NamedTuple):
-    """The files that frames are made from, and the view of ``bench_camera``."""
+    """Input files, and the view of ``bench_camera``."""
 
     motion: Path
     hdr: Path
@@ -39,22 +34,16 @@ class BenchScene(NamedTuple):
 
 def bench_scene(name: str, body: Path, motion: Path, hdr: Path, folder: Path, key: str) -> BenchScene:
     """The scene ``name`` of a ``motion`` of ``body`` and a light; new files are stored in ``folder`` by ``key``."""
-
-    def made(file: Path, make: Callable[[Path], None]) -> Path:
-        if not file.exists():
-            make(file)
-        return file
-
-    if name == SQUAT:
-        motion = made(folder / f"squat_{key}.npz", lambda out, walk=motion: _squat(out, body, walk))  # type: ignore[misc]
-    if name == SUN:
-        sky = sun_and_sky(128, radiance=SUN_RADIANCE)
-        hdr = made(folder / f"sun_{key}.exr", lambda out: write_image(out, sky.radiance))
+    if name == SQUAT and not (squat := folder / f"squat_{key}.npz").exists():
+        _squat(squat, body, motion)
+    if name == SUN and not (sun := folder / f"sun_{key}.exr").exists():
+        write_image(sun, sun_and_sky(128, radiance=SUN_RADIANCE).radiance)
+    motion, hdr = squat if name == SQUAT else motion, sun if name == SUN else hdr
     return BenchScene(motion, hdr, INSIDE if name == INSIDE else USUAL)
 
 
 def bench_camera(size: int, view: str = USUAL) -> Camera:
-    """A square view of a standing person, 1.75 m filling 70 % of the height, 20° to the side; or of the inside."""
+    """A square view, 20° to the side, of a person 1.75 m tall who fills 70 % of the height; or of the inside."""
     distance, angle = 3.4, np.radians(20)
     fov = 2 * np.arctan(0.5 * 1.75 / 0.7 / distance)
     if view == INSIDE:

@@ -1,7 +1,4 @@
-"""The speed–accuracy chart: every point, the Pareto front, one panel for each stage.
-
-Errors are those to the same avatar in full, so each number of Gaussians has a front of its own.
-"""
+"""The speed–accuracy chart: every point, a Pareto front for each number of Gaussians, one panel for each stage."""
 
 from __future__ import annotations
 
@@ -43,10 +40,7 @@ def check_chart(*files: Path) -> None:
 
 
 def draw_chart(rows: list[Row], files: Sequence[Path]) -> None:
-    """Write the chart of ``rows`` to every file, SVG or PNG by its suffix: the same bytes for the same rows.
-
-    Raises ``InputError`` where nothing was measured.
-    """
+    """Write the chart of ``rows`` to every file, SVG or PNG by its suffix; equal rows give equal bytes."""
     rows = [row for row in rows if "psnr_db" in row]
     if not rows:
         raise InputError("chart", expected="at least one measured point", got="none")
@@ -77,10 +71,7 @@ def draw_chart(rows: list[Row], files: Sequence[Path]) -> None:
 
 
 def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
-    """All points, and the usual front in ``words`` beside them.
-
-    Fronts are of images of one size, since smaller ones are always faster, and of the usual scene.
-    """
+    """All points, with the fronts of one image size and the usual scene; one front in ``words`` beside them."""
     usual, size = rows[0]["n"], rows[0]["size"]
     easy = [row for row in rows if row["size"] == size and not _hard(row)]
     fronts = {n: list(pareto([row for row in easy if row["n"] == n])) for n in COLOURS}
@@ -105,7 +96,6 @@ def _overview(axes: Any, words: Any, rows: list[Row]) -> None:
 
 
 def _legend(axes: Any, rows: list[Row]) -> list[Any]:
-    """A handle for everything that ``rows`` show."""
 
     def mark(label: str, **style: Any) -> Any:
         return axes.scatter([], [], label=label, **({"color": "#555"} if "edgecolor" not in style else {}) | style)
@@ -145,12 +135,10 @@ def _hard(row: Row) -> bool:
 
 
 def _mode(row: Row) -> str:
-    """Its shading, without the number of lights."""
     return str(row["shade"]).partition(":")[0]
 
 
 def _area(side: int) -> float:
-    """Of the mark of an image of ``side`` pixels."""
     return 14 + 26 * (side / 512)
 
 
@@ -183,7 +171,7 @@ def _points(axes: Any, rows: list[Row], cost: str) -> None:
 
 
 def _label(row: Row) -> str:
-    """What distinguishes a point, in few words."""
+    """The values of a point that differ from the usual."""
     usual = Setting()
     words = [row["shade"]]
     words += [str(row[name]) for name in ("encoder", "precision", "raster") if row[name] != getattr(usual, name)]

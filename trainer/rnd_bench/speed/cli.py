@@ -1,8 +1,7 @@
-"""``rnd-bench raster, frame, grid, step, compare``: they measure, print tables and write rows."""
+"""``rnd-bench raster, frame, grid, step, compare``: measure, print tables, write rows."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -41,24 +40,16 @@ def run_frame(options: Frame) -> None:
 
     from .point import Setting, measured
 
-    _check(options, "n", "size", "runs")
+    _check(options, "n", "size")
     check_cull(options.cull)
     check_mode(options.shade)
     given = {name: getattr(options, name) for name in Setting.__dataclass_fields__}
     setting = Setting(**given | {"threads": _threads(options.threads)})
-    inputs, rows = _inputs(options.files), list[dict[str, Any]]()
-    for _ in range(options.runs):
-        row = measured(setting, inputs, seconds=6.0, compare=not options.no_compare, file=options.avatar)
-        rows.append(row)
-        _write(options.json, rows if options.runs > 1 else row)  # before anything is printed to a pipe that may close
-        show(_line(row))
-        for name, milliseconds in row["stages"].items():
-            show(f"  {name:16} {milliseconds:6.2f} ms")
-    if options.runs > 1:
-        for column, what in {"ms_median": "median", "ms_p95": "p95", "cold_start_ms": "cold start"}.items():
-            values = sorted(float(each[column]) for each in rows)
-            middle = statistics.median(values)
-            show(f"{what} of {len(rows)} runs: {values[0]:.1f} to {values[-1]:.1f} ms, median {middle:.1f}")
+    row = measured(setting, _inputs(options.files), seconds=6.0, compare=not options.no_compare, file=options.avatar)
+    _write(options.json, row)
+    show(_line(row))
+    for name, milliseconds in row["stages"].items():
+        show(f"  {name:16} {milliseconds:6.2f} ms")
 
 
 def run_grid(options: Grid) -> None:
@@ -67,9 +58,7 @@ def run_grid(options: Grid) -> None:
 
     _check(options)
     check_chart(*options.chart)
-    cross = [name.strip() for name in options.cross.split(",")] if options.cross else []
-    done: list[float] = []
-    # when each new point was done: the first one's time is no other's, since kernels are compiled and references made
+    done: list[float] = []  # times at which new points were done; the first is no measure, as it compiles kernels
 
     def on_row(row: dict[str, Any], new: bool, left: int) -> None:
         state = f"{left} left" if new else "stored"
@@ -80,13 +69,12 @@ def run_grid(options: Grid) -> None:
         show(f"{_line(row)}  ({state})")
 
     inputs = _inputs(options.files)
-    rows = grid(inputs, options.json, quick=options.quick, cross=cross, fresh=options.fresh, on_row=on_row)
+    rows = grid(inputs, options.json, quick=options.quick, fresh=options.fresh, on_row=on_row)
     draw_chart(rows, options.chart)
     show(f"{options.json}, {', '.join(map(str, options.chart))}")
     others = len(earlier_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)
     if others:
-        line = f"{options.json} also holds {others} points of earlier grids, not in the chart (--fresh drops them)"
-        show(line)
+        show(f"{options.json} also holds {others} points of earlier grids, not in the chart (--fresh drops them)")
 
 
 def run_step(options: Step) -> None:
@@ -138,7 +126,6 @@ def run_compare(options: Compare) -> None:
 
 
 def _line(row: dict[str, Any]) -> str:
-    """A row in words."""
     window = "" if row["window"] is None else f" d={row['window']}"
     cull = "" if row["cull"] is None else f", n·v ≥ {row['cull']:g}"
     hard = "" if row["scene"] == USUAL else f", {row['scene']}"

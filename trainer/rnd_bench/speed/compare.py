@@ -1,8 +1,7 @@
-"""Frames of one avatar by two checkouts of this project, alternating: what a change to the player is worth.
+"""Paired times of one avatar's frames by two checkouts of this project.
 
-The pace of a shared machine changes by more than most changes are worth. Each checkout renders in a process of its own,
-eight frames at a time, alternating; what counts is the median of the paired ratios, with a standard error. Motion and
-light change from frame to frame; the kernels of both are compiled first.
+Each checkout renders in a process of its own, eight frames at a time, alternating, so that the machine's load is the
+same for both. Reported is the median of the paired ratios, with its standard error.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 
 PACKAGES = ("runtime", "trainer", "export", "viewer")
-FRAMES, WARM_UP = 8, 2  # of a pair: those that count, and those before them
-MEDIAN_ERROR = 1.25  # standard error of a median in those of a mean, for normal deviates
+FRAMES, WARM_UP = 8, 2  # frames of a pair that are timed, and those before them
+MEDIAN_ERROR = 1.25  # standard error of a median over that of a mean, for normal deviates
 
-# Runs with a checkout's own packages, of any version since FrameRenderer: one line of times for each line on stdin.
+# runs with a checkout's own packages; one line of times for each line on stdin
 RENDER = """
 import json, sys
 from time import perf_counter
@@ -70,7 +69,7 @@ class Checkout:
         )
 
     def render(self, first: int) -> list[dict[str, float]]:
-        """ms of each stage, and of the "frame", of the frames from ``first`` on."""
+        """Milliseconds of each stage, and of the whole "frame", of the frames from ``first`` on."""
         assert self._process.stdin and self._process.stdout
         self._process.stdin.write(f"{first}\n")
         self._process.stdin.flush()
@@ -89,7 +88,7 @@ class Checkout:
 
 
 def compare(checkouts: Sequence[Checkout], pairs: int, on_pair: Callable[[int], None]) -> list[dict[str, Any]]:
-    """Rows by stage: medians and 95th percentiles in ms of both checkouts, and the ratio with its standard error."""
+    """A row for each stage: median and p95 in ms of both checkouts, and the ratio with its standard error."""
     for checkout in checkouts:
         checkout.render(WARM_UP)
     taken: tuple[list[Any], list[Any]] = ([], [])

@@ -1,7 +1,6 @@
-"""One point of the speed–accuracy chart: frames of an avatar, timed in a process of their own.
+"""Timing of frames in a process of their own, without torch, so that memory and time are a player's.
 
-That process imports no torch and computes no reference, so that its memory and its time are a player's. Motion and
-light both change from frame to frame.
+Motion and light change from frame to frame.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,24 +20,26 @@ from numpy.typing import NDArray
 
 from rnd_bench.scenes.scenes import USUAL, bench_camera
 from rnd_runtime.core.errors import InputError
-
-from .clock import summary
+from rnd_runtime.core.signals import temporary_folder
 
 Floats32 = NDArray[np.float32]
 
 WARMUP = 5
 STEP_S = 1 / 30  # of the motion, from frame to frame
 STEP_YAW = 0.02  # radians of the light, from frame to frame
-COMPARED = (8, 19, 30, 41, 52, 63, 74, 85)  # frames whose pixels and positions are compared with the reference
+COMPARED = (8, 19, 30, 41, 52, 63, 74, 85)  # frames compared with the reference
 DEADLINE_S = 300.0
+
+
+def summary(taken: Sequence[float]) -> dict[str, float]:
+    """Median, p95 and minimum of milliseconds."""
+    values = {"median": np.median(taken), "p95": np.percentile(taken, 95), "min": np.min(taken)}
+    return {f"ms_{name}": float(value) for name, value in values.items()}
 
 
 @dataclass(frozen=True)
 class Point:
-    """What is rendered and how; ``seconds`` bounds the time spent on ``frames`` frames.
-
-    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``, ``view`` as of ``scenes.bench_camera``.
-    """
+    """What is rendered and how; ``seconds`` bounds the time spent on ``frames``."""
 
     avatar: str
     motion: str
@@ -54,11 +55,12 @@ class Point:
 
 
 class Measured(NamedTuple):
-    """Times of a point, and what it rendered at the frames ``COMPARED``.
+    """Times of a point, and its frames ``COMPARED``.
 
-    ``row``: ms_median, ms_p95, stages (median ms), stages_p95, cold_start_ms (from the start of the process to its
-    first frame), peak_mb, file_mb, frames, renderer. ``radiance`` [K, H, W, 3] linear, premultiplied; ``means``
-    [K, N, 3] m.
+    Attributes:
+        row: ms_*, stages (median ms), stages_p95, cold_start_ms (process start to first frame), peak_mb, file_mb, …
+        radiance: [K, H, W, 3] linear, premultiplied.
+        means: [K, N, 3] m.
     """
 
     row: dict[str, Any]
@@ -70,12 +72,11 @@ def measure(point: Point) -> Measured:
     """Run ``point`` in a process of its own. Raises ``InputError`` where it cannot be rendered here."""
     threads = str(point.threads)
     environment = os.environ | {"NUMBA_NUM_THREADS": threads, "OMP_NUM_THREADS": threads, "OMP_WAIT_POLICY": "PASSIVE"}
-    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # a player that was used before has its modules compiled
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder)
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # cold starts are timed with compiled modules
+    with temporary_folder() as out:
         (out / "point.json").write_text(json.dumps(asdict(point)), encoding="utf-8")
         code = "import sys; from rnd_bench.speed.frame import render; render(sys.argv[1], float(sys.argv[2]))"
-        line = [sys.executable, "-c", code, folder, repr(time.monotonic())]
+        line = [sys.executable, "-c", code, str(out), repr(time.monotonic())]
         what = f"{point.raster}, {point.shade}"
         try:
             done = subprocess.run(
@@ -93,10 +94,7 @@ def measure(point: Point) -> Measured:
 
 
 def render(folder: str, spawned: float) -> None:
-    """What the process does: reads point.json, leaves row.json and frames.npz.
-
-    ``spawned`` is the parent's monotonic clock, which processes share, when it started this one.
-    """
+    """Read point.json, write row.json and frames.npz; ``spawned`` is the monotonic clock at the process's start."""
     from rnd_runtime.playback.start import load_ahead
 
     out = Path(folder)
@@ -156,7 +154,7 @@ def _render(point: Point, out: Path, spawned: float, ahead: Any) -> None:
 def _peak_mb() -> float:
     import resource
 
-    try:  # this program's own peak; ru_maxrss would also hold that of the parent it was forked from
+    try:  # ru_maxrss includes the peak of the parent process
         status = Path("/proc/self/status").read_text(encoding="ascii")
         return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):

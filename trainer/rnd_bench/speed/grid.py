@@ -1,13 +1,11 @@
-"""The grid of the speed–accuracy chart: one factor at a time around the usual case and a crossed core, or all
-combinations of given factors.
+"""The grid of the speed–accuracy chart: one factor at a time around the usual case, and a crossed core.
 
-Every point is one row of JSON. Rows of this machine, of the same files and the same code are not measured again, so
-that an interrupted run resumes.
+Every point is one row of JSON. Rows of the same machine, files and code are not measured again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -15,7 +13,7 @@ from typing import Any
 
 from rnd_bench.scenes.avatars import forget
 from rnd_bench.scenes.scenes import HARDEST
-from rnd_runtime.core.errors import InputError, check_option
+from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import earlier_rows, write_json
 from rnd_runtime.playback.doctor import machine
 
@@ -45,18 +43,9 @@ QUICK: dict[str, tuple[Any, ...]] = {
 }
 
 
-def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
-    """The points, the usual case first, none twice; with ``cross`` all combinations of those factors and no others.
-
-    Raises ``InputError`` for an unknown or a repeated factor.
-    """
+def settings(quick: bool = False) -> list[Setting]:
+    """The points, the usual case first, none twice."""
     usual = Setting(n=8_000, size=256) if quick else Setting()
-    for name in cross:
-        check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
-    check_option(len(set(cross)) == len(cross), "--cross", "each factor once", ",".join(cross))
-    if cross:
-        combinations = product(*(FACTORS[name] for name in cross))
-        return list(dict.fromkeys([usual, *(_of(usual, cross, values) for values in combinations)]))
     factors = QUICK if quick else FACTORS
     points = [usual, *(replace(usual, **{name: value}) for name, values in factors.items() for value in values)]
     if not quick:
@@ -67,29 +56,18 @@ def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
     return list(dict.fromkeys(points))
 
 
-def _of(usual: Setting, names: Sequence[str], values: Sequence[Any]) -> Setting:
-    point = replace(usual, **dict(zip(names, values)))
-    return replace(point, window=None) if point.encoder == "static" else point  # which has no window
-
-
 def grid(
-    inputs: Inputs,
-    out: Path,
-    *,
-    quick: bool = False,
-    cross: Sequence[str] = (),
-    fresh: bool = False,
-    on_row: Callable[[Row, bool, int], None],
+    inputs: Inputs, out: Path, *, quick: bool = False, fresh: bool = False, on_row: Callable[[Row, bool, int], None]
 ) -> list[Row]:
-    """Measure what ``out`` does not hold yet, or with ``fresh`` everything; writes after each point.
+    """Measure the points missing in ``out``, or with ``fresh`` all; write ``out`` after each.
 
-    ``on_row(row, new, left)`` is called for every point; ``left`` are still to be measured.
+    ``on_row(row, new, left)`` is called for every point, with the number still to be measured.
     """
     inputs.checked()
     if fresh:
         forget(inputs.work)
     rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *FACTORS))
-    wanted, key = settings(quick, cross), inputs.key()
+    wanted, key = settings(quick), inputs.key()
     here = {
         _key(row): row
         for row in rows
@@ -102,8 +80,8 @@ def grid(
         new = row is None
         if row is None:
             try:
-                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick, full_n=wanted[0].n)
-            except InputError as error:  # such as a rasteriser that is missing
+                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick)
+            except InputError as error:  # such as a missing rasteriser
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
             row["inputs"], left = key, left - 1
         done.append(row)
@@ -112,12 +90,12 @@ def grid(
     return done
 
 
-def pareto(rows: list[Row], cost: str = "ms_median", worth: str = "psnr_db") -> Iterator[Row]:
-    """Rows that no other beats in both, by rising cost."""
+def pareto(rows: list[Row]) -> Iterator[Row]:
+    """Rows that no other beats in both time and PSNR, by rising time."""
     best = -1.0
-    for row in sorted(rows, key=lambda row: (row[cost], -row[worth])):
-        if row[worth] > best:
-            best = row[worth]
+    for row in sorted(rows, key=lambda row: (row["ms_median"], -row["psnr_db"])):
+        if row["psnr_db"] > best:
+            best = row["psnr_db"]
             yield row
 
 

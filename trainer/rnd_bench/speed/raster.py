@@ -1,8 +1,7 @@
-"""Time and error of the rasterisers, of the same calls, in one run.
+"""Time and error of the rasterisers, of the same calls; kernels alternate, so that other load is the same for all.
 
-The scene is ``body_splats`` seen from the front, 20° to the side, filling 70 % of the image's height. Timed are 3
-channels and alpha through torch tensors: *forward* without autograd, *forward+backward* to the gradients of means,
-covariances, opacities and features. Kernels alternate, so that other load is the same for all.
+*forward* renders 3 channels and alpha without autograd, *forward+backward* also the gradients of means, covariances,
+opacities and features.
 """
 
 from __future__ import annotations
@@ -29,15 +28,13 @@ from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster import oracle as raster_oracle
 from rnd_trainer.render import raster, raster_reference
 
-from .clock import summary
+from .frame import summary
 
 Row = dict[str, Any]
 WARMUP = 3
 
 
 class Rendering(NamedTuple):
-    """Images of one call and, after a backward pass, its four gradients."""
-
     image: Tensor
     alpha: Tensor
     grads: tuple[Tensor, ...] = ()
@@ -52,17 +49,12 @@ class _Case(NamedTuple):
 
 
 def bench_raster(n: int = 30_000, size: int = 512, repeats: int = 40, threads: int | None = None) -> list[Row]:
-    """Measure every rasteriser; one row for each kernel and pass.
+    """One row for each rasteriser and pass; the plain-torch kernel is run a tenth as often.
 
-    Keys: kernel, pass (forward | forward+backward), n, size, ms_median, ms_p95, ms_min, psnr_db (image and alpha
-    against the float64 oracle), grad_rel_l2 (the worst of the four gradients against the float64 reference; None
-    for forward), threads, machine, warmup, repeats.
+    psnr_db is of image and alpha against the float64 oracle, grad_rel_l2 the worst of the four gradients against the
+    float64 reference.
     """
-    return measure(body_splats(n), bench_camera(size), repeats=repeats, threads=threads)
-
-
-def measure(splats: Splats, camera: Camera, *, repeats: int, threads: int | None = None) -> list[Row]:
-    """``bench_raster`` for any Gaussians; the plain-torch kernel is run a tenth as often."""
+    splats, camera = body_splats(n), bench_camera(size)
     threads = threads or numba.get_num_threads()
     with _threads(threads):
         incoming = _incoming(camera, splats.features.shape[1])
@@ -120,7 +112,7 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def _gl_rasterizers() -> Iterator[tuple[str, Callable[..., Any]]]:
-    """OpenGL on every backend that this machine has; it has no backward pass."""
+    """OpenGL on every available backend; forward only."""
     for backend in ("egl", "osmesa"):
         try:
             rasterizer = GlRasterizer(backend)
@@ -130,7 +122,7 @@ def _gl_rasterizers() -> Iterator[tuple[str, Callable[..., Any]]]:
 
 
 def _as_arrays(rasterize: Callable[..., Any], *arguments: Any) -> tuple[Tensor, Tensor, None]:
-    """``rasterize`` of the runtime with the arguments of the trainer's; contiguous images."""
+    """A rasteriser of the runtime with the trainer's signature."""
     means, covariances, opacities, features = (tensor.numpy() for tensor in arguments[:4])
     found = rasterize(means, covariances, opacities, features, arguments[4])
     image, alpha = np.ascontiguousarray(found.image), np.ascontiguousarray(found.alpha)

@@ -1,8 +1,7 @@
-"""Frames without any approximation, and the error of others against them.
+"""Reference frames without approximations, and the error of others against them.
 
-The networks of the full avatar in float32, skinning and posing in float64, the sum over all 2 048 texels of the light
-with the avatar's own visibility, and the oracle rasteriser. For ``table+sun``, whose suns cast shadows by depth maps,
-a second reference sums the suns' texels behind the same shadows.
+Networks in float32, skinning and posing in float64, the sum over all 2 048 texels of the light with the avatar's own
+visibility, the oracle rasteriser. A second reference for ``table+sun`` applies its shadow maps to the suns' texels.
 """
 
 from __future__ import annotations
@@ -42,11 +41,7 @@ class Reference(NamedTuple):
 
 
 def reference(avatar_file: Path, scene: BenchScene, size: int, folder: Path, *, with_suns: bool = False) -> Reference:
-    """The reference of a full avatar in ``scene``, by ``shade_reference`` or, ``with_suns``, its other formula.
-
-    What is slow of it is stored in ``folder``, by the content of the files, the camera, the frames and the sources of
-    the runtime.
-    """
+    """The reference of a full avatar in ``scene``, ``with_suns`` that for ``table+sun``; stored in ``folder``."""
     asked = f"{bench_camera(size, scene.view).world_to_camera.tolist()} {COMPARED} {STEP_S} {STEP_YAW}"
     inputs = (avatar_file, scene.motion, scene.hdr, asked)
     stem = f"reference_{content_key(*inputs, *sources('rnd_runtime'))}{'_suns' if with_suns else ''}"
@@ -66,7 +61,7 @@ def reference(avatar_file: Path, scene: BenchScene, size: int, folder: Path, *, 
 
 
 def errors(found: Measured, truth: Reference) -> dict[str, Any]:
-    """psnr_db of all compared frames together, psnr_db_worst of one, position_mm (largest, of the same Gaussians)."""
+    """PSNR of all compared frames and of the worst one, and position errors where the Gaussians are the same."""
     squares = [float(np.mean((srgb(ours) - srgb(theirs)) ** 2)) for ours, theirs in zip(found.radiance, truth.radiance)]
     same = found.means.shape == truth.means.shape
     distances = np.linalg.norm(found.means - truth.means, axis=-1) if same else None

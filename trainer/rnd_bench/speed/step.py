@@ -1,4 +1,4 @@
-"""Where the time of a training step goes: operations as torch's profiler times them, by kind."""
+"""Time of a training step by kind of operation, from torch's profiler."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ KINDS = {
     "perceptual network": "convolution|max_pool|grid_sampler",
     "matrix products": r"aten::(mm|addmm|bmm|baddbmm|matmul)$",
 }
-"""patterns of an operation's name, its gradient's included"""
-OPTIMISER, OPTIMISING = "optimiser", "Optimizer.step#"
-"""the beginning of the name of an optimiser's step: operations within it are the optimiser's"""
+"""kind: pattern of an operation's name, which its gradient's contains"""
+OPTIMISER, OPTIMISING = "optimiser", "Optimizer.step#"  # operations within an event of this name are the optimiser's
 REST, OUTSIDE = "element by element", "outside operations"
 WARMUP = 4
 
@@ -41,11 +40,7 @@ def bench_step(
     repeats: int = 24,
     on_step: Callable[[int], None] = lambda done: None,
 ) -> list[dict[str, Any]]:
-    """Milliseconds of a step of the second stage, the total first, then by kind.
-
-    Fewer steps than ``config.steps`` are planned, so that the second stage is soon reached. The profiler adds a few
-    per cent.
-    """
+    """Milliseconds of a step of the second stage, in total and by kind; the profiler adds a few per cent."""
     within = 1 - config.stage1_fraction - config.full_light_fraction
     steps = math.ceil((repeats + WARMUP + 1) / within)
     training = Training(capture, resized(config, None, steps), perceptual)
@@ -76,7 +71,7 @@ def bench_step(
 
 
 def spent_by_kind(profiled: profile) -> dict[str, float]:
-    """Milliseconds of all that was profiled, by kind, each operation without those that it calls."""
+    """Milliseconds by kind, each operation without those that it calls."""
     spent = dict.fromkeys((*KINDS, OPTIMISER, REST), 0.0)
     for operation in profiled.events() or ():
         caller = operation
@@ -88,5 +83,4 @@ def spent_by_kind(profiled: profile) -> dict[str, float]:
 
 
 def kind_of(operation: str) -> str:
-    """The first of KINDS whose pattern is found in ``operation``'s name, else REST."""
     return next((kind for kind, pattern in KINDS.items() if re.search(pattern, operation)), REST)

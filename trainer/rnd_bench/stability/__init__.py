@@ -1,4 +1,1 @@
-"""The cases in which methods of this kind break.
-
-``rnd-bench stability`` runs them at full size, ``tests/bench/stability`` on a small avatar: the same functions.
-"""
+"""Failure modes of avatars: ``rnd-bench stability`` at full size, ``tests/bench/stability`` on a small avatar."""

@@ -1,8 +1,7 @@
-"""``rnd-bench stability``: every row of the stability list at full size, and what takes hours."""
+"""``rnd-bench stability``: every row of the stability list at full size, and the runs of hours."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -15,13 +14,14 @@ import tyro
 from rnd_runtime.core.command import Count, File, Flag, OptionalFile, OptionalFolder, option, show
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import sha256_of, write_json
+from rnd_runtime.core.signals import temporary_folder
 
 if TYPE_CHECKING:
     from rnd_bench.scenes.subject import Subject
 
     from .figures import Figure
 
-SMALL_STEPS = 600  # of the avatar that is trained where none is given
+SMALL_STEPS = 600  # training steps where no checkpoint is given
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Stability:
 
 
 def run(options: Stability) -> None:
-    """Measure the rows that are asked for; each is written as soon as it is known."""
+    """Measure the chosen rows; each is written as soon as it is measured."""
     try:
         from .rows import ROWS, TIMES
     except ModuleNotFoundError as error:
@@ -67,10 +67,9 @@ def run(options: Stability) -> None:
     if unknown := set(wanted) - set(known):
         raise InputError("--rows", expected=f"some of {','.join(known)}", got=",".join(sorted(unknown)))
     check_option(16 <= options.size <= 4096, "--size", "16 to 4096", options.size)
-    rows_of(options.json)  # before hours go by
-    temporary = tempfile.TemporaryDirectory() if options.work is None else nullcontext(str(options.work))
-    with temporary as folder:
-        work = Path(folder)
+    rows_of(options.json)  # refuses another file before hours of work
+    temporary = temporary_folder() if options.work is None else nullcontext(options.work)
+    with temporary as work:
         work.mkdir(parents=True, exist_ok=True)
         subject = _subject(options, work)
 
@@ -87,7 +86,7 @@ def run(options: Stability) -> None:
 
 
 def _subject(options: Stability, work: Path) -> Subject:
-    """The avatar of the checkpoint, exported here, or one trained in minutes on the capture."""
+    """The avatar of the checkpoint, or one trained in minutes on the capture."""
     from rnd_bench.scenes.subject import Subject
     from rnd_runtime.capture.capture import load_capture
 
@@ -105,7 +104,7 @@ def _subject(options: Stability, work: Path) -> Subject:
 
 
 def measured_on(on: str, subject: Subject) -> dict[str, Any]:
-    """What a row says of where and on what it was measured: the avatar's numbers only where that is the avatar."""
+    """Machine and subject of a row."""
     from numba import get_num_threads
 
     from rnd_runtime.playback.doctor import machine
@@ -120,17 +119,19 @@ def measured_on(on: str, subject: Subject) -> dict[str, Any]:
 
 
 def _long_runs(options: Stability, subject: Subject) -> Iterable[tuple[str, str, str, Sequence[Figure]]]:
-    """What --fuzz, --soak, --kill and --determinism ask for: id, failure, what it is measured on, figures."""
+    """The runs of --fuzz, --soak, --kill and --determinism: id, failure, subject, figures."""
     from .rows import AVATAR, SHORT
 
     if options.fuzz:
         yield "F", "hostile files", "small files", _fuzz(options, subject)
     if options.soak:
         from .soak import soak_playback, soak_training
+        from .soak_view import soak_view
 
         state = subject.work / "soak.json"
         yield "S1", "soak, playback", AVATAR, soak_playback(subject, options.soak, state)
         yield "S2", "soak, training", SHORT, soak_training(subject, options.soak // 10, state)
+        yield "S3", "soak, rnd-view", AVATAR, soak_view(subject, options.soak // 10)
     if options.kill:
         from .kill import kill_all
 
@@ -150,7 +151,7 @@ def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
     from .small import studio, train_small
 
     folder = subject.work / "fuzz"
-    if not (folder / "files/light.hdr").exists():  # which is written last
+    if not (folder / "files/light.hdr").exists():  # written last
         capture = studio(subject)
         small = train_small(folder / "run", capture, 12, 200)
         run_commands(folder, [export(small, folder / "small.onnx")])

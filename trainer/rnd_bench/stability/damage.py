@@ -1,4 +1,4 @@
-"""Damage to honest files, drawn by hypothesis: to their bytes, or below their outer layer."""
+"""Random damage to valid files, sampled by hypothesis: to their bytes, or below their outer layer."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ HOSTILE: tuple[Any, ...] = (
 
 
 def damage(draw: Any, honest: bytes, inner: Callable[[bytes, Any], bytes] | None) -> bytes:
-    """A broken copy, by choices of ``draw`` (hypothesis' data.draw)."""
+    """A broken copy; ``draw`` is hypothesis' data.draw."""
     if inner is not None and draw(st.booleans()):
         return inner(honest, draw)
     data = bytearray(honest)
     for _ in range(draw(st.integers(1, 4))):
         kind = draw(st.sampled_from(("flip", "write", "cut", "insert", "repeat")))
-        # half of all damage goes to the head, where the structure is
+        # half of the damage goes to the head, where the structure is
         reach = min(len(data), 256) if draw(st.booleans()) else len(data)
         start = draw(st.integers(0, max(reach - 1, 0)))
         if not data:
@@ -64,7 +64,7 @@ def _slots(tree: Any) -> Any:
 
 
 def npz_damage(honest: bytes, draw: Any) -> bytes:
-    """An archive whose checksums are right and one of whose members is not."""
+    """An archive with valid checksums and one broken member."""
     with zipfile.ZipFile(io.BytesIO(honest)) as source:
         members = {name: source.read(name) for name in source.namelist()}
     name = draw(st.sampled_from(sorted(members)))
@@ -105,7 +105,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def safetensors_damage(honest: bytes, draw: Any) -> bytes:
-    """A safetensors file whose JSON header is broken and whose length is right."""
+    """A safetensors file with a broken JSON header of the right length."""
     size = int.from_bytes(honest[:8], "little")
     head = json_damage(honest[8 : 8 + size], draw)
     return len(head).to_bytes(8, "little") + head + honest[8 + size :]

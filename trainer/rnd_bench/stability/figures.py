@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,10 +20,8 @@ class Figure:
     """One measured number and its limit.
 
     Attributes:
-        what: what was measured, in words.
-        measured: the number, None where the capture lacks what it is measured by. NaN never passes.
+        measured: None where the capture lacks the data. NaN never passes.
         line: the limit, such as "< 3"; empty where the number is only reported.
-        passes: whether it is within the limit.
         baseline, baseline_name: the same number of the plain method, where there is one.
         timing: the number depends on the machine's load; tests do not assert it.
     """
@@ -39,10 +37,14 @@ class Figure:
 
 
 class Result(NamedTuple):
-    """A row's figures, and the worst image beside its reference, 8-bit sRGB [H, W, 3], where there is one."""
+    """A row's figures; optionally its worst image and that image's reference, 8-bit sRGB [H, W, 3]."""
 
     figures: tuple[Figure, ...]
     images: tuple[Bytes, Bytes] | None = None
+
+
+def result(*figures: Figure, images: tuple[Bytes, Bytes] | None = None) -> Result:
+    return Result(figures, images)
 
 
 def below(what: str, measured: float, limit: float, unit: str = "", *, baseline: Baseline = None) -> Figure:
@@ -72,12 +74,11 @@ def holds(what: str, wrong: list[str]) -> Figure:
 
 
 def not_measured(what: str, why: str = "not in this capture") -> Figure:
-    """A figure that the capture has nothing to measure by; it does not pass."""
+    """A figure for which the capture has no data; it does not pass."""
     return Figure(f"{what} ({why})", None, "", "", False)
 
 
 def amount(number: float | None, unit: str) -> str:
-    """A figure with its unit."""
     return "not measured" if number is None else f"{number:.4g} {unit}".rstrip()
 
 
@@ -87,16 +88,16 @@ def _figure(what: str, measured: float, unit: str, line: str, passes: bool, base
     return Figure(what, number, unit, line, bool(passes), None if value is None else float(value), name)
 
 
-def refusal(call: Callable[[], object], *said: str) -> str | None:
-    """What is wrong with how ``call`` refuses bad input; None when it raises one line that holds all of ``said``."""
+def refusal(name: str, call: Callable[..., object], *arguments: Any, words: tuple[str, ...] = ()) -> list[str]:
+    """Faults of how ``call(*arguments)`` refuses bad input: none if it raises one line that contains all ``words``."""
     try:
-        call()
+        call(*arguments)
     except InputError as error:
         line = str(error)
-        missing = [word for word in said if word not in line]
+        missing = [word for word in words if word not in line]
         if "\n" in line:
-            return "more than one line"
-        return f"does not say {missing[0]!r}: {line[:80]}" if missing else None
-    except Exception as error:  # any other exception is the failure that is looked for
-        return f"{type(error).__name__}: {str(error)[:60]}"
-    return "accepted"
+            return [f"{name}: more than one line"]
+        return [f"{name}: does not say {missing[0]!r}: {line[:80]}"] if missing else []
+    except Exception as error:  # any other exception is a fault
+        return [f"{name}: {type(error).__name__}: {str(error)[:60]}"]
+    return [f"{name}: accepted"]

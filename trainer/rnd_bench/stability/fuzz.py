@@ -1,4 +1,4 @@
-"""Every reader is fed broken copies of an honest file, batch by batch, each batch in a process of its own."""
+"""Fuzzing of every reader with broken copies of a valid file, each batch in a process of its own."""
 
 from __future__ import annotations
 
@@ -27,10 +27,9 @@ MEMORY_FACTOR = 2.0
 def fuzz(
     folder: Path, count: int, only: tuple[str, ...] = (), on_batch: Callable[[], object] = lambda: None
 ) -> tuple[list[Figure], dict[str, Any]]:
-    """Feed ``count`` inputs to every reader; figures and the record.
+    """Feed ``count`` inputs to every reader, one reader per core; figures and the record.
 
-    Readers run side by side, as many as there are cores, each on its own copy of ``folder``. What a batch found is
-    stored beside its files, so that an interrupted run resumes. ``on_batch`` is called after each.
+    Each reader has a copy of ``folder``, in which results of batches are stored, so that an interrupted run resumes.
     """
     names = only or READERS
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
@@ -47,7 +46,6 @@ def fuzz(
 
 
 def batches(count: int) -> int:
-    """Number of batches for ``count`` inputs of a reader."""
     return -(-count // BATCH)
 
 
@@ -84,7 +82,7 @@ def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], obj
 
 
 def _batch(folder: Path, name: str, seed: int, size: int) -> dict[str, Any]:
-    """What ``hostile.feed`` reports from a process of its own; of one that died how, and its last input is kept."""
+    """The report of ``hostile.feed`` from a process of its own; if it died, how, and its last input is kept."""
     line = [sys.executable, "-m", "rnd_bench.stability.hostile", name, str(size), str(seed), str(folder)]
     code: int | str
     try:

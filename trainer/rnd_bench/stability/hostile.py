@@ -1,8 +1,8 @@
-"""The process in which a reader is fed broken files, and may die.
+"""The process in which a reader reads broken files, and may die.
 
-``python -m rnd_bench.stability.hostile READER COUNT SEED FOLDER`` reads COUNT inputs and prints one line of JSON. It
-runs under an address-space limit; a timer ends it when an input takes over five seconds of work. An audit hook notes
-what is executed, and files opened for writing outside FOLDER.
+``python -m rnd_bench.stability.hostile READER COUNT SEED FOLDER`` reads COUNT inputs and prints one line of JSON.
+Address space and processor time per input are limited. An audit hook records executed code and files written outside
+FOLDER.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from rnd_runtime.core.errors import InputError
 
 from .damage import damage, json_damage, npz_damage, safetensors_damage
 
-HANG_S = 5.0  # of processor time for one input, so that a busy machine is not taken for a hang
-SPARE_BYTES = 2 << 30  # address space beyond what importing took
+HANG_S = 5.0  # processor time for one input
+SPARE_BYTES = 2 << 30  # address space beyond that of the imports
 EVENTS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pickle.find_class"}
-"""of Python's audit, that no reader of ours has a reason for"""
+"""audit events that no reader may cause"""
 READERS = ("capture", "motion", "body", "exr", "hdr", "checkpoint", "avatar")
 
 
 class Target(NamedTuple):
-    """A reader, the honest file it reads, and how to get below its outer layer (None: bytes only)."""
+    """A reader, a valid file, and a function that damages it below its outer layer (None: bytes only)."""
 
     read: Callable[[Path], object]
     honest: Path
@@ -41,12 +41,11 @@ class Target(NamedTuple):
 
     @property
     def broken(self) -> Path:
-        """The file that broken copies are written to."""
         return self.honest.with_name(f"broken{self.honest.suffix}")
 
 
 def target_of(name: str, folder: Path) -> Target:
-    """The reader ``name`` of ``folder``'s honest files (see ``prepare``). Imports what it needs and no more."""
+    """The reader ``name`` of ``folder``'s valid files; only its own imports are loaded."""
     if name == "capture":
         from rnd_runtime.capture.capture import load_capture
 
@@ -71,7 +70,7 @@ def target_of(name: str, folder: Path) -> Target:
 
 
 def _posed_once(path: Path) -> object:
-    """An avatar and its rest pose: what is wrong with a graph may show only when it is evaluated."""
+    """An avatar and its rest pose: some faults of a graph show only in its evaluation."""
     from rnd_runtime.avatar.avatar import Avatar
     from rnd_runtime.motion.motion import Motion
 
@@ -82,7 +81,7 @@ def _posed_once(path: Path) -> object:
 
 
 def prepare(folder: Path, avatar: Path, checkpoint: Path, capture: Path) -> None:
-    """Write small honest files of every kind into ``folder``, light.hdr last."""
+    """Write small valid files of every kind into ``folder``, light.hdr last."""
     import OpenImageIO as oiio
 
     from rnd_runtime.core.images import write_image
@@ -106,7 +105,7 @@ def feed(name: str, count: int, first: int, folder: Path) -> dict[str, Any]:
     target = target_of(name, folder)
     honest = target.honest.read_bytes()
     report: dict[str, Any] = {"inputs": 0, "refused": 0, "read": 0, "escaped": {}, "audit": [], "peak_bytes": 0}
-    target.read(target.honest)  # imports and caches that are filled late are filled now
+    target.read(target.honest)  # fills imports and caches
     start = _status("VmRSS")
     report["honest_bytes"] = start + _used(lambda: target.read(target.honest))
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
@@ -146,8 +145,8 @@ def feed(name: str, count: int, first: int, folder: Path) -> dict[str, Any]:
 
 
 def _used(work: Callable[[], object]) -> int:
-    """Bytes by which resident memory rose at its highest while ``work`` ran."""
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the high-water mark starts anew
+    """Peak increase of resident memory during ``work``, bytes."""
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the high-water mark
     before = _status("VmRSS")
     work()
     return max(_status("VmHWM") - before, 0)
@@ -159,7 +158,7 @@ def _status(name: str) -> int:
 
 
 def _watch(folder: Path, seen: list[str]) -> None:
-    """Note forbidden events, and files opened for writing outside ``folder``."""
+    """Record forbidden events, and files opened for writing outside ``folder``, in ``seen``."""
     inside = str(folder.resolve())
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:

@@ -1,4 +1,4 @@
-"""``kill -9`` at random moments: files under a final name are complete, and training resumes along the same curve."""
+"""``kill -9`` at random times: files under a final name are complete, and training resumes along the same curve."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ from .processes import TRAIN, Command, environment, export, play
 from .small import studio
 
 STEPS, SAVED_EVERY = 48, 4
-STEP_SECONDS = 60.0  # the latest moment at which a command is killed
-PATIENCE = 4  # runs for each kill, at most: some end by themselves first
+STEP_SECONDS = 60.0  # latest time of a kill after the start
+PATIENCE = 4  # runs per kill, at most: some end before they are killed
 
 
 def kill_all(subject: Subject, times: int) -> list[Figure]:
     """Kill training, export and play ``times`` times each.
 
-    Training resumes after each kill. Whenever it comes to its end, its curve is compared with an unbroken one, and the
-    next starts anew.
+    Training resumes after each kill; each complete curve is compared with an unbroken one.
     """
     folder = subject.work / "kill"
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,7 +46,7 @@ def kill_all(subject: Subject, times: int) -> list[Figure]:
     rng, figures = np.random.default_rng(6), []
 
     def kill(name: str, command: Command, duration: float, ended: Callable[[], None] = lambda: None) -> None:
-        """Add the figure of a command that takes ``duration`` seconds; ``ended`` follows each run to its end."""
+        """Add the figure of a command that takes ``duration`` seconds; ``ended`` is called after each complete run."""
         wrong: set[str] = set()
         killed = runs = 0
         while killed < times and runs < PATIENCE * times:
@@ -63,7 +62,7 @@ def kill_all(subject: Subject, times: int) -> list[Figure]:
     kill("export", exporting, _timed(exporting, folder))
     playing = play(subject.avatar_file, folder / "walk.npz", folder / "play", "--size", 48, "--format", "png,exr,mp4")
     kill("play", playing, _timed(playing, folder))
-    _timed(train("compiled"), folder)  # what numba has just compiled adds in another order than what it finds compiled
+    _timed(train("compiled"), folder)  # kernels just compiled sum in another order than kernels from numba's cache
     duration = _timed(train("whole"), folder)
     curves: list[float] = []
 
@@ -83,14 +82,14 @@ def _resuming(command: Command, out: Path) -> Command:
 
 
 def _started(command: Command, folder: Path, errors: int) -> subprocess.Popen[str]:
-    """At one thread, since bits are compared."""
+    """A process with one thread: bits are compared."""
     line = [sys.executable, "-c", f"import sys; from {command[0]} import main; sys.exit(main())", *command[1]]
     env = environment(OMP_NUM_THREADS="1", NUMBA_NUM_THREADS="1")
     return subprocess.Popen(line, cwd=folder, env=env, stdout=subprocess.DEVNULL, stderr=errors, text=True)
 
 
 def _timed(command: Command, folder: Path) -> float:
-    """Seconds of a run to its end."""
+    """Seconds of a complete run."""
     begin = time.monotonic()
     process = _started(command, folder, subprocess.PIPE)
     errors = process.communicate()[1]
@@ -100,7 +99,7 @@ def _timed(command: Command, folder: Path) -> float:
 
 
 def _killed(command: Command, folder: Path, after: float) -> bool:
-    """Start, wait, kill; whether it was still running."""
+    """Kill a command ``after`` seconds; whether it was still running."""
     process = _started(command, folder, subprocess.DEVNULL)
     try:
         process.wait(after)
@@ -112,7 +111,7 @@ def _killed(command: Command, folder: Path, after: float) -> bool:
 
 
 def incomplete_files(folder: Path) -> list[str]:
-    """Files under their final names that cannot be read to their end."""
+    """Files under their final names that cannot be read completely."""
     readers: dict[str, Callable[[Path], object]] = {
         ".png": read_image,
         ".exr": read_image,
@@ -139,7 +138,7 @@ def _decode(path: Path) -> None:
 
 
 def _off(unbroken: Path, resumed: Path) -> float:
-    """Largest difference of any term in two metrics logs; infinite when rows are missing or doubled."""
+    """Largest difference of any term in two metrics logs; infinite for missing or repeated rows."""
     logs = [
         [json.loads(line) for line in (folder / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
         for folder in (unbroken, resumed)

@@ -1,4 +1,4 @@
-"""Running our commands as a user does, in a process of their own."""
+"""Commands run in processes of their own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PATIENCE_S = 600
 
 Command = tuple[str, list[str]]  # the module whose ``main`` is run, and its arguments
 
-# Several commands in one interpreter, since each start costs seconds: their exit codes and stderr come back as JSON.
+# Runs several commands in one interpreter; prints exit code and stderr of each as JSON.
 _DRIVER = """
 import contextlib, importlib, io, json, os, sys
 for module, arguments in json.loads(sys.argv[1]):
@@ -33,7 +33,7 @@ for module, arguments in json.loads(sys.argv[1]):
 
 
 class Done(NamedTuple):
-    """How a command ended: its exit code (or the exception that escaped it) and its stderr."""
+    """Exit code of a command, or the exception that escaped it, and its stderr."""
 
     code: int | str
     errors: str
@@ -58,12 +58,12 @@ def export(checkpoint: Path, out: Path, *options: str) -> Command:
 
 
 def environment(**more: str) -> dict[str, str]:
-    """This process's environment with its import path, so that a child finds the same packages."""
+    """This process's environment with its import path."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path), **more}
 
 
 def run_commands(folder: Path, commands: Sequence[Command], **more: str) -> list[Done]:
-    """Run ``commands`` one after the other in one fresh interpreter, in ``folder``."""
+    """Run ``commands`` in sequence in one interpreter, in ``folder``."""
     result = subprocess.run(
         [sys.executable, "-c", _DRIVER, json.dumps(list(commands))],
         cwd=folder,

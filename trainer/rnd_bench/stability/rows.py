@@ -1,4 +1,4 @@
-"""Every row of the stability list, in its order."""
+"""The rows of the stability list."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MADE = "Gaussians or a light made for it"
 
 
 class Row(NamedTuple):
-    """One failure mode: its id in the list, its name, what measures it, and ``on`` what."""
+    """One failure mode: its id in the list, its name, its measure and what it is measured ``on``."""
 
     id: str
     failure: str
@@ -85,4 +85,3 @@ ROWS: tuple[Row, ...] = (
     Row("R12", "no display", files.no_display),
 )
 TIMES = Row("T", "time in the worst cases", stress.worst_cases)
-"""not in the list: accuracy and speed under stress belong to the same chart"""

@@ -15,7 +15,7 @@ from rnd_trainer.training.training import Training
 
 
 def tiny_config(*, steps: int, gaussians: int = 1200) -> TrainConfig:
-    """A training of seconds with all that a long one has."""
+    """A training of seconds with all parts of a long one."""
     model = ModelConfig(gaussians=gaussians, nodes=gaussians // 4, width=32, attribute_width=32, window_poses=5)
     config = dataclasses.replace(TrainConfig(), model=model, steps=steps, stage1_fraction=0.4)
     return dataclasses.replace(config, light_texels=64, visibility_directions=6)
@@ -28,7 +28,7 @@ def studio(subject: Subject) -> Capture:
 
 
 def train_small(folder: Path, capture: Capture, steps: int, gaussians: int) -> Path:
-    """Train an avatar of seconds and return its checkpoint."""
+    """Train for seconds and return the checkpoint."""
     training = Training(capture, tiny_config(steps=steps, gaussians=gaussians))
     run(training, folder, on_step=lambda step: None, on_preview=lambda: None)
     return folder / "avatar.ckpt"

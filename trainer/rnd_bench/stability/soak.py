@@ -1,8 +1,8 @@
-"""Hours of playback and of training, watched for memory, pace and bits.
+"""Hours of playback and of training: memory, pace and determinism.
 
-Every process adds its segment to ``soak_NAME.json`` in the work folder, so that an interrupted soak resumes; slopes are
-of single segments. Pace is reported as it is, and over that of a fixed load timed after each frame: the pace of a
-shared machine changes by half within the hour.
+Every process adds a segment to ``soak_NAME.json`` in the work folder, so that an interrupted soak resumes; slopes are
+of single segments. Pace is also reported over that of a fixed load timed after each frame, since the pace of a shared
+machine changes by half within an hour.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from .figures import Figure, at_most, below, not_measured
 from .small import studio, tiny_config
 
 SLOPE_BYTES = 1000.0
-WARM = 200  # frames or steps before memory is watched: caches fill
+WARM = 200  # frames or steps before memory is read: caches fill
 EVERY = 20  # frames or steps between two readings
 TOO_SHORT = "too few in one go"
 PACE = 1.2  # median of the last tenth over that of the first, among frames or steps of one kind
 
 
 def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
-    """Play ``frames`` frames of one motion again and again; earlier processes' frames count."""
+    """Play ``frames`` frames of a repeated motion, including those of earlier processes."""
     walk, camera = subject.walk(4.0), subject.camera()
     count = walk.frame_count
 
@@ -50,10 +50,7 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
 
 
 def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
-    """Train in one go, ``steps`` steps of each kind: plain colours, sampled texels, the whole light.
-
-    Steps of the last kind do twice the first's work, so the end of each kind is compared with its own start.
-    """
+    """Train ``steps`` steps of each kind: plain colours, sampled texels, the whole light."""
     config = tiny_config(steps=3 * steps, gaussians=subject.few(400, 4000))
     training = Training(studio(subject), replace(config, stage1_fraction=1 / 3, full_light_fraction=1 / 3))
     training.warm_up()
@@ -67,7 +64,7 @@ def soak_training(subject: Subject, steps: int, state: Path) -> list[Figure]:
 
 
 def _fixed_load(subject: Subject) -> Callable[[], object]:
-    """One image, always the same: the machine's current pace."""
+    """A constant render, which measures the machine's current pace."""
     rest, camera = subject.rest, subject.camera()
     return lambda: rasterize(rest.means, rest.covariances, rest.opacities, rest.albedo, camera)
 
@@ -82,11 +79,11 @@ def _soak(
     period: int = 0,
     borders: Sequence[int] = (),
 ) -> list[Figure]:
-    """Run ``work`` until ``total``, ``load`` after each.
+    """Call ``work`` and ``load`` until ``total``.
 
     Args:
-        period: frames after which the same bits must come back; 0 where nothing repeats.
-        borders: where each kind of step ends; by default all are of one kind.
+        period: frames after which the same bits are expected; 0: never.
+        borders: ends of the kinds of steps; by default all are of one kind.
     """
     state = state.with_stem(f"{state.stem}_{name}")
     record: dict[str, Any] = json.loads(state.read_text(encoding="utf-8")) if state.exists() else {}
@@ -139,13 +136,13 @@ def _figures(name: str, segments: list[dict[str, Any]], repeats: bool, borders: 
 
 
 def _parts(readings: list[int], borders: Sequence[int]) -> list[list[int]]:
-    """``readings`` cut where a kind of step begins, which allocates memory of its own, once."""
+    """``readings`` split at the borders: each kind of step allocates memory of its own once."""
     cuts = [max(0, -(-border // EVERY) - WARM // EVERY) for border in (0, *borders)]
     return [readings[start:end] for start, end in pairwise(cuts)]
 
 
 def _slope(readings: list[int]) -> float:
-    """Bytes a frame, least squares over the readings."""
+    """Least-squares slope of the readings, bytes per frame."""
     return float(np.polyfit(EVERY * np.arange(len(readings)), readings, 1)[0])
 
 
@@ -155,12 +152,8 @@ def _pace(seconds: list[float]) -> float:
 
 
 def _resident() -> int:
-    """Bytes that this process wrote and holds.
-
-    Clean pages are files', counted only while no other process maps them. Freed memory that malloc retains, tens of MB,
-    is given back first: a leak stays.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # glibc has it
+    """Private dirty and swapped bytes of this process, after malloc has returned freed memory."""
+    with contextlib.suppress(OSError, AttributeError):  # glibc only
         ctypes.CDLL(None).malloc_trim(0)
     fields = dict(line.split(":", 1) for line in Path("/proc/self/smaps_rollup").read_text("ascii").splitlines()[1:])
     return 1024 * sum(int(fields[name].split()[0]) for name in ("Private_Dirty", "Swap"))

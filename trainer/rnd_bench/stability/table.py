@@ -1,4 +1,4 @@
-"""The table of what was measured: JSON, Markdown and images. Rows stay until they are measured again."""
+"""The table of measured rows: JSON, Markdown and images."""
 
 from __future__ import annotations
 
@@ -19,18 +19,14 @@ MARKS = {"pass": "✓", "fail": "✗"}
 
 
 def rows_of(file: Path) -> list[dict[str, Any]]:
-    """Rows measured before; raises ``InputError`` for another file."""
+    """Rows of an earlier table; another file is refused."""
     return earlier_rows(file, what="rows of rnd-bench stability", names=("id", "what"))
 
 
 def store(
     file: Path, about: dict[str, Any], figures: Sequence[Figure], images: tuple[Bytes, Bytes] | None = None
 ) -> None:
-    """Replace a row's figures in ``file`` and in the .md beside it, and its images.
-
-    Args:
-        about: ``id``, ``failure``, and what the row was measured on.
-    """
+    """Replace a row's figures in ``file`` and in the .md beside it, and its images; ``about`` identifies the row."""
     rows = [row for row in rows_of(file) if row["id"] != about["id"]]
     for figure in figures:
         row = {name: about[name] for name in ("id", "failure")}
@@ -54,7 +50,7 @@ def verdict(figure: Figure) -> str:
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a table. JSON has null for NaN: the verdict tells it from what was not measured."""
+    """The rows as a table; null in JSON is NaN where the verdict is not "not measured"."""
     lines = ["| id | failure | measured | | line | | the plain method |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         baseline, unit, measured = "", row["unit"], row["measured"]
@@ -71,7 +67,6 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def line_of(name: str, figure: Figure) -> str:
-    """A figure for the terminal."""
     baseline = ""
     if figure.baseline is not None:
         baseline = f"  ({figure.baseline_name}: {amount(figure.baseline, '')})"

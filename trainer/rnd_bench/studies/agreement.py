@@ -1,8 +1,7 @@
-"""Our renderer, given the truth, against Mitsuba: a ball and a person under every light of the stage.
+"""Our renderer with true attributes against Mitsuba: a ball and a person under every light of the stage.
 
-The runtime shades and splats Gaussians with true positions, normals, albedo and roughness, and with visibility fitted
-to shadows traced through the true surface. Mitsuba renders the same surface with direct light alone, as our model
-does, and with interreflection.
+The runtime renders Gaussians with true positions, normals, albedo and roughness, and with visibility fitted to traced
+shadows. Mitsuba renders the same surface with direct light, as our model does, and with interreflection.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ MODES = ("brute", "table+sun")  # shading modes of the runtime that are compared
 QUADRATURE = 14
 DISC, THICKNESS = 0.55, 0.05  # standard deviations of a Gaussian in its plane and across, in spacings
 OPACITY = 0.99
-RIM = 2  # pixels at the silhouette that "inside" leaves out: splats have softer edges
+RIM = 2  # pixels at the silhouette excluded from "inside": splats have softer edges
 DIRECT, FULL = 2, 5  # path depths
 PROBE = (32, 64)  # texels of our sums, as in training
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One body under one light: the figures and their images.
+    """One body under one light.
 
     Attributes:
         row: see ``compare``.
-        ours, direct, full: linear radiance [H, W, 3]: the runtime's in the first mode, Mitsuba's direct light alone,
+        ours, direct, full: linear radiance [H, W, 3]: the runtime's in the first mode, Mitsuba's of direct light,
             Mitsuba's with interreflection.
     """
 
@@ -77,7 +76,7 @@ def ball(radius: float = 0.5, height: float = 0.92, rings: int = 96) -> Surface:
 
 
 def true_gaussians(surface: Surface) -> Gaussians:
-    """A Gaussian at every vertex (vertices closer than half the usual spacing are merged), all attributes true."""
+    """A Gaussian with true attributes at every vertex; those closer than half the spacing are merged."""
     vertices, spacing = surface.vertices, _spacing(surface)
     chosen = _thinned(vertices, 0.5 * spacing)
     points, normals = vertices[chosen], surface.normals[chosen]
@@ -123,15 +122,11 @@ def fitted_visibility(points: Floats, normals: Floats, radius: float) -> Floats:
 def compare(
     name: str, surface: Surface, camera: Camera, samples: int, chosen: tuple[str, ...] = ()
 ) -> Iterator[Comparison]:
-    """One body under every light, or those ``chosen``, by ``samples`` of Mitsuba's paths a pixel.
+    """One body under every light, or those ``chosen``, with ``samples`` of Mitsuba's paths per pixel.
 
     In a row, ``psnr`` is of sRGB images against direct light, ``psnr_inside`` of the pixels well inside the
-    silhouette; ``energy`` is ours over theirs there; ``interreflection_*`` is Mitsuba's direct light against its full
-    paths, and ``noise_psnr`` the upper bound from Mitsuba's noise. ``cpu_seconds`` is the processor time of the
-    light's images, all cores together.
-
-    Raises:
-        InputError: a light that the stage does not have, or images too small.
+    silhouette, ``energy`` the ratio ours / Mitsuba's there; ``interreflection_*`` compares Mitsuba's direct light with
+    its full paths; ``noise_psnr`` is the upper bound by Mitsuba's noise.
     """
     lights = {light.name: light for light in stage_lights()}
     unknown = sorted(set(chosen) - set(lights))
@@ -156,7 +151,7 @@ def compare(
             "gaussians": len(gaussians.means),
             "size": camera.width,
             "samples": samples,
-            # the mean of both halves has half the deviation that their difference has
+            # the mean of both halves has half the deviation of their difference
             "noise_psnr": _psnr(first, second, inside) + 20 * np.log10(2),
             "interreflection_psnr": _psnr(truth, paths, inside),
             "interreflection_energy": float(paths[inside].sum() / truth[inside].sum() - 1),
@@ -183,14 +178,14 @@ def _psnr(a: NDArray[np.floating], b: NDArray[np.floating], where: NDArray[np.bo
 
 
 def _spacing(surface: Surface) -> float:
-    """The square root of the area of a vertex: the distance of even samples."""
+    """The square root of the area per vertex."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     return float(np.sqrt(area / len(surface.vertices)))
 
 
 def _thinned(points: Floats, distance: float) -> NDArray[np.int64]:
-    """Indices of points of which no two are closer than ``distance``; the first of each cluster stays."""
+    """Indices of points at least ``distance`` apart, the first of each cluster."""
     gone = np.zeros(len(points), bool)
     pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
     for i, j in pairs[np.lexsort(pairs.T[::-1])]:

@@ -1,4 +1,4 @@
-"""``rnd-bench study``: trainings of many variants, and what stands on the light stage."""
+"""``rnd-bench study``: trainings of many variants, and studies on the light stage."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ WIDTH = 140  # characters of the widest table
 
 
 def run_trainings(options: Trainings) -> None:
-    """Train a study's rows into the folder ``options.run``; print their table, write summary and rows."""
+    """Train a study's variants; print their table, write summary and rows."""
     variants = chosen(STUDIES[type(options)], options.variants)
     check_option(1 <= options.seeds <= MAX_SEEDS, "--seeds", f"1 to {MAX_SEEDS}", options.seeds)
     check_mode(options.shade)
@@ -56,7 +56,7 @@ def run_trainings(options: Trainings) -> None:
 
 
 def _trained(options: Trainings, config: TrainConfig, variants: Sequence[StudyRow]) -> list[dict[str, Any]]:
-    """Scores of every row and seed, trained with a progress bar where they were not before."""
+    """Scores of every variant and seed; missing ones are trained."""
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)
     for note in capture_notes(capture, HELD_OUT):
@@ -94,7 +94,7 @@ def _show(summary: Sequence[dict[str, Any]], study: str) -> None:
 
 
 def _with_gain(cell: dict[str, Any]) -> str:
-    """Mean ± spread, and the difference to the row it is read beside; in brackets where the seeds differ by more."""
+    """Mean ± deviation, and the gain over the variant beside; in brackets where the seeds differ by more."""
     text = f"{cell['mean']:.2f}" + ("" if cell["spread"] is None else f" ± {cell['spread']:.2f}")
     if "gain" not in cell:
         return text
@@ -103,12 +103,11 @@ def _with_gain(cell: dict[str, Any]) -> str:
 
 
 def _wide_console() -> Console:
-    """Wraps lines on a narrow terminal instead of cutting figures."""
     return Console(width=max(Console().width, WIDTH), soft_wrap=True)
 
 
 def run_people(options: People) -> None:
-    """Render every subject, train, score; print the means, write all."""
+    """Render every subject, train, score; print the means, write the rows."""
     need_extra()
     options.sizes.check()
     variant = use_variant(options.variant)
@@ -123,8 +122,6 @@ def run_people(options: People) -> None:
         film_subjects(
             options.sizes, options.out, variant, lambda done, total: progress.update(done, step=f"{done}/{total}")
         )
-        if options.film_only:
-            return
         progress.phase("trainings")
 
         def on_run(what: str, done: float, total: int) -> None:
@@ -141,7 +138,7 @@ def run_people(options: People) -> None:
 
 
 def run_agreement(options: Agreement) -> None:
-    """Compare with Mitsuba under every light; print the table, write rows and sheet."""
+    """Compare with Mitsuba under every light; print the table, write rows and images."""
     need_extra()
     check_option(options.size >= 16, "--size", "at least 16", options.size)
     check_option(options.samples >= 2, "--samples", "at least 2", options.samples)

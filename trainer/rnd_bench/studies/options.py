@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import Count, Flag, Number, OptionalCount, OptionalFile, option
+from rnd_runtime.core.command import Count, Number, OptionalCount, OptionalFile, option
 from rnd_runtime.core.errors import check_option, flag
 from rnd_stage.film.plan import Recipe
 from rnd_stage.variants import Variant
@@ -120,8 +120,6 @@ class People:
     """write summary, cost and rows here"""
     perceptual_weights: OptionalFile = None
     """adds LPIPS to the metrics and to the training, as in rnd-train"""
-    film_only: Flag = False
-    """stop when all is rendered"""
     sizes: Annotated[PeopleSizes, tyro.conf.arg(name="")] = field(default_factory=PeopleSizes)
     variant: Variant = "auto"
     """Mitsuba's back end"""

@@ -1,7 +1,4 @@
-"""People of the light stage: render every subject, train on one camera's white light, score the rest.
-
-Images, trainings and rows are in one folder, and nothing is done twice.
-"""
+"""People of the light stage: render every subject, train on one camera's white light, score the rest; resumes."""
 
 from __future__ import annotations
 
@@ -30,11 +27,11 @@ from .variants import VARIANTS
 METHODS = ("ours", "static skinning", "LBS, plain colour")
 COST_FILE = "cost.json"
 FIGURES = ("psnr", "ssim", "lpips", "psnr_box", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
-"""of rnd-eval, averaged over the subjects"""
+"""metrics of rnd-eval, averaged over the subjects"""
 
 
 def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Callable[[int, int], None]) -> None:
-    """Render what is missing of every subject; ``on_image`` is called with the number of images done and of all."""
+    """Render the missing images of every subject; ``on_image`` is called with the numbers of images done and of all."""
     done, total = 0, None
     for subject in range(sizes.subjects):
         out = folder / f"subject{subject}"
@@ -53,7 +50,7 @@ def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Call
         started, started_cpu = time.perf_counter(), time.process_time()
         try:
             film(production, out, on_image=count)
-        finally:  # of an interrupted run too
+        finally:
             images = image_count([view for view in fresh if not missing(out, view, False)])
             spent = {
                 "images": images,
@@ -66,7 +63,7 @@ def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Call
 
 
 def _added(file: Path, spent: dict[str, float]) -> dict[str, Any]:
-    """``spent`` with what earlier runs left in ``file``."""
+    """``spent`` plus the costs of earlier runs in ``file``."""
     before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     return {name: value + before.get(name, 0) for name, value in spent.items()}
 
@@ -74,10 +71,9 @@ def _added(file: Path, spent: dict[str, float]) -> dict[str, Any]:
 def run_study(
     sizes: PeopleSizes, folder: Path, *, perceptual: Perceptual | None, on_run: Callable[[str, float, int], None]
 ) -> dict[str, Any]:
-    """Train and score every method on every filmed subject: rows, their summary, and what it all cost.
+    """Train and score every method on every rendered subject: rows, summaries and cost.
 
-    ``on_run`` is called with a line on what is being trained, how many trainings are done (that in hand by its share of
-    steps) and how many there are.
+    ``on_run`` is called with the current training's name, the number of trainings done (a fraction) and of all.
     """
     started = time.perf_counter()
     base = resized(preset("quick"), sizes.gaussians, sizes.steps)
@@ -117,9 +113,9 @@ def run_study(
 
 
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for every method and split: FIGURES as means over the subjects, the seeds of one counting as one.
+    """A row for every method and split: FIGURES as means over the subjects, of each the mean over its seeds.
 
-    ``psnr_spread`` is the standard deviation over the first subject's seeds; a figure that no row has is None.
+    ``psnr_spread`` is the standard deviation over the first subject's seeds; a figure without rows is None.
     """
     table = []
     for method, split in dict.fromkeys((row["method"], row["split"]) for row in rows):
@@ -139,10 +135,7 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _cost(folder: Path, sizes: PeopleSizes, rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
-    """Seconds an image with its truth, and hours of rendering and training, as measured when it was done.
-
-    Subjects that rnd-stage rendered by itself left no figures; where none did, those of images are None.
-    """
+    """Measured seconds per image, and hours of rendering and training; None where rnd-stage recorded no cost."""
     files = [folder / f"subject{subject}" / COST_FILE for subject in range(sizes.subjects)]
     filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
     images, filming, cpu = (sum(f[key] for f in filmed) for key in ("images", "seconds", "cpu_seconds"))

@@ -8,16 +8,14 @@ from typing import Any
 
 from .variants import StudyRow
 
-MEANS = ("psnr", "ssim", "lpips", "psnr_n")  # figures whose means a summary has
+MEANS = ("psnr", "ssim", "lpips", "psnr_n")
 
 
-def summarise(
-    rows: Sequence[dict[str, Any]], variants: Sequence[StudyRow], figure: str = "psnr"
-) -> list[dict[str, Any]]:
-    """One row for each variant: mean and spread (standard deviation) over seeds of ``figure`` on every split.
+def summarise(rows: Sequence[dict[str, Any]], variants: Sequence[StudyRow]) -> list[dict[str, Any]]:
+    """One row for each variant: mean and standard deviation of the PSNR over seeds, on every split.
 
-    ``gain`` is the mean over seeds of the difference to the variant ``beside``, seed by seed; ``shows`` is whether it
-    exceeds the spread of those differences (None of one seed). The means of ``MEANS`` are added.
+    ``gain`` is the mean of the paired differences to the variant ``beside``; ``shows`` is whether it exceeds their
+    standard deviation (None for one seed). The means of ``MEANS`` are added.
     """
     by_key = {(row["method"], row["split"], row["seed"]): row for row in rows}
     splits = list(dict.fromkeys(row["split"] for row in rows))
@@ -26,14 +24,14 @@ def summarise(
     for variant in variants:
         cells: dict[str, Any] = {"method": variant.name, "what": variant.what, "beside": variant.beside}
         for split in splits:
-            own = {s: by_key[variant.name, split, s][figure] for s in seeds if (variant.name, split, s) in by_key}
+            own = {s: by_key[variant.name, split, s]["psnr"] for s in seeds if (variant.name, split, s) in by_key}
             if not own:
                 continue
             cells[split] = {"mean": statistics.fmean(own.values()), "spread": _spread(list(own.values()))}
             scored = [by_key[variant.name, split, s] for s in own]
-            cells[split] |= _means(scored, (name for name in MEANS if name != figure))
+            cells[split] |= _means(scored, MEANS[1:])
             gains = [
-                value - by_key[variant.beside, split, s][figure]
+                value - by_key[variant.beside, split, s]["psnr"]
                 for s, value in own.items()
                 if variant.beside and (variant.beside, split, s) in by_key
             ]
@@ -52,7 +50,7 @@ def summarise(
 
 
 def _means(rows: Sequence[dict[str, Any]], names: Iterable[str]) -> dict[str, float]:
-    """Of the columns ``names`` that all ``rows`` have a number in."""
+    """Means of the columns that are numbers in all ``rows``."""
     return {
         name: statistics.fmean(row[name] for row in rows)
         for name in names
@@ -61,5 +59,5 @@ def _means(rows: Sequence[dict[str, Any]], names: Iterable[str]) -> dict[str, fl
 
 
 def _spread(values: list[float]) -> float | None:
-    """None of a single value: JSON has no NaN."""
+    """Standard deviation; None for a single value."""
     return statistics.stdev(values) if len(values) > 1 else None

@@ -1,4 +1,4 @@
-"""The trainings of a study on one capture: same steps, same seeds; each is run once and scored."""
+"""The trainings of a study on one capture, each run once and scored."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ from rnd_trainer.training.training import StepResult, Training
 
 from .variants import StudyRow
 
-ROWS = "rows.json"  # of one run, in its folder
-MOTION = "motion"
-"""of a row: the file of the poses that were scored in, and learned from unless the method says otherwise"""
-CAPTURE = "capture_sha256"  # of a row: the digest of capture.json, which names the images of every split
-FEATURES = "consistency_sha256"  # of a row: the network whose features L_gc compared in training
+ROWS = "rows.json"  # in the folder of a run
+MOTION = "motion"  # column: the motion file of the scored poses
+CAPTURE = "capture_sha256"  # column: digest of capture.json
+FEATURES = "consistency_sha256"  # column: the network of L_gc
 ELSEWHERE = "another folder for RUN, or delete this one"
-NOISY_MOTION = "motion_noisy.npz"  # beside a capture's exact motion
-TIMED = 20  # evaluations of the motion encoder whose median is reported
+NOISY_MOTION = "motion_noisy.npz"  # in a capture's folder
+TIMED = 20  # timed evaluations of the motion encoder
 
 
 def ablate(
@@ -50,13 +49,11 @@ def ablate(
     mode: str = "table+sun",
     on_run: Callable[[str, int, float, int], None],
 ) -> list[dict[str, Any]]:
-    """Train and score every variant with every seed; rows as of rnd-eval with the encoder's cost added.
+    """Train and score every variant with every seed; rows of rnd-eval with the encoder's cost.
 
-    The third stage is off but in the row that asks for it. Each run leaves ``rows.json`` in ``folder/NAME-SEED`` and is
-    not done again where that exists. ``on_run`` is called with the variant's name, the seed, the number of runs done
-    (that in hand by its share of steps) and of all runs.
-
-    Raises ``InputError``, before anything is trained, where an earlier run in ``folder`` is not of this study.
+    The third stage is off by default. Runs with ``rows.json`` in ``folder/NAME-SEED`` are not repeated; those of other
+    studies are refused before any training. ``on_run`` is called with the variant's name, the seed, the number of runs
+    done (a fraction) and of all.
     """
     learned = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256_of(capture.file)}
     rows: list[dict[str, Any]] = []
@@ -105,7 +102,7 @@ def ablate(
 
 
 def check_needs(variants: Iterable[StudyRow], capture: Capture) -> None:
-    """Raise ``InputError`` where ``capture`` lacks what one of ``variants`` learns from."""
+    """Raise ``InputError`` if ``capture`` lacks data of one of ``variants``."""
     for variant in variants:
         if variant.noisy:
             _noisy(capture)
@@ -127,7 +124,7 @@ def _noisy(capture: Capture) -> Capture:
 
 
 def _refuse_others(before: dict[str, Any], same: dict[str, Any], stage: str, file: Path) -> None:
-    """Raise ``InputError`` where an earlier run does not say ``same``."""
+    """Raise ``InputError`` if an earlier run differs from ``same``."""
     for name, value in same.items():
         got = before.get(name)
         if got != value:
@@ -146,7 +143,7 @@ def _rows(run_folder: Path) -> list[dict[str, Any]]:
 def time_encoders(
     rows: list[dict[str, Any]], folder: Path, variants: Sequence[StudyRow], seed: int
 ) -> list[dict[str, Any]]:
-    """``rows`` with every variant's ``encoder_cost`` measured now, one after the other, on its avatar of ``seed``."""
+    """``rows`` with every variant's ``encoder_cost`` measured in sequence on its avatar of ``seed``."""
     costs = {
         variant.name: encoder_cost(load_checkpoint(_run_folder(folder, variant, seed) / "avatar.ckpt").model)
         for variant in variants
@@ -156,7 +153,7 @@ def time_encoders(
 
 @torch.no_grad()
 def encoder_cost(model: AvatarModel) -> dict[str, float]:
-    """FLOPs (2 per multiply-add) and median milliseconds in torch of the motion encoder D_W at its nodes."""
+    """GFLOP (2 per multiply-add) and median milliseconds in torch of the motion encoder D_W at its nodes."""
     if not model.config.dynamic_skinning:
         return {"encoder_gflop": 0.0, "encoder_ms": 0.0}
     joints = model.log_weights.shape[1] - 1
@@ -181,7 +178,7 @@ def _train(
     truth: Capture,
     on_share: Callable[[float], None],
 ) -> dict[str, float]:
-    """Train on ``seen``; the poses' errors before and after, in degrees, where they were not exact."""
+    """Train on ``seen``; return the poses' errors before and after, degrees, where they were not exact."""
     folder.mkdir(parents=True, exist_ok=True)
     training = Training(seen, config, perceptual, consistency=consistency)
     if (folder / STATE_FILE).exists():

@@ -1,8 +1,4 @@
-"""The variants of the studies: what is switched, and beside which other it is read.
-
-``VARIANTS`` are the paper's ablations. ``CAUSES`` tell what limits the figures: each takes one doubt away (true light,
-true normals) or adds one (noisy poses, fewer Gaussians). ``LENGTHS`` vary the number of steps.
-"""
+"""The variants of the studies: the paper's ablations, causes that limit quality, numbers of steps."""
 
 from __future__ import annotations
 
@@ -14,16 +10,16 @@ from typing import Any
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.config import TrainConfig, nodes_for
 
-POSE_SECONDS = 0.3 / 9
-"""between two poses of a window: d poses span (d − 1) of these, so that the ablation of d is one of memory"""
+POSE_SECONDS = 0.3 / 9  # between two poses of a window, for every d
 
 
 @dataclass(frozen=True)
 class StudyRow:
-    """One row of the table.
+    """A variant.
 
     Attributes:
-        what: what is switched; beside: the row it is compared with.
+        what: what is switched.
+        beside: the variant it is compared with.
         model, train: fields of the configuration that differ from ours.
         noisy: train on the capture's ``motion_noisy.npz``, score with the exact poses.
         length: factor on the number of steps.
@@ -92,11 +88,10 @@ LENGTHS = (
         for name, length in (("1/8", 1 / 8), ("1/4", 1 / 4), ("1/2", 1 / 2), ("5", 5.0))
     ),
 )
-STUDIES = {"ablations": VARIANTS, "causes": CAUSES, "lengths": LENGTHS}
 
 
 def chosen(variants: Sequence[StudyRow], names: Sequence[str]) -> tuple[StudyRow, ...]:
-    """Those of ``names``, in the study's order; all where none is named. Raises ``InputError`` for others."""
+    """The variants of ``names`` in the study's order, by default all; unknown names are refused."""
     known = [variant.name for variant in variants]
     unknown = [name for name in names if name not in known]
     if unknown:

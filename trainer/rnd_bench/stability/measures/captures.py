@@ -1,4 +1,4 @@
-"""Rows R5, R6 and a part of L9: broken captures, and how they are refused."""
+"""Rows R5, R6 and a part of L9: broken captures and their refusals."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ import numpy as np
 import OpenImageIO as oiio
 
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Figure, Result, at_most, holds, not_measured, refusal
+from rnd_bench.stability.figures import Figure, Result, at_most, holds, not_measured, refusal, result
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.images import read_image, write_image
 from rnd_trainer.training.data import load_views
 
-Breaker = Callable[[Path, dict[str, Any]], None]
-FRAME = 2  # index in capture.json of the image that is broken
-COPIED = 6  # training images of a copy
+FRAME = 2  # index in capture.json of the broken frame
+COPIED = 6  # training frames of a copy
 _FEW = f"fewer than {COPIED} training images in this capture"
 
 
 def _copy(subject: Subject, name: str) -> Path:
-    """A capture of its own to break: the first training frames of the subject's."""
+    """A copy of the subject's capture with its first training frames."""
     source, folder = subject.capture.folder, subject.work / f"capture_{name}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -43,10 +42,6 @@ def _copy(subject: Subject, name: str) -> Path:
     return folder
 
 
-def _too_small(subject: Subject) -> bool:
-    return len(subject.capture.split("train")) < COPIED
-
-
 def _save(folder: Path, record: dict[str, Any]) -> None:
     (folder / "capture.json").write_text(json.dumps(record), encoding="utf-8")
 
@@ -56,20 +51,18 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def broken_captures(subject: Subject) -> Result:
-    """R5: sizes that differ, a missing mask, 16 bits, alpha, EXIF rotation, a frame that does not exist."""
+    """R5: different sizes, a missing mask, 16 bits, alpha, EXIF rotation, a frame that does not exist."""
     what = "broken captures not refused with frame and values"
-    if _too_small(subject):
-        return Result((not_measured(what, _FEW),))
+    if len(subject.capture.split("train")) < COPIED:
+        return result(not_measured(what, _FEW))
     wrong: list[str] = []
 
-    def case(name: str, breaker: Breaker, *said: str) -> None:
+    def case(name: str, breaker: Callable[[Path, dict[str, Any]], None], *words: str) -> None:
         folder = _copy(subject, "broken")
         record = _record(folder)
         breaker(folder, record)
         _save(folder, record)
-        fault = refusal(lambda: load_capture(folder), *said)
-        if fault is not None:
-            wrong.append(f"{name}: {fault}")
+        wrong.extend(refusal(name, load_capture, folder, words=words))
 
     frame = _record(_copy(subject, "broken"))["frames"][FRAME]
     number, camera = f"frame {frame['frame']}", subject.capture.cameras[frame["camera"]]
@@ -109,14 +102,14 @@ def broken_captures(subject: Subject) -> Result:
     after = load_capture(folder)
     if np.abs(after.load_frame(after.frames[FRAME]).image_srgb - eight).max() > 1e-6:
         wrong.append("16 bits: not the same image")
-    return Result((holds(what, wrong),))
+    return result(holds(what, wrong))
 
 
 def bad_masks(subject: Subject) -> Result:
-    """R6: one empty mask of six is skipped and counted; two, above a fifth, stop."""
-    whats = "masks not skipped, counted or stopped at", "empty masks kept"
-    if _too_small(subject):
-        return Result(tuple(not_measured(what, _FEW) for what in whats))
+    """R6: one empty mask of six is skipped and counted; two, above a fifth, are refused."""
+    whats = "masks not skipped, counted or refused", "empty masks used"
+    if len(subject.capture.split("train")) < COPIED:
+        return result(*(not_measured(what, _FEW) for what in whats))
     folder, wrong = _copy(subject, "masks"), []
     record = _record(folder)
     camera = subject.capture.cameras[record["frames"][0]["camera"]]
@@ -126,20 +119,17 @@ def bad_masks(subject: Subject) -> Result:
     if len(views) != 5 or bad != [record["frames"][1]["frame"]]:
         wrong.append(f"one empty: {len(views)} views, counted {bad}")
     write_image(folder / record["frames"][4]["mask"], empty + 255)
-    fault = refusal(lambda: load_views(load_capture(folder), "train"), "20%", "2 of 6")
-    if fault is not None:
-        wrong.append(f"two of six: {fault}")
-    return Result((holds(whats[0], wrong), at_most(whats[1], len(views) - 5, 0)))
+    wrong += refusal("two of six", lambda: load_views(load_capture(folder), "train"), words=("20%", "2 of 6"))
+    return result(holds(whats[0], wrong), at_most(whats[1], len(views) - 5, 0))
 
 
 def flipped_normals(subject: Subject) -> Figure:
-    """Whether a capture is refused whose normals all point away from the camera."""
-    what = "a capture whose normals are all flipped is not found at load"
+    """L9: a capture whose normals all point away from the camera is refused."""
+    what = "a capture whose normals are all flipped is not refused"
     folder = _copy(subject, "flipped")
     normals = [folder / frame["normal"] for frame in _record(folder)["frames"] if frame.get("normal")]
     if not normals:
         return not_measured(what)
     for file in normals:
         write_image(file, np.asarray(255 - read_image(file), np.uint8))
-    fault = refusal(lambda: load_views(load_capture(folder), "train"), "normal")
-    return holds(what, [] if fault is None else [fault])
+    return holds(what, refusal("flipped", lambda: load_views(load_capture(folder), "train"), words=("normal",)))

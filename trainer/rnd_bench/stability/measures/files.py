@@ -1,9 +1,9 @@
-"""Rows R4 and R12: files that are broken on purpose, and machines without a display."""
+"""Rows R4 and R12: broken avatars and checkpoints; machines without a display."""
 
 from __future__ import annotations
 
 import io
-import pickle  # noqa: TID251 (to write a payload that must never be run)
+import pickle  # noqa: TID251 (writes a payload that must never be run)
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, at_most, holds, refusal
+from rnd_bench.stability.figures import Result, at_most, holds, refusal, result
 from rnd_bench.stability.processes import export, play, run_commands
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.file import METADATA_KEY
@@ -23,12 +23,11 @@ from rnd_runtime.gl import context as gl_context
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_trainer.model.checkpoint import load_checkpoint
 
-CUTS = (0.1, 0.5, 0.99)
+CUTS = (0.1, 0.5, 0.99)  # of a file's length
+_READERS: dict[str, Callable[[Path], object]] = {".onnx": Avatar.load, ".ckpt": load_checkpoint}
 
 
 class _Payload:
-    """What a pickle would run."""
-
     def __init__(self, mark: Path) -> None:
         self.mark = mark
 
@@ -37,7 +36,7 @@ class _Payload:
 
 
 def broken_files(subject: Subject) -> Result:
-    """R4: cut, flipped, of an older schema, with external data, foreign operators, or a pickle in disguise."""
+    """R4: truncated, flipped bits, an older schema, external data, foreign operators, a renamed pickle."""
     folder = subject.work / "broken"
     folder.mkdir(parents=True, exist_ok=True)
     mark = folder / "executed"
@@ -45,26 +44,21 @@ def broken_files(subject: Subject) -> Result:
     files = [*_avatars(subject, folder, mark), *_checkpoints(subject, folder, mark)]
     wrong = []
     for file in files:
-        read = Avatar.load if file.suffix == ".onnx" else load_checkpoint
-        fault = refusal(lambda read=read, file=file: read(file), file.name)  # type: ignore[misc]
-        if fault is not None:
-            wrong.append(f"{file.name}: {fault}")
+        wrong += refusal(file.name, _READERS[file.suffix], file, words=(file.name,))
     flips = _flipped_bytes(subject, folder)
     out = folder / "out"
     runs = [play(f, subject.still_file, out) if f.suffix == ".onnx" else export(f, out) for f in files]
     for file, done in zip(files, run_commands(folder, runs)):
         if not done.refused:
             wrong.append(f"{file.name}: {done}")
-    figures = (
+    return result(
         holds("broken files not refused in one line with exit 2", wrong),
         holds("flipped bytes that crash a reader", flips),
         at_most("payloads executed", float(mark.exists()), 0),
     )
-    return Result(figures)
 
 
 def _avatars(subject: Subject, folder: Path, mark: Path) -> list[Path]:
-    """Broken copies of avatar.onnx."""
     data = subject.avatar_file.read_bytes()
     files = {f"cut_{round(100 * cut)}.onnx": data[: int(cut * len(data))] for cut in CUTS}
     older = onnx.load_from_string(data)
@@ -90,7 +84,6 @@ def _avatars(subject: Subject, folder: Path, mark: Path) -> list[Path]:
 
 
 def _checkpoints(subject: Subject, folder: Path, mark: Path) -> list[Path]:
-    """Broken copies of avatar.ckpt."""
     data = subject.checkpoint.read_bytes()
     files = {f"cut_{round(100 * cut)}.ckpt": data[: int(cut * len(data))] for cut in CUTS}
     files["pickle.ckpt"] = pickle.dumps(_Payload(mark))
@@ -114,48 +107,42 @@ def _written(folder: Path, files: dict[str, bytes]) -> list[Path]:
 
 
 def _flipped_bytes(subject: Subject, folder: Path) -> list[str]:
-    """Readers fed with single flipped bytes: refused, or read as another valid file; no other exception."""
-    rng, wrong = np.random.default_rng(9), []
-    for source, read in ((subject.avatar_file, Avatar.load), (subject.checkpoint, load_checkpoint)):
+    """Faults of readers on single flipped bits: anything but a refusal or a valid file."""
+    rng, faults = np.random.default_rng(9), list[str]()
+    for source in (subject.avatar_file, subject.checkpoint):
         data = source.read_bytes()
         ends = min(20_000, len(data))  # structure is dense at the head and, for ONNX, at the tail
         count = subject.few(6, 60)
-        places = [*rng.integers(0, ends, count), *(len(data) - 1 - rng.integers(0, ends, count))]
-        for place in places:
+        offsets = [*rng.integers(0, ends, count), *(len(data) - 1 - rng.integers(0, ends, count))]
+        for offset in offsets:
             flipped = bytearray(data)
-            flipped[place] ^= 1 << int(rng.integers(8))
+            flipped[offset] ^= 1 << int(rng.integers(8))
             file = folder / f"flipped{source.suffix}"
             file.write_bytes(flipped)
-            fault = refusal(lambda read=read, file=file: read(file))  # type: ignore[misc]
-            if fault is not None and fault != "accepted":
-                wrong.append(f"{source.suffix} byte {place}: {fault}")
-    return wrong
+            faults += refusal(f"{source.suffix} byte {offset}", _READERS[source.suffix], file)
+    return [fault for fault in faults if not fault.endswith(": accepted")]
 
 
 def no_display(subject: Subject) -> Result:
-    """R12: no display, no EGL, no OSMesa: errors say what to install, and the CPU kernel renders."""
+    """R12: without display, EGL and OSMesa errors name the package to install, and the CPU kernel renders."""
     wrong = []
     loaders = dict(gl_context._LOADERS)
     try:
         for name in loaders:
             gl_context._LOADERS[name] = _broken
         for backend, hint in gl_context.INSTALL.items():
-            fault = refusal(lambda b=backend: gl_context.create_context(b), hint)  # type: ignore[misc]
-            if fault is not None:
-                wrong.append(f"{backend}: {fault}")
+            wrong += refusal(backend, gl_context.create_context, backend, words=(hint,))
         with make_rasterizer("auto") as raster:
             if raster.name != "cpu":
                 wrong.append(f"auto took {raster.name}")
-        fault = refusal(lambda: make_rasterizer("gl"), "apt-get install")
-        if fault is not None:
-            wrong.append(f"gl: {fault}")
+        wrong += refusal("gl", make_rasterizer, "gl", words=("apt-get install",))
     finally:
         gl_context._LOADERS.update(loaders)
     command = play(subject.avatar_file, subject.still_file, subject.work / "out_dark", "--size", 24)
     done = run_commands(subject.work, [command], DISPLAY="", WAYLAND_DISPLAY="")[0]
     if done.code != 0:
         wrong.append(f"rnd-play: {done}")
-    return Result((holds("machines without a display that are not met", wrong),))
+    return result(holds("faults without a display", wrong))
 
 
 def _broken(version: int) -> gl_context.Loader:

@@ -1,4 +1,4 @@
-"""Rows L11–L13: the albedo–light scale, light baked into albedo, visibility under crossed arms."""
+"""Rows L11–L13: albedo–light scale, light baked into albedo, visibility with crossed arms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from rnd_bench.scenes.poses import CROSSED
 from rnd_bench.scenes.psnr import Floats, decibels, srgb
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Figure, Result, at_most, below, not_measured, reported
+from rnd_bench.stability.figures import Figure, Result, at_most, below, not_measured, reported, result
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import srgb_to_linear, to_bytes
@@ -23,13 +23,12 @@ from rnd_runtime.shading.shadow import directional_visibility
 from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate
 from rnd_trainer.losses.metrics import mask_box
 from rnd_trainer.model.checkpoint import load_checkpoint
-from rnd_trainer.training.data import usable
 
 TEXELS = (16, 32)  # of the sky under which visibility is compared: every texel's shadow is traced
 
 
 def relit_scale(subject: Subject) -> Result:
-    """L11: relit images as they are, and with the albedo scaled per channel."""
+    """L11: relit images, raw and with the albedo scaled per channel."""
     evaluator = Evaluator(load_checkpoint(subject.checkpoint), subject.capture)
     relit = bool(subject.capture.split("relight"))
     scale = albedo_scale(evaluator) if relit else None
@@ -41,24 +40,19 @@ def relit_scale(subject: Subject) -> Result:
         ("the same inside the mask's box, raw", raw, "psnr_box"),
         ("the same inside the mask's box, scaled", scaled, "psnr_box"),
     )
-    return Result(
-        tuple(not_measured(what) if s is None else reported(what, s[name], "dB") for what, s, name in figures)
-    )
+    return result(*(not_measured(what) if s is None else reported(what, s[name], "dB") for what, s, name in figures))
 
 
 def baked_light(subject: Subject) -> Result:
-    """L12: correlation of the albedo's error with the light that fell on it, over training images."""
+    """L12: correlation of the albedo's error with irradiance, over training images."""
     what = "|correlation| of albedo error and irradiance"
     capture, errors, lights, colours = subject.capture, [], [], []
     frames = [frame for frame in capture.split("train") if frame.albedo and frame.light]
     if not frames:
-        return Result((not_measured(what),))
-    frames = frames[:: max(1, len(frames) // subject.few(6, 25))]
+        return result(not_measured(what))
     shader = Shader(capture.load_light(frames[0].light or ""), "table+sun")
-    for frame in frames:
-        truth = capture.load_frame(frame)
+    for truth, camera, time in subject.observed(frames, subject.few(6, 25)):
         assert truth.albedo_srgb is not None
-        camera, time = capture.cameras[frame.camera], frame.frame / capture.motion.fps
         posed = subject.avatar.pose(capture.motion, time)
         white, black = (np.full_like(posed.albedo, level) for level in (1, 0))
         irradiance = shader.shade(replace(posed, albedo=white), camera.position)
@@ -76,15 +70,14 @@ def baked_light(subject: Subject) -> Result:
         scale = (estimate * true).sum(0) / np.maximum((estimate**2).sum(0), 1e-12)
         return abs(float(np.corrcoef((scale * estimate - true).mean(1), light)[0, 1]))
 
-    figure = below(what, correlation(ours), 0.2, baseline=("the image's colour as albedo", correlation(colour)))
-    return Result((figure,))
+    return result(below(what, correlation(ours), 0.2, baseline=("the image's colour as albedo", correlation(colour))))
 
 
 def crossed_arms(subject: Subject) -> Result:
-    """L13: the visibility network against visibility traced to every texel.
+    """L13: visibility by the network and visibility traced to every texel.
 
-    On the capture's held-out poses, under its own light, each against the capture's images. With crossed arms under an
-    overcast sky, one against the other.
+    On held-out poses under the capture's light both are compared with its images; with crossed arms under an overcast
+    sky, with each other.
     """
     posed = subject.avatar.pose(subject.motion(CROSSED), 0.0)
     lit = _Overcast(subject, posed, Light(np.minimum(subject.light.radiance, 1.0)), ())
@@ -98,12 +91,12 @@ def crossed_arms(subject: Subject) -> Result:
         decibels(x, truth) for x in (ours, image(subject.rest.visibility @ lit.basis.T), image(np.clip(lit.ours, 0, 1)))
     )
     what = "arms crossed, overcast: PSNR to exact visibility"
-    figures = (
+    return result(
         lost_to_exact(subject),
         reported(what, psnr, "dB", baseline=("visibility of the rest pose", blind)),
         reported("the same, and with v clamped to 0…1", psnr, "dB", baseline=("clamped", clamped)),
+        images=(to_bytes(ours), to_bytes(truth)),
     )
-    return Result(figures, (to_bytes(ours), to_bytes(truth)))
 
 
 def lost_to_exact(subject: Subject) -> Figure:
@@ -111,17 +104,12 @@ def lost_to_exact(subject: Subject) -> Figure:
     ours: list[float] = []
     exact: list[float] = []
     frames = [frame for frame in capture.split("novel_pose") if frame.light is not None]
-    frames = frames[:: max(1, len(frames) // subject.few(4, 8))]
     if not frames:
         return not_measured(what)
     sky, suns = extract_directional(capture.load_light(frames[0].light or ""))
-    for frame in frames:
-        truth = capture.load_frame(frame)
-        if not usable(truth.mask):
-            continue
+    for truth, camera, time in subject.observed(frames, subject.few(4, 8)):
         box = mask_box(torch.from_numpy(truth.mask))
-        camera = capture.cameras[frame.camera]
-        posed = subject.avatar.pose(capture.motion, frame.frame / capture.motion.fps)
+        posed = subject.avatar.pose(capture.motion, time)
         lit = _Overcast(subject, posed, sky, suns)
         for found, visibility in ((ours, lit.ours), (exact, lit.traced)):
             found.append(decibels(srgb(_splat(posed, lit.radiance(visibility), camera))[box], truth.image_srgb[box]))
@@ -129,7 +117,7 @@ def lost_to_exact(subject: Subject) -> Figure:
 
 
 class _Overcast:
-    """Diffuse light of a sky, texel by texel, on posed Gaussians; suns beside it with hard shadows."""
+    """Diffuse light on posed Gaussians: a sky, texel by texel, and directional lights with hard shadows."""
 
     def __init__(self, subject: Subject, posed: Gaussians, sky: Light, suns: tuple[DirectionalLight, ...]) -> None:
         self.albedo = posed.albedo
@@ -141,7 +129,7 @@ class _Overcast:
         radii = 1.25 * subject.avatar.spacing
         self.traced = directional_visibility(posed.means, posed.normals, directions, radii=radii).astype(np.float64)
         cosine = np.maximum(posed.normals @ directions.T, 0)
-        self._sum = (cosine, flux)
+        self._sum = cosine, flux
         self._suns = np.zeros_like(posed.albedo)
         for sun in suns:
             way = sky.rotation @ sun.direction
@@ -149,7 +137,7 @@ class _Overcast:
             self._suns += reached * np.maximum(posed.normals @ way, 0)[:, None] * sun.irradiance
 
     def radiance(self, visibility: Floats) -> Floats:
-        """[N, 3] for visibility [N, K]."""
+        """Radiance [N, 3] for visibility [N, K] of the texels."""
         cosine, flux = self._sum
         return self.albedo / np.pi * (np.maximum((visibility * cosine) @ flux, 0) + self._suns)
 

@@ -1,4 +1,4 @@
-"""Rows P13–P16: motion files that are broken, of other layouts, of another body, out of view."""
+"""Rows P13–P16: motion files that are broken, have other layouts, another body, or are out of view."""
 
 from __future__ import annotations
 
@@ -8,26 +8,25 @@ from typing import Any
 import numpy as np
 
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, at_most, holds, refusal
+from rnd_bench.stability.figures import Result, at_most, holds, refusal, result
 from rnd_bench.stability.processes import Command, play, run_commands
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.motion.readers.arrays import read_motion_file
 from rnd_runtime.motion.skeleton import smpl_skeleton
 
-HIGH = 6.0  # m: no camera that sees a body there sees one at the origin
+HIGH = 6.0  # m; no camera sees both a body at this height and one at the origin
 
 
 def _fields(subject: Subject, frames: int) -> dict[str, Any]:
-    """Of a motion file of the avatar's own joints at rest."""
+    """The arrays of a motion file of the avatar's joints at rest."""
     names = subject.avatar.skeleton.names
-    poses, trans = np.zeros((frames, 3 * len(names))), np.zeros((frames, 3))
-    rate, up = np.array(30.0), np.array("y")
-    return {"poses": poses, "trans": trans, "mocap_framerate": rate, "joint_names": np.array(names), "up_axis": up}
+    arrays = {"poses": np.zeros((frames, 3 * len(names))), "trans": np.zeros((frames, 3)), "joint_names": names}
+    return {**arrays, "mocap_framerate": np.array(30.0), "up_axis": np.array("y")}
 
 
 def bad_motions(subject: Subject) -> Result:
-    """P13: each broken file ends in one line that names file, field and frame; the command exits with 2."""
+    """P13: each broken file is refused with file, field and frame; the command exits with 2."""
     joints = len(subject.avatar.skeleton)
     good = _fields(subject, 5)
 
@@ -48,12 +47,10 @@ def bad_motions(subject: Subject) -> Result:
     }
     wrong: list[str] = []
     runs: list[Command] = []
-    for name, (change, said) in cases.items():
+    for name, (change, words) in cases.items():
         file = subject.work / f"bad_{name.replace(' ', '_')}.npz"
         np.savez(file, **{**good, **change})
-        fault = refusal(lambda file=file: load_motion(file, subject.avatar.skeleton), file.name, *said)  # type: ignore[misc]
-        if fault is not None:
-            wrong.append(f"{name}: {fault}")
+        wrong += refusal(name, load_motion, file, subject.avatar.skeleton, words=(file.name, *words))
         out = subject.work / f"out_bad_{len(runs)}"
         runs.append(play(subject.avatar_file, file, out, "--size", 16))
     wrong += [f"{name}: {done}" for name, done in zip(cases, run_commands(subject.work, runs)) if not done.refused]
@@ -67,11 +64,11 @@ def bad_motions(subject: Subject) -> Result:
         motion = load_motion(file, subject.avatar.skeleton)
         if motion.frame_count != frames or ("missing" in name and not any("frame rate" in n for n in motion.notes)):
             wrong.append(name)
-    return Result((holds("motions not met as they should be", wrong),))
+    return result(holds("motions neither read nor refused correctly", wrong))
 
 
 def joint_counts(subject: Subject) -> Result:
-    """P14: 22, 24, 52, 55 joints are matched by name; 63, 69, 72, 156 and 165 columns; others are refused."""
+    """P14: 22, 24, 52 and 55 joints are matched by name; other counts are refused."""
     rng, wrong = np.random.default_rng(0), []
     skeleton = smpl_skeleton(rng.normal(size=(24, 3)))
     keys = {66: "poses", 72: "poses", 156: "poses", 165: "poses", 63: "pose_body", 69: "body_pose"}
@@ -85,7 +82,7 @@ def joint_counts(subject: Subject) -> Result:
         if len(read.joint_names) != columns // 3 + (columns in (63, 69)):
             wrong.append(f"{columns} columns: {len(read.joint_names)} joints")
         motion = load_motion(file, skeleton)
-        if columns in (156, 165):  # right_hand is the right index finger's base, not column 23
+        if columns in (156, 165):  # right_hand is the base of the right index finger
             right = read.joint_names.index("right_index1")
             truth = axis_angle_to_matrix(poses[:, 3 * right : 3 * right + 3])
             if not np.allclose(motion.rotations[:, 23], truth):
@@ -93,14 +90,13 @@ def joint_counts(subject: Subject) -> Result:
     for columns in (48, 75, 90):
         file = subject.work / f"joints_{columns}.npz"
         np.savez(file, poses=np.zeros((2, columns)), trans=np.zeros((2, 3)))
-        fault = refusal(lambda file=file: read_motion_file(file), "66, 72, 156 or 165", str(columns // 3))  # type: ignore[misc]
-        if fault is not None:
-            wrong.append(f"{columns} columns: {fault}")
-    return Result((holds("layouts not matched by name or not refused with both counts", wrong),))
+        counts = "66, 72, 156 or 165", str(columns // 3)
+        wrong += refusal(f"{columns} columns", read_motion_file, file, words=counts)
+    return result(holds("layouts not matched by name or not refused with both counts", wrong))
 
 
 def other_betas(subject: Subject) -> Result:
-    """P15: a motion that brings betas of its own."""
+    """P15: a motion file with its own betas."""
     given = _fields(subject, 2)
     plain, fat = subject.work / "plain.npz", subject.work / "fat.npz"
     np.savez(plain, **given)
@@ -108,16 +104,14 @@ def other_betas(subject: Subject) -> Result:
     motions = [load_motion(file, subject.avatar.skeleton) for file in (plain, fat)]
     moved = float(np.abs(np.subtract(*(subject.avatar.pose(motion, 0.0).means for motion in motions))).max())
     warned = any("betas" in note for note in motions[1].notes)
-    return Result(
-        (
-            at_most("largest move of a Gaussian by the motion's betas", 1e3 * moved, 0, "mm"),
-            at_most("warnings missing", float(not warned), 0),
-        )
+    return result(
+        at_most("largest displacement of a Gaussian by the motion's betas", 1e3 * moved, 0, "mm"),
+        at_most("warnings missing", float(not warned), 0),
     )
 
 
 def wrong_camera(subject: Subject) -> Result:
-    """P16: a camera of another fit; a motion, y up and six metres above the floor, read by either up axis."""
+    """P16: a camera of another fit; a Y-up motion 6 m above the floor, read with either up axis."""
     lifted = subject.work / "lifted.npz"
     np.savez(lifted, poses=np.zeros((2, 72)), trans=np.tile([0.0, HIGH, 0.0], (2, 1)), mocap_framerate=60.0)
     view = subject.camera(0.0, 0.1, 32)
@@ -135,17 +129,11 @@ def wrong_camera(subject: Subject) -> Result:
         "the right up axis": (lifted, "above", "y", 0),
         "the wrong up axis": (lifted, "above", "z", 2),
     }
-    runs = [
-        play(
-            subject.avatar_file,
-            file,
-            subject.work / f"out_view_{number}",
-            *("--format", "png", "--camera", files[camera], "--motion-up", up),
-        )
-        for number, (file, camera, up, _) in enumerate(cases.values())
-    ]
-    wrong = []
+    wrong, runs = [], []
+    for number, (file, camera, up, _) in enumerate(cases.values()):
+        options = ("--format", "png", "--camera", files[camera], "--motion-up", up)
+        runs.append(play(subject.avatar_file, file, subject.work / f"out_view_{number}", *options))
     for (name, (*_, code)), done in zip(cases.items(), run_commands(subject.work, runs), strict=True):
         if done.code != code or (code == 2 and "nothing of the avatar is in view" not in done.errors):
             wrong.append(f"{name}: {done}")
-    return Result((holds("empty first frames not called so", wrong),))
+    return result(holds("empty first frames not reported", wrong))

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_bench.scenes.poses import APART, ARMS_DOWN, EXTREMES, Angles
 from rnd_bench.scenes.psnr import Bytes, Floats, decibels, srgb
-from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Figure, Result, above, at_most, below, not_measured, reported
+from rnd_bench.scenes.subject import Subject, blend_skinned
+from rnd_bench.stability.figures import Figure, Result, above, at_most, below, not_measured, reported, result
 from rnd_runtime.avatar.file import POSED_OUTPUTS
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import to_bytes
@@ -24,30 +24,29 @@ from rnd_runtime.posing.forearm import skinning_bones
 from rnd_runtime.shading.light import Light, texel_directions
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.losses.metrics import mask_box
-from rnd_trainer.training.data import usable
 
 BYTE = 1 / 255
-HOLE_MARGIN = 0.006  # of the image's side, by which silhouettes are eroded: their edges are soft
+HOLE_MARGIN = 0.006  # of the image's side: erosion of silhouettes, whose edges are soft
 
 
 def out_of_distribution(subject: Subject) -> Result:
-    """P1: T-pose, squat, arms up, splits; then the images of held-out poses."""
+    """P1: T-pose, squat, arms up, splits; then images of held-out poses."""
     motions = [subject.motion(pose) for pose in EXTREMES.values()]
     holes = [_holes(subject, subject.avatar.pose(motion, 0.0), motion) for motion in motions]
     held_out, worst = held_out_poses(subject)
     ours, plain = (_stretch(subject, pose) for pose in (subject.avatar.pose, subject.by_template))
     names = "edge stretch of the 6-NN graph, p99.9, worst pose", "the same, the edge that is stretched most"
-    figures = (
+    return result(
         below(names[0], ours[0], 3, "×", baseline=("template LBS", plain[0])),
         reported(names[1], ours[1], "×", baseline=("template LBS", plain[1])),
         below("alpha holes inside the template's silhouette", 100 * max(holes), 1, "%"),
         held_out,
+        images=worst,
     )
-    return Result(figures, worst)
 
 
 def _stretch(subject: Subject, pose: Callable[[Motion, float], Gaussians]) -> tuple[float, float]:
-    """Edge lengths in the extreme poses over those with the legs apart: p99.9 and the largest of the worst pose."""
+    """Edge lengths in extreme poses over those with the legs apart: p99.9 and maximum, of the worst pose."""
 
     def lengths(angles: Angles) -> Floats:
         means = pose(subject.motion(angles), 0.0).means
@@ -59,10 +58,9 @@ def _stretch(subject: Subject, pose: Callable[[Motion, float], Gaussians]) -> tu
 
 
 def _holes(subject: Subject, posed: Gaussians, motion: Motion) -> float:
-    """Share of the silhouette's inside where alpha is below one half."""
+    """Share of the eroded silhouette where alpha is below one half."""
     camera, body = subject.camera(), subject.body
-    blend = np.einsum("vj,jrc->vrc", body.skinning_weights, subject.bones(motion, 0.0).astype(np.float64))
-    vertices = np.einsum("vrc,vc->vr", blend[:, :, :3], body.vertices) + blend[:, :, 3]
+    vertices = blend_skinned(body.skinning_weights, subject.bones(motion, 0.0), body.vertices)[0]
     points = vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     pixels = points[:, :2] / points[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     inside = np.zeros((camera.height, camera.width), np.uint8)
@@ -74,21 +72,16 @@ def _holes(subject: Subject, posed: Gaussians, motion: Motion) -> float:
 
 
 def held_out_poses(subject: Subject) -> tuple[Figure, tuple[Bytes, Bytes] | None]:
-    """PSNR of ours over that of template LBS on held-out poses, inside the mask's box; our worst frame."""
-    what, capture = "PSNR over template LBS on held-out poses, mean", subject.capture
-    frames = capture.split("novel_pose")
+    """PSNR gain over template LBS on held-out poses, inside the mask's box; our worst frame."""
+    what, motion = "PSNR over template LBS on held-out poses, mean", subject.capture.motion
     shader = Shader(Light(subject.avatar.trained_light), "table+sun")
     ours: list[float] = []
     plain: list[float] = []
     worst = None
-    for frame in frames[:: max(1, len(frames) // subject.few(4, 12))]:
-        truth = capture.load_frame(frame)
-        if not usable(truth.mask):
-            continue
+    for truth, camera, time in subject.observed(subject.capture.split("novel_pose"), subject.few(4, 12)):
         box = mask_box(torch.from_numpy(truth.mask))
-        camera, time = capture.cameras[frame.camera], frame.frame / capture.motion.fps
-        image = subject.image(subject.avatar.pose(capture.motion, time), camera, shader)
-        template = subject.image(subject.by_template(capture.motion, time), camera, shader)
+        image = subject.image(subject.avatar.pose(motion, time), camera, shader)
+        template = subject.image(subject.by_template(motion, time), camera, shader)
         ours.append(decibels(image[box], truth.image_srgb[box]))
         plain.append(decibels(template[box], truth.image_srgb[box]))
         if ours[-1] == min(ours):
@@ -102,8 +95,8 @@ def held_out_poses(subject: Subject) -> tuple[Figure, tuple[Bytes, Bytes] | None
 def axis_angle_wrap(subject: Subject) -> Result:
     """P3: a joint through π ± 1e-3, and θ against θ + 2πk.
 
-    The pose does rotate by 2e-3 there, so the change of plain blend skinning is reported too. At π a ring of skin that
-    two bones share half and half collapses and turns over: the limit is for the mean over the covered pixels.
+    The pose rotates by 2e-3 there, so the change by template LBS is reported too. At π skin with equal weights of two
+    bones collapses and inverts: the limit is for the mean over the covered pixels.
     """
     step, axis = 1e-3, np.array([0.6, 0.64, 0.48])
 
@@ -123,28 +116,27 @@ def axis_angle_wrap(subject: Subject) -> Result:
     ]
     mean, worst = (max(change(*pair) for pair in pairs) / BYTE for change in (_mean, largest))
     base_mean, base_worst = (("axis-angle differences", change(*differences) / BYTE) for change in (_mean, largest))
-    figures = (
+    return result(
         below("image change through π ± 1e-3, mean over covered pixels", mean, 1, "/255", baseline=base_mean),
         reported("the same, worst pixel", worst, "/255", baseline=base_worst),
         reported("the same, plain blend skinning, worst pixel", largest(*plain) / BYTE, "/255"),
         below("image change by θ + 2πk, worst pixel", max(largest(wraps[0], t) for t in wraps[1:]) / BYTE, 1, "/255"),
     )
-    return Result(figures)
 
 
 def _mean(a: Floats, b: Floats) -> float:
-    """Mean difference over the pixels that either image covers."""
+    """Mean difference over pixels covered in either image."""
     covered = (a > 0).any(-1) | (b > 0).any(-1)
     return float(np.abs(a - b)[covered].mean())
 
 
 def largest(a: Floats, b: Floats) -> float:
-    """The largest difference of two images."""
+    """Largest difference."""
     return float(np.abs(a - b).max())
 
 
 def _by_axis_angle_difference(subject: Subject, before: Angles, now: Angles) -> Floats:
-    """The image when joint velocities are differences of axis-angles, as in the paper."""
+    """The image for joint velocities that are differences of axis-angles, as in the paper."""
     motion, avatar = subject.motion(before, now), subject.avatar
     names = avatar.skeleton.names
     velocity = np.zeros((len(names) - 1, 3))
@@ -185,15 +177,14 @@ def global_rotation(subject: Subject) -> Result:
         renderer.relight(_smooth_light(rotation))
         image = max(image, largest(srgb(renderer.render(rotated, time).radiance), reference))
         encoders = max(encoders, float(np.abs(subject.weights(rotated, time) - weights).max()))
-    figures = (
+    return result(
         below("largest pixel difference", image / BYTE, 2, "/255"),
         at_most("skinning weights, largest difference", encoders, 1e-6),
     )
-    return Result(figures)
 
 
 def _smooth_light(rotation: Floats) -> Light:
-    """An analytic sky under ``rotation``; smooth, so that texels do not matter."""
+    """An analytic sky under ``rotation``, smooth at the scale of texels."""
     local = texel_directions(64, 128) @ rotation
     x, y, z = np.moveaxis(local, -1, 0)
     lobe = np.exp(4 * (local @ [0.64, 0.48, 0.6] - 1))

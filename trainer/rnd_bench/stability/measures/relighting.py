@@ -1,8 +1,9 @@
-"""Rows L1–L10 and L15: suns, broken and black maps, orientation, resizing, rotation, white furnace, normals, probes."""
+"""Rows L1–L10 and L15: suns, broken and black maps, orientation, resizing, rotation, furnace, normals, probes."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from rnd_bench.scenes.lights import SUN_RADIUS, sun_and_sky, sun_disc
 from rnd_bench.scenes.psnr import Floats, decibels
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, above, at_least, at_most, below, holds
+from rnd_bench.stability.figures import Result, above, at_least, at_most, below, holds, result
 from rnd_bench.stability.processes import play, run_commands
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import to_bytes, write_image
@@ -33,12 +34,12 @@ from .captures import flipped_normals
 HALF_MAX = 65504.0  # the largest half float; a brighter texel is infinity in a half EXR
 SUNS = (1e5, 1e6, HALF_MAX)
 FIREFLY = 4.0  # times the brightest neighbour
-GRAZING = 0.1  # cosine between normal and view below which a view grazes
+GRAZING = 0.1  # largest n·v of a grazing view
 ELEVATIONS = (-90.0, -60.0, -10.0, 0.0, 20.0, 45.0, 75.0, 88.0, 90.0)
 
 
 def ball(count: int = 2000) -> Gaussians:
-    """A white, rough unit ball, unshadowed: normals in all directions."""
+    """A white, rough, unshadowed unit ball."""
     k = np.arange(count) + 0.5
     y, azimuth = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - y * y)
@@ -53,34 +54,42 @@ def ball(count: int = 2000) -> Gaussians:
 
 
 def bright_suns(subject: Subject) -> Result:
-    """L1: suns of 1e5, 1e6 and half's largest number, at several elevations."""
+    """L1: suns of radiance 1e5, 1e6 and the largest half float, at several elevations."""
     white = ball()
     worst, plain, flies = 0.0, 0.0, 0.0
     for radiance in SUNS:
         for elevation in (40.0,) if subject.small else (5.0, 40.0, 85.0):
-            way = np.array([np.cos(np.radians(elevation)), np.sin(np.radians(elevation)), 0.2])
+            way = _towards(elevation, 0.2)
             way /= np.linalg.norm(way)
-            disc = sun_disc(256, way, radiance) * np.ones(3)
-            light = Light(disc.astype(np.float32))
+            disc = sun_disc(256, way, radiance)
+            light = Light((disc * np.ones(3)).astype(np.float32))
             facing = int(np.argmax(white.normals @ way))
             cosine = float(white.normals[facing] @ way)
             expected = np.pi * np.sin(SUN_RADIUS) ** 2 * radiance * cosine / np.pi
             dark = replace(white, albedo=np.zeros_like(white.albedo))
-            shader, eye = Shader(light, "table+sun"), 20.0 * way  # suns light what faces the camera
+            shader, eye = Shader(light, "table+sun"), 20.0 * way
             lit = shader.shade(white, eye) - shader.shade(dark, eye)  # without the specular part
-            worst = float(np.maximum(worst, abs(float(lit[facing, 1]) / expected - 1)))  # NaN goes through
-            small = cv2.resize(disc[..., 1].astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
-            energy = float((small * texel_solid_angles(32, 64)).sum())
-            plain = max(plain, abs(energy / (2 * np.pi * (1 - np.cos(SUN_RADIUS)) * radiance) - 1))
+            worst = float(np.maximum(worst, abs(float(lit[facing, 1]) / expected - 1)))  # keeps NaN
+            plain = max(plain, _bilinear_error(disc, 2 * np.pi * (1 - np.cos(SUN_RADIUS)) * radiance))
         sky = sun_and_sky(128, radiance=radiance)
         posed = subject.avatar.pose(subject.walk(0.3), 0.2)
         flies = max(flies, _fireflies(subject.radiance(posed, shader=Shader(sky, "table+sun"))))
     baseline = "bilinear downsizing to 32×64", 100 * plain
-    figures = (
+    return result(
         below("energy of the sun on a facing surface, error", 100 * worst, 1, "%", baseline=baseline),
         at_most("fireflies: pixels over four times their brightest neighbour", flies, 0),
     )
-    return Result(figures)
+
+
+def _towards(elevation: float, z: float) -> Floats:
+    """Direction [3], not normalised, at ``elevation`` degrees in the plane of x and y, with ``z`` beside it."""
+    return np.array([np.cos(np.radians(elevation)), np.sin(np.radians(elevation)), z])
+
+
+def _bilinear_error(disc: Floats, energy: float) -> float:
+    """Relative error of the energy of a light [H, W, 1] resized bilinearly to 32×64."""
+    small = cv2.resize(disc[..., 0].astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
+    return abs(float((small * texel_solid_angles(32, 64)).sum()) / energy - 1)
 
 
 def _fireflies(image: np.ndarray) -> float:
@@ -93,21 +102,20 @@ def _fireflies(image: np.ndarray) -> float:
 
 
 def dark_maps(subject: Subject) -> Result:
-    """L2: a black map and one of 1e-6, fed to the player."""
-    wrong, runs = [], []
-    for name, level in (("black", 0.0), ("faint", 1e-6)):
+    """L2: rnd-play with a black map and with one of 1e-6."""
+    wrong, runs, levels = [], [], {"black": 0.0, "faint": 1e-6}
+    for name, level in levels.items():
         file = subject.work / f"{name}.exr"
         write_image(file, np.full((16, 32, 3), level, np.float32))
-        out = subject.work / f"out_{name}"
         options = ("--hdr", file, "--size", 32, "--frames", "0:1", "--format", "png")
-        runs.append((name, level, play(subject.avatar_file, subject.still_file, out, *options)))
-    for (name, level, _), done in zip(runs, run_commands(subject.work, [run for *_, run in runs])):
+        runs.append(play(subject.avatar_file, subject.still_file, subject.work / f"out_{name}", *options))
+    for (name, level), done in zip(levels.items(), run_commands(subject.work, runs)):
         if done.code != 0 or f"{level:.3g}" not in done.errors or "dark" not in done.errors:
             wrong.append(f"{name}: {done}")
         shade = Shader(load_light(subject.work / f"{name}.exr"), "table+sun")
         if not np.isfinite(subject.radiance(subject.rest, shader=shade)).all():
             wrong.append(f"{name}: not finite")
-    return Result((holds("maps that are not met with a warning naming their maximum", wrong),))
+    return result(holds("maps without a warning that names their maximum", wrong))
 
 
 def broken_texels(subject: Subject) -> Result:
@@ -126,15 +134,14 @@ def broken_texels(subject: Subject) -> Result:
         image = subject.image(subject.rest, shader=Shader(light, "table+sun"))
         if not np.isfinite(image).all():
             wrong.append(f"{name}: not finite")
-        worst = float(np.minimum(worst, decibels(image, truth)))  # NaN goes through
-    figures = (holds("texels not repaired or not counted", wrong), above("PSNR to the clean map", worst, 45, "dB"))
-    return Result(figures)
+        worst = float(np.minimum(worst, decibels(image, truth)))  # keeps NaN
+    return result(holds("texels not repaired or not counted", wrong), above("PSNR to the clean map", worst, 45, "dB"))
 
 
 def orientation(subject: Subject) -> Result:
-    """L4: one lit texel on each axis, in all three up-axis modes."""
+    """L4: a lit spot on each axis, for all three up axes."""
     white = ball()
-    # which direction of our world an axis of the file's world is
+    # rotations from the file's world to ours
     ways: dict[Up, Floats] = {
         "y": np.eye(3),
         "z": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0.0]]),
@@ -144,49 +151,43 @@ def orientation(subject: Subject) -> Result:
     directions = texel_directions(32, 64)
     for up, to_world in ways.items():
         for axis in (*np.eye(3), *-np.eye(3)):
-            radiance = np.where((directions @ axis > np.cos(0.2))[..., None], 50.0, 0).astype(np.float32)
-            radiance = np.repeat(radiance, 3, axis=2)
+            spot = (directions @ axis > np.cos(0.2)).astype(np.float32)
+            radiance = 50 * np.repeat(spot[..., None], 3, axis=2)
             for mode in ("table", "table+sun", "brute"):
                 lit = Shader(Light(radiance, up=up), mode).shade(white, [0, 0, 0])[:, 1]
                 brightest = (lit[:, None] * white.normals).sum(0)
                 brightest = brightest / np.linalg.norm(brightest)
                 worst = float(np.minimum(worst, brightest @ (to_world @ axis)))
-    return Result((above("cosine between the lit side and the axis, worst of 54", worst, 0.99),))
+    return result(above("cosine between the lit side and the axis, worst of 54", worst, 0.99))
 
 
 def resizing(subject: Subject) -> Result:
-    """L5: a sun at every elevation, the poles included, from 256×512 to 32×64 and to odd sizes."""
+    """L5: a sun at elevations up to the poles, resized from 256×512 to 32×64 and to odd sizes."""
     worst, plain = 0.0, 0.0
     for elevation in ELEVATIONS:
-        way = [np.cos(np.radians(elevation)), np.sin(np.radians(elevation)), 0.1]
-        source = sun_disc(256, way, 1e4) * np.ones(3)
+        source = sun_disc(256, _towards(elevation, 0.1), 1e4)
         energy = float((source[..., 0] * texel_solid_angles(256, 512)).sum())
         for height, width in ((32, 64), (17, 34), (100, 200)):
-            small = downsize(source, height, width)[..., 0]
+            small = downsize(source * np.ones(3), height, width)[..., 0]
             worst = float(np.maximum(worst, abs((small * texel_solid_angles(height, width)).sum() / energy - 1)))
-        linear = cv2.resize(source[..., 0].astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
-        plain = max(plain, abs(float((linear * texel_solid_angles(32, 64)).sum()) / energy - 1))
+        plain = max(plain, _bilinear_error(source, energy))
     baseline = "bilinear", 100 * plain
-    return Result((below("energy of a sun after resizing, error", 100 * worst, 0.1, "%", baseline=baseline),))
+    return result(below("energy of a sun after resizing, error", 100 * worst, 0.1, "%", baseline=baseline))
 
 
 def turning_light(subject: Subject) -> Result:
     """L7: the light rotated by 360° in steps of 0.5°."""
     posed = subject.avatar.pose(subject.walk(0.3), 0.2)
     camera = subject.camera()
-    steps = subject.few(180, 720)
-    changes = []
-    before = subject.image(posed, camera, subject.shader.turned(0.0))
-    for step in range(1, steps):
-        now = subject.image(posed, camera, subject.shader.turned(np.radians(0.5 * step)))
-        changes.append(float(np.abs(now - before).mean()))
-        before = now
+    angles = np.radians(0.5 * np.arange(subject.few(180, 720)))
+    frames = (subject.image(posed, camera, subject.shader.turned(angle)) for angle in angles)
+    changes = [float(np.abs(now - before).mean()) for before, now in pairwise(frames)]
     ratio = max(changes) / float(np.median(changes))
-    return Result((below("frame difference, largest over median", ratio, 3, "×"),))
+    return result(below("frame difference, largest over median", ratio, 3, "×"))
 
 
 def white_furnace(subject: Subject) -> Result:
-    """L8: what a uniform white light gives back, roughness 0…1, albedo 0 and 1."""
+    """L8: reflectance under uniform white light, roughness 0…1, albedo 0 and 1."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     cosines = (nodes + 1) / 2
     hemispherical, facing = [], []
@@ -197,12 +198,11 @@ def white_furnace(subject: Subject) -> Result:
     finite = bool(np.isfinite([*hemispherical, *facing]).all())
     what = f"albedo 1, played as {LARGEST_ALBEDO:.3f}: reflectance, largest over roughness"
     baseline = "the formula as printed", 1 + max(hemispherical)
-    figures = (
+    return result(
         at_most(what, LARGEST_ALBEDO + max(hemispherical), 1.0, baseline=baseline),
         at_least("albedo 0: reflectance at normal incidence, smallest over roughness", min(facing), F0 * (1 - 2e-3)),
         at_most("not finite", float(not finite), 0),
     )
-    return Result(figures)
 
 
 def _specular_reflectance(roughness: float, cosine: float) -> float:
@@ -221,7 +221,7 @@ def _specular_reflectance(roughness: float, cosine: float) -> float:
 
 
 def broken_normals(subject: Subject) -> Result:
-    """L9: normals flipped, zero, not unit: 1 % and all of them."""
+    """L9: normals flipped, zero, not unit, NaN: 1 % and all of them."""
     rest, wrong = subject.rest, []
     for share in (0.01, 1.0):
         hit = np.arange(len(rest.means)) % round(1 / share) == 0
@@ -233,14 +233,13 @@ def broken_normals(subject: Subject) -> Result:
                 image = subject.radiance(broken, shader=Shader(subject.light, mode))
                 if not np.isfinite(image).all():
                     wrong.append(f"{share:.0%} {name} by {mode}")
-    return Result((holds("broken normals that make an image not finite", wrong), flipped_normals(subject)))
+    return result(holds("broken normals that make an image not finite", wrong), flipped_normals(subject))
 
 
 def grazing(subject: Subject) -> Result:
-    """L10: the specular term at silhouettes against the sum over a map fine enough for the lobe.
+    """L10: the specular term at silhouettes against the sum over a map that resolves the lobe.
 
-    At roughness 0.1 the lobe is a degree wide: next to 2048 rows of texels, 256 err by up to 11 %, 512 by 3 % and 1024
-    by less than 1 %.
+    At roughness 0.1 the lobe is 1° wide: against 2048 rows of texels, 256 err by up to 11 %, 512 by 3 %, 1024 by < 1 %.
     """
     worst: dict[float, float] = {}
     finite = True
@@ -252,27 +251,21 @@ def grazing(subject: Subject) -> Result:
             eye = 60.0 * np.array(way)
             view = eye - dark.means
             cosine = (dark.normals * view).sum(1) / np.linalg.norm(view, axis=1)
-            part = _part(dark, np.flatnonzero((cosine > 0) & (cosine < GRAZING)))
+            part = dark.only((cosine > 0) & (cosine < GRAZING))
             ours = Shader(subject.light, "table+sun").shade(part, eye)
             exact = shade_reference(part, subject.light, eye, texels=(rows, 2 * rows))
             finite &= bool(np.isfinite(ours).all())
             worst[roughness] = float(np.maximum(worst.get(roughness, 0.0), ours.mean() / exact.mean() - 1))
     others = max(excess for roughness, excess in worst.items() if roughness > 0.1)
-    figures = (
+    return result(
         at_most("specular over the reference at silhouettes, roughness 0.3 to 0.9, worst view", 100 * others, 10, "%"),
         at_most("the same at roughness 0.1", 100 * worst[0.1], 10, "%"),
         at_most("not finite", float(not finite), 0),
     )
-    return Result(figures)
-
-
-def _part(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    names = ("means", "covariances", "opacities", "normals", "albedo", "roughness", "visibility")
-    return replace(gaussians, **{name: getattr(gaussians, name)[rows] for name in names})
 
 
 def monochrome_probe(subject: Subject) -> Result:
-    """L15: a coloured light through a 32×64 probe of three channels, and of one."""
+    """L15: a coloured light as a 32×64 probe of three channels, and of one."""
     directions = texel_directions(64, 128)
     lamps = np.zeros((64, 128, 3))
     for way, colour in (((1, 0.4, 0.6), (6, 1, 0.5)), ((-1, 0.3, 0.5), (0.5, 1, 6)), ((0, 1, -0.2), (1, 4, 1))):
@@ -285,4 +278,4 @@ def monochrome_probe(subject: Subject) -> Result:
     mono = subject.image(subject.rest, shader=Shader(one, "brute"))
     baseline = "one channel", decibels(mono, truth)
     figure = above("PSNR under coloured lamps, RGB probe", decibels(ours, truth), 35, "dB", baseline=baseline)
-    return Result((figure,), (to_bytes(ours), to_bytes(truth)))
+    return result(figure, images=(to_bytes(ours), to_bytes(truth)))

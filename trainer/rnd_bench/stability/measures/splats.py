@@ -10,9 +10,9 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_bench.scenes.poses import EXTREMES
-from rnd_bench.scenes.psnr import Bytes, Floats, decibels, srgb
+from rnd_bench.scenes.psnr import Floats, decibels, srgb
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, above, at_most, below, holds, refusal
+from rnd_bench.stability.figures import Result, above, at_most, below, holds, refusal, result
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Rasterizer
@@ -32,14 +32,14 @@ Floats32 = NDArray[np.float32]
 Splats = tuple[Floats32, Floats32, Floats32, Floats32]  # means, covariances, opacities, features
 
 NEEDLE = 10
-SCREEN_FILLING = 50  # per cent of the image that one Gaussian of more than half opacity may cover
-SLOWEST = 3  # times the median that the slowest frame of a flight may take
-UPPER = [0, 1, 2, 4, 5, 8]  # of a covariance [3, 3] as nine numbers
+SCREEN_FILLING = 50  # %; largest share of the image that one Gaussian of α > 0.5 may cover
+SLOWEST = 3  # times the median; limit of the slowest frame of a flight
+UPPER = [0, 1, 2, 4, 5, 8]  # the upper triangle of a flattened 3×3 matrix
 GL_BACKENDS: tuple[Backend, ...] = ("egl", "osmesa")
 
 
 def needles(subject: Subject) -> Result:
-    """G1: axis ratios of the Gaussians in every extreme pose, and as seen from top, bottom and the back."""
+    """G1: axis ratios of the Gaussians in extreme poses, and projected from top, bottom and back."""
     shares, seen = [], []
     for pose in EXTREMES.values():
         posed = subject.avatar.pose(subject.motion(pose), 0.0)
@@ -51,21 +51,22 @@ def needles(subject: Subject) -> Result:
             flat = oracle.image_covariances(posed.means[front], posed.covariances[front], camera)
             axes = np.sqrt(np.linalg.eigvalsh(flat))
             seen.append(float((axes[:, 1] > NEEDLE * axes[:, 0]).mean()))
-    figures = (
+    return result(
         below("longest over middle axis above 10", 100 * max(shares), 1, "%"),
         below("aspect on the screen above 10, unseen views", 100 * max(seen), 1, "%"),
     )
-    return Result(figures)
 
 
 def _splats(seed: int, count: int = 200) -> Splats:
     """Random Gaussians around the origin."""
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(count, 3, 3)) * rng.uniform(0.1, 1, (count, 3, 1)) * 0.06
-    upper = (axes @ axes.transpose(0, 2, 1)).reshape(-1, 9)[:, UPPER]
-    arrays = 0.5 * rng.normal(size=(count, 3)), upper, rng.uniform(0, 1, count), rng.uniform(0, 1, (count, 3))
-    means, covariances, opacities, features = (np.asarray(a, np.float32) for a in arrays)
-    return means, covariances, opacities, features
+    means, opacities, features = (
+        0.5 * rng.normal(size=(count, 3)),
+        rng.uniform(0, 1, count),
+        rng.uniform(0, 1, (count, 3)),
+    )
+    return means.astype(np.float32), _upper(axes), opacities.astype(np.float32), features.astype(np.float32)
 
 
 def _camera(width: int = 96, height: int = 96, eye: tuple[float, float, float] = (0.2, 0.3, -2.5)) -> Camera:
@@ -75,7 +76,7 @@ def _camera(width: int = 96, height: int = 96, eye: tuple[float, float, float] =
 def broken_quaternions(subject: Subject) -> Result:
     """G2: zero, NaN, denormal and infinite rotations, scales and covariances; q and −q, and the paper's r + Δr.
 
-    Rotations and scales go through the model's own posing, which has vectors: 2 xyz/w of a quaternion.
+    Rotations and scales pass through the model's posing, as vectors 2 xyz/w of a quaternion.
     """
     means, covariances, opacities, features = _splats(1)
     camera = _camera()
@@ -100,17 +101,16 @@ def broken_quaternions(subject: Subject) -> Result:
     negative = {**given, "rotation": 2 * -q[:, 1:] / -q[:, :1]}
     ours = float(np.abs(image(_posed(**given)) - image(_posed(**negative))).max())
     unit = q / np.linalg.norm(q, axis=1, keepdims=True)
-    added = [image(_upper(quaternion_to_matrix(sign * unit + delta), scales)) for sign in (1, -1)]
+    added = [image(_upper(quaternion_to_matrix(sign * unit + delta) * scales[:, None])) for sign in (1, -1)]
     baseline = "r + Δr", float(np.abs(added[0] - added[1]).max())
-    figures = (
+    return result(
         holds("injected values that come through", wrong),
         at_most("image of q against −q with Δr, largest difference", ours, 1e-6, baseline=baseline),
     )
-    return Result(figures)
 
 
 def _posed(rotation: ArrayLike, turn: ArrayLike, scales: ArrayLike) -> Floats32:
-    """Covariances [N, 6] as the model poses Gaussians of these vectors [N, 3] and scales [N, 3] m at rest."""
+    """Covariances [N, 6] m² by the model's posing at rest, of vectors [N, 3] and scales [N, 3] m."""
     vectors, turns, sizes = (torch.tensor(np.array(x, np.float32)) for x in (rotation, turn, scales))
     count = len(sizes)
     up = torch.tensor([0.0, 1.0, 0.0]).expand(count, 3)
@@ -120,14 +120,13 @@ def _posed(rotation: ArrayLike, turn: ArrayLike, scales: ArrayLike) -> Floats32:
     return pose_gaussians(weights, bones, nothing, turns, frames, vectors, sizes, up, limbs)[1].numpy()
 
 
-def _upper(rotations: Floats, scales: Floats) -> Floats32:
-    """Covariances [N, 6] m² of rotations [N, 3, 3] and scales [N, 3] m."""
-    factors = rotations * scales[:, None]
+def _upper(factors: Floats) -> Floats32:
+    """Covariances F Fᵀ [N, 6] m² of factors [N, 3, 3] m."""
     return (factors @ factors.transpose(0, 2, 1)).reshape(-1, 9)[:, UPPER].astype(np.float32)
 
 
 def fly_through(subject: Subject) -> Result:
-    """G3: from before the body, through it, to its back; one camera stands in a Gaussian."""
+    """G3: a flight through the body from front to back; cameras at and in Gaussians."""
     posed = subject.avatar.pose(subject.walk(0.5), 0.4)
     chest = np.median(posed.means, axis=0).astype(np.float64)
     eyes = [chest + np.array([0.02, 0.05, z]) for z in np.linspace(2.5, -2.5, subject.few(21, 101))]
@@ -147,16 +146,16 @@ def fly_through(subject: Subject) -> Result:
         if share >= filling:
             filling, worst = share, image
     slowest = max(seconds) / float(np.median(seconds))
-    figures = (
+    return result(
         below("frames that are not finite", float(not finite), 1),
         below("share of the image that one Gaussian covers with α > 0.5", 100 * filling, SCREEN_FILLING, "%"),
         replace(below("slowest frame over the median", slowest, SLOWEST, "×"), timing=True),
+        images=(to_bytes(srgb(worst[..., :3])), to_bytes(subject.image(posed))),
     )
-    return Result(figures, (to_bytes(srgb(worst[..., :3])), to_bytes(subject.image(posed))))
 
 
 def _largest_share(posed: Gaussians, camera: Camera) -> float:
-    """The largest share of the image where a single Gaussian's own α exceeds one half."""
+    """Largest share of the image in which a single Gaussian's α exceeds one half."""
     points = oracle.camera_points(posed.means, camera)
     near = (points[:, 2] >= oracle.NEAR) & (points[:, 2] < 0.5) & (posed.opacities > 0.5)
     if not near.any():
@@ -170,7 +169,7 @@ def _largest_share(posed: Gaussians, camera: Camera) -> float:
 
 
 def nothing_in_view(subject: Subject) -> Result:
-    """G5: no Gaussian, one, and a camera that looks away."""
+    """G5: no Gaussian, one Gaussian, and a camera that looks away."""
     camera, wrong = _camera(64, 48), []
     background = np.array([0.2, 0.5, 0.7], np.float32)
     rest, away = subject.rest, Camera.look_at([0, 1, 5], [0, 1, 9], width=64, height=48, fov_y=0.6)
@@ -186,11 +185,11 @@ def nothing_in_view(subject: Subject) -> Result:
     one = rasterize(means[:1], covariances[:1], opacities[:1], features[:1], camera)
     if not (np.isfinite(one.image).all() and one.image.shape == (48, 64, 3)):
         wrong.append("N = 1")
-    return Result((holds("cases in which the background does not come back", wrong),))
+    return result(holds("cases in which the background does not come back", wrong))
 
 
 def equal_depths(subject: Subject) -> Result:
-    """G6: Gaussians at the same positions in five colours, the camera rotated by 0.1° steps."""
+    """G6: five colours of Gaussians at the same positions, the camera rotated by 0.1° steps."""
     means, covariances, opacities = (np.repeat(a, 5, axis=0) for a in _splats(4, 40)[:3])
     features = np.random.default_rng(5).uniform(0, 1, (len(means), 3)).astype(np.float32)
     worst = 0.0
@@ -199,11 +198,11 @@ def equal_depths(subject: Subject) -> Result:
         camera = _camera(48, 48, (2.5 * np.sin(angle), 0.3, -2.5 * np.cos(angle)))
         ours, truth = (draw(means, covariances, opacities, features, camera) for draw in (rasterize, oracle.rasterize))
         worst = max(worst, float(np.abs(ours.image - truth.image).max()))
-    return Result((below("against (depth, index) in the oracle, largest difference", worst / BYTE, 1, "/255"),))
+    return result(below("against (depth, index) in the oracle, largest difference", worst / BYTE, 1, "/255"))
 
 
 def image_sizes(subject: Subject) -> Result:
-    """G7: 1×1, 1×4096, odd sizes, and above the limit of GL."""
+    """G7: 1×1, 1×4096, odd sizes, and above OpenGL's limit."""
     splats, wrong = _splats(6), []
     with _Rasters() as rasters:
         for name, raster in rasters.all.items():
@@ -212,14 +211,12 @@ def image_sizes(subject: Subject) -> Result:
                 if image.shape != (height, width, 3) or not np.isfinite(image).all():
                     wrong.append(f"{name} {width}×{height}")
             if name != "cpu":
-                fault = refusal(lambda r=raster: r(*splats, _camera(40_000, 2)))  # type: ignore[misc]
-                if fault is not None:
-                    wrong.append(f"{name} 40000×2: {fault}")
-    return Result((holds("sizes that come out wrong", wrong + rasters.missing),))
+                wrong += refusal(f"{name} 40000×2", raster, *splats, _camera(40_000, 2))
+    return result(holds("sizes that come out wrong", wrong + rasters.missing))
 
 
 class _Rasters:
-    """The CPU kernel and OpenGL on both backends, closed at the end."""
+    """The CPU kernel and OpenGL on both backends."""
 
     def __enter__(self) -> _Rasters:
         self.all: dict[str, Rasterizer] = {"cpu": rasterize}
@@ -241,7 +238,7 @@ class _Rasters:
 
 
 def grey_card(subject: Subject) -> Result:
-    """G9: 18 % grey is 118; grey splats of any opacity over grey stay grey."""
+    """G9: 18 % grey is 118; grey Gaussians of any opacity over grey remain grey."""
     card = int(to_bytes(linear_to_srgb(0.18)))
     means, covariances, opacities, _ = _splats(7)
     raster = rasterize(means, covariances, opacities, np.full((len(means), 3), 0.18, np.float32), _camera())
@@ -249,16 +246,15 @@ def grey_card(subject: Subject) -> Result:
     covered = raster.alpha > 0.02
     straight = raster.image[covered] / raster.alpha[covered][:, None]
     ramp, divided = (int(np.abs(to_bytes(linear_to_srgb(x)).astype(int) - card).max()) for x in (over, straight))
-    figures = (
+    return result(
         at_most("0.18 → 118, off by", abs(card - 118), 0, "/255"),
         at_most("alpha ramp of grey over grey, off by", ramp, 1, "/255"),
         at_most("grey with its alpha divided out, off by", divided, 1, "/255"),
     )
-    return Result(figures)
 
 
 def rasters_agree(subject: Subject) -> Result:
-    """G10: oracle, CPU kernel, OpenGL on EGL and on OSMesa, torch; the avatar itself, as bytes."""
+    """G10: CPU kernel, OpenGL on EGL and on OSMesa, and torch against the oracle, on the avatar."""
     posed = subject.avatar.pose(subject.walk(0.3), 0.2)
     camera = subject.camera(0.4, 0.2, subject.few(64, 160))
     splats = posed.means, posed.covariances, posed.opacities, subject.shader.shade(posed, camera.position)
@@ -271,13 +267,10 @@ def rasters_agree(subject: Subject) -> Result:
         images["torch"] = srgb(by_torch.numpy())
     worst = min(images, key=lambda name: np.nan_to_num(decibels(images[name], truth), nan=-np.inf))
     largest = max(float(np.abs(image - truth).max()) for image in images.values())
-    figures = (
+    enlarged = [to_bytes(np.repeat(np.repeat(image, 2, axis=0), 2, axis=1)) for image in (images[worst], truth)]
+    return result(
         holds("backends missing", rasters.missing),
         at_most("largest difference to the oracle", largest / BYTE, 2, "/255"),
         above(f"PSNR to the oracle, worst ({worst})", decibels(images[worst], truth), 50, "dB"),
+        images=(enlarged[0], enlarged[1]),
     )
-    return Result(figures, (_enlarged(images[worst]), _enlarged(truth)))
-
-
-def _enlarged(image: Floats) -> Bytes:
-    return to_bytes(np.repeat(np.repeat(image, 2, axis=0), 2, axis=1))

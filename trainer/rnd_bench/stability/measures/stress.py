@@ -11,7 +11,7 @@ from rnd_bench.scenes.poses import EXTREMES
 from rnd_bench.scenes.psnr import decibels, srgb
 from rnd_bench.scenes.subject import Subject
 from rnd_bench.speed.reference import posed_reference
-from rnd_bench.stability.figures import Result, reported
+from rnd_bench.stability.figures import Result, reported, result
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.raster import oracle as raster_oracle
 from rnd_runtime.raster.cpu import rasterize
@@ -20,10 +20,10 @@ from rnd_runtime.shading.shader import Shader
 
 
 def worst_cases(subject: Subject) -> Result:
-    """T: an ordinary frame, a camera inside the body, a squat, a light of 1e6: time, and PSNR to the full reference.
+    """T: an ordinary frame, a camera inside the body, a squat, a light of 1e6.
 
-    Frames are in memory, without the tone map. The reference has everything after the networks in float64, the sum
-    over all 2 048 texels and the oracle rasteriser.
+    Frame times exclude the tone map. The reference has everything after the networks in float64, the sum over all
+    2 048 texels and the oracle rasteriser.
     """
     heights = subject.rest.means[:, 1]
     low, high = float(heights.min()), float(heights.max())
@@ -54,4 +54,4 @@ def worst_cases(subject: Subject) -> Result:
             reported(f"{name}: frame time, p95", float(np.percentile(times, 95)), "ms"),
             reported(f"{name}: PSNR to the full reference", decibels(srgb(ours.image), srgb(truth)), "dB"),
         ]
-    return Result(tuple(figures))
+    return result(*figures)

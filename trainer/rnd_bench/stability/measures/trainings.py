@@ -1,4 +1,4 @@
-"""Rows P17 and R9–R11: trainings of seconds on the studio's capture."""
+"""Rows P17 and R9–R11: short trainings on the studio's capture."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, at_most, holds, reported
+from rnd_bench.stability.figures import Result, at_most, holds, reported, result
 from rnd_bench.stability.small import studio, tiny_config
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
@@ -19,15 +19,15 @@ from rnd_runtime.motion.motion import Motion
 from rnd_trainer.training.training import MAX_BAD_STEPS, Training
 
 NOISE_DEGREES = 2.0
-SHORT = 12  # steps with an image of a training that is only compared with another; more without one follow
+SHORT = 12  # steps with an image; steps without one follow
 
 
 def noisy_training_poses(subject: Subject) -> Result:
-    """P17: train on poses with 2° of noise on every joint, refining them."""
+    """P17: pose refinement of 2° noise on every joint."""
     rng = np.random.default_rng(4)
     clean = studio(subject)
     noise = np.radians(NOISE_DEGREES) / np.sqrt(3) * rng.normal(size=(*clean.motion.rotations.shape[:2], 3))
-    noise[:, 0] = 0  # the camera's own freedom can make up for a wrong root
+    noise[:, 0] = 0  # root and camera are ambiguous
     motion = dataclasses.replace(clean.motion, rotations=clean.motion.rotations @ axis_angle_to_matrix(noise))
     config = tiny_config(steps=subject.few(60, 800), gaussians=subject.few(600, 4000))
     training = Training(dataclasses.replace(clean, motion=motion), dataclasses.replace(config, refine_poses=True))
@@ -36,15 +36,14 @@ def noisy_training_poses(subject: Subject) -> Result:
     while training.step_index < config.steps:
         training.step()
     after = _joint_error(training.motion(), clean, frames)
-    figures = (
+    return result(
         at_most("joint error after training over before", after / before, 1.0, "×"),
         reported("joint error before", before, "mm"),
     )
-    return Result(figures)
 
 
 def _joint_error(motion: Motion, clean: Capture, frames: list[int]) -> float:
-    """Mean distance in mm of the posed joints to the true ones."""
+    """Mean distance of the posed joints to the true ones, mm."""
 
     def joints(given: Motion) -> np.ndarray:
         transforms = clean.body.skeleton.joint_transforms(given.rotations[frames], given.translations[frames])
@@ -69,24 +68,23 @@ def _training(subject: Subject, seed: int = 0) -> Training:
 
 
 def _to_the_end(training: Training) -> list[dict[str, float]]:
-    """The loss terms of the steps that are left, of all stages."""
+    """Loss terms of the remaining steps."""
     return [training.step().terms for _ in range(training.schedule.total - training.step_index)]
 
 
 def seeds(subject: Subject) -> Result:
-    """R9: one seed twice at one thread; the spread of three."""
+    """R9: two runs of one seed with one thread; the deviation of three seeds."""
     trainings = [_training(subject, seed) for seed in (0, 0, 1, 2)]
     with _one_thread():
         terms = [_to_the_end(training) for training in trainings]
     once, twice = (training.model.state_dict().values() for training in trainings[:2])
     unequal = sum(not torch.equal(a, b) for a, b in zip(once, twice))
     losses = [float(np.mean([step["image"] for step in steps if "image" in step][-4:])) for steps in terms[1:]]
-    figures = (
+    return result(
         at_most("tensors that differ between two runs of one seed", unequal, 0),
         reported("image loss of three seeds: mean", float(np.mean(losses))),
         reported("image loss of three seeds: standard deviation", float(np.std(losses, ddof=1))),
     )
-    return Result(figures)
 
 
 def not_finite(subject: Subject) -> Result:
@@ -107,11 +105,11 @@ def not_finite(subject: Subject) -> Result:
     except InputError as error:
         if taken != MAX_BAD_STEPS - 1 or "not finite" not in str(error):
             wrong.append(f"it stopped after {taken}: {error}")
-    return Result((holds("ways in which a NaN is not met", wrong),))
+    return result(holds("ways in which a NaN is not met", wrong))
 
 
 def resumed(subject: Subject) -> Result:
-    """R11: stop at half and resume."""
+    """R11: a run resumed at half, against an unbroken one."""
     with _one_thread():
         curve = _to_the_end(_training(subject))
         half = _training(subject)
@@ -123,4 +121,4 @@ def resumed(subject: Subject) -> Result:
         rest = _to_the_end(again)
     pairs = zip(rest, curve[SHORT // 2 :], strict=True)
     off = max(abs(ours[name] - theirs[name]) for ours, theirs in pairs for name in theirs)
-    return Result((at_most("losses after resuming, largest difference to the unbroken run", off, 0),))
+    return result(at_most("losses after resuming, largest difference to the unbroken run", off, 0))

@@ -1,4 +1,4 @@
-"""Row P2: a forearm that twists."""
+"""Row P2: a twisted forearm."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from scipy.spatial import cKDTree
 from rnd_bench.scenes.poses import Angles
 from rnd_bench.scenes.psnr import Floats
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, above, below, reported
+from rnd_bench.stability.figures import Result, above, below, reported, result
 from rnd_runtime.core.gaussians import Gaussians
 
-RING_M = 0.02  # length of a slice of a limb whose radius is measured
-RING_COUNT = 8  # Gaussians that a slice needs to have a radius
+RING_M = 0.02  # m; least length of a slice of the limb
+RING_COUNT = 8  # least Gaussians of a slice
 NEIGHBOURS = 12  # that define the surface around a Gaussian
-FEWER_OR_MORE = (9, 16)  # neighbours: how well a twisted surface's normals are known at all
+FEWER_OR_MORE = (9, 16)  # neighbours; their normals differ by the uncertainty of the surface's normals
 
 
 def candy_wrapper(subject: Subject) -> Result:
-    """P2: the forearm twisted at either end, 0 to 180° by 10°."""
+    """P2: the forearm twisted at either end, 0 to 180° in steps of 10°."""
     ratios, plain_ratios, errors, plain_errors, uncertain, finite = [], [], [], [], [], True
     names, joints = subject.avatar.skeleton.names, subject.avatar.skeleton.rest_joints
     elbow = joints[names.index("left_elbow")]
@@ -46,14 +46,13 @@ def candy_wrapper(subject: Subject) -> Result:
     lbs = "template LBS, A_R n"
     fewer, more = FEWER_OR_MORE
     thinnest = ("template LBS", min(plain_ratios))
-    figures = (
+    return result(
         above("cross-section ratio at 150°, thinnest slice", min(ratios), 0.5, baseline=thinnest),
         below("not finite by 180°", float(not finite), 1, "poses"),
         below("normal error at 120°, mean of the worst slice", worst, 15, "°", baseline=(lbs, plain_worst)),
         reported("the same, mean of all slices", mean, "°", baseline=(lbs, plain_mean)),
         reported(f"the surface's own normals, by {fewer} and by {more} neighbours, worst slice", unsure, "°"),
     )
-    return Result(figures)
 
 
 class _Limb:
@@ -74,16 +73,16 @@ class _Limb:
         return along, np.linalg.norm(offset - np.outer(along, self.axis), axis=1)
 
     def ratio(self, posed: Gaussians) -> float:
-        """Radius over that at rest, of the slice that lost most."""
+        """Radius over that at rest, least of all slices."""
         radii = self._radii(posed.means)[1]
         return min(float(radii[s].mean() / self.radii[s].mean()) for s in self.slices)
 
     def normal_error(self, posed: Gaussians) -> Floats:
-        """Mean angle of each slice [S], degrees, to the rest normals as the surface around them moved."""
+        """Mean angle of each slice [S], degrees, between posed normals and those of the moved surface."""
         return self._angles(self._surface_normals(posed, NEIGHBOURS), posed.normals[self.around])
 
     def uncertainty(self, posed: Gaussians) -> Floats:
-        """Angle between that surface's normals by fewer and by more neighbours, [S] degrees."""
+        """Mean angle of each slice [S], degrees, between the surface's normals by fewer and by more neighbours."""
         fewer, more = (self._surface_normals(posed, count) for count in FEWER_OR_MORE)
         return self._angles(fewer, more)
 
@@ -96,10 +95,10 @@ class _Limb:
         return np.array([error[s].mean() for s in self.slices])
 
     def _surface_normals(self, posed: Gaussians, neighbours: int) -> Floats:
-        """The rest normals [M, 3] of the Gaussians around the bone as the surface moved, from positions alone.
+        """Expected normals [M, 3] around the bone, from positions alone.
 
         Planes through the neighbours, at rest and posed, give a map F of tangents and normal; the expected normal is
-        F's inverse transpose times the one at rest.
+        F⁻ᵀ n_rest.
         """
         found = np.zeros((int(self.around.sum()), 3))
         nearest = cKDTree(self.rest.means).query(self.rest.means[self.around], k=neighbours)[1]
