@@ -1,4 +1,4 @@
-"""rnd-data check: a sound capture passes, and every usual mistake is named."""
+"""rnd-data check: a correct capture passes, usual mistakes are named."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _wrong(folder) -> dict[str, str]:
     return {f.subject: f.sentence for f in check_capture(folder).findings if f.level == "wrong"}
 
 
-def test_a_sound_capture_passes(sound) -> None:
+def test_a_correct_capture_passes(sound) -> None:
     report = check_capture(sound)
     assert not report.wrong, report.findings
     assert len(report.ious) == 8 and min(entry.iou for entry in report.ious) > SOUND
@@ -169,8 +169,8 @@ def test_frame_rates_of_another_motion_are_named(folder) -> None:
     assert "frame rate 3000 is too high" in _wrong(folder)["frame rate"]
 
 
-def test_a_distorted_lens_is_named_by_what_an_import_noted(tmp_path) -> None:
-    """Keys at the top of capture.json are free text: what is no import's note changes nothing."""
+def test_a_distorted_lens_is_explained_by_the_imports_notes(tmp_path) -> None:
+    """Other notes in capture.json have no effect."""
     write_true_capture(tmp_path, k1=-0.4)
     before = check_capture(tmp_path).findings
     found = {f.subject: f for f in before}
@@ -211,7 +211,7 @@ def test_masks_are_counted_as_a_training_counts_them(folder) -> None:
     assert "2 of 8" in _wrong(folder)["masks"]
 
 
-def test_what_would_not_train_is_named(folder) -> None:
+def test_captures_that_cannot_be_trained_are_named(folder) -> None:
     def relit(record) -> None:
         record["lights"] = {"noon": {"file": "body.npz"}, "dusk": {"file": "body.npz"}}
         for number, frame in enumerate(record["frames"]):
@@ -247,7 +247,7 @@ def test_the_command_prints_writes_and_exits(folder, tmp_path, capsys) -> None:
     assert check(folder)[0] == 2
 
 
-def test_the_overlay_shows_the_person_and_what_differs(folder) -> None:
+def test_the_overlay_shows_the_person_and_the_differences(folder) -> None:
     """Close up, the mask alone in red, the template alone in blue."""
     check_and_report(folder, folder / "out")
     image = read_image(folder / "out" / "check.png")

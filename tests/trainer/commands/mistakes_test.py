@@ -1,4 +1,4 @@
-"""Options and files that a command cannot use: one line that names them, exit code 2, and nothing is begun."""
+"""Invalid options and files: one line that names them, and exit code 2."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
         ("rnd-stage OUT --estimate-seed -1", "--estimate-seed: expected at least 0, got -1"),
     ],
 )
-def test_numbers_that_no_command_can_use(line, message, tmp_path, monkeypatch, capsys) -> None:
+def test_invalid_numbers_are_refused(line, message, tmp_path, monkeypatch, capsys) -> None:
     command, *words = line.replace("OUT", str(tmp_path / "out")).split()
     monkeypatch.setattr("sys.argv", [command, *words])
     code = _code(COMMANDS[command])
@@ -107,14 +107,14 @@ def _code(main) -> object:
         return ended.code
 
 
-def test_rows_of_another_bench_are_not_added_to(tmp_path, monkeypatch, capsys) -> None:
+def test_rows_of_another_bench_are_refused(tmp_path, monkeypatch, capsys) -> None:
     rows = tmp_path / "raster.json"
     rows.write_text(json.dumps([{"n": 3, "machine": "this one"}]))
     assert rnd_bench.cli.main(["grid", str(ASSETS), "--quick", "--json", str(rows)]) == 2
     assert "expected rows of rnd-bench, got another file" in capsys.readouterr().err
 
 
-def test_a_file_that_may_not_be_read_is_named(tmp_path, monkeypatch) -> None:
+def test_an_unreadable_file_is_named(tmp_path, monkeypatch) -> None:
     file = tmp_path / "avatar.onnx"
     file.write_bytes(b"secret")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # whoever runs the tests
@@ -127,13 +127,13 @@ def test_json_has_no_nan(tmp_path) -> None:
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, [1.5, None]], "b": None}
 
 
-def test_pictures_too_small_for_the_losses_are_refused(tiny_capture) -> None:
+def test_images_too_small_for_the_losses_are_refused(tiny_capture) -> None:
     with pytest.raises(InputError, match=r"training images: expected at least 11 pixels wide and high, got \d+ x"):
         load_views(tiny_capture, "train", 0.1)
 
 
-def test_slivers_of_a_person_keep_the_losses_window(tiny_capture) -> None:
-    """Where little of a person is in the picture, the crop is as wide as the structural term's window."""
+def test_crops_have_at_least_the_size_of_the_ssim_window(tiny_capture) -> None:
+    """The crop of a partly visible person is as wide as the SSIM window."""
     camera = next(iter(tiny_capture.cameras.values()))
     views, _ = load_views(tiny_capture, "train", 11.5 / min(camera.width, camera.height))
     assert min(min(view.camera.width, view.camera.height) for view in views) >= 11

@@ -1,4 +1,4 @@
-"""Held-out figures: against independent metrics, on perfect and on spoilt renderings, and as rows of JSON."""
+"""Held-out scores: against independent metrics, on perfect and degraded renderings, and as JSON rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate, flicker
 from rnd_trainer.evaluation.evaluator import Rendered, render_runtime
 from rnd_trainer.evaluation.held_out import playback, score, strip_names
-from rnd_trainer.evaluation.scores import frame_scores, normal_picture, outline_length, silhouette, to_srgb8
+from rnd_trainer.evaluation.scores import frame_scores, normal_image, outline_length, silhouette, to_srgb8
 from rnd_trainer.losses.metrics import psnr, ssim_map
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.model import AvatarModel
@@ -52,7 +52,7 @@ def _perfect(truth) -> Rendered:
     return Rendered(linear, torch.from_numpy(normal) * mask[..., None], linear, mask)
 
 
-def test_a_perfect_rendering_is_perfect_in_every_figure(tiny_capture) -> None:
+def test_a_perfect_rendering_has_perfect_scores(tiny_capture) -> None:
     truth = _truth(tiny_capture)
     scores = frame_scores(_perfect(truth), truth)
     assert scores["psnr"] == scores["psnr_box"] == math.inf
@@ -71,7 +71,7 @@ def test_an_albedo_is_compared_after_its_scale(tiny_capture) -> None:
     )
 
 
-def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
+def test_box_scores_are_those_of_the_crop(tiny_capture) -> None:
     truth = _truth(tiny_capture)
     perfect = _perfect(truth)
     spoilt = dataclasses.replace(perfect, image=0.7 * perfect.image)
@@ -83,7 +83,7 @@ def test_figures_of_the_box_are_those_of_the_cut(tiny_capture) -> None:
     assert scores["psnr_box"] < scores["psnr"] < 60
 
 
-def test_an_outline_is_off_by_as_much_as_a_disc_is_too_wide(tiny_capture) -> None:
+def test_outline_error_is_that_of_a_disc_too_wide(tiny_capture) -> None:
     row, column = torch.meshgrid(torch.arange(256.0), torch.arange(256.0), indexing="ij")
     distance = torch.hypot(row - 127.3, column - 127.9)
 
@@ -109,15 +109,15 @@ def test_an_outline_is_off_by_as_much_as_a_disc_is_too_wide(tiny_capture) -> Non
 
 @pytest.mark.parametrize(("wrong", "degrees"), [("hole", 0.0), ("beside", math.degrees(math.acos(1 / 3)))])
 def test_normals_without_data_are_not_scored(tiny_capture, wrong, degrees) -> None:
-    """Where the truth has no normal ours may be anything: it counts neither as wrong nor as right."""
+    """Rendered normals do not count without true normals."""
     truth = _truth(tiny_capture)
     tilted = np.full_like(truth.image_srgb, [-(3**-0.5)] * 3)
-    turned = tilted * [1, 1, -1]
+    flipped = tilted * [1, 1, -1]
     normal, half = tilted.copy(), len(tilted) // 2
     normal[:half] = 0
     ours = tilted.copy()
     rows = slice(half) if wrong == "hole" else slice(half, None)
-    ours[rows] = turned[rows]
+    ours[rows] = flipped[rows]
     rendered = dataclasses.replace(_perfect(truth), normals=torch.from_numpy(ours))
     scores = frame_scores(rendered, dataclasses.replace(truth, normal=normal, normal_gt=None))
     assert scores["normal_deg"] == pytest.approx(degrees, abs=0.1)
@@ -136,7 +136,7 @@ def test_psnr_and_ssim_are_opencvs(tiny_capture) -> None:
 
 
 @pytest.mark.parametrize(("visibility", "shadows"), [("pose", True), ("paper", False), ("none", False)])
-def test_a_model_that_learned_without_shadows_is_judged_without(tiny_capture, monkeypatch, visibility, shadows):
+def test_a_model_trained_without_shadows_is_evaluated_without(tiny_capture, monkeypatch, visibility, shadows):
     body = tiny_capture.body
     config = ModelConfig(gaussians=800, nodes=200, width=32, attribute_width=32, visibility=visibility)
     model = AvatarModel(config, sample_template(body, 800, 200, seed=1))
@@ -145,19 +145,19 @@ def test_a_model_that_learned_without_shadows_is_judged_without(tiny_capture, mo
     shader = Shader(Light(overhead), "table+sun")
     assert shader.directional
 
-    def picture() -> torch.Tensor:
+    def image() -> torch.Tensor:
         pose = pose_input(tiny_capture.motion, body.skeleton, 0.0, config)
         return render_runtime(model, pose, tiny_capture.cameras["front"], shader).image
 
-    played = picture()
+    played = image()
     monkeypatch.setattr(
         "rnd_runtime.shading.shader.directional_visibility",
         lambda points, normals, ways, **_: np.ones((len(points), len(ways)), np.float32),
     )
-    assert torch.equal(played, picture()) is not shadows
+    assert torch.equal(played, image()) is not shadows
 
 
-def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_capture) -> None:
+def test_evaluation_culls_as_the_player(tiny_run, tiny_capture) -> None:
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
     frame = tiny_capture.split("train")[0]
     whole, all_of_it, *fewer = (
@@ -168,7 +168,7 @@ def test_an_avatar_is_judged_without_what_the_player_leaves_out(tiny_run, tiny_c
     assert 0 < backs < backs_and_sides < 0.1 * everything
 
 
-def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
+def test_a_sliver_at_the_edge_is_scored_and_an_empty_frame_is_left_out(tiny_run, tiny_capture, monkeypatch) -> None:
     evaluator, original = (
         Evaluator(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture),
         type(tiny_capture).load_frame,
@@ -193,10 +193,10 @@ def test_a_sliver_at_the_edge_is_scored_and_nobody_is_left_out(tiny_run, tiny_ca
     assert evaluate(evaluator, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
 
 
-def test_normal_pictures_are_black_where_nothing_is() -> None:
+def test_normal_images_are_black_without_coverage() -> None:
     normals = torch.tensor([[[0.0, 0.0, -0.5], [0.0, 0.0, -2.0]]])
-    picture = normal_picture(normals, torch.tensor([[0.01, 0.5]]))
-    assert torch.equal(picture, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
+    image = normal_image(normals, torch.tensor([[0.01, 0.5]]))
+    assert torch.equal(image, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
 
 
 def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
@@ -210,7 +210,7 @@ def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
     assert torch.equal(band, (outside - inside) > 0)
 
 
-def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_path) -> None:
+def test_rows_name_all_scores_and_their_provenance(tiny_run, tiny_capture, tmp_path) -> None:
     rows = score(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture, method="m", strips=tmp_path)
     assert [row["split"] for row in rows] == ["novel_view"]
     row = json.loads(json.dumps(rows[0]))
@@ -219,7 +219,7 @@ def test_rows_name_every_figure_and_their_origin(tiny_run, tiny_capture, tmp_pat
     assert (tmp_path / "novel_view.png").exists() and len(list((tmp_path / "novel_view").glob("*.png"))) == 2
 
 
-def test_strips_have_names_of_their_own_and_are_no_jpegs() -> None:
+def test_strips_have_unique_names_and_are_png() -> None:
     assert strip_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
     cameras = ["cam0/000001.jpg", "cam1/000001.jpg", "cam1/000002.jpg"]
     assert list(strip_names(cameras).values()) == ["cam0_000001", "cam1_000001", "000002"]
@@ -280,19 +280,19 @@ def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> 
     assert result.scores["psnr"] == pytest.approx(expected, rel=1e-6)
 
 
-def test_flicker_is_nothing_when_nothing_moves_and_something_when_it_jumps(tiny_run, tiny_capture) -> None:
+def test_flicker_is_zero_for_a_static_motion_and_positive_for_jumps(tiny_run, tiny_capture) -> None:
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
     moves = tiny_capture.motion
     still = dataclasses.replace(moves, rotations=np.repeat(moves.rotations[:1], 6, axis=0))
     assert flicker(Evaluator(checkpoint, tiny_capture, motion=still), "train") == 0
     jumping = dataclasses.replace(moves, rotations=moves.rotations[[0, 1, 0, 1, 0, 1]])
-    shaken = flicker(Evaluator(checkpoint, tiny_capture, motion=jumping), "train")
-    assert shaken is not None and shaken > 1
+    jumping_flicker = flicker(Evaluator(checkpoint, tiny_capture, motion=jumping), "train")
+    assert jumping_flicker is not None and jumping_flicker > 1
     assert flicker(Evaluator(checkpoint, tiny_capture), "relight") is None
 
 
 def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:
-    """A evaluator of grey pictures of these sRGB ``values`` by motion frame."""
+    """An evaluator of grey images of these sRGB ``values`` by motion frame."""
 
     def render(frame: object, index: int) -> Rendered:
         grey = torch.full((*mask.shape, 3), float(srgb_to_linear(np.array(values[index]))))
@@ -302,8 +302,8 @@ def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:
     return SimpleNamespace(capture=capture, motion=SimpleNamespace(frame_count=len(values)), render=render)
 
 
-def test_flicker_is_what_does_not_change_evenly() -> None:
-    """Half the second difference: nothing at constant speed, the whole of a step to and fro."""
+def test_flicker_is_half_the_second_difference() -> None:
+    """Zero at constant speed, the full step for an alternating value."""
     mask = np.ones((4, 5), np.float32)
     assert flicker(_shown([k * 10 / 255 for k in range(8)], mask)) == pytest.approx(0, abs=1e-3)
     assert flicker(_shown([k % 2 * 10 / 255 for k in range(8)], mask)) == pytest.approx(10, abs=1e-3)
@@ -324,8 +324,8 @@ def test_the_training_light_is_the_learned_one_and_others_the_captures(tiny_run,
         assert np.array_equal(evaluator._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
 
 
-def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:
-    """A renamed or edited capture keeps it; another map of the same name, in a folder of the same name, is another."""
+def test_the_training_light_is_identified_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:
+    """Also in a renamed or edited capture; another map of the same name is another light."""
     shutil.copytree(ASSETS / "capture", tmp_path / "me/capture")
     mine = load_capture(tmp_path / "me/capture")
     training = Training(mine, dataclasses.replace(tiny_config, image_scale=0.1))
@@ -341,7 +341,7 @@ def test_the_light_of_the_training_is_known_by_its_map(tiny_capture, tiny_config
 
 
 def test_the_albedos_scale_is_fitted_to_training_frames() -> None:
-    """By least squares, wherever both cover; lights that are held out say nothing about it."""
+    """By least squares, without held-out lights."""
     rng = np.random.default_rng(0)
     ours, factor = rng.uniform(0.1, 0.3, (6, 7, 3)).astype(np.float32), np.array([1.5, 2.0, 0.5])
     splits = {"train": 1.0, "relight": 3.0}
@@ -379,7 +379,7 @@ def test_frames_a_second_are_those_of_the_median_frame(tiny_run, tiny_capture, t
     assert playback(tmp_path / "avatar.onnx", evaluator) == {"file_mb": 3.0, "fps": pytest.approx(100)}
 
 
-def test_an_exported_avatar_of_another_checkpoint_is_left_out_in_words(
+def test_an_exported_avatar_of_another_checkpoint_is_skipped_with_a_warning(
     tiny_checkpoint, tiny_avatar, tmp_path, capsys
 ) -> None:
     checkpoint, exported = tmp_path / "avatar.ckpt", tmp_path / "avatar.onnx"

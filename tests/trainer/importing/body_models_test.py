@@ -1,4 +1,4 @@
-"""Body models from every file they come in, against the published formulas."""
+"""Body models from all file formats, against the published formulas."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_shapes_agree_with_the_published_formula(tmp_path, monkeypatch, joints, 
 
 
 @pytest.mark.parametrize(("columns", "shapes"), [(10, 10), (16, 16), (20, 10), (400, 300)])
-def test_smplx_columns_of_expressions_are_no_shape(tmp_path, columns, shapes) -> None:
+def test_smplx_expressions_are_not_shape_parameters(tmp_path, columns, shapes) -> None:
     """v1.0 holds ten of either, v1.1 300 and 100."""
     arrays = _family(55)
     arrays["shapedirs"] = RNG.normal(size=(len(arrays["v_template"]), 3, columns))
@@ -129,14 +129,14 @@ def test_smplx_columns_of_expressions_are_no_shape(tmp_path, columns, shapes) ->
     assert (model.shape_dirs == arrays["shapedirs"][..., :shapes]).all()
 
 
-def test_our_own_body_has_one_shape(tmp_path) -> None:
+def test_a_body_npz_has_one_shape(tmp_path) -> None:
     coarse_body().save(tmp_path / "body.npz")
     model = load_body_model(tmp_path / "body.npz")
     assert model.family == "template"
     assert_allclose(model.shaped(np.ones(10)).vertices, coarse_body().vertices, atol=1e-6)
 
 
-def test_a_file_that_executes_something_is_refused_and_does_not(tmp_path) -> None:
+def test_a_pickle_with_code_is_refused_and_not_executed(tmp_path) -> None:
     class Bomb:
         def __reduce__(self):
             return (print, ("executed",))
@@ -147,7 +147,7 @@ def test_a_file_that_executes_something_is_refused_and_does_not(tmp_path) -> Non
         load_body_model(path)
 
 
-def test_what_does_not_fit_is_named(tmp_path) -> None:
+def test_wrong_members_are_refused(tmp_path) -> None:
     arrays = smpl_arrays()
 
     def refusal(**changes) -> str:
@@ -188,7 +188,7 @@ def test_a_converted_body_is_the_shaped_one(tmp_path) -> None:
     assert body.license == "mine"
 
 
-def test_conversions_that_cannot_be_meant_are_refused(tmp_path, monkeypatch) -> None:
+def test_conversions_without_effect_are_refused(tmp_path, monkeypatch) -> None:
     coarse_body().save(tmp_path / "body.npz")
     before = (tmp_path / "body.npz").read_bytes()
     monkeypatch.setattr(body_models, "anny_body", coarse_body)

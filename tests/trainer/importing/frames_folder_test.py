@@ -1,4 +1,4 @@
-"""Masks and normals of a folder of frames: which file belongs to which frame, and what is refused."""
+"""Masks and normals of a folder of frames: matching of files to frames, and refusals."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_another_count_of_masks_goes_by_their_numbers(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["masks", "normals"])
-def test_an_image_without_a_number_is_no_mask_of_a_videos_frames(tmp_path, kind) -> None:
+def test_a_file_without_a_number_is_not_a_mask_of_a_video(tmp_path, kind) -> None:
     _write(tmp_path)
     film = write_film(tmp_path)
     for k in range(FRAMES):
@@ -145,7 +145,7 @@ def test_sixteen_bits_of_coverage_stay_soft(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 3, 4, 5)])
-def test_an_array_that_is_no_mask_is_refused(tmp_path, shape) -> None:
+def test_arrays_of_other_shapes_are_refused(tmp_path, shape) -> None:
     np.save(tmp_path / "m.npy", np.zeros(shape))
     with pytest.raises(InputError, match=r"m\.npy: mask: expected \[H, W\], got"):
         read_mask(tmp_path / "m.npy")
@@ -211,7 +211,7 @@ def test_a_capture_is_not_written_among_its_sources(tmp_path) -> None:
             import_source(source, tmp_path, ImportOptions(**given, **more))
 
 
-def test_a_folder_that_cannot_be_made_is_refused_before_anything_is_read(tmp_path, monkeypatch) -> None:
+def test_an_unwritable_folder_is_refused_before_reading(tmp_path, monkeypatch) -> None:
     source = write_frames(tmp_path)
     (tmp_path / "file").touch()
     monkeypatch.setattr("rnd_trainer.importing.importer._read", lambda *_: pytest.fail("read"))

@@ -33,7 +33,7 @@ def test_every_layout_is_the_same_scene(tmp_path, name) -> None:
     assert not report.wrong, report.findings
 
 
-def test_an_image_beside_folders_is_no_video_and_a_capture_no_source(tmp_path) -> None:
+def test_an_image_beside_folders_and_a_capture_are_not_sources(tmp_path) -> None:
     (tmp_path / "00000.png").touch()
     (tmp_path / ".hidden").mkdir()
     assert find_layout(tmp_path)[1] == "a folder of frames"
@@ -159,7 +159,7 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_what_a_source_lacks_is_named(tmp_path, name) -> None:
+def test_missing_parts_of_a_source_are_named(tmp_path, name) -> None:
     layout, damage, words = DAMAGED[name]
     source = LAYOUTS[layout].write_into(tmp_path / "source")
     damage(source)
@@ -177,7 +177,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize(("name", "content"), [(name, text) for name in OTHERS for text in OTHERS[name]])
-def test_json_of_other_programs_is_no_layout(tmp_path, name, content) -> None:
+def test_json_of_other_programs_is_not_a_layout(tmp_path, name, content) -> None:
     (tmp_path / name).write_text(content)
     np.savez(tmp_path / "poses.npz", poses=np.zeros(3))
     with pytest.raises(InputError, match="source: expected a known layout"):

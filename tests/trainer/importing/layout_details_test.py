@@ -1,4 +1,4 @@
-"""Details of the layouts that one well-behaved scene cannot tell apart, each against its definition."""
+"""Details of the layouts, each against its definition."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def _nothing() -> np.ndarray:
     return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
 
 
-def test_other_cameras_hold_out_every_so_many_of_the_frames_that_there_are() -> None:
-    """Counted, not by their numbers, which may be even all of them; after the border they are of novel poses."""
+def test_other_cameras_hold_out_frames_at_an_interval() -> None:
+    """By count, not by number; after the border as novel poses."""
     numbers = list(range(0, 40, 2))
     samples = [Sample(name, number, _nothing) for name in cameras() for number in numbers]
     kept = select_samples(_dataset(list(range(40)), samples), FrameSelection(held_out_every=4))
@@ -142,13 +142,13 @@ def test_nerfstudios_lens_is_in_opencvs_order(tmp_path) -> None:
     assert (lens.camera.K[0, 0], lens.camera.K[1, 1]) == (50, 60)
 
 
-def test_nerfstudios_camera_angle_is_of_the_width(tmp_path) -> None:
+def test_nerfstudios_camera_angle_is_horizontal(tmp_path) -> None:
     layouts.write_nerfstudio(tmp_path)
     K = _first_lens(tmp_path, ("fl_x", "fl_y"), camera_angle_x=np.pi / 2).camera.K
     assert_allclose(K, [[WIDTH / 2, 0, WIDTH / 2], [0, WIDTH / 2, HEIGHT / 2], [0, 0, 1]])
 
 
-def test_ranas_field_of_view_is_of_the_width(tmp_path) -> None:
+def test_ranas_field_of_view_is_horizontal(tmp_path) -> None:
     layouts.write_rana(tmp_path)
     for file in tmp_path.glob("*.json"):
         record = json.loads(file.read_text())
@@ -174,7 +174,7 @@ def test_optimised_poses_come_before_others(tmp_path) -> None:
         assert_allclose(read.poses.rotations[:, 1:22], axis_angle_to_matrix(axis_angles())[:, 1:22], atol=1e-6)
 
 
-def test_the_alpha_of_a_picture_is_its_mask(tmp_path) -> None:
+def test_the_alpha_of_an_image_is_its_mask(tmp_path) -> None:
     """Of transforms.json, where no mask is named."""
     layouts.write_nerfstudio(tmp_path)
     pixels = np.full((HEIGHT, WIDTH, 4), 90, np.uint8)

@@ -1,4 +1,4 @@
-"""Masks made from a video, against the true ones; networks in ONNX of every axis order; refusals."""
+"""Masks estimated from a video, against the true ones; ONNX networks of every axis order; refusals."""
 
 import functools
 from pathlib import Path
@@ -101,18 +101,18 @@ def test_masks_from_poses(video, noise, moving, floor):
     assert _mean_iou(masks, truth) > _mean_iou([np.uint8(255) * t for t in templates], truth)
 
 
-def test_masks_from_movement_alone(video):
+def test_masks_from_motion_alone(video):
     composites, _, truth = video()
     assert _mean_iou(make_masks(composites), truth) > WITHOUT_POSES
 
 
-def test_equal_pictures_give_equal_masks(video):
+def test_equal_images_give_equal_masks(video):
     composites, templates, _ = video()
     runs = [np.stack(list(make_masks(composites[:4], templates[:4]))) for _ in range(2)]
     assert (runs[0] == runs[1]).all()
 
 
-def test_nothing_to_go_by_is_refused(video):
+def test_a_static_video_without_poses_is_refused(video):
     still = [video()[0][0]] * 5
     with pytest.raises(InputError, match="--mask-net"):
         next(make_masks(still))
@@ -130,7 +130,7 @@ def test_a_frame_whose_template_is_out_of_view_has_an_empty_mask(video):
 def _red_network(
     path: Path, *, channels_first=True, size: int | str = 64, two=False, logits=False, rank=4, gain=1.0
 ) -> Path:
-    """A network that finds what is more red than green."""
+    """A network that segments pixels that are more red than green."""
     weights = np.float32([[8, -8, 0]]) if not two else np.float32([[0, 0, 0], [8, -8, 0]])
     weights, count = gain * weights, len(weights)
     shape = [1, 3, size, size] if channels_first else [1, size, size, 3]
@@ -191,8 +191,8 @@ def test_networks_of_every_layout(tmp_path, layout):
     assert _mean_iou([mask], [truth]) > HALF_SIZE
 
 
-def test_the_network_looks_at_the_templates_surroundings(tmp_path):
-    """Something as red, far from the person, is none of it."""
+def test_the_network_gets_a_crop_around_the_template(tmp_path):
+    """Red pixels far from the person are not in the mask."""
     composite, truth = _red_on_green(slice(20, 40))
     composite[20:70, 100:118] = composite[20:70, 20:38]
     template = np.zeros_like(truth)
@@ -201,7 +201,7 @@ def test_the_network_looks_at_the_templates_surroundings(tmp_path):
     assert _mean_iou([mask], [truth]) > HALF_SIZE
 
 
-def test_what_is_no_such_network_is_refused(tmp_path):
+def test_other_networks_are_refused(tmp_path):
     (tmp_path / "text.onnx").write_bytes(b"hello")
     with pytest.raises(InputError, match="ONNX"):
         ImageNetwork(tmp_path / "text.onnx", outputs=(1,))

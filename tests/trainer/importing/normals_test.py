@@ -1,4 +1,4 @@
-"""Normal maps in everybody's axes come out in the camera's OpenCV axes."""
+"""Normal maps in any axes are converted to OpenCV camera axes."""
 
 import numpy as np
 import onnx
@@ -33,7 +33,7 @@ def _sphere(size: int = 64) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("signs", SIGNS)
-def test_axes_are_told_by_the_template(signs):
+def test_axes_are_found_by_the_template(signs):
     normals, inside = _sphere()
     axes = find_axes([normals * np.float32(signs)], [normals.astype(np.float64)])
     assert axes.signs == signs
@@ -47,7 +47,7 @@ def test_axes_in_words():
     assert find_axes([sapiens], [normals]).name == "right, up, towards the viewer"
 
 
-def test_maps_that_agree_with_nothing_are_refused():
+def test_maps_that_disagree_with_the_template_are_refused():
     normals, inside = _sphere()
     rng = np.random.default_rng(0)
     noise = rng.normal(size=normals.shape).astype(np.float32)
@@ -60,7 +60,7 @@ def test_maps_that_agree_with_nothing_are_refused():
 
 
 def test_swapped_axes_are_named():
-    """Red and blue the other way round, or turned about: no sign mends that, the flag does."""
+    """Red and blue swapped, or rotated axes: no signs fix that, the option does."""
     normals, _ = _sphere()
     for wrong, flag in ((normals[..., ::-1], "z,y,x"), (-np.roll(normals, 1, -1), "-y,-z,-x")):
         with pytest.raises(InputError, match=rf"with --normal-axes={flag} it would be 1\.00"):
@@ -89,14 +89,14 @@ def test_files_of_another_kind_are_refused(tmp_path):
             read_normals(tmp_path / name)
 
 
-@pytest.mark.parametrize("as_picture", [True, False])
-def test_a_network_sees_the_person_on_grey(tmp_path, as_picture):
+@pytest.mark.parametrize("as_image", [True, False])
+def test_a_networks_input_is_the_person_on_grey(tmp_path, as_image):
     """The network gives back its image (as n in 0…1, or −1…1): the image of a normal map comes out as that map."""
     normals, inside = _sphere()
     image = np.round(255 * (normals * np.float32([1, -1, -1]) + 1) / 2).astype(np.uint8)
     image[~inside] = (10, 200, 90)
     mask = np.where(inside, 255, 0).astype(np.uint8)
-    scale, shift = (1.0, 0.0) if as_picture else (2.0, -1.0)
+    scale, shift = (1.0, 0.0) if as_image else (2.0, -1.0)
     weights = scale * np.eye(3, dtype=np.float32)
     graph = helper.make_graph(
         [helper.make_node("Conv", ["x", "w", "b"], ["y"])],
@@ -112,22 +112,22 @@ def test_a_network_sees_the_person_on_grey(tmp_path, as_picture):
     found = normal_map(normal_network(tmp_path / "n.onnx"), image, mask)
     axes = find_axes([found], [normals])
     assert axes.signs == (1, -1, -1)
-    turned = to_opencv(found, axes)
-    assert (turned[~inside] == 0).all()
-    cosines = (turned * normals).sum(-1)[inside]
+    in_opencv = to_opencv(found, axes)
+    assert (in_opencv[~inside] == 0).all()
+    cosines = (in_opencv * normals).sum(-1)[inside]
     assert (
         np.degrees(np.arccos(np.clip(cosines, -1, 1))).mean() < 1.5
     )  # 8 bits, resized up and down; edges blend in grey
 
 
-def test_what_looks_away_is_turned_edge_on():
+def test_back_facing_normals_are_projected():
     normals, _ = _sphere()
     axes = find_axes([normals], [normals])
     away = to_opencv(np.array([[[0.6, 0, 0.8]]], np.float32), axes)
     assert_allclose(away, [[[1, 0, 0]]], atol=1e-6)
 
 
-def test_holes_are_filled_from_next_to_them():
+def test_holes_are_filled_from_the_nearest_pixels():
     normals, inside = _sphere()
     holed = normals.copy()
     holed[30:33, 30:33] = 0

@@ -1,4 +1,4 @@
-"""Every command of docs/own-video.md, run as it stands there."""
+"""Every command of docs/own-video.md, run as written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Body poses from every program that estimates them put the same person in front of the camera."""
+"""Body poses of all supported pose estimators give the same person in camera axes."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_root_conventions_agree_with_their_definitions() -> None:
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_a_programs_poses_put_the_person_where_it_saw_it(tmp_path, program) -> None:
+def test_poses_of_each_program_agree_in_camera_axes(tmp_path, program) -> None:
     found = read_poses(PROGRAMS[program](tmp_path))
     assert found.poses.frames.tolist() == list(range(FRAMES))
     focal = float(found.K[0, 0]) if found.focal is None else found.focal(WIDTH, HEIGHT)
@@ -80,13 +80,13 @@ def test_a_programs_poses_put_the_person_where_it_saw_it(tmp_path, program) -> N
 
 
 @pytest.mark.parametrize("program", ["phalp", "romp", "wham"])
-def test_a_programs_lens_goes_by_the_longer_side(tmp_path, program) -> None:
+def test_assumed_focal_lengths_depend_on_the_longer_side(tmp_path, program) -> None:
     broad, low = 64, 48  # pixels of a landscape image; the scene's are portraits
     expected = {"phalp": 5000 * broad / 256, "romp": broad / 2 / np.tan(np.radians(30)), "wham": np.hypot(broad, low)}
     assert read_poses(PROGRAMS[program](tmp_path)).focal(broad, low) == pytest.approx(expected[program])
 
 
-def test_easymocaps_files_put_the_person_where_it_saw_it(tmp_path) -> None:
+def test_easymocaps_files_agree_in_the_world(tmp_path) -> None:
     world, folder = layouts.camera_world(), write_easymocap_folder(tmp_path)
     found = read_poses(folder)
     assert found.K is None and found.focal is None and found.numbered
@@ -134,7 +134,7 @@ def test_romps_results_of_a_video_may_be_beside_those_of_its_frames(tmp_path) ->
         assert_allclose(poses.root(world.rest), world.positions, atol=ATOL)
 
 
-def test_a_frame_in_which_romp_saw_nobody_is_left_out(tmp_path) -> None:
+def test_a_romp_frame_without_people_is_left_out(tmp_path) -> None:
     folder = write_romp(tmp_path)
     np.savez(folder / f"{1:08d}.npz", results=None)
     assert read_poses(folder).poses.frames.tolist() == [0, 2, 3]
@@ -188,7 +188,7 @@ def test_joints_that_an_npz_names_are_matched_by_name(tmp_path) -> None:
         ({"surface_model_type": "smplh", "expression": np.zeros(10)}, "SMPL"),
     ],
 )
-def test_members_tell_smplx(tmp_path, more, family) -> None:
+def test_smplx_is_recognised_by_its_members(tmp_path, more, family) -> None:
     thetas = layouts.camera_world().thetas
     np.savez(tmp_path / "p.npz", global_orient=thetas[:, :3], body_pose=thetas[:, 3:66], betas=BETAS, **more)
     poses = read_poses(tmp_path / "p.npz").poses
@@ -202,7 +202,7 @@ def test_a_shape_of_another_body_is_noted(tmp_path, gender, noted) -> None:
 
 
 def test_phalps_lost_tracks_and_other_entries_are_left_out(tmp_path) -> None:
-    """A lost track repeats its last sight, ``tracked_time`` frames old; a person seen once is no longer track."""
+    """A lost track repeats its last detection, ``tracked_time`` frames old."""
     joblib, path = pytest.importorskip("joblib"), write_phalp(tmp_path)
     content = {"version": "1.0", **joblib.load(path)}
     moments = list(content.values())[1:]
@@ -225,7 +225,7 @@ def test_phalps_lost_tracks_and_other_entries_are_left_out(tmp_path) -> None:
         read_poses(path)
 
 
-def test_of_whams_repeated_frames_the_first_counts(tmp_path) -> None:
+def test_the_first_of_whams_repeated_frames_is_used(tmp_path) -> None:
     track = {"pose": np.zeros((4, 72)), "trans": np.arange(12.0).reshape(4, 3), "betas": np.zeros((4, 10))}
     layouts.write_pickle(tmp_path / "a.pkl", {0: track | {"frame_ids": [7, 5, 7, 6]}})
     poses = read_poses(tmp_path / "a.pkl").poses

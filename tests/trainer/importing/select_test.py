@@ -1,4 +1,4 @@
-"""Frames are chosen by pose, and within a pose by sharpness."""
+"""Selection of frames by pose, and by sharpness within a pose."""
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from rnd_trainer.importing.select import select_frames, sharpness
 
 
 def _turning(frames: int) -> Motion:
-    """One turn about the vertical in ``frames`` frames, each held for four."""
+    """One rotation about the vertical in ``frames`` frames, each held for four."""
     angles = np.zeros((frames, 24, 3))
     angles[:, 0, 1] = 2 * np.pi * (np.arange(frames) // 4 * 4) / frames
     walk = np.linspace(0, 3, frames)[:, None] * np.array([1.0, 0, 0])
@@ -31,7 +31,7 @@ def test_one_frame_of_every_pose_and_the_sharpest():
     assert (sharp[chosen] == sharp.reshape(20, 4).max(1)).all()
 
 
-def test_fewer_frames_cover_the_turn():
+def test_fewer_frames_cover_the_rotation():
     chosen = select_frames(_turning(80), SKELETON, np.ones(80), 5)
     gaps = np.diff([*chosen, chosen[0] + 80])
     assert len(chosen) == 5 and gaps.max() <= 24  # farthest-point bins are within a factor 2 of the best, 16
@@ -50,7 +50,7 @@ def test_unusable_frames_are_never_taken():
     assert (select_frames(_turning(80), SKELETON, sharp, 500) == np.flatnonzero(sharp == 0.1)).all()
 
 
-def test_nonsense_is_refused():
+def test_invalid_arguments_are_refused():
     for sharpnesses, count in ((np.ones(3), 1), (np.ones(80), 0)):
         with pytest.raises(InputError):
             select_frames(_turning(80), SKELETON, sharpnesses, count)

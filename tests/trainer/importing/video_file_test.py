@@ -1,4 +1,4 @@
-"""Frames of a video by number: as many as are shown, upright, in the colours that their stream means."""
+"""Frames of a video by number: count, rotation and colours."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _grey() -> list[np.ndarray]:
 
 
 def _write(path: Path, images: list[np.ndarray]) -> Path:
-    """Lossless but for its 4:2:0."""
+    """Lossless except for 4:2:0."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=25, options={"qp": "0", "preset": "ultrafast"})
         stream.height, stream.width = images[0].shape[:2]
@@ -45,15 +45,15 @@ def _trimmed(path: Path, out: Path, count: int) -> Path:
     return out
 
 
-def test_frames_that_a_cut_hides_are_not_counted(tmp_path) -> None:
+def test_frames_hidden_by_an_edit_list_are_not_counted(tmp_path) -> None:
     film = VideoFile(_trimmed(_write(tmp_path / "whole.mp4", _grey()), tmp_path / "cut.mp4", 3))
     assert list(film.numbers) == list(range(FRAMES - 3))
     for number in (0, 1, 6, 2):
         assert np.abs(film.frame(number).astype(int) - STEP * (number + 3)).max() <= CODED
 
 
-def test_a_phones_video_stands_upright(tmp_path) -> None:
-    """Its container says to turn it by 90° clockwise: x' = h − y, y' = x."""
+def test_a_phones_video_is_upright(tmp_path) -> None:
+    """Its container rotates it by 90° clockwise: x' = h − y, y' = x."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[:8, :8] = 240  # at the upper left of what is stored
     path = _write(tmp_path / "phone.mp4", [image] * 2)
@@ -71,7 +71,7 @@ def test_a_phones_video_stands_upright(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("height", "matrix"), [(720, "itu709"), (480, "itu601")])
-def test_colours_without_a_name_are_those_of_the_size(tmp_path, height, matrix) -> None:
+def test_unnamed_colours_depend_on_the_size(tmp_path, height, matrix) -> None:
     """BT.709 from 720 lines on, BT.601 below."""
     colours = np.zeros((height, 64, 3), np.uint8) + np.uint8([200, 60, 90])
     frame = av.VideoFrame.from_ndarray(colours, format="rgb24").reformat(format="yuv420p", dst_colorspace=matrix)

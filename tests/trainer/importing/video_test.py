@@ -89,7 +89,7 @@ def test_a_video_becomes_a_capture(tmp_path, program) -> None:
 PAIRED = {
     # number of each image → pose of the scene, number of each pose file → pose of the scene, images kept, noted
     "ffmpeg's, both from 1": ({1: 0, 2: 1, 3: 2, 4: 3}, {1: 0, 2: 1, 3: 2, 4: 3}, 4, ""),
-    "nobody seen in some": ({8: 0, 9: 1, 10: 2, 11: 3}, {9: 1, 11: 3}, 2, ""),
+    "no person in some": ({8: 0, 9: 1, 10: 2, 11: 3}, {9: 1, 11: 3}, 2, ""),
     "each lacks one": ({1: 0, 2: 1, 4: 3}, {2: 1, 3: 2, 4: 3}, 2, ""),
     "poses from 0": ({1: 0, 2: 1, 3: 2, 4: 3}, {0: 0, 1: 1, 2: 2, 3: 3}, 4, "from 0, frames from 1"),
     "poses from 0, one missing": ({1: 0, 2: 1, 3: 2, 4: 3}, {0: 0, 2: 2}, 2, "from 0, frames from 1"),
@@ -178,7 +178,7 @@ def test_poses_of_other_frames_and_numbers_that_count_none_are_refused(tmp_path)
         _import(later, source, _fits(later, microseconds))
 
 
-def test_rough_masks_are_made_where_there_are_none(tmp_path) -> None:
+def test_missing_masks_are_estimated(tmp_path) -> None:
     camera = ROMP.resized(4 * WIDTH, 4 * HEIGHT)
     notes = _import(tmp_path, write_film(tmp_path, camera), write_romp(tmp_path), masks=None)
     assert any("masks made from the template" in note and "rough" in note for note in notes)
@@ -210,14 +210,14 @@ def test_the_sharpest_frame_of_a_pose_is_kept(tmp_path) -> None:
         (FrameSelection(every=3), {0: "train", 3: "novel_pose"}),
     ],
 )
-def test_splits_are_of_the_frames_that_may_be_taken(tmp_path, selection, frames) -> None:
+def test_splits_are_of_the_selected_frames(tmp_path, selection, frames) -> None:
     source = write_frames(tmp_path)
     poses = write_poses(tmp_path)
     _import(tmp_path, source, poses, intrinsics=INTRINSICS, selection=selection)
     assert {frame.frame: frame.split for frame in load_capture(tmp_path / "out").frames} == frames
 
 
-def test_what_a_video_needs_is_asked_for(tmp_path) -> None:
+def test_missing_options_of_a_video_are_named(tmp_path) -> None:
     film, poses = write_film(tmp_path), write_poses(tmp_path)
 
     def refusal(source: Path = film, **options: object) -> str:

@@ -1,4 +1,4 @@
-"""rnd-data import: a source of another convention is named with the option that corrects it, and the option does."""
+"""rnd-data import: other conventions are named with the option that corrects them."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ UNUSED = [
 
 
 @pytest.mark.parametrize(("source", "options", "words"), UNUSED)
-def test_options_that_would_change_nothing_are_refused(frames, import_it, source, options, words) -> None:
+def test_options_without_effect_are_refused(frames, import_it, source, options, words) -> None:
     if source == "rana":
         layouts.write_rana(frames / "rana")
     else:

@@ -17,7 +17,7 @@ from rnd_trainer.model.model import Attributes, PosedGaussians
 
 @pytest.fixture(scope="module")
 def perceptual(tmp_path_factory) -> Perceptual:
-    """An AlexNet of random weights: its first cells are random edge detectors, which is all that is needed."""
+    """An AlexNet of random weights."""
     from safetensors.torch import save_file
 
     generator = torch.Generator().manual_seed(0)

@@ -94,7 +94,7 @@ def test_a_perturbed_pose_is_near_the_training_pose_with_its_root_and_speed() ->
     assert torch.equal(*twice)
 
 
-def test_a_nudged_pose_is_hardly_another(model) -> None:
+def test_jitter_has_the_stated_standard_deviations(model) -> None:
     pose = _poses(1, seed=4)[0]
     nudged = jittered_pose(pose, np.random.default_rng(0))
     moved, faster = nudged.window - pose.window, nudged.velocity - pose.velocity
@@ -104,7 +104,7 @@ def test_a_nudged_pose_is_hardly_another(model) -> None:
     assert torch.equal(nudged.bones, pose.bones)
 
 
-def test_descending_calms_weights_that_jump(model) -> None:
+def test_descent_smooths_skinning_weights(model) -> None:
     """A network that varies fast with the pose learns not to, in poses that were never sampled."""
     with torch.no_grad():
         model.skinning.logits.weight.copy_(3 * torch.randn(model.skinning.logits.weight.shape))
@@ -129,7 +129,7 @@ def test_descending_calms_weights_that_jump(model) -> None:
     assert jump() < 0.5 * before
 
 
-def test_stretch_is_the_templates_before_anything_is_learned(model, template) -> None:
+def test_initial_stretch_is_the_templates(model, template) -> None:
     pose = _squat()
     stretch = _stretch(EdgeLengths(model), model, pose).detach().numpy()
     posed = skin(template.points, template.weights, pose.bones.double().numpy())

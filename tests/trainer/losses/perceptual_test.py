@@ -107,7 +107,7 @@ def _tensors(net: nn.Sequential, name: str, layers: int, heads: bool = True) -> 
 
 
 def write_alexnet(path: Path) -> None:
-    """A whole AlexNet with LPIPS heads and random weights."""
+    """A complete AlexNet with LPIPS heads and random weights."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         save_file(_tensors(nn.Sequential(*_alexnet()), "alexnet", len(TAPS["alexnet"])), path)
@@ -124,7 +124,7 @@ def nets() -> dict[str, nn.Sequential]:
 
 @pytest.fixture(scope="module")
 def folder(nets, tmp_path_factory) -> Path:
-    """A whole file of each network, with heads, and one of VGG16's first two blocks."""
+    """A complete file of each network, with heads, and one of VGG16's first two blocks."""
     path = tmp_path_factory.mktemp("weights")
     for name in NAMES:
         save_file(_tensors(nets[name], name, len(TAPS[name])), path / f"{name}.safetensors")
@@ -276,8 +276,8 @@ def test_a_crop_is_an_image_and_its_gradient_stays_inside(distances) -> None:
 
 
 @pytest.mark.parametrize(("name", "layers"), [("alexnet", 3), ("squeezenet1_1", 4), ("vgg16", 3)])
-def test_grids_centre_each_cell_in_what_it_sees(name, layers, nets, tmp_path) -> None:
-    """NaN reaches every cell that sees its pixel: over one stride of pixels, cells lie evenly about them."""
+def test_grids_centre_each_cell_in_its_receptive_field(name, layers, nets, tmp_path) -> None:
+    """NaN reaches every cell whose receptive field contains its pixel."""
     save_file(_tensors(nets[name], name, layers, heads=False), tmp_path / "part.safetensors")
     net = load_perceptual(tmp_path / "part.safetensors").to(dtype=torch.float64)  # float32 may take Winograd
     assert len(net.grids) == layers
@@ -293,7 +293,7 @@ def test_grids_centre_each_cell_in_what_it_sees(name, layers, nets, tmp_path) ->
     assert [min(o) == -max(o) for o in offsets] == [True] * layers
 
 
-def test_whole_networks_are_lpips_and_parts_are_not(distances, folder, nets, tmp_path) -> None:
+def test_complete_networks_are_lpips_and_parts_are_not(distances, folder, nets, tmp_path) -> None:
     for name in NAMES:
         assert distances[name].backbone == name
         assert distances[name].is_lpips
@@ -311,7 +311,7 @@ def test_whole_networks_are_lpips_and_parts_are_not(distances, folder, nets, tmp
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_torchvisions_pth_is_read_and_its_classifier_passed_over(zipped, nets, small, tmp_path) -> None:
+def test_torchvisions_pth_is_read_without_its_classifier(zipped, nets, small, tmp_path) -> None:
     state = OrderedDict(_tensors(nets["alexnet"], "alexnet", 1, heads=False))
     state["features.0.weight"] = nn.Parameter(state["features.0.weight"])  # torchvision's old files hold these
     state["classifier.1.weight"] = torch.zeros(4, 4)
@@ -352,7 +352,7 @@ def test_files_that_cannot_be_read_are_refused(small, tmp_path) -> None:
 
 @pytest.mark.parametrize("suffix", [".safetensors", ".pth"])
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
-def test_a_file_cut_short_is_refused(suffix, share, small, tmp_path) -> None:
+def test_a_truncated_file_is_refused(suffix, share, small, tmp_path) -> None:
     whole = small
     if suffix == ".pth":
         whole = small.with_suffix(".pth")

@@ -1,4 +1,4 @@
-"""Gaussians keep apart: the repulsion term, and what it costs."""
+"""The repulsion term: value, gradient and its part in training."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_two_on_one_point_have_a_finite_gradient():
     assert bool((points.grad == 0).all())
 
 
-def test_crowded_points_part_and_the_others_stay():
+def test_near_points_separate_and_others_stay():
     rng = np.random.default_rng(2)
     start = np.concatenate([rng.uniform(0, 0.02, (60, 3)), [[0.5, 0.5, 0.5]]]).astype(np.float32)
     points = torch.as_tensor(start).clone().requires_grad_()
@@ -62,7 +62,7 @@ def test_crowded_points_part_and_the_others_stay():
     np.testing.assert_array_equal(moved[-1], start[-1])
 
 
-def test_training_holds_them_apart_every_few_steps(tiny_capture, tiny_config):
+def test_training_evaluates_repulsion_at_its_interval(tiny_capture, tiny_config):
     config = dataclasses.replace(tiny_config, least_distance=1.5, repulsion_every=3)
     training = Training(tiny_capture, config)
     model = training.model
@@ -77,7 +77,7 @@ def test_training_holds_them_apart_every_few_steps(tiny_capture, tiny_config):
     assert "repulsion" not in without.step().terms
 
 
-def test_only_the_gaussians_own_residuals_are_pushed(tiny_capture, tiny_config):
+def test_only_residual_offsets_get_gradients(tiny_capture, tiny_config):
     training = Training(tiny_capture, dataclasses.replace(tiny_config, least_distance=1.5))
     posed = training.model(training.poses[0])
     training.objective._repulsion(training.model, posed).backward()

@@ -1,4 +1,4 @@
-"""Checkpoints: what is written is read back, and broken files are refused in one line."""
+"""Checkpoints: round trip, and refusal of broken files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_a_checkpoint_rebuilds_the_same_model(tiny_checkpoint) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
-def test_a_file_cut_short_is_refused(tiny_checkpoint, tmp_path, share) -> None:
+def test_a_truncated_file_is_refused(tiny_checkpoint, tmp_path, share) -> None:
     whole = tiny_checkpoint.read_bytes()
     cut = tmp_path / "cut.ckpt"
     cut.write_bytes(whole[: int(share * len(whole))])
@@ -68,7 +68,7 @@ def test_neighbours_out_of_range_are_refused(tiny_checkpoint, tmp_path) -> None:
         load_checkpoint(path)
 
 
-def test_files_that_are_no_checkpoints_are_refused(tmp_path) -> None:
+def test_other_files_are_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="checkpoint not found"):
         load_checkpoint(tmp_path / "nowhere.ckpt")
     pickled = tmp_path / "pickled.ckpt"
@@ -77,7 +77,7 @@ def test_files_that_are_no_checkpoints_are_refused(tmp_path) -> None:
         load_checkpoint(pickled)
 
 
-def test_configuration_goes_through_json_and_refuses_what_it_does_not_know() -> None:
+def test_configuration_survives_json_and_refuses_unknown_fields() -> None:
     config = preset("quick")
     assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
     with pytest.raises(InputError, match="weight_lipps"):

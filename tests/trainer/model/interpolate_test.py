@@ -12,7 +12,7 @@ FLOAT32_SUM = 1e-6  # four products of numbers near 1
 def test_values_and_gradients_equal_plain_indexing() -> None:
     generator = torch.Generator().manual_seed(0)
     nodes, count = 40, 300
-    neighbours = torch.randint(0, nodes - 3, (count, 4), generator=generator)  # three nodes nobody reads
+    neighbours = torch.randint(0, nodes - 3, (count, 4), generator=generator)  # three unused nodes
     weights = torch.rand(count, 4, generator=generator)
     values = torch.randn(nodes, 7, generator=generator)
     incoming = torch.randn(count, 7, generator=generator)
@@ -30,7 +30,7 @@ def test_values_and_gradients_equal_plain_indexing() -> None:
     assert (fast.grad[-3:] == 0).all()
 
 
-def test_double_precision_takes_the_plain_route() -> None:
+def test_double_precision_uses_torch() -> None:
     neighbours, weights = torch.tensor([[0, 1], [1, 1]]), torch.tensor([[0.25, 0.75], [0.5, 0.5]])
     values = torch.tensor([[1.0], [3.0]], dtype=torch.float64)
     out = NodeInterpolation(neighbours, weights, 2)(values)

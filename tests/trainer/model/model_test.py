@@ -1,4 +1,4 @@
-"""The avatar model: what it is at the start, what may not change it, and that gradients reach everything."""
+"""The avatar model: initial state, invariances, bounds and gradients."""
 
 from __future__ import annotations
 
@@ -53,18 +53,18 @@ def test_an_untrained_avatar_is_the_template_skinned(model, template) -> None:
     assert torch.allclose(posed.visibility, sh_of_one.expand(600, 16), atol=1e-5)
 
 
-def test_turning_and_moving_the_root_turns_and_moves_everything(model) -> None:
+def test_a_rigid_motion_of_the_root_moves_everything(model) -> None:
     _randomised(model)
     pose = _pose(model)
-    turn = torch.as_tensor(axis_angle_to_matrix(np.array([0.4, -1.9, 0.7])), dtype=torch.float32)
+    rotation = torch.as_tensor(axis_angle_to_matrix(np.array([0.4, -1.9, 0.7])), dtype=torch.float32)
     shift = torch.tensor([1.0, -2.0, 0.5])
-    bones = turn @ pose.bones
+    bones = rotation @ pose.bones
     bones[:, :, 3] += shift
     before, after = model(pose), model(PoseInput(pose.window, pose.velocity, bones))
-    assert (before.means @ turn.T + shift - after.means).abs().max() < FLOAT32_POSITION_M
-    assert (before.normals @ turn.T - after.normals).abs().max() < 1e-5
+    assert (before.means @ rotation.T + shift - after.means).abs().max() < FLOAT32_POSITION_M
+    assert (before.normals @ rotation.T - after.normals).abs().max() < 1e-5
     assert torch.equal(before.weights, after.weights)
-    assert (before.visibility - after.visibility).abs().max() < 1e-4  # its normals went through the turn
+    assert (before.visibility - after.visibility).abs().max() < 1e-4  # its normals were rotated
 
 
 def test_attributes_are_valid_for_any_weights(model) -> None:
@@ -81,7 +81,7 @@ def test_attributes_are_valid_for_any_weights(model) -> None:
     assert (weights >= 0).all() and torch.allclose(weights.sum(1), torch.ones(600), atol=1e-5)
 
 
-def test_what_is_played_is_hardly_glossier_than_the_networks_say(model) -> None:
+def test_evaluation_bounds_the_roughness_residual(model) -> None:
     with torch.no_grad():
         model.appearance_residual[:, -1] = torch.tensor([-9, -0.3, 0, 9.0]).repeat(150)
         trained = model.attributes(model.encoded_nodes()).roughness

@@ -75,7 +75,7 @@ def test_a_collapsed_blend_gives_finite_gradients() -> None:
     assert all(leaves[i].grad.isfinite().all() for i in WANTED if leaves[i].grad is not None)
 
 
-def test_a_nan_stays_with_its_gaussian() -> None:
+def test_a_nan_affects_its_gaussian_only() -> None:
     scene = [t.float() for t in _scene(4, 3)]
     scene[2][1, 0] = math.nan
     means, covariances, _ = _pose(scene)

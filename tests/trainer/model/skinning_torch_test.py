@@ -28,10 +28,10 @@ def _random(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def _twist(degrees: float) -> torch.Tensor:
-    """The blend of two bones, half each, of which one is turned about x."""
-    turned = axis_angle_to_matrix(np.array([math.radians(degrees), 0, 0]))
+    """The blend of two bones, half each, one of them rotated about x."""
+    rotated = axis_angle_to_matrix(np.array([math.radians(degrees), 0, 0]))
     bones = torch.zeros(2, 3, 4, dtype=torch.float64)
-    bones[0, :, :3], bones[1, :, :3] = torch.eye(3), torch.as_tensor(turned)
+    bones[0, :, :3], bones[1, :, :3] = torch.eye(3), torch.as_tensor(rotated)
     return blend_transforms(torch.tensor([[0.5, 0.5]], dtype=torch.float64), bones)
 
 

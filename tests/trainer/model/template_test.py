@@ -19,7 +19,7 @@ def template():
     return sample_template(body(), 2000, 500, seed=0)
 
 
-def test_samples_lie_on_the_surface_and_are_even(template) -> None:
+def test_samples_are_on_the_surface_and_evenly_spaced(template) -> None:
     surface = cKDTree(body().vertices).query(template.points)[0]
     assert surface.max() < 0.03  # no farther than an edge of the template
     nearest = cKDTree(template.codes).query(template.codes, k=2)[0][:, 1]
@@ -47,7 +47,7 @@ def test_interpolation_is_smooth(template) -> None:
 
 @pytest.mark.parametrize("candidates", (1, BUCKET - 1, 10 * BUCKET + 1))
 @pytest.mark.parametrize("lattice", (False, True), ids=("scattered", "ties"))
-def test_farthest_points_are_those_of_the_plain_search(candidates, lattice) -> None:
+def test_farthest_points_equal_exhaustive_search(candidates, lattice) -> None:
     rng = np.random.default_rng(candidates)
     points = rng.integers(0, 5, (candidates, 3)) if lattice else rng.normal(size=(candidates, 3))
     points, first = points.astype(np.float32), candidates // 3
@@ -65,7 +65,7 @@ def test_same_seed_same_points(template) -> None:
     assert not np.array_equal(sample_template(body(), 2000, 500, seed=1).points, template.points)
 
 
-def test_spread_pose_parts_the_legs(template) -> None:
+def test_spread_pose_separates_the_legs(template) -> None:
     names = body().skeleton.names
     left = template.weights[:, names.index("left_hip")] > 0.9
     right = template.weights[:, names.index("right_hip")] > 0.9

@@ -1,4 +1,4 @@
-"""Limbs under twists: what is widened, what must not be, and which way bones run."""
+"""Widening of twisted limbs, and the axes of bones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ EXACT = 1e-12
 
 
 def _half_blend(axis_angle) -> torch.Tensor:
-    """[1, 3, 3], half of a bone at rest and half of a turned one."""
+    """[1, 3, 3], half of a bone at rest and half of a rotated one."""
     return torch.as_tensor(0.5 * (np.eye(3) + axis_angle_to_matrix(np.asarray(axis_angle, float))))[None]
 
 
@@ -37,21 +37,21 @@ def test_a_twisted_limb_keeps_its_cross_section(degrees: float, kept: float) -> 
     assert kept <= lost * (1 + _excess([np.radians(degrees), 0, 0])) <= 1
 
 
-def test_it_is_smooth_through_a_half_turn() -> None:
+def test_widening_is_smooth_through_180_degrees() -> None:
     near = [_excess([np.pi + step, 0, 0]) for step in (-1e-3, 0, 1e-3)]
     assert abs(near[0] - near[1]) < 1e-5 and abs(near[2] - near[1]) < 1e-5
     assert near[1] == pytest.approx((3 / 2) ** 3 - 1, abs=1e-6)
 
 
 @pytest.mark.parametrize("degrees", [0, 45, 90, 150])
-def test_bends_and_rigid_motions_are_left_alone(degrees: float) -> None:
+def test_bends_and_rigid_motions_are_not_widened(degrees: float) -> None:
     for axis in ([0, 1, 0], [0, 0.6, -0.8]):
         assert _excess(np.radians(degrees) * np.array(axis)) == pytest.approx(0, abs=EXACT)
     rigid = torch.as_tensor(axis_angle_to_matrix(np.radians(degrees) * np.array([0.6, 0, 0.8])))[None]
     assert float(excess(rigid, cofactor(rigid), _limb())) == pytest.approx(0, abs=EXACT)
 
 
-def test_only_limbs_are_widened_and_a_blend_of_nothing_is_finite() -> None:
+def test_only_limbs_are_widened_and_a_zero_blend_is_finite() -> None:
     assert _excess([2.0, 0, 0], _limb(share=0.0)) == 0
     nothing = torch.zeros(1, 3, 3, dtype=torch.float64)
     assert torch.isfinite(excess(nothing, nothing, _limb())).all()

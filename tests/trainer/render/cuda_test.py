@@ -69,7 +69,7 @@ def test_every_loss_and_its_gradient_are_the_cpus(tiny_capture, tiny_config, tmp
 
 
 @pytest.mark.parametrize("changes", [{}, {"refine_poses": True}], ids=["as it is", "refining poses"])
-def test_a_training_on_the_gpu_is_whole(changes, tiny_capture, tiny_config, tmp_path: Path) -> None:
+def test_a_training_on_the_gpu_runs_all_stages(changes, tiny_capture, tiny_config, tmp_path: Path) -> None:
     """All three stages, a preview in each, stopped and resumed in the third; and the avatar plays on the CPU."""
     config = dataclasses.replace(tiny_config, save_every=13, **changes)
     training = Training(tiny_capture, config, device="cuda")

@@ -45,7 +45,7 @@ def test_reference_equals_the_oracle(size):
 
 
 def test_reference_gradient_is_that_of_the_oracle():
-    """On five Gaussians so wide that every pixel lies inside all of them: there the rule has no jumps."""
+    """Five Gaussians that cover every pixel: no discontinuities."""
     means, covariances, opacities, features = (a.astype(np.float64) for a in random_scene(2, 5, 2, spread=0.2))
     covariances += [1.0, 0, 0, 1.0, 0, 1.0]
     scene = means, covariances, 0.2 + 0.4 * opacities, features
@@ -92,7 +92,7 @@ def test_kernel_gradient_from_inside_the_cloud():
 
 
 def test_no_gradient_through_a_clamped_alpha():
-    """One pixel under the centre of an opaque Gaussian: α is 0.99 whatever moves, the colour still counts."""
+    """One pixel at the centre of an opaque Gaussian: α stays 0.99, the colour has a gradient."""
     camera = Camera(1, 1, np.array([[10.0, 0, 0.5], [0, 10, 0.5], [0, 0, 1]]), np.eye(4))
     scene = ([[0.0, 0, 2]], [[0.1, 0, 0, 0.1, 0, 0.1]], [1.0], [[0.3, 0.7]])
     means, covariances, opacities, features = tensors(scene, torch.float32)
@@ -103,7 +103,7 @@ def test_no_gradient_through_a_clamped_alpha():
     np.testing.assert_allclose(features.grad, [[0.99, 0.99]], rtol=1e-6)
 
 
-def test_only_what_is_asked_for():
+def test_depth_is_optional():
     scene, camera = random_scene(0), off_centre_camera(20, 16)
     means, covariances, opacities, features = tensors(scene, torch.float64)
     image, alpha, depth = raster.rasterize(means.detach(), covariances.detach(), opacities.detach(), features, camera)

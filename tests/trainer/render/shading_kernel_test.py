@@ -71,7 +71,7 @@ def test_fused_shading_has_the_same_bits_for_any_thread_count() -> None:
     assert torch.equal(*results)
 
 
-def test_a_nan_stays_visible() -> None:
+def test_a_nan_is_propagated() -> None:
     scene = [t.float() for t in _scene(4, 8)]
     scene[0][2] = math.nan
     radiance = shade(*scene[:5], Texels(scene[5], scene[6]))

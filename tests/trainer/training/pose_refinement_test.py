@@ -1,4 +1,4 @@
-"""Corrections of body poses: the same bones as the runtime's, bounded, and better after than before."""
+"""Pose refinement: bones as in the runtime, bounds, and improvement by training."""
 
 from __future__ import annotations
 
@@ -42,26 +42,25 @@ def test_the_corrected_motion_has_the_corrected_bones_and_stays_within_bounds() 
     with torch.no_grad():
         for raw in refinement.raw:
             raw.copy_(torch.randn(raw.shape, generator=torch.Generator().manual_seed(0)))
-    turn, shift = refinement.bounded(4)
-    assert turn.abs().max() <= ROTATION_BOUND and shift.abs().max() <= TRANSLATION_BOUND
+    rotation, shift = refinement.bounded(4)
+    assert rotation.abs().max() <= ROTATION_BOUND and shift.abs().max() <= TRANSLATION_BOUND
     corrected = refinement.apply_to(moves)
     expected = skinning_bones(skeleton, corrected.rotations[4], corrected.translations[4])
     assert np.abs(refinement.bones(4).detach().numpy() - expected).max() < FLOAT32
 
 
 def test_between_training_frames_and_beyond_them_corrections_are_as_smooth_as_the_motion() -> None:
-    """Else they would alternate, and what a window and a velocity tell the networks would be noise."""
     skeleton, moves = body().skeleton, motion(body())
     refinement = PoseRefinement(moves, skeleton, [1, 4])
     with torch.no_grad():
-        for raw, turn in zip(refinement.raw, (0.03, 0.06)):
-            raw[:, 0] = turn
+        for raw, rotation in zip(refinement.raw, (0.03, 0.06)):
+            raw[:, 0] = rotation
     corrected = refinement.apply_to(moves)
     first, last = (float(refinement.bounded(frame)[0][0, 0].detach()) for frame in (1, 4))
     fade = 1 / (moves.fps * FADE_SECONDS)
     expected = np.array([first * (1 - fade), first, (2 * first + last) / 3, (first + 2 * last) / 3, last])
-    turned = np.swapaxes(moves.rotations, -1, -2) @ corrected.rotations
-    angles = np.arccos((np.trace(turned, axis1=-2, axis2=-1) - 1) / 2)
+    relative = np.swapaxes(moves.rotations, -1, -2) @ corrected.rotations
+    angles = np.arccos((np.trace(relative, axis1=-2, axis2=-1) - 1) / 2)
     np.testing.assert_allclose(angles[:5], expected[:, None].repeat(angles.shape[1], 1), atol=1e-6)
     shifts = (corrected.translations - moves.translations)[:, 0]
     assert shifts[4] == np.abs(shifts).max() and 0 < shifts[2] < shifts[3] < shifts[4]

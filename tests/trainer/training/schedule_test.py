@@ -1,4 +1,4 @@
-"""How rates fall over a training."""
+"""Decay of the learning rates."""
 
 from __future__ import annotations
 

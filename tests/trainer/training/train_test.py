@@ -1,4 +1,4 @@
-"""The training loop on a tiny capture: it learns, it resumes on the same curve, it survives what it may meet."""
+"""Training on a tiny capture: loss, stages, resuming, refusals, interrupts."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
     assert end < 0.6 * first  # shaded: the light is learned from white in sixty steps
 
 
-def test_half_of_the_pictures_stand_over_black_and_half_over_any_colour(tiny_config) -> None:
+def test_half_of_the_backgrounds_are_black_and_half_random(tiny_config) -> None:
     objective = Objective(tiny_config, LightProbe(), None, None, None, torch.Generator().manual_seed(0))
-    drawn = torch.stack([objective._background() for _ in range(400)])
-    black = (drawn == 0).all(dim=1)
+    sampled = torch.stack([objective._background() for _ in range(400)])
+    black = (sampled == 0).all(dim=1)
     assert 0.4 < black.float().mean() < 0.6
-    deciles = linear_to_srgb(drawn[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
+    deciles = linear_to_srgb(sampled[~black]).flatten().quantile(torch.linspace(0.1, 0.9, 9))
     torch.testing.assert_close(deciles, torch.linspace(0.1, 0.9, 9), atol=0.06, rtol=0)
 
 
-def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
+def test_all_stages_write_a_complete_checkpoint(tiny_run, tiny_config) -> None:
     rows = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == list(range(14))
     assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
@@ -79,7 +79,7 @@ def test_all_stages_leave_a_whole_checkpoint(tiny_run, tiny_config) -> None:
     assert (status["step"], status["steps"], status["ended"]) == (14, 14, "finished")
 
 
-def test_a_run_names_its_phases_the_search_of_the_light_too(tiny_capture, tiny_config, tmp_path) -> None:
+def test_a_run_reports_its_phases_with_the_light_search(tiny_capture, tiny_config, tmp_path) -> None:
     phases: dict[str, int] = {}
 
     def count(name: str, done: float, total: float) -> None:
@@ -92,8 +92,8 @@ def test_a_run_names_its_phases_the_search_of_the_light_too(tiny_capture, tiny_c
     assert phases["searching the light"] >= 2
 
 
-def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
-    """And is not lit again by a training that goes on from there."""
+def test_the_state_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    """Resuming does not initialise the light again."""
     training = Training(tiny_capture, tiny_config)
     while training.step_index < 6:
         assert not training.lit
@@ -107,7 +107,7 @@ def test_what_is_saved_after_the_first_stage_is_lit(tiny_capture, tiny_config, t
     assert training.lit and resumed.lit and resumed.step().terms == training.step().terms
 
 
-def test_warming_up_takes_every_term_and_changes_nothing(tiny_capture, tiny_config, one_thread, monkeypatch) -> None:
+def test_warm_up_evaluates_every_term_without_effect(tiny_capture, tiny_config, one_thread, monkeypatch) -> None:
     plain, warmed = Training(tiny_capture, tiny_config), Training(tiny_capture, tiny_config)
     asked = []
 
@@ -139,7 +139,7 @@ def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, 
             assert torch.equal(ours, theirs)
 
 
-def test_a_training_without_its_third_stage_can_have_it_later(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+def test_the_third_stage_can_be_added_when_resuming(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
     whole = Training(tiny_capture, tiny_config)
     run(whole, tmp_path / "whole", on_step=_nothing, on_preview=_nothing)
     without = dataclasses.replace(tiny_config, unseen_fraction=0.0)
@@ -155,7 +155,7 @@ def test_a_training_without_its_third_stage_can_have_it_later(tiny_capture, tiny
 
 
 @pytest.mark.parametrize("light", ["learn", "none"])
-def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, light) -> None:
+def test_the_third_stage_changes_the_skinning_only(tiny_capture, tiny_config, light) -> None:
     training = Training(tiny_capture, dataclasses.replace(tiny_config, light=light))
     while training.stage < 3:
         training.step()
@@ -167,7 +167,7 @@ def test_the_third_stage_changes_the_skinning_alone(tiny_capture, tiny_config, l
     assert changed == {"skinning"} and torch.equal(probe, training.probe.raw)
 
 
-def test_skinning_that_is_not_learned_has_no_third_stage(tiny_capture, tiny_config) -> None:
+def test_static_skinning_has_no_third_stage(tiny_capture, tiny_config) -> None:
     still = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
     assert Training(tiny_capture, dataclasses.replace(tiny_config, model=still)).schedule.total == 12
 
@@ -178,7 +178,7 @@ def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, 
         other.resume(tiny_run / "training.state")
 
 
-def test_resuming_on_other_pictures_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
+def test_resuming_on_other_images_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
     moved = dataclasses.replace(tiny_capture.motion, translations=tiny_capture.motion.translations + 0.01)
     fewer = tuple(frame for frame in tiny_capture.frames if frame.frame != tiny_capture.frames[0].frame)
     first, second, *others = tiny_capture.frames
@@ -201,19 +201,18 @@ def test_resuming_under_another_light_of_the_capture_is_refused(tiny_capture, ti
         Training(dataclasses.replace(tiny_capture, lights=brighter), config).resume(tmp_path / "training.state")
 
 
-def test_a_last_bit_of_another_machines_sine_is_no_other_motion(tiny_run, tiny_capture, tiny_config) -> None:
+def test_a_last_bit_of_a_pose_does_not_change_the_digest(tiny_run, tiny_capture, tiny_config) -> None:
     moves = tiny_capture.motion
     near = dataclasses.replace(moves, rotations=np.nextafter(moves.rotations, 2))
     Training(dataclasses.replace(tiny_capture, motion=near), tiny_config).resume(tiny_run / "training.state")
 
 
-def test_how_often_a_state_is_saved_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
+def test_the_save_interval_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
     config = dataclasses.replace(tiny_config, save_every=3, preview_every=5)
     Training(tiny_capture, config).resume(tiny_run / "training.state")
 
 
-def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config) -> None:
-    """A limb at the picture's edge must not end a training of hours."""
+def test_crops_too_small_for_the_network_skip_its_losses(tiny_capture, tiny_config) -> None:
 
     class Demanding:
         smallest = 10**4
@@ -227,7 +226,7 @@ def test_crops_too_small_for_the_network_do_without_it(tiny_capture, tiny_config
 
 
 def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config, tmp_path) -> None:
-    """A network's first blocks do for it; another one does not go on with the same training."""
+    """A network's first blocks are enough; resuming with another one is refused."""
     tensors = {name: torch.randn(shape) / 30 for name, shape in BACKBONES[-1].shapes(2).items()}
     for name in ("a", "b"):
         save_file({k: v + (name == "b") for k, v in tensors.items()}, tmp_path / f"{name}.safetensors")
@@ -244,10 +243,8 @@ def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config
         Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
 
 
-def test_a_training_on_shrunk_pictures_is_resumed_where_a_byte_of_them_differs(
-    tiny_capture, tiny_config, tmp_path
-) -> None:
-    """Another CPU may round a sum's last bit otherwise."""
+def test_resuming_tolerates_a_byte_of_difference_in_downscaled_images(tiny_capture, tiny_config, tmp_path) -> None:
+    """Rounding differs between CPUs."""
     config = dataclasses.replace(tiny_config, image_scale=0.5)
     Training(tiny_capture, config).save(tmp_path)
     other = Training(tiny_capture, config)
@@ -261,7 +258,7 @@ def test_a_training_on_shrunk_pictures_is_resumed_where_a_byte_of_them_differs(
         other.resume(tmp_path / "training.state")
 
 
-def test_a_state_that_the_disk_does_not_take_is_one_line(tmp_path, monkeypatch) -> None:
+def test_a_full_disk_is_an_input_error(tmp_path, monkeypatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
 
@@ -293,7 +290,7 @@ def _half_of(folder: Path) -> Path:
     ("changes", "motion"),
     [({}, None), ({"motion": "b.npz"}, "b.npz"), ({"refine_poses": True}, "OUT/refined_motion.npz")],
 )
-def test_a_training_is_scored_in_its_own_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
+def test_a_training_is_scored_in_its_refined_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
     scored: list[EvalOptions] = []
     monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
     options = rnd_trainer.commands.train.TrainOptions(Path("capture"), learning=Learning(**changes))
@@ -323,7 +320,7 @@ def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path)
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_ctrl_c_in_the_last_step_leaves_nothing_to_resume(tiny_capture, tiny_config, tmp_path) -> None:
+def test_ctrl_c_in_the_last_step_ends_a_finished_training(tiny_capture, tiny_config, tmp_path) -> None:
     config = dataclasses.replace(tiny_config, steps=2, unseen_fraction=0.0)
 
     def press(step: object) -> None:
@@ -333,7 +330,7 @@ def test_ctrl_c_in_the_last_step_leaves_nothing_to_resume(tiny_capture, tiny_con
     assert not run(Training(tiny_capture, config), tmp_path, on_step=press, on_preview=_nothing)
 
 
-def test_the_log_forgets_steps_that_are_done_again(tiny_capture, tiny_config, tmp_path) -> None:
+def test_the_log_drops_repeated_steps(tiny_capture, tiny_config, tmp_path) -> None:
     training = Training(tiny_capture, dataclasses.replace(tiny_config, steps=2))
     (tmp_path / "metrics.jsonl").write_text(
         '{"step": 0}\n{"step": 0, "ima\n[0]\n3\n{"steps": 0}\n{"step": "0"}\n{}}\n{"step": 1}\n{"step": 2}\n{"st'
@@ -380,7 +377,7 @@ def test_training_under_the_captures_light_keeps_it(tiny_capture, tiny_config) -
     assert torch.allclose(training.light(), torch.ones(32, 64, 3), atol=1e-5)
 
 
-def test_a_device_that_is_not_there_is_refused() -> None:
+def test_a_missing_device_is_refused() -> None:
     from rnd_trainer.commands.train import _device
 
     assert _device("cpu") == "cpu"
@@ -404,7 +401,7 @@ def test_a_device_is_named_as_torch_names_it(monkeypatch) -> None:
         _device("cuda")
 
 
-def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(tiny_capture, tmp_path, monkeypatch, capsys) -> None:
+def test_a_full_gpu_is_an_input_error_and_keeps_the_last_state(tiny_capture, tmp_path, monkeypatch, capsys) -> None:
     def step(self: Training) -> Any:
         if self.step_index == 3:
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
@@ -421,7 +418,7 @@ def test_a_gpu_that_is_full_is_one_line_and_the_last_state_stands(tiny_capture, 
     assert load_checkpoint(out / "avatar.ckpt").info["step"] == 2
 
 
-def test_a_training_that_was_stopped_early_says_so(tiny_capture, tiny_config, tmp_path, capsys) -> None:
+def test_a_training_stopped_in_the_first_stage_has_a_note(tiny_capture, tiny_config, tmp_path, capsys) -> None:
     training = Training(tiny_capture, tiny_config)
     training.step()
     training.save(tmp_path)
@@ -431,7 +428,7 @@ def test_a_training_that_was_stopped_early_says_so(tiny_capture, tiny_config, tm
     assert note in capsys.readouterr().err
 
 
-def test_a_finished_training_has_nothing_to_say(tiny_run) -> None:
+def test_a_finished_training_has_no_note(tiny_run) -> None:
     assert load_checkpoint(tiny_run / "avatar.ckpt").note() is None
 
 

@@ -1,4 +1,4 @@
-"""Training views: crops that see what the whole picture saw, exact colours, shrunk pictures."""
+"""Training views: crops with their cameras, exact colours, shrunk images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rnd_trainer.training.data import CROP_MARGIN, load_views
 from rnd_trainer.training.training import Training
 
 
-def test_a_crop_is_the_picture_and_its_camera_agrees(tiny_capture) -> None:
+def test_a_crop_is_the_image_and_its_camera_agrees(tiny_capture) -> None:
     views, bad = load_views(tiny_capture, "train")
     assert bad == [] and len(views) == 6
     for view in views:
@@ -54,7 +54,7 @@ def test_normals_are_unit_inside_and_zero_outside(tiny_capture) -> None:
     assert normals[solid][:, 2].mean() < -0.5  # towards the camera
 
 
-def test_normals_without_data_are_asked_of_nobody(tiny_capture, monkeypatch) -> None:
+def test_normals_without_data_are_not_in_the_loss(tiny_capture, monkeypatch) -> None:
     original = type(tiny_capture).load_frame
 
     def holed(capture, frame):
@@ -82,24 +82,24 @@ def test_shrinking_keeps_light_and_view(tiny_capture) -> None:
     assert float(total[1] * 4) == pytest.approx(float(total[0]), rel=0.01)  # rounding to bytes
 
 
-def test_true_normals_that_are_not_there_are_refused(tiny_capture) -> None:
+def test_missing_true_normals_are_refused(tiny_capture) -> None:
     without = tuple(replace(frame, normal_gt=None) for frame in tiny_capture.frames)
     with pytest.raises(InputError, match="--normals true: expected normal_gt of every training image, got none"):
         load_views(dataclasses.replace(tiny_capture, frames=without), "train", true_normals=True)
 
 
-def test_a_split_that_is_not_there_is_refused(tiny_capture) -> None:
+def test_an_empty_split_is_refused(tiny_capture) -> None:
     with pytest.raises(InputError, match="split 'relight': expected at least one frame, got none"):
         load_views(tiny_capture, "relight")
 
 
-def test_a_capture_of_which_nothing_trains_says_so(tiny_capture) -> None:
+def test_a_capture_without_training_images_is_refused(tiny_capture) -> None:
     frames = tuple(replace(frame, split="relight") for frame in tiny_capture.frames)
     with pytest.raises(InputError, match="split 'train': expected at least one frame, got none"):
         Training(dataclasses.replace(tiny_capture, frames=frames), TrainConfig())
 
 
-def test_a_light_that_changes_is_not_learned(tiny_capture) -> None:
+def test_several_training_lights_are_refused(tiny_capture) -> None:
     lights = itertools.cycle(["noon", "evening"])
     frames = tuple(replace(frame, light=next(lights)) for frame in tiny_capture.frames)
     two = dataclasses.replace(tiny_capture, frames=frames)

@@ -1,4 +1,4 @@
-"""The learnable probe, the drawing of its texels, and the trainer's shading against the runtime's oracle."""
+"""The learnable probe, sampling of its texels, and the trainer's shading against the runtime's oracle."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_probe_starts_white_with_mean_luminance_one() -> None:
     assert abs(float(mean) - 1) < 1e-5
 
 
-def test_what_reaches_the_body_stays_as_it_started() -> None:
+def test_the_exposed_luminance_is_constant() -> None:
     probe, radiance = LightProbe(), _sunny()
     exposure = torch.rand(32, 64, generator=torch.Generator().manual_seed(1)) * probe.solid_angles
     probe.start_from(radiance, exposure)
@@ -42,7 +42,7 @@ def test_what_reaches_the_body_stays_as_it_started() -> None:
     assert abs(reaches[0] / reaches[1] - 1) < 1e-5
 
 
-def test_drawn_texels_are_unbiased_and_always_hold_the_sun() -> None:
+def test_sampled_texels_are_unbiased_and_always_include_the_sun() -> None:
     probe, radiance = LightProbe(), _sunny()
     generator = torch.Generator().manual_seed(0)
     # any function of direction will do: the average over draws must be its full sum

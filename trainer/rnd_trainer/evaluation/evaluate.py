@@ -1,4 +1,4 @@
-"""Held-out quality of a trained avatar: novel views, novel poses, new lights."""
+"""Evaluation on held-out frames: novel views, novel poses, new lights."""
 
 from __future__ import annotations
 
@@ -25,15 +25,12 @@ from .scores import frame_scores, to_srgb8
 
 HELD_OUT: tuple[Split, ...] = ("novel_view", "novel_pose", "relight")
 FLICKER_FRAMES = 24
-"""consecutive frames of the held-out motion that the flicker figure looks at"""
+"""consecutive frames over which flicker is measured"""
 
 
 @dataclass
 class SplitScore:
-    """Means over the frames of one split of what ``evaluation.scores.frame_scores`` names.
-
-    Each is of the frames that have it: a sliver of a person may have no normals to compare, and none for LPIPS.
-    """
+    """Means of ``evaluation.scores.frame_scores`` over a split, each over the frames that have it."""
 
     split: str
     frames: int
@@ -43,13 +40,12 @@ class SplitScore:
 class Evaluator:
     """Renders a trained avatar for the frames of a capture, each under its light.
 
-    The light that the avatar was trained under is the learned probe, others come from the capture: both are what a
-    player has.
+    Frames under a training light are lit by the learned probe, others by the capture's light maps.
 
     Args:
         mode: shading of the runtime.
-        motion: poses to render, the capture's own unless given (exact ones for an avatar trained on noisy poses).
-        cull: as of the player.
+        motion: poses to render, by default the capture's.
+        cull: as of ``rnd_runtime.playback.frame.FrameRenderer``.
     """
 
     def __init__(
@@ -66,12 +62,12 @@ class Evaluator:
         self._shaders: dict[str | None, Shader | None] = {}
 
     def render(self, frame: Frame, albedo_scale: Tensor | None = None, index: int | None = None) -> Rendered:
-        """``frame``'s camera and light; ``index`` shows another motion frame instead of its own."""
+        """Render ``frame``, or with its camera and light motion frame ``index``."""
         index = frame.frame if index is None else index
         if frame.split == "relight" and frame.light is None:
-            expected = "the name of the light it was taken under"
+            expected = "the name of its light"
             raise InputError(
-                "light of a relight picture", expected=expected, got="none", frame=frame.frame, file=self.capture.file
+                "light of a relight image", expected=expected, got="none", frame=frame.frame, file=self.capture.file
             )
         model = self.checkpoint.config.model
         pose = pose_input(self.motion, self.checkpoint.skeleton, index / self.motion.fps, model)
@@ -83,7 +79,7 @@ class Evaluator:
         if name not in self._shaders:
             known = name is not None and name not in self._trained
             light = self.capture.load_light(name) if name and known else Light(self.checkpoint.probe.numpy())
-            plain = self.checkpoint.config.light == "none"  # colours that no light changes
+            plain = self.checkpoint.config.light == "none"
             self._shaders[name] = None if plain else Shader(light, self.mode)
         return self._shaders[name]
 
@@ -97,13 +93,13 @@ def evaluate(
     perceptual: Perceptual | None = None,
     on_frame: Callable[[Frame, Rendered, Tensor], None] | None = None,
 ) -> SplitScore:
-    """Score one split; pictures that show nobody are left out, as in training.
+    """Score one split, without frames whose masks are empty or full.
 
     Args:
-        albedo_scale: [3] factor on the albedo, for relighting with the albedo–light ambiguity taken out.
-        shown_scale: [3] factor on the albedo picture alone, where that is compared with the truth.
-        perceptual: LPIPS of these weights is reported too.
-        on_frame: called with each frame, its rendering and the true image [H, W, 3] (sRGB).
+        albedo_scale: [3] factor on the albedo, which removes the albedo–light ambiguity from relighting.
+        shown_scale: [3] factor on the albedo image alone, for its score.
+        perceptual: network of LPIPS.
+        on_frame: called with each frame, its rendering and the true image [H, W, 3] sRGB.
     """
     rows: list[dict[str, float]] = []
     frames = evaluator.capture.split(split)
@@ -116,21 +112,20 @@ def evaluate(
         if on_frame is not None:
             on_frame(frame, rendered, torch.from_numpy(truth.image_srgb))
     if not rows:
-        expected = "a person in one picture at least"
+        expected = "a person in one image at least"
         raise InputError(f"split {split!r}", expected=expected, got="none", file=evaluator.capture.folder)
-    figures: dict[str, list[float]] = {}
+    by_name: dict[str, list[float]] = {}
     for row in rows:
         for name, value in row.items():
-            figures.setdefault(name, []).append(value)
-    return SplitScore(split, len(rows), {name: float(np.mean(values)) for name, values in figures.items()})
+            by_name.setdefault(name, []).append(value)
+    return SplitScore(split, len(rows), {name: float(np.mean(values)) for name, values in by_name.items()})
 
 
 def flicker(evaluator: Evaluator, split: Split = "novel_pose") -> float | None:
-    """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive frames of the motion.
+    """Mean |I₋₁ − 2 I₀ + I₊₁| / 2 over the person, in 8-bit sRGB levels, over consecutive motion frames.
 
-    From the split's first frame on, whether all of them are held out or not: nothing is compared with a picture.
-    Motion at constant speed cancels in the second difference to first order; what jumps does not. None where the
-    motion has fewer than three frames from there on, or nobody is seen.
+    Starts at the first frame of ``split``. Motion at constant speed cancels to first order. None with fewer than three
+    frames or without visible pixels.
     """
     frames = sorted(evaluator.capture.split(split), key=lambda frame: (frame.camera, frame.frame))
     if not frames:
@@ -149,12 +144,11 @@ def flicker(evaluator: Evaluator, split: Split = "novel_pose") -> float | None:
 
 
 def albedo_scale(evaluator: Evaluator) -> Tensor | None:
-    """Per-channel least-squares factor [3] from the learned to the true albedo, over training frames that have it.
+    """Per-channel least-squares factor [3] from learned to true albedo, over training frames with albedo.
 
-    Albedo and light are known up to this factor; IntrinsicAvatar's protocol fits it before relighting.
-    None where the capture has no albedo, or nothing there is covered by both.
+    Removes the albedo–light ambiguity as in IntrinsicAvatar's protocol. None without true albedo.
     """
-    ours, theirs = [], []
+    learned, true = [], []
     for frame in evaluator.capture.split("train"):
         if frame.albedo is None:
             continue
@@ -162,10 +156,10 @@ def albedo_scale(evaluator: Evaluator) -> Tensor | None:
         assert truth.albedo_srgb is not None
         rendered = evaluator.render(frame)
         inside = (torch.from_numpy(truth.mask) > 0.99) & (rendered.alpha > 0.99)
-        ours.append(rendered.albedo[inside])
-        theirs.append(torch.from_numpy(srgb_to_linear(truth.albedo_srgb)).float()[inside])
-    if not ours:
+        learned.append(rendered.albedo[inside])
+        true.append(torch.from_numpy(srgb_to_linear(truth.albedo_srgb)).float()[inside])
+    if not learned:
         return None
-    x, y = torch.cat(ours), torch.cat(theirs)
+    x, y = torch.cat(learned), torch.cat(true)
     scale = (x * y).sum(0) / (x * x).sum(0)
     return scale if bool(torch.isfinite(scale).all()) else None

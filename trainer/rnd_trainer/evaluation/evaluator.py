@@ -1,4 +1,4 @@
-"""Pictures of a model by the runtime's shading and rasteriser, so that what is judged is what is played."""
+"""Rendering of a model by the runtime's shading and rasteriser, as in playback."""
 
 from __future__ import annotations
 
@@ -40,9 +40,13 @@ def to_gaussians(posed: PosedGaussians, pose: PoseInput) -> Gaussians:
 
 @dataclass
 class Rendered:
-    """What the player would show, before any background; all but ``alpha`` [H, W] is premultiplied by it.
+    """Rendered image as in playback, without background; premultiplied by ``alpha``.
 
-    ``image`` [H, W, 3] linear radiance, ``normals`` [H, W, 3] in the camera's axes, ``albedo`` [H, W, 3] linear.
+    Attributes:
+        image: [H, W, 3] linear radiance.
+        normals: [H, W, 3] in camera axes.
+        albedo: [H, W, 3] linear.
+        alpha: [H, W].
     """
 
     image: Tensor
@@ -60,9 +64,12 @@ def render_runtime(
     albedo_scale: Tensor | None = None,
     cull: float | None = None,
 ) -> Rendered:
-    """Pose ``model``, shade it under the light of ``shader`` and splat it; ``albedo_scale`` [3] is optional.
+    """Pose, shade and splat ``model``.
 
-    ``cull`` as of ``rnd_runtime.playback.frame.FrameRenderer``.
+    Args:
+        shader: with the light; None: plain colours.
+        albedo_scale: [3] factor on the albedo.
+        cull: as of ``rnd_runtime.playback.frame.FrameRenderer``.
     """
     pose, root = _in_root_frame(pose)
     camera = camera.in_frame(root)
@@ -78,12 +85,12 @@ def render_runtime(
     splats = gaussians.means, gaussians.covariances, gaussians.opacities
     seen = None if cull is None else in_view(*splats, camera, normals=gaussians.normals, cull=cull)
     raster = sharpened(rasterize(*splats, features, camera, seen=seen))
-    image, seen_normals, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
-    return Rendered(image, seen_normals, albedo, torch.from_numpy(raster.alpha))
+    image, normals_image, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
+    return Rendered(image, normals_image, albedo, torch.from_numpy(raster.alpha))
 
 
 def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
-    """``pose`` in the frame in which playback poses, and that frame → world [4, 4]."""
+    """``pose`` in the root's frame, as in playback, and the transform [4, 4] from that frame to the world."""
     bones = pose.bones.detach().cpu().numpy()
     root = np.vstack([bones[0].astype(np.float64), [0, 0, 0, 1]])
     local = taken_along(bones, np.linalg.inv(root))
@@ -93,13 +100,13 @@ def _in_root_frame(pose: PoseInput) -> tuple[PoseInput, Floats]:
 def _shade(
     model: AvatarModel, gaussians: Gaussians, posed: PosedGaussians, pose: PoseInput, camera: Camera, shader: Shader
 ) -> NDArray[np.float32]:
-    """Radiance [N, 3]; the ablated kinds of visibility see no shadows, and the paper's dims by direction."""
+    """Radiance [N, 3]; with ``visibility="none"`` without shadows, with ``"paper"`` times the view's visibility."""
     kind = model.config.visibility
     if kind == "pose":
         return shader.shade(gaussians, camera.position)
-    everywhere = np.zeros_like(gaussians.visibility)
-    everywhere[:, 0] = SH_DC_OF_ONE
-    radiance = shader.shade(replace(gaussians, visibility=everywhere), camera.position, shadows=False)
+    unoccluded = np.zeros_like(gaussians.visibility)
+    unoccluded[:, 0] = SH_DC_OF_ONE
+    radiance = shader.shade(replace(gaussians, visibility=unoccluded), camera.position, shadows=False)
     if kind == "paper":
         eye = torch.as_tensor(camera.position, dtype=torch.float32, device=posed.means.device)
         view = torch.nn.functional.normalize(eye - posed.means, dim=-1)

@@ -1,4 +1,4 @@
-"""Every figure of a trained avatar on the held-out splits of a capture, as rows for a table or a JSON file."""
+"""Scores of a trained avatar on the held-out splits of a capture, as rows for a table or a JSON file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from .evaluate import HELD_OUT, Evaluator, albedo_scale, evaluate, flicker
 from .preview import contact_sheet, strip
 
 PLAYED = 40
-"""frames that playback is timed on"""
+"""frames of the playback timing"""
 
 
 def score(
@@ -42,28 +42,28 @@ def score(
     avatar: Path | None = None,
     cull: float | None = None,
 ) -> list[dict[str, Any]]:
-    """Rows of every held-out split that the capture has, relighting raw and with the albedo scaled.
+    """Score all held-out splits of the capture, relighting with and without scaled albedo.
 
     Args:
         method: name of the rows.
         mode: shading of the runtime.
-        strips: folder for strips (truth, render, normals, albedo, error) and a contact sheet of each split.
-        perceptual: adds LPIPS.
-        avatar: the exported file; adds its size and its frames a second.
-        cull: as of the player.
+        strips: folder for strips and a contact sheet per split.
+        perceptual: network of LPIPS.
+        avatar: exported file; adds its size and frame rate.
+        cull: as of ``rnd_runtime.playback.frame.FrameRenderer``.
 
     Raises:
         InputError: the capture has no held-out split.
     """
     evaluator = Evaluator(checkpoint, capture, mode, cull=cull)
-    lit = checkpoint.config.light != "none"  # else there is no albedo: colours that no light changes
+    lit = checkpoint.config.light != "none"  # otherwise there is no albedo
     scale = albedo_scale(evaluator) if lit else None
     jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
     if scale is not None and capture.split("relight"):
         jobs.append(("relight", scale))
     if not jobs:
         raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)
-    whole = {
+    common = {
         "flicker": flicker(evaluator),
         "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
         "shade": mode,
@@ -84,10 +84,10 @@ def score(
         folder = None if strips is None else strips / name.replace(", ", "_").replace(" ", "_")
         shown: list[Any] = []
 
-        def keep(frame: Any, rendered: Any, target: Any, folder: Path | None = folder, kept: Any = shown) -> None:
+        def keep(frame: Any, rendered: Any, target: Any, folder: Path | None = folder, strips: Any = shown) -> None:
             if folder is not None:
-                kept.append(strip(rendered, target.numpy()))
-                write_image(folder / f"{names[frame.image]}.png", kept[-1])
+                strips.append(strip(rendered, target.numpy()))
+                write_image(folder / f"{names[frame.image]}.png", strips[-1])
 
         result = evaluate(
             evaluator, split, albedo_scale=factor, shown_scale=scale, perceptual=perceptual, on_frame=keep
@@ -104,27 +104,23 @@ def score(
                 "frames": result.frames,
                 **result.scores,
                 "normals": "exact" if exact else "estimated",
-                **whole,
+                **common,
             }
         )
     return rows
 
 
 def strip_names(images: Iterable[str]) -> dict[str, str]:
-    """A name without folder and suffix for each of ``images``, paths in a capture.
-
-    The picture's own where no other has it, else with the folders before it.
-    """
+    """Unique names for ``images``, paths in a capture: the stem, or with its folders if it is not unique."""
     paths = {image: PurePosixPath(image).with_suffix("") for image in images}
     stems = Counter(path.name for path in paths.values())
     return {image: path.name if stems[path.name] == 1 else "_".join(path.parts) for image, path in paths.items()}
 
 
 def playback(avatar: Path, evaluator: Evaluator) -> dict[str, Any]:
-    """Size of an exported avatar in MB, and frames a second of the runtime from pose to pixels in memory.
+    """Size in MB of an exported avatar, and its median frame rate in Hz from pose to pixels in memory.
 
-    Under the learned light, shaded as it is judged, seen by the first held-out camera, over ``PLAYED`` consecutive
-    poses; the median.
+    Under the learned light, for the first held-out camera, over ``PLAYED`` consecutive frames.
     """
     frame = next(frame for split in HELD_OUT for frame in evaluator.capture.split(split))
     renderer = FrameRenderer(
@@ -144,7 +140,7 @@ def playback(avatar: Path, evaluator: Evaluator) -> dict[str, Any]:
 
 
 def sizes(capture: Capture, splits: Iterable[Split] = HELD_OUT) -> list[tuple[int, int]]:
-    """Widths and heights in pixels of the pictures of ``splits``, each once."""
+    """Unique widths and heights in pixels of the images of ``splits``."""
     cameras = (capture.cameras[frame.camera] for split in splits for frame in capture.split(split))
     return sorted({(camera.width, camera.height) for camera in cameras})
 

@@ -17,11 +17,11 @@ from rnd_trainer.training.data import TrainingView
 from .evaluator import Rendered, render_runtime
 
 ERROR_GAIN = 4
-"""of the error picture: an error of 64/255 is white"""
+"""gain of the error image: an error of 64/255 is white"""
 TILES = ("truth", "render", "normals", "albedo", f"error x {ERROR_GAIN}")
-"""the pictures side by side in a strip"""
+"""images side by side in a strip"""
 CAPTION = 24
-"""pixels of the words above strips"""
+"""height of the captions, pixels"""
 FONT, LETTERS = cv2.FONT_HERSHEY_SIMPLEX, 0.45
 
 
@@ -42,10 +42,7 @@ def strip(rendered: Rendered, target_srgb: np.ndarray) -> np.ndarray:
 def save_preview(
     path: Path, model: AvatarModel, probe: torch.Tensor | None, views: list[tuple[TrainingView, PoseInput]]
 ) -> None:
-    """A picture with one row for each view: what the player would show of the training so far.
-
-    Without a ``probe`` [32, 64, 3] (in the first stage) the plain colours are shown.
-    """
+    """Write an image with a strip per view; without ``probe`` [32, 64, 3] of plain colours."""
     shader = None if probe is None else Shader(Light(probe.detach().cpu().numpy()), "table+sun")
     rows = []
     for view, pose in views:
@@ -55,31 +52,31 @@ def save_preview(
 
 
 def contact_sheet(path: Path, strips: list[np.ndarray], rows: int = 6) -> None:
-    """``rows`` of the strips [H, 5·W, 3], evenly chosen, under one another."""
+    """Write ``rows`` evenly spaced strips [H, 5·W, 3] below one another."""
     count = min(rows, len(strips))
     _write_sheet(path, [strips[k * len(strips) // count] for k in range(count)])
 
 
 def captions(tile: int, strips: int = 1) -> np.ndarray:
-    """[CAPTION, 5·tile·strips, 3] uint8: above each tile of so many pixels what it shows, in grey on black."""
-    picture = np.zeros((CAPTION, tile * len(TILES) * strips, 3), np.uint8)
+    """[CAPTION, 5·tile·strips, 3] uint8: a caption for each tile of ``tile`` pixels, grey on black."""
+    image = np.zeros((CAPTION, tile * len(TILES) * strips, 3), np.uint8)
     for number, word in enumerate(TILES * strips):
         (wide, _), _ = cv2.getTextSize(word, FONT, LETTERS, 1)
         scale = LETTERS * min(1.0, 0.9 * tile / wide)
         left = number * tile + round((tile - wide * scale / LETTERS) / 2)
-        cv2.putText(picture, word, (left, CAPTION - 8), FONT, scale, (170, 170, 170), 1, cv2.LINE_AA)
-    return picture
+        cv2.putText(image, word, (left, CAPTION - 8), FONT, scale, (170, 170, 170), 1, cv2.LINE_AA)
+    return image
 
 
 def _write_sheet(path: Path, strips: list[np.ndarray]) -> None:
-    """Strips under one another, and words above; narrower pictures stand in their columns, black on both sides."""
+    """Write strips below captions; narrower images are centred in their columns."""
     tile = max(strip.shape[1] for strip in strips) // len(TILES)
     columns = [_centred(strip, tile) for strip in strips]
     write_image(path, np.concatenate([captions(tile), *columns], axis=0))
 
 
 def _centred(strip: np.ndarray, tile: int) -> np.ndarray:
-    """The strip [H, 5·W, 3] with each picture in the middle of ``tile`` ≥ W pixels: [H, 5·tile, 3]."""
-    pictures = strip.reshape(len(strip), len(TILES), -1, 3)
-    left, right = (tile - pictures.shape[2]) // 2, (tile - pictures.shape[2] + 1) // 2
-    return np.pad(pictures, ((0, 0), (0, 0), (left, right), (0, 0))).reshape(len(strip), -1, 3)
+    """Strip [H, 5·W, 3] with each image padded to ``tile`` ≥ W pixels: [H, 5·tile, 3]."""
+    images = strip.reshape(len(strip), len(TILES), -1, 3)
+    left, right = (tile - images.shape[2]) // 2, (tile - images.shape[2] + 1) // 2
+    return np.pad(images, ((0, 0), (0, 0), (left, right), (0, 0))).reshape(len(strip), -1, 3)

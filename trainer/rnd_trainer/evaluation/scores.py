@@ -1,4 +1,4 @@
-"""What one rendering is worth beside its truth: image, normals and albedo, whole frame and the person's box."""
+"""Scores of one rendering: image, normals and albedo, in the full frame and the person's box."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from rnd_trainer.losses.perceptual import Perceptual
 from .evaluator import Rendered
 
 BOX_MARGIN = 8
-"""pixels around the mask's box in which the second figure of each pair is computed"""
+"""pixels around the mask's bounding box"""
 EDGE = 4
-"""pixels on either side of the silhouette that are the truth's own in `lpips_inner`"""
+"""pixels on either side of the silhouette taken from the truth in `lpips_inner`"""
 COVERED = 0.05
-"""coverage below which a pixel has no normal, in the truth as in ours"""
+"""coverage below which a pixel has no normal"""
 
 
 def frame_scores(
     rendered: Rendered, truth: FrameImages, perceptual: Perceptual | None = None, scale: Tensor | None = None
 ) -> dict[str, float]:
-    """Figures of one picture by name; what the capture or the weights do not allow is left out.
+    """Scores of one image by name, as far as the capture and the weights allow.
 
-    ``psnr, ssim, lpips`` of the sRGB picture on black, in the full frame and (``*_box``) in the mask's bounding
-    box: the full frame is nine tenths background, so its figures flatter everybody. ``psnr_n, ssim_n`` of normal
-    pictures (n + 1)/2, ``normal_deg`` the mean angle, both where the truth has normals; ``psnr_albedo`` of sRGB, after
-    ``scale`` [3], where mask and render both cover more than half. ``lpips_inner`` has the outline from the truth;
-    ``outline_px`` is the area that coverage is wrong by, per length of outline.
+    - ``psnr, ssim, lpips``: sRGB on black, full frame; ``*_box``: in the mask's bounding box.
+    - ``psnr_n, ssim_n``: normal images (n + 1)/2; ``normal_deg``: mean angle in degrees.
+    - ``psnr_albedo``: sRGB, after ``scale`` [3], where mask and render both cover more than half.
+    - ``lpips_inner``: with the outline from the truth.
+    - ``outline_px``: area of wrong coverage per length of outline, pixels.
     """
     target, mask = torch.from_numpy(truth.image_srgb).float(), torch.from_numpy(truth.mask)
     image = to_srgb8(rendered.image)
@@ -58,12 +58,12 @@ def frame_scores(
         if (inside & known).any():
             scores["normal_deg"] = normal_degrees(rendered.normals, expected, inside & known)
         hole = ((mask > COVERED) & ~known)[..., None]
-        ours = normal_picture(rendered.normals, rendered.alpha).masked_fill(hole, 0)
-        theirs = normal_picture(expected, mask).masked_fill(hole, 0)
+        rendered_image = normal_image(rendered.normals, rendered.alpha).masked_fill(hole, 0)
+        true_image = normal_image(expected, mask).masked_fill(hole, 0)
         scores |= {
-            "psnr_n": psnr(ours, theirs),
-            "ssim_n": ssim(ours, theirs),
-            "psnr_n_box": psnr(ours[box], theirs[box]),
+            "psnr_n": psnr(rendered_image, true_image),
+            "ssim_n": ssim(rendered_image, true_image),
+            "psnr_n_box": psnr(rendered_image[box], true_image[box]),
         }
     if truth.albedo_srgb is not None and inside.any():
         albedo = rendered.albedo if scale is None else rendered.albedo * scale
@@ -73,26 +73,26 @@ def frame_scores(
 
 
 def silhouette(mask: Tensor) -> Tensor:
-    """Pixels [H, W, 1] within ``EDGE`` of where coverage [H, W] passes a half."""
+    """Pixels [H, W, 1] within ``EDGE`` of the outline of coverage [H, W] at 0.5."""
     covered = (mask > 0.5).float()[None]
-    near_person, near_nothing = (
+    near_person, near_background = (
         torch.nn.functional.max_pool2d(side, 2 * EDGE + 1, stride=1, padding=EDGE) for side in (covered, 1 - covered)
     )
-    return (near_person * near_nothing)[0, ..., None] > 0
+    return (near_person * near_background)[0, ..., None] > 0
 
 
 def outline_length(mask: Tensor) -> float:
-    """Length in pixels of the outline of coverage [H, W]: its total variation ∫|∇m| (the coarea formula)."""
+    """Outline length in pixels of coverage [H, W]: its total variation ∫|∇m| (coarea formula)."""
     down, right = torch.gradient(mask)
     return float(torch.hypot(down, right).sum())
 
 
-def normal_picture(normals: Tensor, coverage: Tensor) -> Tensor:
-    """Unit normals [H, W, 3] as a picture (n + 1)/2, black where less than 5 % is covered [H, W]."""
+def normal_image(normals: Tensor, coverage: Tensor) -> Tensor:
+    """Unit normals [H, W, 3] as an image (n + 1)/2, black where ``coverage`` [H, W] is at most ``COVERED``."""
     unit = torch.nn.functional.normalize(normals, dim=-1)
     return torch.where((coverage > COVERED)[..., None], (unit + 1) / 2, torch.zeros_like(unit))
 
 
 def to_srgb8(image: Tensor) -> Tensor:
-    """Linear premultiplied [H, W, 3] on black → sRGB as a PNG holds it."""
+    """Linear premultiplied [H, W, 3] on black → sRGB, rounded to 8 bits."""
     return torch.from_numpy(np.round(np.clip(linear_to_srgb(image.numpy()), 0, 1) * 255) / 255).float()
