@@ -44,7 +44,7 @@ class Stability:
     fuzz: Count = 0
     """broken inputs for every reader; resumes in WORK"""
     soak: Count = 0
-    """frames of playback, and a tenth as many steps of training; resumes in WORK"""
+    """frames of playback, and a tenth as many steps of training and clients of rnd-view; resumes in WORK"""
     kill: Count = 0
     """times that training, export and play are each killed"""
     determinism: Flag = False

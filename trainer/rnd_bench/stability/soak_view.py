@@ -1,0 +1,148 @@
+"""``rnd-view`` for hours, with clients that come and go: pages, files, strangers, idle and broken connections."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import urlsplit
+from urllib.request import urlopen
+
+import numpy as np
+
+from rnd_bench.scenes.subject import Subject
+from rnd_runtime.core.errors import InputError
+
+from .figures import Figure, at_most, below, not_measured
+from .processes import environment
+from .soak import TOO_SHORT
+
+VIEW = "import sys; from rnd_viewer.view.cli import main; sys.exit(main())"
+SIDE = 64
+"""px: of the images that pages ask for"""
+IDLE = 100
+"""connections that ask for nothing, more than the server holds"""
+WARM = 1200
+"""clients before memory is watched: each thread of the server takes an arena of malloc's"""
+EVERY = 20
+"""clients between two readings of memory"""
+ANSWER_S = 2.0
+SLOPE_BYTES = 1000.0
+PATIENCE_S = 30.0
+
+
+def soak_view(subject: Subject, clients: int) -> list[Figure]:
+    """Let ``clients`` clients of each kind by turns visit one ``rnd-view`` on a loopback address."""
+    idle: deque[socket.socket] = deque()
+    seconds, memory = [], []
+    with _viewer(subject.avatar_file) as (url, process), ExitStack() as stack:
+        stack.callback(_close_all, idle)
+        kinds: list[Callable[[str], None]] = [_page, _file, _leave, _stranger, _garbage, lambda url: _idle(url, idle)]
+        for number in range(clients):
+            kinds[number % len(kinds)](url)
+            started = perf_counter()
+            _file(url)
+            seconds.append(perf_counter() - started)
+            if number >= WARM and number % EVERY == 0:
+                memory.append(_memory(process.pid))
+        ended = process.poll() is not None
+    name = f"rnd-view, {clients} clients"
+    growth = f"{name}: memory a client"
+    slope = np.polyfit(EVERY * np.arange(len(memory)), memory, 1)[0] if len(memory) > 10 else None
+    return [
+        not_measured(growth, TOO_SHORT) if slope is None else below(growth, float(slope), SLOPE_BYTES, "bytes"),
+        below(f"{name}: longest answer to a page", max(seconds), ANSWER_S, "s"),
+        at_most(f"{name}: ended early", int(ended), 0),
+    ]
+
+
+@contextmanager
+def _viewer(avatar: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """``rnd-view`` of ``avatar`` and the URL that it prints."""
+    command = [sys.executable, "-c", VIEW, str(avatar), "--size", str(SIDE), "--port", "0", "--no-browser"]
+    with subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout
+            line = process.stdout.readline()
+            if not line.startswith("rnd-view: http://"):
+                raise InputError("rnd-view does not start", got=line.strip() or f"exit {process.wait()}")
+            yield line.removeprefix("rnd-view: ").strip(), process
+            process.send_signal(signal.SIGTERM)
+            process.wait(PATIENCE_S)
+        finally:
+            process.kill()
+
+
+@contextmanager
+def _websocket(url: str) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """A connected page and what it asks for: one image."""
+    from websockets.sync.client import connect
+
+    address = urlsplit(url)._replace(scheme="ws", path="/socket").geturl()
+    with connect(address, max_size=None, compression=None) as page:
+        view = json.loads(page.recv(PATIENCE_S))["scene"]["view"]
+        state = {"time": 0.0, "width": SIDE, "height": SIDE} | view
+        yield page, {"ask": "render", "number": 1, "state": state}
+
+
+def _page(url: str) -> None:
+    with _websocket(url) as (page, request):
+        page.send(json.dumps(request))
+        header = json.loads(page.recv(PATIENCE_S))
+        assert header["kind"] == "frame", header
+        assert len(page.recv(PATIENCE_S)) == 4 * SIDE * SIDE
+
+
+def _leave(url: str) -> None:
+    """A page that is gone before its image is there."""
+    with _websocket(url) as (page, request):
+        page.send(json.dumps(request))
+        page.socket.shutdown(socket.SHUT_RDWR)
+
+
+def _file(url: str) -> None:
+    with urlopen(url, timeout=PATIENCE_S) as answer:
+        answer.read()
+
+
+def _stranger(url: str) -> None:
+    with suppress(HTTPError):
+        urlopen(urlsplit(url)._replace(query="token=wrong").geturl(), timeout=PATIENCE_S)
+        raise AssertionError("a wrong token is taken")
+
+
+def _garbage(url: str) -> None:
+    with _connect(url) as connection, suppress(OSError):
+        connection.sendall(os.urandom(1 << 16))
+
+
+def _idle(url: str, idle: deque[socket.socket]) -> None:
+    idle.append(_connect(url))
+    if len(idle) > IDLE:
+        idle.popleft().close()
+
+
+def _close_all(connections: Iterable[socket.socket]) -> None:
+    for connection in connections:
+        connection.close()
+
+
+def _connect(url: str) -> socket.socket:
+    place = urlsplit(url)
+    return socket.create_connection((place.hostname, place.port), PATIENCE_S)
+
+
+def _memory(process: int) -> int:
+    """Bytes that ``process`` wrote and holds."""
+    fields = dict(line.split(":", 1) for line in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()[1:])
+    return 1024 * sum(int(fields[name].split()[0]) for name in ("Private_Dirty", "Swap"))
