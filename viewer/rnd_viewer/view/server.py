@@ -83,7 +83,7 @@ def serve(
     visitor = _Visitor(shown, fps_floor)
     training = shown if isinstance(shown, Training) else None
 
-    class Connection(server_module.ServerConnection):  # type: ignore[name-defined, misc]
+    class Connection(server_module.ServerConnection):  # type: ignore[name-defined]
         def process_event(self, event: Any) -> None:
             if self.recv_messages.frames.qsize() >= MAX_WAITING:
                 raise ConnectionError("too many requests wait")  # which ends the connection
