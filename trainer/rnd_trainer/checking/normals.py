@@ -18,18 +18,12 @@ _AXES = "xyz"
 
 
 class AxesAgreement(NamedTuple):
-    """Agreement of normal maps with the template.
+    """Agreement of normal maps with the template."""
 
-    Attributes:
-        cosine: mean cosine to the template's normals, as they are.
-        facing: share of normals that face the camera (z < 0).
-        best_cosine, best_axes: of the best signed permutation, such as "x,-y,-z".
-    """
-
-    cosine: float
-    facing: float
-    best_cosine: float
-    best_axes: str
+    cosine: float  # mean cosine to the template's normals, as they are
+    facing: float  # share of normals that face the camera (z < 0)
+    best_cosine: float  # of the best signed permutation
+    best_axes: str  # that permutation, such as "x,-y,-z"
 
     @property
     def wrong(self) -> bool:

@@ -17,15 +17,10 @@ NEAR = 0.05
 
 
 class RenderedMesh(NamedTuple):
-    """A mesh rasterized at the pixel centres of a camera.
+    """A mesh rasterised at the pixel centres of a camera."""
 
-    Attributes:
-        mask: [H, W] True where the mesh covers the pixel's centre.
-        normals: [H, W, 3] unit face normals in OpenCV camera axes, towards the viewer (z < 0); zero outside.
-    """
-
-    mask: NDArray[np.bool_]
-    normals: Floats
+    mask: NDArray[np.bool_]  # [H, W] True where the mesh covers the pixel's centre
+    normals: Floats  # [H, W, 3] unit face normals in OpenCV camera axes, z < 0; zero outside
 
 
 def render_mesh(vertices: Floats, faces: NDArray[np.int32], camera: Camera, k1: float = 0.0) -> RenderedMesh:

@@ -22,23 +22,15 @@ SIZE = 192
 
 @dataclass(frozen=True, eq=False)
 class MaskView:
-    """One frame's mask and template.
-
-    Attributes:
-        camera: the frame's camera, scaled to ``mask``.
-        mask: [h, w] True for the person.
-        faces: [F, 3] of the template.
-        vertices: [V, 3] m, world: the posed template.
-        root_rotation, root_position: [3, 3] and [3] m, world.
-    """
+    """One frame's mask and template."""
 
     frame: Frame
-    camera: Camera
-    mask: NDArray[np.bool_]
-    faces: NDArray[np.int32]
-    vertices: Floats
-    root_rotation: Floats
-    root_position: Floats
+    camera: Camera  # the frame's, scaled to ``mask``
+    mask: NDArray[np.bool_]  # [h, w] True for the person
+    faces: NDArray[np.int32]  # [F, 3] of the template
+    vertices: Floats  # [V, 3] m, world: the posed template
+    root_rotation: Floats  # [3, 3] world
+    root_position: Floats  # [3] m, world
 
     def template(self) -> RenderedMesh:
         """The template as the camera sees it."""

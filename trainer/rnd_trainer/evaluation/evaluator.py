@@ -40,19 +40,12 @@ def to_gaussians(posed: PosedGaussians, pose: PoseInput) -> Gaussians:
 
 @dataclass
 class Rendered:
-    """Rendered image as in playback, without background; premultiplied by ``alpha``.
+    """Rendered image as in playback, without background; premultiplied by ``alpha``."""
 
-    Attributes:
-        image: [H, W, 3] linear radiance.
-        normals: [H, W, 3] in camera axes.
-        albedo: [H, W, 3] linear.
-        alpha: [H, W].
-    """
-
-    image: Tensor
-    normals: Tensor
-    albedo: Tensor
-    alpha: Tensor
+    image: Tensor  # [H, W, 3] linear radiance
+    normals: Tensor  # [H, W, 3] camera axes
+    albedo: Tensor  # [H, W, 3] linear
+    alpha: Tensor  # [H, W]
 
 
 @torch.no_grad()

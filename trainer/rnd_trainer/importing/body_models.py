@@ -31,19 +31,12 @@ _NO_PARENT = 2**32 - 1  # SMPL's files hold the root's parent, −1, as an unsig
 
 @dataclass(frozen=True, eq=False)
 class BodyModel:
-    """A body whose shape depends on ``betas``.
+    """A body whose shape depends on ``betas``."""
 
-    Attributes:
-        family: "SMPL", "SMPL-H", "SMPL-X", or without shape parameters "Anny" or "template".
-        template: the body for betas 0.
-        shape_dirs: [V, 3, B] m per unit of each beta; B may be 0.
-        joint_regressor: [J, V], joints from shaped vertices.
-    """
-
-    family: str
-    template: Body
-    shape_dirs: Floats
-    joint_regressor: Floats | None = None
+    family: str  # "SMPL", "SMPL-H", "SMPL-X", or without shape parameters "Anny" or "template"
+    template: Body  # for betas 0
+    shape_dirs: Floats  # [V, 3, B] m per unit of each beta; B may be 0
+    joint_regressor: Floats | None = None  # [J, V], joints from shaped vertices
 
     def shaped(self, betas: Floats | None = None) -> Body:
         """The body for ``betas`` [≤ B] in its rest pose: v = T + S β, joints = 𝒥 v.

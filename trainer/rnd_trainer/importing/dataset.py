@@ -17,60 +17,37 @@ from .poses import Poses
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A calibrated camera of a source.
+    """A calibrated camera of a source."""
 
-    Attributes:
-        camera: pixel centres at +0.5, metres, in the source's world.
-        distortion: OpenCV's k1 k2 p1 p2 [k3 …]; empty for undistorted images.
-        undone: coefficients removed by ``undistort_dataset``.
-    """
-
-    camera: Camera
-    distortion: tuple[float, ...] = ()
-    undone: tuple[float, ...] = ()
+    camera: Camera  # pixel centres at +0.5, metres, in the source's world
+    distortion: tuple[float, ...] = ()  # OpenCV's k1 k2 p1 p2 [k3 …]; empty for undistorted images
+    undone: tuple[float, ...] = ()  # coefficients removed by ``undistort_dataset``
 
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One image with its labels, read on demand.
+    """One image with its labels, read on demand."""
 
-    Attributes:
-        camera, frame: name of the lens; number of the frame in ``Poses``.
-        image: returns [H, W, 3] uint8 sRGB.
-        mask: returns [H, W] uint8 coverage; None without a mask.
-        normals: returns [H, W, 3] in OpenCV camera axes, zero where unknown; None without normals.
-        split: None: chosen by ``select_samples``.
-        name: stem of the image file, which mask files may share; empty for a video's frame.
-    """
-
-    camera: str
-    frame: int
-    image: Callable[[], Bytes]
-    mask: Callable[[], Bytes] | None = None
-    normals: Callable[[], NDArray[np.float32]] | None = None
-    split: Split | None = None
-    name: str = ""
+    camera: str  # name of the lens
+    frame: int  # number of the frame in ``Poses``
+    image: Callable[[], Bytes]  # [H, W, 3] uint8 sRGB
+    mask: Callable[[], Bytes] | None = None  # [H, W] uint8 coverage
+    normals: Callable[[], NDArray[np.float32]] | None = None  # [H, W, 3] OpenCV camera axes, zero where unknown
+    split: Split | None = None  # None: chosen by ``select_samples``
+    name: str = ""  # stem of the image file; empty for a video's frame
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedDataset:
-    """A source as read.
+    """A source as read."""
 
-    Attributes:
-        kind: name of the data set's format.
-        lenses: by camera name.
-        fps: frames per second of the images.
-        notes: assumptions, one sentence each.
-        image_names: by frame, of all images of a camera if ``samples`` is a subset; else empty.
-    """
-
-    kind: str
-    lenses: dict[str, Lens]
+    kind: str  # name of the format
+    lenses: dict[str, Lens]  # by camera name
     samples: Sequence[Sample]
     poses: Poses
     fps: float = 30.0
-    notes: tuple[str, ...] = ()
-    image_names: Mapping[int, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # assumptions, one sentence each
+    image_names: Mapping[int, str] = field(default_factory=dict)  # by frame, of all images if ``samples`` is a subset
 
 
 def undistort_dataset(dataset: ImportedDataset) -> ImportedDataset:

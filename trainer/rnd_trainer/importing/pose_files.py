@@ -37,26 +37,15 @@ _ROMP_HALF_ANGLE = np.radians(30.0)
 
 @dataclass(frozen=True, eq=False)
 class PoseFile:
-    """Content of a file of body poses.
+    """Content of a file of body poses."""
 
-    Attributes:
-        kind: the program that wrote it.
-        poses: in camera axes if ``in_camera``, otherwise in the world.
-        K: [3, 3] intrinsics of the file, or None.
-        focal: the program's assumed focal length in px as a function of width and height, or None.
-        fps: frames per second of the file, or None.
-        notes: assumptions, one sentence each.
-        numbered: one file per frame, numbered by name; otherwise frames count from 0.
-        in_camera: poses are in camera axes.
-    """
-
-    kind: str
-    poses: Poses
-    K: Floats | None = None
-    focal: Callable[[int, int], float] | None = None
+    kind: str  # the program that wrote it
+    poses: Poses  # in camera axes if ``in_camera``, otherwise in the world
+    K: Floats | None = None  # [3, 3] intrinsics
+    focal: Callable[[int, int], float] | None = None  # the program's assumed focal length in px of width and height
     fps: float | None = None
-    notes: tuple[str, ...] = ()
-    numbered: bool = False
+    notes: tuple[str, ...] = ()  # assumptions, one sentence each
+    numbered: bool = False  # one file per frame, numbered by name; otherwise frames count from 0
     in_camera: bool = False
 
 

@@ -19,25 +19,15 @@ RootConvention = Literal["smpl", "easymocap", "position"]
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Body poses in the source's world.
+    """Body poses in the source's world."""
 
-    Attributes:
-        frames: [F] frame numbers, strictly ascending.
-        rotations: [F, J, 3, 3] local, the root first.
-        root: returns root positions [F, 3] m for the root's rest position [3] m; called once to check it.
-        joint_names: J.
-        family: "SMPL" or "SMPL-X": whose rest pelvis ``root`` takes.
-        betas: shape, or None.
-        convention: "smpl" (rest + trans), "easymocap" (R rest + Th), or "position" for a layout with root positions.
-    """
-
-    frames: NDArray[np.int64]
-    rotations: Floats
-    root: Callable[[Floats], Floats]
-    joint_names: tuple[str, ...] = SMPL_NAMES
-    family: str = "SMPL"
-    betas: Floats | None = None
-    convention: RootConvention = "position"
+    frames: NDArray[np.int64]  # [F] frame numbers, strictly ascending
+    rotations: Floats  # [F, J, 3, 3] local, the root first
+    root: Callable[[Floats], Floats]  # root positions [F, 3] m for the root's rest position [3] m
+    joint_names: tuple[str, ...] = SMPL_NAMES  # J
+    family: str = "SMPL"  # or "SMPL-X": whose rest pelvis ``root`` takes
+    betas: Floats | None = None  # shape
+    convention: RootConvention = "position"  # "smpl": rest + trans, "easymocap": R rest + Th, "position": as stored
 
     def __post_init__(self) -> None:
         count = len(self.frames)

@@ -30,18 +30,13 @@ MAX_FILLED = 100_000
 
 @dataclass(frozen=True, eq=False)
 class PlacedScene:
-    """Body, motion and cameras of a data set in a world with Y up; motion frame 0 is the first pose.
-
-    Attributes:
-        rotation: [3, 3] from the source's world to the capture's.
-        notes: assumptions, one sentence each.
-    """
+    """Body, motion and cameras of a data set in a world with Y up; motion frame 0 is the first pose."""
 
     body: Body
     motion: Motion
     cameras: dict[str, Camera]
-    rotation: Floats
-    notes: list[str]
+    rotation: Floats  # [3, 3] from the source's world to the capture's
+    notes: list[str]  # assumptions, one sentence each
 
 
 def place_scene(dataset: ImportedDataset, model: BodyModel, up: str | None = None) -> PlacedScene:

@@ -30,21 +30,15 @@ _KEY = "rnd_checkpoint"
 
 @dataclass
 class Checkpoint:
-    """A trained avatar.
-
-    Attributes:
-        probe: [32, 64, 3] linear radiance.
-        info: provenance, see ``Training.info``.
-        file, sha256: of the checkpoint.
-    """
+    """A trained avatar."""
 
     model: AvatarModel
-    probe: Tensor
+    probe: Tensor  # [32, 64, 3] linear radiance
     skeleton: Skeleton
     config: TrainConfig
-    info: dict[str, Any]
+    info: dict[str, Any]  # provenance, see ``Training.info``
     file: Path
-    sha256: str
+    sha256: str  # of ``file``
 
     def learned_from(self, capture: Path) -> bool:
         """Whether the avatar was trained on this capture.json."""

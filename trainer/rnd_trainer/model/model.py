@@ -35,11 +35,11 @@ GLOSSIEST_RESIDUAL = -0.6
 
 @dataclass
 class PoseInput:
-    """Network input: motion window [d, J−1, 6], joint velocities [J−1, 3] rad/s, bone transforms [J, 3, 4]."""
+    """Network input: motion window, joint velocities and bone transforms."""
 
-    window: Tensor
-    velocity: Tensor
-    bones: Tensor
+    window: Tensor  # [d, J−1, 6]
+    velocity: Tensor  # [J−1, 3] rad/s
+    bones: Tensor  # [J, 3, 4]
 
     def to(self, device: torch.device) -> PoseInput:
         """The same on ``device``."""
@@ -48,48 +48,29 @@ class PoseInput:
 
 @dataclass
 class Attributes:
-    """Activated attributes in the rest pose.
+    """Activated attributes in the rest pose."""
 
-    Attributes:
-        opacity: [N].
-        rotation: [N, 3] rotation vectors in the tangent frame.
-        scales: [N, 3] m.
-        normals: [N, 3] unit.
-        points: [N, 3] m, with the static offset.
-        colour, albedo: [N, 3] linear.
-        roughness: [N].
-    """
-
-    opacity: Tensor
-    rotation: Tensor
-    scales: Tensor
-    normals: Tensor
-    points: Tensor
-    colour: Tensor
-    albedo: Tensor
-    roughness: Tensor
-    raw_geometry_residual: Tensor
+    opacity: Tensor  # [N]
+    rotation: Tensor  # [N, 3] rotation vectors in the tangent frame
+    scales: Tensor  # [N, 3] m
+    normals: Tensor  # [N, 3] unit
+    points: Tensor  # [N, 3] m, with the static offset
+    colour: Tensor  # [N, 3] linear
+    albedo: Tensor  # [N, 3] linear
+    roughness: Tensor  # [N]
+    raw_geometry_residual: Tensor  # [N, 13]
 
 
 @dataclass
 class PosedGaussians:
-    """Posed Gaussians in the world frame.
+    """Posed Gaussians in the world frame."""
 
-    Attributes:
-        means: [N, 3] m.
-        covariances: [N, 6] m².
-        normals: [N, 3] unit.
-        visibility: [N, 16] SH coefficients in the root's frame.
-        weights: [N, J] skinning weights.
-        offset: [N, 3] pose-dependent offset in units of its bound.
-    """
-
-    means: Tensor
-    covariances: Tensor
-    normals: Tensor
-    visibility: Tensor
-    weights: Tensor
-    offset: Tensor
+    means: Tensor  # [N, 3] m
+    covariances: Tensor  # [N, 6] m²
+    normals: Tensor  # [N, 3] unit
+    visibility: Tensor  # [N, 16] SH coefficients in the root's frame
+    weights: Tensor  # [N, J] skinning weights
+    offset: Tensor  # [N, 3] pose-dependent offset in units of its bound
     attributes: Attributes
 
 
@@ -113,11 +94,12 @@ class AvatarModel(nn.Module):
         super().__init__()
         self.config = config
         joints = template.weights.shape[1]
+        weights = torch.as_tensor(template.weights, dtype=torch.float64).clamp(min=WEIGHT_FLOOR)
         buffers = {
             "points": template.points,
             "rest_normals": template.normals,
             "codes": template.codes,
-            "log_weights": _log_weights(template.weights),
+            "log_weights": torch.log(weights / weights.sum(dim=-1, keepdim=True)),
             "tangents": tangent_frames(torch.as_tensor(template.normals)),
             "spacing": template.spacing,
         }
@@ -232,11 +214,6 @@ class AvatarModel(nn.Module):
 def _by_name(values: Tensor, columns: dict[str, int]) -> dict[str, Tensor]:
     """[N, C] split into named columns."""
     return dict(zip(columns, values.split(list(columns.values()), dim=-1)))
-
-
-def _log_weights(weights) -> Tensor:
-    floored = torch.as_tensor(weights, dtype=torch.float64).clamp(min=WEIGHT_FLOOR)
-    return torch.log(floored / floored.sum(dim=-1, keepdim=True))
 
 
 def _log_uniform(raw: Tensor, bounds: tuple[float, float]) -> Tensor:

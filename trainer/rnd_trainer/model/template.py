@@ -34,33 +34,22 @@ SPREAD = {
     "left_shoulder": (0, 0, -0.35),
     "right_shoulder": (0, 0, 0.35),
 }
-"""pose of the encoded positions (axis-angle, rad): legs apart, arms off the torso"""
+"""pose of the encoded positions (axis-angle, rad); separates neighbours at armpits and crotch"""
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """N surface points of a body in its rest pose; the first M are the nodes.
+    """N surface points of a body in its rest pose; the first M are the nodes."""
 
-    Attributes:
-        points: [N, 3] m, rest pose.
-        normals: [N, 3] unit, rest pose.
-        codes: [N, 3] m, encoded positions: the points in the spread pose, which separates armpit and crotch neighbours.
-        weights: [N, J] the template's skinning weights.
-        spacing: mean distance of neighbouring Gaussians, m.
-        neighbours, neighbour_weights: [N, 4] nodes and weights of the interpolation; rows sum to 1.
-        limbs: axes [N, 3], levers [N, 3] and shares [N] of ``model.twist.TwistFrames``.
-        nodes: M.
-    """
-
-    points: Floats
-    normals: Floats
-    codes: Floats
-    weights: Floats
-    spacing: float
-    neighbours: NDArray[np.int64]
-    neighbour_weights: Floats
-    limbs: tuple[Floats, Floats, Floats]
-    nodes: int
+    points: Floats  # [N, 3] m
+    normals: Floats  # [N, 3] unit
+    codes: Floats  # [N, 3] m, encoded positions: points in the spread pose
+    weights: Floats  # [N, J] skinning weights
+    spacing: float  # m, mean distance of neighbouring Gaussians
+    neighbours: NDArray[np.int64]  # [N, 4] nodes of the interpolation
+    neighbour_weights: Floats  # [N, 4], rows sum to 1
+    limbs: tuple[Floats, Floats, Floats]  # axes [N, 3], levers [N, 3], shares [N] of ``model.twist.TwistFrames``
+    nodes: int  # M
 
 
 def sample_template(body: Body, count: int, nodes: int, seed: int) -> Template:

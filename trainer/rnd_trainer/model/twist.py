@@ -28,17 +28,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TwistFrames:
-    """Limb around each of N points of the rest pose.
+    """Limb around each of N points of the rest pose."""
 
-    Attributes:
-        axes: [N, 3] unit, along the limb, of either sign.
-        levers: [N, 3] m, from the limb's axis to the point, times ``shares``.
-        shares: [N] 0…1: 1 where the point's bones are collinear, 0 where no direction prevails.
-    """
-
-    axes: Tensor
-    levers: Tensor
-    shares: Tensor
+    axes: Tensor  # [N, 3] unit, along the limb, of either sign
+    levers: Tensor  # [N, 3] m, from the limb's axis to the point, times ``shares``
+    shares: Tensor  # [N] 0…1: 1 where the point's bones are collinear, 0 where no direction prevails
 
 
 def twist_frames(points: Floats, weights: Floats, skeleton: Skeleton) -> tuple[Floats, Floats, Floats]:

@@ -21,10 +21,10 @@ UNIFORM_SHARE = 0.2
 
 @dataclass
 class Texels:
-    """K samples of incident light: directions [K, 3] towards the light, power [K, 3] = L Δω / probability."""
+    """K samples of incident light."""
 
-    directions: Tensor
-    power: Tensor
+    directions: Tensor  # [K, 3] towards the light
+    power: Tensor  # [K, 3] = L Δω / probability
 
 
 class LightProbe(nn.Module):

@@ -17,11 +17,11 @@ from .shading import light_visibility, shade, traced_visibility, view_visibility
 
 @dataclass
 class Splat:
-    """Image [H, W, 3] linear and normals [H, W, 3] in camera axes, premultiplied by alpha [H, W]."""
+    """Differentiable image, premultiplied by ``alpha``."""
 
-    image: Tensor
-    normals: Tensor
-    alpha: Tensor
+    image: Tensor  # [H, W, 3] linear
+    normals: Tensor  # [H, W, 3] camera axes
+    alpha: Tensor  # [H, W]
 
 
 def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera) -> Splat:

@@ -36,19 +36,13 @@ _TO_LINEAR = torch.as_tensor(srgb_to_linear(np.arange(256) / 255), dtype=torch.f
 
 @dataclass
 class TrainingView:
-    """One training image, cropped, in 8 bits.
-
-    Attributes:
-        image: [h, w, 3] sRGB, premultiplied on black.
-        mask: [h, w].
-        normal: [h, w, 3] in camera axes as (n + 1)/2, black where it is unknown inside the mask; None without normals.
-    """
+    """One training image, cropped, in 8 bits."""
 
     frame: Frame
     camera: Camera
-    image: NDArray[np.uint8]
-    mask: NDArray[np.uint8]
-    normal: NDArray[np.uint8] | None
+    image: NDArray[np.uint8]  # [h, w, 3] sRGB, premultiplied on black
+    mask: NDArray[np.uint8]  # [h, w]
+    normal: NDArray[np.uint8] | None  # [h, w, 3] camera axes, (n + 1)/2; black where unknown inside the mask
 
     def target(self, background: Tensor) -> tuple[Tensor, Tensor]:
         """Linear image [h, w, 3] over ``background`` [3] (linear), and the mask [h, w] in 0…1."""

@@ -76,34 +76,21 @@ REFLECTANCE = 0.22
 
 @dataclass
 class FirstLight:
-    """Initial light.
+    """Initial light."""
 
-    Attributes:
-        radiance: [32, 64, 3] linear.
-        exposure: [32, 64], mean radiance of the visible body, if it were white, per unit radiance of a texel.
-    """
-
-    radiance: NDArray[np.float32]
-    exposure: NDArray[np.float32]
+    radiance: NDArray[np.float32]  # [32, 64, 3] linear
+    exposure: NDArray[np.float32]  # [32, 64] mean radiance of a visible white body per unit radiance of a texel
 
 
 @dataclass
 class Observations:
-    """n observations of body points.
+    """n observations of body points."""
 
-    Attributes:
-        point: [n] index of the point.
-        colour: [n, 3] linear.
-        image: [n] index of the image.
-        posed: means and normals of the points in each image.
-        spacing: m.
-    """
-
-    point: NDArray[np.int64]
-    colour: Floats
-    image: NDArray[np.int64]
-    posed: list[tuple[torch.Tensor, torch.Tensor]]
-    spacing: float
+    point: NDArray[np.int64]  # [n] index
+    colour: Floats  # [n, 3] linear
+    image: NDArray[np.int64]  # [n] index
+    posed: list[tuple[torch.Tensor, torch.Tensor]]  # means and normals of the points in each image
+    spacing: float  # m
 
 
 def start_light(
@@ -207,17 +194,11 @@ def _transport(seen: Observations, directions: Floats, solid_angles: Floats) -> 
 
 @dataclass
 class Quadratic:
-    """Squared error Lᵀ disagreement L of a light L, per channel, over Q columns of the dictionary.
+    """Squared error Lᵀ disagreement L of a light L, per channel, over Q columns of the dictionary."""
 
-    Attributes:
-        disagreement: [3, Q, Q].
-        power: [Q, Q]; Lᵀ power L is the squared irradiance.
-        seen: [Q]; seen · L is the total irradiance.
-    """
-
-    disagreement: Floats
-    power: Floats
-    seen: Floats
+    disagreement: Floats  # [3, Q, Q]
+    power: Floats  # [Q, Q]; Lᵀ power L is the squared irradiance
+    seen: Floats  # [Q]; seen · L is the total irradiance
 
     def is_undetermined(self) -> bool:
         """Whether the observations do not constrain the light."""

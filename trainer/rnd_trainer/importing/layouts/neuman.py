@@ -34,17 +34,13 @@ _HUGS = Path("4d_humans") / "smpl_optimized_aligned_scale.npz"
 
 
 class _Fits(NamedTuple):
-    """Fits x = scale · rotation · smpl(pose) + shift in COLMAP's world, one row an image.
+    """Fits x = scale · rotation · smpl(pose) + shift in COLMAP's world, one row an image."""
 
-    Attributes:
-        rotations: [F, 3, 3]. scales: [F]. shifts: [F, 3]. angles: [F, J, 3] rad. betas: [B] or [F, B].
-    """
-
-    rotations: Floats
-    scales: Floats
-    shifts: Floats
-    angles: Floats
-    betas: Floats
+    rotations: Floats  # [F, 3, 3]
+    scales: Floats  # [F]
+    shifts: Floats  # [F, 3]
+    angles: Floats  # [F, J, 3] rad
+    betas: Floats  # [B] or [F, B]
 
 
 def detect(source: Path) -> str | None:

@@ -32,15 +32,10 @@ _MIN_PIXELS = 100
 
 @dataclass(frozen=True)
 class NormalAxes:
-    """Directions of a source's axes, found by the template.
+    """Directions of a source's axes, found by the template."""
 
-    Attributes:
-        signs: factors of x, y and z to OpenCV's axes.
-        agreement: mean cosine with the template's normals, signs applied.
-    """
-
-    signs: tuple[int, int, int]
-    agreement: float
+    signs: tuple[int, int, int]  # factors of x, y and z to OpenCV's axes
+    agreement: float  # mean cosine with the template's normals, signs applied
 
     @property
     def name(self) -> str:
