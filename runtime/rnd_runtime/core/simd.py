@@ -1,11 +1,9 @@
-"""Sixteen float32 lanes as one value inside numba: the registers that posing and the CPU rasteriser are written in.
+"""Sixteen float32 lanes as one numba value.
 
-``Lanes`` maps to LLVM's ``<16 x float>`` and ``Mask`` to ``<16 x i1>``. A kernel then reads like scalar code
-while every operation is one AVX-512 instruction (two of AVX2, four of SSE or NEON: LLVM splits what the
-machine lacks), whatever the auto-vectoriser recognises. Multiplications may fuse with additions (``contract``);
-no other liberty is taken, so a NaN fails every comparison.
+``Lanes`` maps to LLVM's ``<16 x float>`` and ``Mask`` to ``<16 x i1>``: one AVX-512 instruction per operation, two of
+AVX2, four of SSE or NEON. Multiplications may fuse with additions (``contract``); a NaN fails every comparison.
 
-numba's cache looks only at the file of the kernel it stored; after an edit of this one, ``.kernels`` does.
+numba's cache tracks only the file of the kernel it stored; ``.kernels`` tracks this one.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ class Lanes(types.Type):
 
 
 class Mask(types.Type):
-    """Type of sixteen truth values."""
+    """Type of sixteen booleans."""
 
 
 LANES, MASK = Lanes(name="lanes"), Mask(name="mask")
@@ -61,7 +59,7 @@ def _splat(builder: Any, value: Any) -> Any:
 
 
 def _widen(builder: Any, value: Any, kind: Any) -> Any:
-    """A scalar float becomes sixteen equal lanes; lanes stay."""
+    """A scalar float broadcast to sixteen lanes; lanes stay."""
     if kind == LANES:
         return value
     if kind == types.float64:
@@ -70,7 +68,7 @@ def _widen(builder: Any, value: Any, kind: Any) -> Any:
 
 
 def _operator(function: Callable[..., Any], result: Any, emit: Callable[[Any, Any, Any], Any]) -> None:
-    """Give ``function`` a meaning for two Lanes, or Lanes and a float."""
+    """Overload ``function`` for two Lanes, or Lanes and a float."""
 
     @type_callable(function)
     def _(context: Any) -> Callable[[Any, Any], Any]:
@@ -111,7 +109,7 @@ def _lower_and(context: Any, builder: Any, signature: Any, values: Any) -> Any:
 
 @intrinsic
 def lanes(context, value):  # type: ignore[no-untyped-def]
-    """Sixteen times ``value``."""
+    """``value`` in all sixteen lanes."""
     return LANES(value), lambda ctx, builder, sig, args: _widen(builder, args[0], sig.args[0])
 
 
@@ -140,7 +138,7 @@ def select(context, mask, yes, no):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def any_lane(context, mask):  # type: ignore[no-untyped-def]
-    """Does the mask hold in any lane?"""
+    """Whether the mask holds in any lane."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(WIDTH))
@@ -161,7 +159,7 @@ def bits(context, mask):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def lowest_bit(context, value):  # type: ignore[no-untyped-def]
-    """Index of the lowest bit of an int64 that is not zero."""
+    """Index of the lowest set bit of a non-zero int64."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -177,10 +175,9 @@ def _call(builder: Any, name: str, result: Any, *args: Any, flags: tuple[str, ..
 
 @intrinsic
 def maximum(context, a, b):  # type: ignore[no-untyped-def]
-    """The larger of two lanes, neither of them NaN.
+    """Lane-wise max; neither value may be NaN.
 
-    Written as ``select`` and stored where one of the two came from, it becomes a masked store, which some
-    processors take twenty times as long over.
+    As ``select`` and ``store`` it would compile to a masked store, up to 20 times slower.
     """
     return LANES(a, b), lambda ctx, builder, sig, args: _call(
         builder, "llvm.maxnum.v16f32", _FLOATS, *args, flags=("nnan", "nsz")
@@ -201,13 +198,13 @@ def sqrt(context, values):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def floor(context, values):  # type: ignore[no-untyped-def]
-    """The greatest whole numbers that are not above ``values``."""
+    """⌊values⌋."""
     return LANES(values), lambda ctx, builder, sig, args: _call(builder, "llvm.floor.v16f32", _FLOATS, args[0])
 
 
 @intrinsic
 def reduce_add(context, values):  # type: ignore[no-untyped-def]
-    """Sum over the lanes, as a tree that is the same every time."""
+    """Sum over the lanes, in a fixed tree order."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         value, width = args[0], WIDTH
@@ -220,7 +217,7 @@ def reduce_add(context, values):  # type: ignore[no-untyped-def]
 
 
 def _halves(builder: Any, value: Any, width: int) -> tuple[Any, Any]:
-    """The lower and the upper half of ``width`` lanes."""
+    """Lower and upper half of ``width`` lanes."""
     half = width // 2
     kind = ir.VectorType(_INT, half)
     undefined = ir.Constant(value.type, ir.Undefined)
@@ -237,7 +234,7 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> A
 
 @intrinsic
 def load(context, array, index):  # type: ignore[no-untyped-def]
-    """``array[index : index + 16]`` of a flat contiguous float32 array; no bounds are checked."""
+    """``array[index : index + 16]`` of a flat contiguous float32 array, unchecked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.load(_address(ctx, builder, sig.args[0], *args), align=4)
@@ -247,7 +244,7 @@ def load(context, array, index):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store(context, array, index, value):  # type: ignore[no-untyped-def]
-    """``array[index : index + 16] = value``; no bounds are checked."""
+    """``array[index : index + 16] = value``, unchecked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         builder.store(args[2], _address(ctx, builder, sig.args[0], *args[:2]), align=4)
@@ -259,9 +256,9 @@ def store(context, array, index, value):  # type: ignore[no-untyped-def]
 def _prefetched(write: int) -> Callable[[Any, Any, Any], Any]:
     def prefetched(context: Any, array: Any, index: Any) -> Any:
         def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
-            place = builder.bitcast(_address(ctx, builder, sig.args[0], *args), ir.IntType(8).as_pointer())
-            kept, data = ir.Constant(_INT, 3), ir.Constant(_INT, 1)
-            _call(builder, "llvm.prefetch.p0i8", ir.VoidType(), place, ir.Constant(_INT, write), kept, data)
+            address = builder.bitcast(_address(ctx, builder, sig.args[0], *args), ir.IntType(8).as_pointer())
+            locality, data = ir.Constant(_INT, 3), ir.Constant(_INT, 1)
+            _call(builder, "llvm.prefetch.p0i8", ir.VoidType(), address, ir.Constant(_INT, write), locality, data)
             return ctx.get_dummy_value()
 
         return types.void(array, types.intp), emit
@@ -269,13 +266,13 @@ def _prefetched(write: int) -> Callable[[Any, Any, Any], Any]:
     return prefetched
 
 
-prefetch = intrinsic(_prefetched(0))  # the cache line of array[index] will be read
-prefetch_to_write = intrinsic(_prefetched(1))  # or written; past the end does no harm
+# Of the cache line of array[index]; an index past the end is harmless.
+prefetch, prefetch_to_write = intrinsic(_prefetched(0)), intrinsic(_prefetched(1))
 
 
 @intrinsic
 def broadcast(context, array, index):  # type: ignore[no-untyped-def]
-    """Sixteen times ``array[index]`` of a flat contiguous float32 array; no bounds are checked."""
+    """``array[index]`` of a flat contiguous float32 array in all lanes, unchecked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         data = ctx.make_array(sig.args[0])(ctx, builder, args[0]).data
@@ -286,16 +283,16 @@ def broadcast(context, array, index):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def load_points(context, array, index):  # type: ignore[no-untyped-def]
-    """x, y, z of sixteen rows of three from ``array[index]`` on (flat, contiguous, float32); no bounds are checked."""
+    """x, y, z of sixteen rows [3] from flat ``array[index]`` on (contiguous float32), unchecked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         ahead = [builder.add(args[1], ir.Constant(args[1].type, WIDTH * k)) for k in range(3)]
         a, b, c = (builder.load(_address(ctx, builder, sig.args[0], args[0], at), align=4) for at in ahead)
         values = []
         for axis in range(3):
-            places = range(axis, 3 * WIDTH, 3)
-            of_two = [at if at < 2 * WIDTH else 0 for at in places]
-            of_all = [k if at < 2 * WIDTH else at - WIDTH for k, at in enumerate(places)]
+            positions = range(axis, 3 * WIDTH, 3)
+            of_two = [at if at < 2 * WIDTH else 0 for at in positions]
+            of_all = [k if at < 2 * WIDTH else at - WIDTH for k, at in enumerate(positions)]
             two = builder.shuffle_vector(a, b, _constant(of_two, _INT, _INTS))
             values.append(builder.shuffle_vector(two, c, _constant(of_all, _INT, _INTS)))
         return ctx.make_tuple(builder, sig.return_type, values)
@@ -305,12 +302,12 @@ def load_points(context, array, index):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def store_mask(context, array, index, mask):  # type: ignore[no-untyped-def]
-    """``array[index : index + 16] = mask`` of a flat contiguous array of booleans; no bounds are checked."""
+    """``array[index : index + 16] = mask`` of a flat contiguous boolean array, unchecked."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         bytes_ = ir.VectorType(ir.IntType(8), WIDTH)
-        place = builder.gep(ctx.make_array(sig.args[0])(ctx, builder, args[0]).data, [args[1]])
-        builder.store(builder.zext(args[2], bytes_), builder.bitcast(place, bytes_.as_pointer()), align=1)
+        address = builder.gep(ctx.make_array(sig.args[0])(ctx, builder, args[0]).data, [args[1]])
+        builder.store(builder.zext(args[2], bytes_), builder.bitcast(address, bytes_.as_pointer()), align=1)
         return ctx.get_dummy_value()
 
     return types.void(array, types.intp, mask), emit
@@ -318,12 +315,12 @@ def store_mask(context, array, index, mask):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def transpose(context, source, target):  # type: ignore[no-untyped-def]
-    """The 16 × 16 numbers of ``source`` into ``target``, rows as columns; both flat, contiguous and float32."""
+    """Transpose ``source`` [16 · 16] into ``target``; both flat, contiguous float32."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
-        places = [ir.Constant(ir.IntType(64), WIDTH * k) for k in range(WIDTH)]
-        rows = [builder.load(_address(ctx, builder, sig.args[0], args[0], at), align=4) for at in places]
-        for step in (1, 2, 4, 8):  # swap the blocks of this size that lie off the diagonal
+        starts = [ir.Constant(ir.IntType(64), WIDTH * k) for k in range(WIDTH)]
+        rows = [builder.load(_address(ctx, builder, sig.args[0], args[0], at), align=4) for at in starts]
+        for step in (1, 2, 4, 8):  # swap the off-diagonal blocks of this size
             upper = [k for k in range(WIDTH) if not k & step]
             low = [j if not j & step else WIDTH + j - step for j in range(WIDTH)]
             high = [j + step if not j & step else WIDTH + j for j in range(WIDTH)]
@@ -331,7 +328,7 @@ def transpose(context, source, target):  # type: ignore[no-untyped-def]
                 a, b = rows[k], rows[k + step]
                 rows[k] = builder.shuffle_vector(a, b, _constant(low, _INT, _INTS))
                 rows[k + step] = builder.shuffle_vector(a, b, _constant(high, _INT, _INTS))
-        for at, row in zip(places, rows):
+        for at, row in zip(starts, rows):
             builder.store(row, _address(ctx, builder, sig.args[1], args[1], at), align=4)
         return ctx.get_dummy_value()
 
@@ -339,8 +336,7 @@ def transpose(context, source, target):  # type: ignore[no-untyped-def]
 
 
 def _exp2_coefficients() -> list[float]:
-    """Coefficients of 2^x on [-½, ½], degree 5, near minimax (relative error 1e-7): interpolation at
-    Chebyshev's points."""
+    """Degree 5 coefficients of 2^x on [−½, ½], interpolated at Chebyshev nodes (relative error 1e-7)."""
     nodes = 0.5 * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
     return [float(c) for c in np.linalg.solve(np.vander(nodes, increasing=True), np.exp2(nodes))]
 
@@ -350,17 +346,17 @@ _EXP2 = _exp2_coefficients()
 
 @intrinsic
 def exp2(context, power):  # type: ignore[no-untyped-def]
-    """2^power for powers in [-126, 127], NaN for NaN; elsewhere the lane holds rubbish, which the caller masks out."""
+    """2^power for powers in [−126, 127]; NaN for NaN; undefined elsewhere."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
-        whole = _call(builder, "llvm.rint.v16f32", _FLOATS, args[0])
-        rest = builder.fsub(args[0], whole)
+        rounded = _call(builder, "llvm.rint.v16f32", _FLOATS, args[0])
+        rest = builder.fsub(args[0], rounded)
         value = _splat(builder, ir.Constant(_FLOAT, np.float32(_EXP2[-1]).item()))
         for coefficient in reversed(_EXP2[:-1]):
             term = _splat(builder, ir.Constant(_FLOAT, np.float32(coefficient).item()))
             value = builder.fadd(builder.fmul(value, rest, flags=("contract",)), term, flags=("contract",))
         shift = _constant([23] * WIDTH, _INT, _INTS)
-        exponent = builder.shl(builder.fptosi(whole, _INTS), shift)
+        exponent = builder.shl(builder.fptosi(rounded, _INTS), shift)
         return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _FLOATS)
 
     return LANES(power), emit
@@ -368,7 +364,7 @@ def exp2(context, power):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def fetch_add(context, counter):  # type: ignore[no-untyped-def]
-    """Atomically raise ``counter[0]`` (int64) by one; returns what it was. Hands out tiles to threads."""
+    """Atomically increment ``counter[0]`` (int64); return its old value."""
 
     def emit(ctx: Any, builder: Any, sig: Any, args: Any) -> Any:
         data = ctx.make_array(sig.args[0])(ctx, builder, args[0]).data
@@ -379,13 +375,13 @@ def fetch_add(context, counter):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def at_least(x, low):  # type: ignore[no-untyped-def]
-    """The larger of the lanes ``x`` and ``low``; ``low`` for NaN too."""
+    """Lane-wise max of ``x`` and ``low``; ``low`` where x is NaN."""
     return select(x > low, x, low)
 
 
 @njit(inline="always")
 def aligned_floats(count: int) -> np.ndarray[Any, Any]:
-    """An uninitialised flat float32 array on a cache line's border: no load of lanes straddles two lines."""
+    """Uninitialised flat float32 array [count], aligned to cache lines."""
     scratch = np.empty(count + WIDTH, np.float32)
     skip = (-(scratch.ctypes.data // 4)) % WIDTH
     return scratch[skip : skip + count]

@@ -1,4 +1,4 @@
-"""What of an avatar no pose changes, and what is to be posed."""
+"""Pose-independent data of an avatar, and the input of posing."""
 
 from __future__ import annotations
 
@@ -28,32 +28,33 @@ from .skinning import (
 
 Floats32 = NDArray[np.float32]
 
-_DEEPEST = 60.0  # logarithm below which a floor is 0 beside the largest weight, and not yet in float32
+_DEEPEST = 60.0  # max log ratio of a Gaussian's largest weight to its floor
 
 
 class Template(NamedTuple):
-    """The template relative to a Gaussian's largest weight: its floor, and what some joints have above."""
+    """Skinning weights relative to a Gaussian's largest: its floor, and the joints above it."""
 
     floors: Floats32  # [N]
     gaussians: NDArray[np.intp]  # [L] ascending
     joints: NDArray[np.intp]  # [L]
-    logs: Floats32  # [L] of the weight less the floor
+    logs: Floats32  # [L] log(weight − floor)
 
 
 @dataclass(frozen=True, eq=False)
 class RestPose:
-    """What of an avatar does not depend on the pose.
+    """Pose-independent data of an avatar.
 
     Attributes:
-        neighbours: [N, K] nodes between which a Gaussian is interpolated.
+        neighbours: [N, K] nodes that a Gaussian is interpolated between.
         neighbour_weights: [N, K].
-        log_template: [N, J] log of the template's skinning weights, up to a constant for each Gaussian.
+        log_template: [N, J] log of the template's skinning weights, up to a constant per Gaussian.
         points: [N, 3] m, x_c.
         factors: [N, 9] m, R S row by row.
         normals: [N, 3] unit.
-        limbs: [N, 7] the limb's axis (unit), the lever from it to the point (m, times the share), and the
-            share of a limb (0…1).
-        max_offset: m. floor: m², added to variances. fallback: share of A_R in a normal.
+        limbs: [N, 7] the limb's axis (unit), share · lever from it to the point (m), and the share of a limb (0…1).
+        max_offset: m.
+        floor: m², added to variances.
+        fallback: weight of A_R in a normal.
     """
 
     neighbours: NDArray[np.int32]
@@ -73,9 +74,9 @@ class RestPose:
         """Pose all Gaussians.
 
         Args:
-            logits: [M, J] Δ logits at the nodes; None where skinning is the template's.
+            logits: [M, J] Δ logits at the nodes; None for the template's skinning.
             offsets: [M, 6] Δx and Δr before tanh.
-            visibility: [M, S] SH coefficients, S ≤ 16; what is missing is 0.
+            visibility: [M, S] SH coefficients, S ≤ 16; missing ones are 0.
             bones: [J, 3, 4] m, rest pose → posed.
         """
         nodes = self.nodes(logits, offsets, visibility)
@@ -85,10 +86,10 @@ class RestPose:
     def node_fields(
         self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike, bones: ArrayLike
     ) -> Floats32:
-        """What is interpolated between the nodes, [M, 48 + C].
+        """Fields [M, 48 + C] that are interpolated between nodes.
 
-        Σ_j e^(Δ_j − c) B_j row by row [12], the same without B, c and two zeros; offsets [6] and zeros up to 16;
-        visibility [16]; Δ logits with zeros up to C, a padded number of 16.
+        Σ_j e^(Δ_j − c) B_j row by row [12], Σ_j e^(Δ_j − c), c, 0, 0; offsets padded to 16; visibility [16]; Δ logits
+        padded to C, a multiple of 16.
         """
         fields: Floats32 = node_fields(*self.nodes(logits, offsets, visibility), bone_rows(floats(bones)))
         return fields
@@ -96,14 +97,14 @@ class RestPose:
     def nodes(
         self, logits: ArrayLike | None, offsets: ArrayLike, visibility: ArrayLike
     ) -> tuple[Floats32, Floats32, Floats32]:
-        """The networks' outputs as the kernels want them: Δ logits [M, J], which may be None, offsets, visibility."""
+        """Δ logits [M, J] (0 for None), offsets and visibility as kernels need them."""
         offsets = floats(offsets)
         changes = np.zeros((len(offsets), self.log_template.shape[1])) if logits is None else logits
         return floats(changes), offsets, floats(visibility)
 
     @cached_property
     def limits(self) -> tuple[np.float32, np.float32, np.float32]:
-        """Of offsets, of variances, and a normal's share of A_R."""
+        """max_offset, floor and fallback."""
         return np.float32(self.max_offset), np.float32(self.floor), np.float32(self.fallback)
 
     @cached_property
@@ -111,7 +112,7 @@ class RestPose:
         """The template as it is summed."""
         given = np.asarray(self.log_template, np.float32)
         lowest = np.where(given > -np.inf, given, np.float32(np.inf)).min(1)
-        gaussians, joints = np.nonzero(~(given <= lowest[:, None]))  # what is no number stays none
+        gaussians, joints = np.nonzero(~(given <= lowest[:, None]))  # NaN stays NaN
         heights = given[gaussians, joints].astype(np.float64) - lowest[gaussians]
         top = np.zeros(len(given))
         with np.errstate(invalid="ignore"):
@@ -122,7 +123,7 @@ class RestPose:
 
     @cached_property
     def arrays(self) -> RestArrays:
-        """As the kernel wants them."""
+        """Kernel arrays."""
         count = len(self.points)
         padded = -(-count // WIDTH) * WIDTH
         own = np.zeros((padded, OWN), np.float32)
@@ -138,8 +139,8 @@ class RestPose:
         neighbours = np.zeros((padded, self.neighbours.shape[1]), np.int32)
         weights = np.zeros(neighbours.shape, np.float32)
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
-        by_sixteens = own.reshape(-1, WIDTH, OWN).transpose(0, 2, 1)
-        return RestArrays(neighbours, weights, *_slots(self.template, padded), by_sixteens.ravel())
+        blocks = own.reshape(-1, WIDTH, OWN).transpose(0, 2, 1)
+        return RestArrays(neighbours, weights, *_slots(self.template, padded), blocks.ravel())
 
 
 def _slots(template: Template, padded: int) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats32]:
@@ -148,30 +149,29 @@ def _slots(template: Template, padded: int) -> tuple[NDArray[np.int32], NDArray[
     counts = np.bincount(gaussians, minlength=padded)
     starts = np.concatenate([[0], np.cumsum(counts.reshape(-1, WIDTH).max(1))])
     slots = starts[gaussians // WIDTH] + np.arange(len(joints)) - (np.cumsum(counts) - counts)[gaussians]
-    of_slots = np.zeros((starts[-1], WIDTH), np.int32)
-    logs_of_slots = np.full(of_slots.shape, NEVER, np.float32)
-    of_slots[slots, gaussians % WIDTH], logs_of_slots[slots, gaussians % WIDTH] = joints, logs
-    return starts.astype(np.int32), of_slots.ravel(), logs_of_slots.ravel()
+    slot_joints = np.zeros((starts[-1], WIDTH), np.int32)
+    slot_logs = np.full(slot_joints.shape, NEVER, np.float32)
+    slot_joints[slots, gaussians % WIDTH], slot_logs[slots, gaussians % WIDTH] = joints, logs
+    return starts.astype(np.int32), slot_joints.ravel(), slot_logs.ravel()
 
 
 class RestArrays(NamedTuple):
-    """Constants of a ``RestPose`` in the order in which they are read; N is a padded number of registers of 16.
+    """Constants of a ``RestPose`` in reading order; N is padded to a multiple of 16.
 
-    A frame reads them all, and caches that others share do not keep them: every number less and every stream less of
-    them counts. Sixteen Gaussians have as many slots for joints each, since processors could not predict a number of
-    its own for each; 2.5 of 24 joints in the mean.
+    Sixteen Gaussians share a number of joint slots, since a number per Gaussian would mispredict branches; 2.5 of 24
+    joints on average.
     """
 
     neighbours: NDArray[np.int32]  # [N, K]
     weights: Floats32  # [N, K]
-    starts: NDArray[np.int32]  # [N/16 + 1]: the slots of the sixteen i are starts[i] : starts[i + 1]
-    joints: NDArray[np.int32]  # [S · 16], one of each Gaussian's joints a slot: as many as the one with most has
-    logs: Floats32  # [S · 16] of the template's weights less its floor, relative to the greatest
-    own: Floats32  # [N/16 · 23 · 16] points, factors, normals, limbs, floors by component, sixteen by sixteen
+    starts: NDArray[np.int32]  # [N/16 + 1]: slots of block i are starts[i] : starts[i + 1]
+    joints: NDArray[np.int32]  # [S · 16], a joint of each of sixteen Gaussians per slot
+    logs: Floats32  # [S · 16] ``Template.logs``
+    own: Floats32  # [N/16 · 23 · 16] points, factors, normals, limbs, floors; blocks of sixteen by component
 
 
 class Unposed(NamedTuple):
-    """N Gaussians before they are posed: arguments of ``RestPose.pose`` for M nodes, and their material."""
+    """N unposed Gaussians: arguments of ``RestPose.pose`` for M nodes, and their material."""
 
     rest: RestPose
     logits: Floats32 | None  # [M, J]
@@ -184,5 +184,5 @@ class Unposed(NamedTuple):
 
     @property
     def root_rotation(self) -> Floats32:
-        """[3, 3], root frame → that of the bones."""
+        """[3, 3], root frame → frame of the bones."""
         return self.bones[0, :, :3]

@@ -1,26 +1,24 @@
-"""Poses all Gaussians of an avatar in one compiled pass (numba over sixteen lanes).
+"""Posing of all Gaussians in one compiled pass (numba, sixteen lanes).
 
-The networks' outputs at M nodes are interpolated for each of N Gaussians; then, with A blended skinning::
+Network outputs at M nodes are interpolated for each of N Gaussians; A is the blended bone transform::
 
     fields = Σ_k weight_k · node fields[neighbour_k]          Δ logits, Δx and Δr before tanh, visibility
     W      = softmax(log W_template + Δ logits)
-    A      = Σ_j W_j B_j = [A_R | A_T]                        see below
-    t      = min(1, |cofactor(A_R) u| / |A_R u|²)             u: the limb's axis; 1 but where it is twisted
+    A      = Σ_j W_j B_j = [A_R | A_T]
+    t      = min(1, |cofactor(A_R) u| / |A_R u|²)             u: the limb's axis; t < 1 where it is twisted
     κ      = share · (Newton–Schulz factor of t − 1)          widens what a twist has pinched
     mean   = A_R (x_c + max_offset · tanh Δx + κ lever) + A_T
     Σ      = F Fᵀ + floor² I,  F = A_R · C · R(tanh Δr) · (R S)   R(v): the quaternion normalize(1, v/2)
     normal = normalize((cofactor(A_R) + fallback · A_R) (n_c + κ u (u·n_c)))      C = (1 + κ) I − κ u uᵀ
 
-``posing.reference`` computes the same in float64.
+The float64 reference is ``posing.reference``.
 
-The template gives a Gaussian a few joints, and to all others its floor of 1e-6, which Δ logits may raise. A is summed
-exactly over these few joints; the floor's part is summed over all joints at the nodes and interpolated as the fields
-are. With the node's largest Δ logit c_k and c = Σ_k weight_k c_k::
+The template gives a Gaussian a few joints above a floor of 1e-6. A is summed exactly over these joints; the floor's
+part is summed over all joints at the nodes and interpolated. With c_k the node's max Δ logit and c = Σ_k weight_k c_k::
 
     A ∝ Σ_{j of the template} (W_template,j / floor − 1) e^{Δ_j − c} B_j + Σ_k weight_k Σ_j e^{Δ_kj − c_k} B_j
 
-The second sum takes the mean of the nodes' exponentials for the exponential of their mean: a trained avatar's Gaussians
-move by 0.6 µm in the mean, at most by 0.2 mm.
+The second sum is approximate: Gaussians of a trained avatar move by 0.6 µm (mean), 0.2 mm (max).
 """
 
 from __future__ import annotations
@@ -49,19 +47,19 @@ from rnd_runtime.core.simd import (
 
 Floats32 = NDArray[np.float32]
 
-_CHUNK = 256  # Gaussians handed to a thread at a time
+_CHUNK = 256  # Gaussians per unit of parallel work
 _LOG2_E = np.float32(np.log2(np.e))
-_SMALLEST_POWER = np.float32(-126)  # of two in float32
-_LARGEST_TANH = np.float32(9)  # beyond it tanh is 1 in float32
+_MIN_EXPONENT = np.float32(-126)  # of a normal float32
+_MAX_TANH = np.float32(9)  # tanh is 1 in float32 beyond it
 _ZERO, _HALF, _ONE, _TWO, _THREE = (np.float32(x) for x in (0, 0.5, 1, 2, 3))
-SHORTEST = np.float32(1e-9)  # of a normal before it is normalised
+SHORTEST = np.float32(1e-9)  # min length of a normal in its normalisation
 TWIST_STEPS = 3  # of Newton–Schulz, s → s (3 − s²)/2 on s = √t: two leave 0.54 of a limb at 150°, three 0.73
-SMALLEST_SQUARE = np.float32(1e-6)  # of |A_R u|: a blend without length has no axis to be widened about
-NEVER = np.float32(-1e30)  # log of no weight
-# First components of a Gaussian's rest pose: points, factors, normals, limbs, floor; and how many there are
+SMALLEST_SQUARE = np.float32(1e-6)  # min |A_R u|²
+NEVER = np.float32(-1e30)  # log of weight 0
+# First component of each part of a Gaussian's rest pose; OWN: their number
 POINTS, FACTORS, NORMALS, LIMBS, FLOOR, OWN = (0, 3, 12, 15, 22, 23)
-# A node's fields: Σ_j e^(Δ_j − c) B_j by rows, the same without B, and c; offsets, visibility, sixteen each; Δ_j
-_SUM, _LARGEST, _OFFSETS, _VISIBILITY, _CHANGES = (12, 13, WIDTH, 2 * WIDTH, 3 * WIDTH)
+# A node's fields: Σ_j e^(Δ_j − c) B_j [12], Σ_j e^(Δ_j − c), c; offsets [16]; visibility [16]; Δ_j
+_SUM, _MAX_LOGIT, _OFFSETS, _VISIBILITY, _LOGITS = (12, 13, WIDTH, 2 * WIDTH, 3 * WIDTH)
 
 
 class PosedArrays(NamedTuple):
@@ -75,22 +73,22 @@ class PosedArrays(NamedTuple):
 
 @njit(inline="always")
 def _exp(x):  # type: ignore[no-untyped-def]
-    """What is no number stays none: here and in ``_tanh`` comparisons fall to the bound only where they hold."""
+    """e^x, clamped below; NaN stays NaN, as every comparison with it fails."""
     power = x * _LOG2_E
-    return exp2(select(power < _SMALLEST_POWER, _SMALLEST_POWER, power))
+    return exp2(select(power < _MIN_EXPONENT, _MIN_EXPONENT, power))
 
 
 @njit(inline="always")
 def _tanh(x):  # type: ignore[no-untyped-def]
-    """To 1e-7, absolute."""
-    x = select(x > _LARGEST_TANH, _LARGEST_TANH, x)
-    x = select(x < -_LARGEST_TANH, -_LARGEST_TANH, x)
+    """tanh with an absolute error of 1e-7."""
+    x = select(x > _MAX_TANH, _MAX_TANH, x)
+    x = select(x < -_MAX_TANH, -_MAX_TANH, x)
     return lanes(_ONE) - lanes(_TWO) / (_exp(x * _TWO) + _ONE)
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def pose_kernel(rest, nodes, bones, limits, count):  # type: ignore[no-untyped-def]
-    """``PosedArrays`` of the ``count`` Gaussians of ``rest``; arguments as ``RestPose`` makes them."""
+    """``PosedArrays`` of the ``count`` Gaussians of ``rest``; arguments as made by ``RestPose``."""
     logits, offsets, visibility = nodes
     rows = bone_rows(bones)
     fields = node_fields(logits, offsets, visibility, rows)
@@ -103,7 +101,7 @@ def pose_kernel(rest, nodes, bones, limits, count):  # type: ignore[no-untyped-d
 
 @njit(error_model="numpy", nogil=True, cache=True)
 def bone_rows(bones):  # type: ignore[no-untyped-def]
-    """[J, 16]: of each joint B row by row, a one and zeros."""
+    """[J, 16]: each joint's B row by row, 1 and zeros."""
     rows = np.zeros((len(bones), WIDTH), np.float32)
     for j in range(len(bones)):
         for k in range(_SUM):
@@ -114,20 +112,20 @@ def bone_rows(bones):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def node_fields(logits, offsets, visibility, bones):  # type: ignore[no-untyped-def]
-    """[M, 48 + J up to a multiple of 16]: of every node what is interpolated."""
+    """Fields [M, 48 + J padded to a multiple of 16] of all nodes."""
     joints = len(bones)
-    columns = _CHANGES + (joints + WIDTH - 1) // WIDTH * WIDTH
+    columns = _LOGITS + (joints + WIDTH - 1) // WIDTH * WIDTH
     fields = np.zeros((len(offsets), columns), np.float32)
     for m in prange(len(offsets)):
-        largest = logits[m, 0]
+        max_logit = logits[m, 0]
         for j in range(joints):
-            fields[m, _CHANGES + j] = logits[m, j]
-            largest = max(largest, logits[m, j])
+            fields[m, _LOGITS + j] = logits[m, j]
+            max_logit = max(max_logit, logits[m, j])
         blend = lanes(_ZERO)
         for j in range(joints):
-            blend += _exp(lanes(logits[m, j] - largest)) * load(bones, j * WIDTH)
+            blend += _exp(lanes(logits[m, j] - max_logit)) * load(bones, j * WIDTH)
         store(fields, m * columns, blend)
-        fields[m, _LARGEST] = largest
+        fields[m, _MAX_LOGIT] = max_logit
         for k in range(offsets.shape[1]):
             fields[m, _OFFSETS + k] = offsets[m, k]
         for k in range(visibility.shape[1]):
@@ -136,40 +134,42 @@ def node_fields(logits, offsets, visibility, bones):  # type: ignore[no-untyped-
 
 
 @njit(error_model="numpy")
-def _interpolate_sixteen(first, fields, rest, blends, offsets, visibility, changes):  # type: ignore[no-untyped-def]
-    """Fields of sixteen Gaussians a row each: sixteen columns of ``blends``, ``offsets`` and ``visibility`` (of which
-    theirs is filled), and Δ logits less the nodes' largest in ``changes``."""
-    width, changing = fields.shape[1], len(changes) // WIDTH
+def _interpolate_sixteen(first, fields, rest, blends, offsets, visibility, logits_16):  # type: ignore[no-untyped-def]
+    """Interpolate fields of sixteen Gaussians, one per row of 16.
+
+    Fills ``blends`` and ``offsets`` [16, 16], their rows of ``visibility``, and Δ logits − c in ``logits_16``.
+    """
+    width, logit_count = fields.shape[1], len(logits_16) // WIDTH
     for lane in range(WIDTH):
         i = first + lane
-        blend, offset, seen = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
+        blend, offset, visible = lanes(_ZERO), lanes(_ZERO), lanes(_ZERO)
         for k in range(rest.neighbours.shape[1]):
             at, weight = rest.neighbours[i, k] * width, rest.weights[i, k]
             blend += weight * load(fields, at)
             offset += weight * load(fields, at + _OFFSETS)
-            seen += weight * load(fields, at + _VISIBILITY)
+            visible += weight * load(fields, at + _VISIBILITY)
         store(blends, lane * WIDTH, blend)
         store(offsets, lane * WIDTH, offset)
-        store(visibility, i * WIDTH, seen)
-        for column in range(0, changing, WIDTH):
-            change = lanes(_ZERO) - broadcast(blends, lane * WIDTH + _LARGEST)
+        store(visibility, i * WIDTH, visible)
+        for column in range(0, logit_count, WIDTH):
+            change = lanes(_ZERO) - broadcast(blends, lane * WIDTH + _MAX_LOGIT)
             for k in range(rest.neighbours.shape[1]):
-                at = rest.neighbours[i, k] * width + _CHANGES + column
+                at = rest.neighbours[i, k] * width + _LOGITS + column
                 change += rest.weights[i, k] * load(fields, at)
-            store(changes, lane * changing + column, change)
+            store(logits_16, lane * logit_count + column, change)
 
 
 @njit(error_model="numpy")
-def _blend_sixteen(first, rest, bones, rows, changes, shares, blend):  # type: ignore[no-untyped-def]
-    """A [3, 4] by component of sixteen Gaussians, from what is interpolated for them in ``rows`` and ``changes``.
+def _blend_sixteen(first, rest, bones, rows, logits_16, shares, blend):  # type: ignore[no-untyped-def]
+    """A [3, 4] by component of sixteen Gaussians from interpolated ``rows`` and ``logits_16``.
 
-    NaN where a logit is NaN or +∞, as a softmax is: the node's sums are. ``shares`` [slots, lanes] is working memory.
+    NaN where a logit is NaN or +∞, as in a softmax. ``shares`` [slots, 16] is scratch.
     """
-    width = len(changes) // WIDTH
+    width = len(logits_16) // WIDTH
     start, end = WIDTH * rest.starts[first // WIDTH], WIDTH * rest.starts[first // WIDTH + 1]
     for at in range(start, end, WIDTH):
         for lane in range(WIDTH):
-            shares[at - start + lane] = changes[lane * width + rest.joints[at + lane]]
+            shares[at - start + lane] = logits_16[lane * width + rest.joints[at + lane]]
         logs = load(rest.logs, at)
         weights = _exp(load(shares, at - start) + logs)
         store(shares, at - start, select(logs < _HALF * NEVER, _ZERO, weights))
@@ -198,7 +198,7 @@ def _apply(a, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit
 def _cofactors(a):  # type: ignore[no-untyped-def]
-    """det(A) A⁻ᵀ, finite whatever A is."""
+    """det(A) A⁻ᵀ, finite for any A."""
     return (
         a[4] * a[8] - a[5] * a[7],
         a[5] * a[6] - a[3] * a[8],
@@ -214,7 +214,7 @@ def _cofactors(a):  # type: ignore[no-untyped-def]
 
 @njit
 def _rotated_rows(x, y, z, f):  # type: ignore[no-untyped-def]
-    """R(x, y, z) F with F row by row; R of the quaternion normalize(1, v/2)."""
+    """R F for R of the quaternion normalize(1, v/2), v = (x, y, z); F row by row."""
     x, y, z = _HALF * x, _HALF * y, _HALF * z
     scale = _TWO / (_ONE + x * x + y * y + z * z)
     first = _row(_ONE - scale * (y * y + z * z), scale * (x * y - z), scale * (x * z + y), f)
@@ -241,7 +241,7 @@ def _widening(a, cofactors, axis, share):  # type: ignore[no-untyped-def]
 
 @njit
 def _load3(array, first, i, stride):  # type: ignore[no-untyped-def]
-    """Components ``first`` … ``first + 2`` of sixteen Gaussians, which begin at ``i`` and lie ``stride`` apart."""
+    """Components ``first`` … ``first + 2`` of sixteen Gaussians from ``i`` on, ``stride`` apart."""
     at = first * stride + i
     return load(array, at), load(array, at + stride), load(array, at + 2 * stride)
 
@@ -250,7 +250,7 @@ def _load3(array, first, i, stride):  # type: ignore[no-untyped-def]
 def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyped-def]
     """Means, covariances and normals of Gaussians i … i + 15, twelve rows of sixteen in ``out``.
 
-    ``blend`` has their A and ``offset`` their bounded offsets and turns, both by component.
+    ``blend`` holds A and ``offset`` the bounded offsets and rotations, both by component.
     """
     max_offset, floor, fallback = limits
     at, stride = i * OWN, WIDTH
@@ -278,17 +278,10 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     f = _rotated_rows(rotation[0], rotation[1], rotation[2], f)
     wide = _ONE + kappa
     x, y, z = _row(kappa * axis[0], kappa * axis[1], kappa * axis[2], f)
-    f = (
-        wide * f[0] - axis[0] * x,
-        wide * f[1] - axis[0] * y,
-        wide * f[2] - axis[0] * z,
-        wide * f[3] - axis[1] * x,
-        wide * f[4] - axis[1] * y,
-        wide * f[5] - axis[1] * z,
-        wide * f[6] - axis[2] * x,
-        wide * f[7] - axis[2] * y,
-        wide * f[8] - axis[2] * z,
-    )
+    row0 = wide * f[0] - axis[0] * x, wide * f[1] - axis[0] * y, wide * f[2] - axis[0] * z
+    row1 = wide * f[3] - axis[1] * x, wide * f[4] - axis[1] * y, wide * f[5] - axis[1] * z
+    row2 = wide * f[6] - axis[2] * x, wide * f[7] - axis[2] * y, wide * f[8] - axis[2] * z
+    f = row0 + row1 + row2
     f0, f1, f2 = _row(a[0], a[1], a[2], f)
     f3, f4, f5 = _row(a[3], a[4], a[5], f)
     f6, f7, f8 = _row(a[6], a[7], a[8], f)
@@ -314,7 +307,7 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
 
 @njit(inline="always")
 def _prefetch_sixteen(first, rest, posed):  # type: ignore[no-untyped-def]
-    """Has what a later sixteen reads and writes brought to the caches: a seventh of the time."""
+    """Prefetch what a later sixteen reads and writes; saves 1/7 of the time."""
     neighbours = rest.neighbours.shape[1]
     for line in range(0, OWN * WIDTH, WIDTH):
         prefetch(rest.own, first * OWN + line)
@@ -328,19 +321,19 @@ def _prefetch_sixteen(first, rest, posed):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
-    """All Gaussians, whose arrays are as long as a multiple of registers."""
+    """Pose all Gaussians; array lengths are multiples of 16."""
     count = len(rest.neighbours)
     means, covariances, normals = posed.means, posed.covariances, posed.normals
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         shares, rows = aligned_floats(len(bones) * WIDTH), aligned_floats(WIDTH * WIDTH)
-        changes = aligned_floats((fields.shape[1] - _CHANGES) * WIDTH)
+        logits_16 = aligned_floats((fields.shape[1] - _LOGITS) * WIDTH)
         blend, offset = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         out = aligned_floats(WIDTH * WIDTH)
         for first in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, count), WIDTH):
             _prefetch_sixteen(first + WIDTH, rest, posed)
-            _interpolate_sixteen(first, fields, rest, rows, out, posed.visibility, changes)
+            _interpolate_sixteen(first, fields, rest, rows, out, posed.visibility, logits_16)
             transpose(out, offset)
-            _blend_sixteen(first, rest, bones, rows, changes, shares, blend)
+            _blend_sixteen(first, rest, bones, rows, logits_16, shares, blend)
             for c in range(6):
                 store(offset, c * WIDTH, _tanh(load(offset, c * WIDTH)))
             _pose_sixteen(first, blend, offset, rest, limits, out)

@@ -1,7 +1,7 @@
-"""Blending of tiles, front to back, and its gradient (numba over sixteen lanes).
+"""Blending of tiles, front to back, and its gradient (numba, sixteen lanes).
 
-A tile is 4×4 blocks of 4×4 pixels; a block is one value of sixteen lanes. Tiles are handed to threads one
-by one, the fullest first; which thread draws a tile changes no bit of it.
+A tile is 4×4 blocks of 4×4 pixels; a block is one value of sixteen lanes. Threads take tiles one by one, fullest first;
+the result does not depend on the thread, to the bit.
 """
 
 from __future__ import annotations
@@ -34,21 +34,20 @@ from .outline import sharpening
 from .project import TILE
 
 BLOCK = 4
-HALF_BLOCK = np.float32(1.5)  # from a block's centre to its outer pixel centres
+HALF_BLOCK = np.float32(1.5)  # px from a block's centre to its outer pixel centres
 BLOCKS = TILE // BLOCK
 PIXELS = TILE * TILE
 ALL_BLOCKS = (1 << (BLOCKS * BLOCKS)) - 1
 LOG2_ALPHA_MIN = np.float32(-math.log2(255.0))
-LOG2_ALPHA_NEARLY_MIN = LOG2_ALPHA_MIN - np.float32(1e-3)  # no block is lost to rounding
+LOG2_ALPHA_NEARLY_MIN = LOG2_ALPHA_MIN - np.float32(1e-3)  # margin for rounding
 LOG2_ALPHA_MAX = np.float32(math.log2(0.99))
 TRANSMITTANCE_MIN = np.float32(0.9999e-4)  # see raster.oracle
 LN2 = np.float32(math.log(2.0))
-ZERO = np.float32(0)
-ONE = np.float32(1)
-NEVER = np.float32(-1e30)  # log2 of an opacity that reaches no pixel
+ZERO, ONE = np.float32(0), np.float32(1)
+NEVER = np.float32(-1e30)  # log2 of opacity 0
 MOMENTS = 6
 BATCH = 4 * WIDTH  # Gaussians gathered at a time, one bit of an int64 each
-_Y, _SHEAR, _FALL_Y, _FALL_X, _PEAK = (BATCH * k for k in range(1, 6))  # of gathered shapes, after their x
+_Y, _SHEAR, _FALL_Y, _FALL_X, _PEAK = (BATCH * k for k in range(1, 6))  # offsets in gathered shapes, after x
 
 
 @njit(inline="always")
@@ -61,7 +60,7 @@ def _centers(block):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _start_tile(tile_x, tile_y, width, height, transmittance):  # type: ignore[no-untyped-def]
-    """Transmittance 1 inside the image, 0 (as if saturated) outside."""
+    """Set transmittance to 1 inside the image, 0 outside."""
     for block in range(BLOCKS * BLOCKS):
         x, y = _centers(block)
         inside = (x < np.float32(width - tile_x)) & (y < np.float32(height - tile_y))
@@ -70,10 +69,10 @@ def _start_tile(tile_x, tile_y, width, height, transmittance):  # type: ignore[n
 
 @njit(inline="always")
 def _may_reach(dx, dy, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
-    """Where α may reach 1/255 in a block whose centre is ``dx``, ``dy`` from a Gaussian's: sixteen such, one bit each.
+    """Bit mask of the sixteen block centres, ``dx``, ``dy`` from a Gaussian, in whose block α may reach 1/255.
 
-    Pixel centres lie within 1.5 px of their block's centre, so |dy| and |dx − shear·dy| are at least what the
-    centre has less 1.5 and 1.5·(1 + |shear|).
+    A block's pixel centres are within 1.5 px: |dy| and |dx − shear·dy| are at least those of the block's centre
+    less 1.5 and 1.5·(1 + |shear|).
     """
     d = magnitude(dx - shear * dy) - (magnitude(shear) * HALF_BLOCK + HALF_BLOCK)
     dy = magnitude(dy) - HALF_BLOCK
@@ -82,16 +81,8 @@ def _may_reach(dx, dy, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-
 
 
 @njit(inline="always")
-def _reached_blocks(x, y, shear, fall_y, fall_x, peak):  # type: ignore[no-untyped-def]
-    """Blocks of a tile that a Gaussian may reach, one bit each."""
-    dx = block_x() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - x)
-    dy = block_y() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - y)
-    return _may_reach(dx, dy, lanes(shear), fall_y, fall_x, peak)
-
-
-@njit(inline="always")
 def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # type: ignore[no-untyped-def]
-    """A batch of pairs side by side: ``shapes`` by component, ``colours`` [BATCH, columns]; the rest reach nothing."""
+    """Gather a batch: ``shapes`` by component, ``colours`` [BATCH, columns]; the rest of the batch has opacity 0."""
     channels = splats.attributes.shape[1]
     for k in range(last - first):
         g = splats.pair_gaussians[first + k]
@@ -109,7 +100,7 @@ def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # t
 
 @njit(inline="always")
 def _fetch(first, last, splats):  # type: ignore[no-untyped-def]
-    """Has the pairs of a later batch brought to the caches: they lie anywhere."""
+    """Prefetch the Gaussians of a later batch."""
     for pair in range(first, last):
         g = splats.pair_gaussians[pair]
         prefetch(splats.centers, 2 * g)
@@ -119,7 +110,7 @@ def _fetch(first, last, splats):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
-    """Which of ``count`` gathered Gaussians may reach a block, one bit each."""
+    """Bit mask of the ``count`` gathered Gaussians that may reach a block."""
     row = np.float32(block // BLOCKS * BLOCK + 0.5 * BLOCK)
     column = np.float32(block % BLOCKS * BLOCK + 0.5 * BLOCK)
     reaching = 0
@@ -133,7 +124,7 @@ def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped-def]
-    """Fill ``weights`` [BATCH, 16] of Gaussians ``reaching`` a block of transmittance ``left``; what is left then."""
+    """Fill ``weights`` [BATCH, 16] of Gaussians ``reaching`` a block; takes and returns its transmittance ``left``."""
     columns, rows = _centers(block)
     while reaching != 0:
         k = lowest_bit(reaching)
@@ -152,7 +143,7 @@ def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped
 
 @njit(inline="always")
 def _add_up(at, reaching, weights, colours, first, columns, sums):  # type: ignore[no-untyped-def]
-    """Add four of the attributes, from ``first`` on, to their ``sums`` from ``at`` on."""
+    """Add four attributes, from ``first`` on, to ``sums`` at ``at``."""
     a, b, c, d = (load(sums, at), load(sums, at + WIDTH), load(sums, at + 2 * WIDTH), load(sums, at + 3 * WIDTH))
     while reaching != 0:
         k = lowest_bit(reaching)
@@ -170,9 +161,9 @@ def _add_up(at, reaching, weights, colours, first, columns, sums):  # type: igno
 
 @njit(error_model="numpy")
 def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[no-untyped-def]
-    """Add up, for each block, K blended attributes, then alpha, then nothing up to whole fours (sixteen lanes each).
+    """Add K blended attributes, then alpha, padded to a multiple of four, to each block's sums.
 
-    A batch of Gaussians at a time, block by block, so that a block's sums stay in registers meanwhile.
+    Works by batch and block, so that a block's sums stay in registers.
     """
     transmittance, sums, shapes, colours, weights = buffers
     columns = len(colours) // BATCH
@@ -205,9 +196,9 @@ def _fullest_first(starts):  # type: ignore[no-untyped-def]
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
 def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-def]
-    """Images [H, W, K] of the attributes and [H, W] of alpha; with ``outlines`` as ``.outline`` sharpens them."""
+    """Attributes [H, W, K] and alpha [H, W]; with ``outlines`` they are sharpened (``.outline``)."""
     channels = splats.attributes.shape[1]
-    columns = channels // 4 * 4 + 4  # and alpha, up to whole fours
+    columns = channels // 4 * 4 + 4  # with alpha, padded to a multiple of four
     image, coverage = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
     tiles_x = (width + TILE - 1) // TILE
     starts = splats.tile_starts
@@ -218,7 +209,7 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
         shapes, weights = aligned_floats(6 * BATCH), aligned_floats(BATCH * WIDTH)
         colours = aligned_floats(columns * BATCH)
         colours[:] = ZERO
-        colours[channels::columns] = ONE  # of alpha
+        colours[channels::columns] = ONE  # alpha
         buffers = (transmittance, sums, shapes, colours, weights)
         while True:
             n = fetch_add(counter)
@@ -247,10 +238,10 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
 
 @njit(error_model="numpy")
 def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  # type: ignore[no-untyped-def]
-    """Replay the tile front to back; one scalar a pixel (what is still to come behind, weighted by the
-    incoming gradients) replaces the transmittance's recovery by division.
+    """Replay a tile front to back and fill the ``slots`` of its pairs.
 
-    ``wanted`` holds, for each block, the incoming gradients of K attributes, then of alpha.
+    ``remaining`` holds the gradient-weighted sum of what is still behind, so no transmittance is recovered by division.
+    ``wanted`` holds each block's incoming gradients of K attributes, then alpha.
     """
     transmittance, remaining, wanted, gathered = buffers
     centers, shapes, attributes = splats.centers, splats.shapes, splats.attributes
@@ -262,13 +253,14 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
         g, slot = pair_gaussians[pair], pair_slots[pair]
         x, y = np.float32(centers[g, 0] - tile_x), np.float32(centers[g, 1] - tile_y)
         shear, fall_y, fall_x, peak = shapes[g, 0], shapes[g, 1], shapes[g, 2], shapes[g, 3]
-        reached = _reached_blocks(x, y, shear, fall_y, fall_x, peak) & open_blocks
+        dx = block_x() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - x)  # of the tile's blocks
+        dy = block_y() * np.float32(BLOCK) + (np.float32(0.5 * BLOCK) - y)
+        reached = _may_reach(dx, dy, lanes(shear), fall_y, fall_x, peak) & open_blocks
         if reached == 0:
             for k in range(MOMENTS + channels):
                 slots[slot, k] = ZERO
             continue
-        s, sd, sdd = lanes(ZERO), lanes(ZERO), lanes(ZERO)
-        sy, syy, sdy = lanes(ZERO), lanes(ZERO), lanes(ZERO)
+        s, sd, sdd, sy, syy, sdy = (lanes(ZERO), lanes(ZERO), lanes(ZERO), lanes(ZERO), lanes(ZERO), lanes(ZERO))
         for c in range(channels):
             store(gathered, c * WIDTH, lanes(ZERO))
         while reached != 0:
@@ -297,7 +289,7 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
                 at += WIDTH
             rest = load(remaining, block * WIDTH) - weight * value
             store(remaining, block * WIDTH, rest)
-            # ∂L/∂log2 α = ln2·(w·value − rest·α/(1 − α)): all that lies behind shrinks by 1 − α
+            # ∂L/∂log2 α = ln2·(w·value − rest·α/(1 − α))
             gradient = LN2 * (weight * value - rest * (alpha / (ONE - alpha)))
             gradient = select(hit & unfinished & (power < LOG2_ALPHA_MAX), gradient, ZERO)
             gd, gy = gradient * d, gradient * dy
@@ -315,10 +307,10 @@ def _blend_tile_backward(tile_x, tile_y, first, last, splats, buffers, slots):  
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
 def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):  # type: ignore[no-untyped-def]
-    """Gradients of each (Gaussian, tile) pair: slots [P, 6 + K].
+    """Gradients [P, 6 + K] of each (Gaussian, tile) pair.
 
-    Six moments of g = ∂L/∂log2 α over the tile's pixels (Σg, Σg·d, Σg·d², Σg·dy, Σg·dy², Σg·d·dy), then K
-    gradients of the attributes. ``image`` and ``coverage`` are ``blend``'s.
+    Six moments of g = ∂L/∂log2 α over the tile's pixels (Σg, Σg·d, Σg·d², Σg·dy, Σg·dy², Σg·d·dy), then K attribute
+    gradients. ``image`` and ``coverage`` are the results of ``blend``.
     """
     height, width, channels = image.shape
     slots = np.empty((splats.pair_slots.size, MOMENTS + channels), np.float32)

@@ -1,4 +1,4 @@
-"""Front-to-back order and its sorting into tiles (numba)."""
+"""Depth order of Gaussians and their sorting into tiles (numba)."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ RADIX_BITS = 11
 
 
 class Splats(NamedTuple):
-    """What the blending kernels read. P counts (Gaussian, tile) pairs; pairs of a tile lie front to back."""
+    """Input of the blending kernels; P (Gaussian, tile) pairs, front to back within a tile."""
 
     centers: NDArray[np.float64]  # [N, 2] px
     shapes: NDArray[np.float32]  # [N, 4] shear, fall_y, fall_x, peak
     attributes: NDArray[np.float32]  # [N, K] features, then the depth when it is asked for
-    slot_starts: NDArray[np.int64]  # [N + 1]: the slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]
+    slot_starts: NDArray[np.int64]  # [N + 1]: slots of Gaussian i are slot_starts[i] : slot_starts[i + 1]
     tile_starts: NDArray[np.int64]  # [tiles + 1] into the pairs
     pair_gaussians: NDArray[np.int32]  # [P]
-    pair_slots: NDArray[np.int32]  # [P] where the pair's gradient goes; empty where none is asked for
+    pair_slots: NDArray[np.int32]  # [P] slot of the pair's gradient; empty without gradients
 
 
 @njit(error_model="numpy")
 def front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
-    """Indices of the drawn Gaussians by depth, equal depths by index.
+    """Indices of the rendered Gaussians by depth, equal depths by index.
 
-    A stable radix sort of 32-bit keys that span just the visible range: 1 m of depth is cut into 0.2 nm,
-    where float32 depths (60 nm at 1 m) would cost 50 dB.
+    A stable radix sort of 32-bit keys over the visible depth range: steps of 0.2 nm at a range of 1 m; float32 depths
+    (60 nm at 1 m) cost 50 dB.
     """
     count = 0
     near, far = np.inf, -np.inf
@@ -69,26 +69,32 @@ def front_to_back(depths, slot_starts):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _next_tile(tile, x, x0, x1, tiles_x):  # type: ignore[no-untyped-def]
-    """The next tile of a range, row by row, without a branch to mispredict."""
+    """The next tile of a range, row by row, without a branch."""
     wraps = x == x1
     return tile + (tiles_x - (x1 - x0) if wraps else 1), x0 if wraps else x + 1
 
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
 def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # type: ignore[no-untyped-def]
-    """Counting sort of the (Gaussian, tile) pairs into tiles, front to back within each.
+    """Sort (Gaussian, tile) pairs into tiles by counting, front to back within each.
 
-    Takes what ``.project.project`` returns and the image's ``size`` (width, height). Returns tile_starts,
-    pair_gaussians and pair_slots of ``Splats``, the last one empty unless ``with_slots``. Each thread counts and
-    places a stretch of the Gaussians, near ones first, so their number changes nothing.
+    Each thread takes a range of the Gaussians, so the number of threads does not change the result.
+
+    Args:
+        boxes, depths, slot_starts: from ``.project.project``.
+        size: the image's width and height.
+        with_slots: fill ``pair_slots``.
+
+    Returns:
+        tile_starts, pair_gaussians and pair_slots of ``Splats``.
     """
     tiles_x, tiles_y = (size[0] + TILE - 1) // TILE, (size[1] + TILE - 1) // TILE
     order = front_to_back(depths, slot_starts)
-    stretch = (order.size + threads - 1) // threads
+    share = (order.size + threads - 1) // threads
     offsets = np.zeros((threads, tiles_x * tiles_y), np.int32)
     for part in prange(threads):
         own = offsets[part]
-        for g in order[part * stretch : (part + 1) * stretch]:
+        for g in order[part * share : (part + 1) * share]:
             x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
             for _ in range(slot_starts[g], slot_starts[g + 1]):
@@ -99,7 +105,7 @@ def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # t
     pair_slots = np.empty(starts[-1] if with_slots else 0, np.int32)
     for part in prange(threads):
         own = offsets[part]
-        for g in order[part * stretch : (part + 1) * stretch]:
+        for g in order[part * share : (part + 1) * share]:
             x0, y0, x1, _ = tile_range(boxes, g)
             tile, x = y0 * tiles_x + x0, x0
             for slot in range(slot_starts[g], slot_starts[g + 1]):
@@ -114,7 +120,7 @@ def sort_into_tiles(boxes, depths, slot_starts, size, threads, with_slots):  # t
 
 @njit(error_model="numpy")
 def _starts(offsets):  # type: ignore[no-untyped-def]
-    """Where each tile's pairs begin [tiles + 1]; the counts [threads, tiles] become where each thread's begin."""
+    """First pair of each tile [tiles + 1]; counts [threads, tiles] become each thread's first pair."""
     starts = np.empty(offsets.shape[1] + 1, np.int64)
     running = 0
     for tile in range(offsets.shape[1]):

@@ -1,4 +1,4 @@
-"""The cheapest shading: a light of sixteen SH coefficients and one number of occlusion per Gaussian."""
+"""The cheapest shading: a light of sixteen SH coefficients times ambient occlusion."""
 
 from __future__ import annotations
 
@@ -50,18 +50,17 @@ class AmbientLight:
 
     @classmethod
     def project(cls, light: Light, texels: tuple[int, int]) -> AmbientLight:
-        """From ``light`` downsized to ``texels`` (height, width)."""
+        """Project ``light``, downsized to ``texels`` (height, width)."""
         flux = light.resized(*texels).radiance * texel_solid_angles(*texels)[..., None]
         return cls(np.einsum("hwj,hwc->jc", sh_basis(texel_directions(*texels)), flux))
 
     def shade(
         self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
     ) -> Floats32:
-        """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + specular of the bare light) · occlusion.
+        """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + unoccluded specular) · occlusion.
 
-        Occlusion is the visibility's mean over the upper hemisphere, weighted by the cosine. Both it and E(n)
-        are exact up to degree 2 and know nothing of each other: light from the open side counts no more than
-        from the blocked one. 0 where not ``seen``.
+        Occlusion is the cosine-weighted mean visibility over the upper hemisphere. Occlusion and E(n) are exact up to
+        degree 2 and independent of each other. 0 where not ``seen``.
         """
         root = np.asarray(gaussians.root_rotation, np.float64)
         in_root = sh_rotation(root.T @ light_to_world) @ self.coefficients
@@ -80,7 +79,7 @@ class AmbientLight:
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: ignore[no-untyped-def]
-    """As ``.lookup.shade_from_tables``, with ``tables`` the light [16, 3] in the root's frame and the lobes."""
+    """``.lookup.shade_from_tables`` with ``tables``: the light [16, 3] in the root's frame, and the lobes."""
     for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
         indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(FREE)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
@@ -94,7 +93,7 @@ def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: 
 
 @njit(error_model="numpy")
 def _shade_sixteen(indices, visibility, root_rotation, tables, scratch, rows, columns):  # type: ignore[no-untyped-def]
-    """Radiance over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are there to be transposed."""
+    """Radiance, written over the albedo in ``scratch``; ``rows`` and ``columns`` [16, 16] are scratch."""
     light, lobes = tables
     normal = transposed(root_rotation, load3(scratch, NORMAL))
     view = unit(transposed(root_rotation, load3(scratch, VIEW)))
@@ -115,8 +114,8 @@ def _shade_sixteen(indices, visibility, root_rotation, tables, scratch, rows, co
         for j in range(9):
             diffuse += COSINE_LOBE[j] * light[j, channel] * at_normal[j]
         for j in range(1, 16):
-            left = shrink[0] if j < 4 else (shrink[1] if j < 9 else shrink[2])
-            specular += left * (at_lobe[j] * light[j, channel])
+            factor = shrink[0] if j < 4 else (shrink[1] if j < 9 else shrink[2])
+            specular += factor * (at_lobe[j] * light[j, channel])
         at = channel * WIDTH
         diffuse_part = load(scratch, ALBEDO + at) * at_least(diffuse, ZERO)
         store(scratch, RADIANCE + at, occlusion * (diffuse_part + energy * at_least(specular, ZERO)) + broken)
