@@ -29,6 +29,7 @@ from .file import (
     read_metadata,
 )
 from .onnx_parts import OnnxFile
+from .operators import check_operators
 
 Floats32 = NDArray[np.float32]
 
@@ -43,9 +44,10 @@ class Networks:
         rest: ``REST_OUTPUTS``, empty unless ``posed_outside``.
     """
 
-    def __init__(self, file: OnnxFile, threads: int | None = None, path: Path | None = None) -> None:
+    def __init__(self, file: OnnxFile, size: int, threads: int | None = None, path: Path | None = None) -> None:
         self.metadata, self.advice = read_metadata(file), read_advice(file)
         check_shapes(file, self.metadata)
+        check_operators(file, size)
         self.trained_light = decode_light(self.metadata)
         self._file, self._threads, self._path = file, threads or cores(), path
         self._sessions: dict[tuple[str, ...], Any] = {}
@@ -64,7 +66,8 @@ class Networks:
         """
         try:
             path = existing_file(path, what="avatar")
-            return cls(OnnxFile(path.read_bytes()), threads, path)
+            content = path.read_bytes()
+            return cls(OnnxFile(content), len(content), threads, path)
         except InputError as error:
             raise explained(error, path, "avatar") from error
 

@@ -7,28 +7,44 @@ encoding and onnx.proto of IR version 8) to leave out nodes, constants and outpu
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from rnd_runtime.core.errors import InputError
 
 # Field numbers of onnx.proto
-_MODEL_GRAPH, _MODEL_METADATA = 7, 14
+_MODEL_GRAPH, _MODEL_OPSET, _MODEL_METADATA, _MODEL_TRAINING, _MODEL_FUNCTIONS = 7, 8, 14, 20, 25
 _GRAPH_NODE, _GRAPH_INITIALIZER, _GRAPH_INPUT, _GRAPH_OUTPUT, _GRAPH_VALUE_INFO = 1, 5, 11, 12, 13
-_NODE_INPUT, _NODE_OUTPUT = 1, 2
-_TENSOR_NAME, _TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 8, 13, 14
-_FLOAT = 1  # TensorProto.DataType
+_GRAPH_SPARSE = 15
+_NODE_INPUT, _NODE_OUTPUT, _NODE_OPERATOR, _NODE_ATTRIBUTE, _NODE_DOMAIN = 1, 2, 4, 5, 7
+_ATTRIBUTE_NAME, _ATTRIBUTE_INT, _ATTRIBUTE_TENSOR, _ATTRIBUTE_INTS = 1, 3, 5, 8
+_ATTRIBUTE_PLAIN = {1, 2, 3, 4, 5, 7, 8, 9, 13, 20}  # numbers, texts, a tensor; no graphs, references or sparse tensors
+_TENSOR_DIMS, _TENSOR_TYPE, _TENSOR_INT64, _TENSOR_NAME, _TENSOR_RAW = 1, 2, 7, 8, 9
+_TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
+_FLOAT, _INT64 = 1, 7  # TensorProto.DataType
+_DEFAULT_DOMAINS = ("", "ai.onnx")
 
 _VARINT, _EIGHT_BYTES, _LENGTH, _FOUR_BYTES = 0, 1, 2, 5  # wire types
 _LONGEST_VARINT = 10  # bytes: 64 bits, seven in each
 
 
 class Node(NamedTuple):
-    """An operation: names of what it reads and makes, and its bytes."""
+    """An operation: names of what it reads and makes, its bytes, its name and its whole-number attributes."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     data: memoryview
+    operator: str
+    attributes: dict[str, tuple[int, ...]]
+
+
+class Constant(NamedTuple):
+    """A tensor of the file: its field's bytes, its shape, and its numbers where they are int64."""
+
+    data: memoryview
+    shape: tuple[int, ...]
+    integers: tuple[int, ...] | None
 
 
 class OnnxFile:
@@ -39,7 +55,8 @@ class OnnxFile:
         metadata: the model's ``metadata_props``.
 
     Raises:
-        InputError: not a protocol buffer, cut short, without a graph, or with data in other files.
+        InputError: not a protocol buffer, cut short, without a graph, with graphs within operators, functions,
+            operators of other domains, or data in other files.
     """
 
     def __init__(self, data: bytes) -> None:
@@ -54,7 +71,7 @@ class OnnxFile:
         self._head = bytearray()  # the model without its graph
         self._graph_head = bytearray()  # the graph without nodes, constants, inputs and outputs
         self._nodes: list[Node] = []
-        self._constants: dict[str, memoryview] = {}
+        self._constants: dict[str, Constant] = {}
         self._input_data: dict[str, memoryview] = {}
         self.inputs: dict[str, list[int]] = {}
         self.outputs: dict[str, list[int]] = {}
@@ -64,6 +81,10 @@ class OnnxFile:
                 self._read_graph(value)
                 continue
             self._head += whole
+            if number in (_MODEL_TRAINING, _MODEL_FUNCTIONS):
+                raise InputError("ONNX model", expected="one graph", got="functions or training graphs")
+            if number == _MODEL_OPSET:
+                _check_domain({n: v for n, v, _ in _fields(value)}.get(1, value[:0]))
             if number == _MODEL_METADATA:
                 entry = {n: _text(v) for n, v, _ in _fields(value)}
                 self.metadata[entry.get(1, "")] = entry.get(2, "")
@@ -71,16 +92,12 @@ class OnnxFile:
     def _read_graph(self, graph: memoryview) -> None:
         for number, value, whole in _fields(graph):
             if number == _GRAPH_NODE:
-                names: dict[int, list[str]] = {_NODE_INPUT: [], _NODE_OUTPUT: []}
-                for part, text, _ in _fields(value):
-                    if part in names:
-                        names[part].append(_text(text))
-                self._nodes.append(Node(tuple(names[_NODE_INPUT]), tuple(names[_NODE_OUTPUT]), whole))
+                self._nodes.append(_node(value, whole))
             elif number == _GRAPH_INITIALIZER:
-                parts = {part: text for part, text, _ in _fields(value)}
-                if _TENSOR_EXTERNAL_DATA in parts or _TENSOR_DATA_LOCATION in parts:
-                    raise InputError("not a whole ONNX model", got="constants in another file")
-                self._constants[_text(parts[_TENSOR_NAME])] = whole
+                name, constant = _tensor(value, whole)
+                self._constants[name] = constant
+            elif number == _GRAPH_SPARSE:
+                raise InputError("ONNX model", expected="dense constants", got="sparse ones")
             elif number == _GRAPH_INPUT:
                 name, shape = _value_info(value)
                 self.inputs[name], self._input_data[name] = shape, whole
@@ -89,6 +106,16 @@ class OnnxFile:
                 self.outputs[name] = shape
             elif number != _GRAPH_VALUE_INFO:  # shapes that onnxruntime infers anyway
                 self._graph_head += whole
+
+    @property
+    def nodes(self) -> list[Node]:
+        """All operations, in an order in which they can be computed."""
+        return self._nodes
+
+    @property
+    def constants(self) -> dict[str, Constant]:
+        """The graph's tensors by name."""
+        return self._constants
 
     def _lost(self, names: Iterable[str]) -> list[str]:
         """Those of ``names`` that are no value of the graph."""
@@ -114,13 +141,89 @@ class OnnxFile:
         graph = bytearray(self._graph_head)
         for node in reversed(kept):
             graph += node.data
-        for values in (self._constants, self._input_data):
-            for name, data in values.items():
-                if name in wanted:
-                    graph += data
+        for name, constant in self._constants.items():
+            if name in wanted:
+                graph += constant.data
+        for name, data in self._input_data.items():
+            if name in wanted:
+                graph += data
         for name in outputs:
             graph += bytes_field(_GRAPH_OUTPUT, bytes_field(1, name.encode()))
         return bytes(self._head + bytes_field(_MODEL_GRAPH, graph))
+
+
+def _node(data: memoryview, whole: memoryview) -> Node:
+    names: dict[int, list[str]] = {_NODE_INPUT: [], _NODE_OUTPUT: []}
+    operator, attributes = "", {}
+    for number, value, _ in _fields(data):
+        if number in names:
+            names[number].append(_text(value))
+        elif number == _NODE_OPERATOR:
+            operator = _text(value)
+        elif number == _NODE_DOMAIN:
+            _check_domain(value)
+        elif number == _NODE_ATTRIBUTE:
+            name, numbers = _attribute(value)
+            if name in attributes:
+                raise InputError("ONNX model", expected=f"one attribute {name}", got="several")
+            attributes[name] = numbers
+    return Node(tuple(names[_NODE_INPUT]), tuple(names[_NODE_OUTPUT]), whole, operator, attributes)
+
+
+def _check_domain(domain: memoryview) -> None:
+    if (name := _text(domain)) not in _DEFAULT_DOMAINS:
+        raise InputError("ONNX model", expected="standard operators", got=f"some of {name}")
+
+
+def _attribute(data: memoryview) -> tuple[str, tuple[int, ...]]:
+    """Name and whole numbers of an AttributeProto."""
+    name, numbers = "", []
+    for number, value, whole in _fields(data):
+        if number not in _ATTRIBUTE_PLAIN:
+            raise InputError("ONNX model", expected="numbers as attributes", got="graphs or tensors in operators")
+        if number == _ATTRIBUTE_NAME:
+            name = _text(value)
+        elif number == _ATTRIBUTE_TENSOR:
+            _tensor(value, whole)
+        elif number in (_ATTRIBUTE_INT, _ATTRIBUTE_INTS):
+            numbers += _signed(value)
+    return name, tuple(numbers)
+
+
+def _tensor(data: memoryview, whole: memoryview) -> tuple[str, Constant]:
+    name, kind, raw = "", 0, data[:0]
+    dims: list[int] = []
+    integers: list[int] = []
+    for number, value, _ in _fields(data):
+        if number in (_TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION):
+            raise InputError("not a whole ONNX model", got="constants in another file")
+        if number == _TENSOR_NAME:
+            name = _text(value)
+        elif number == _TENSOR_DIMS:
+            dims += _signed(value)
+        elif number == _TENSOR_TYPE:
+            kind = _varint(value, 0)[0]
+        elif number == _TENSOR_RAW:
+            raw = value
+        elif number == _TENSOR_INT64:
+            integers += _signed(value)
+    if min(dims, default=0) < 0:
+        raise InputError("ONNX model", expected="sizes of a constant", got=min(dims))
+    if kind == _INT64 and raw:
+        integers = list(struct.unpack(f"<{len(raw) // 8}q", raw[: len(raw) // 8 * 8])) if len(raw) <= _SHORT else []
+    return name, Constant(whole, tuple(dims), tuple(integers) if kind == _INT64 else None)
+
+
+_SHORT = 1024  # bytes of a constant that may be a shape
+
+
+def _signed(data: memoryview) -> list[int]:
+    """The int64 numbers that are packed in ``data``."""
+    numbers, at = [], 0
+    while at < len(data):
+        number, at = _varint(data, at)
+        numbers.append(number - (1 << 64) if number >> 63 else number)
+    return numbers
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:

@@ -150,12 +150,13 @@ def test_a_graph_that_cannot_be_evaluated_is_named(tiny_avatar, tmp_path) -> Non
     def point_outside(model, name: str) -> None:
         graph = model.graph
         graph.initializer.append(onnx.numpy_helper.from_array(np.array([10**6]), "outside"))
-        graph.node.append(onnx.helper.make_node("Gather", [name, "outside"], ["lost"], axis=0))
-        graph.node.append(onnx.helper.make_node("ReduceSum", ["lost"], ["sum"], keepdims=0))
-        node = next(node for node in graph.node if name in node.output)
+        place = next(index for index, node in enumerate(graph.node) if name in node.output)
+        node = graph.node[place]
         node.output[list(node.output).index(name)] = "before"
-        graph.node[-2].input[0] = "before"
-        graph.node.append(onnx.helper.make_node("Add", ["before", "sum"], [name]))
+        make = onnx.helper.make_node
+        graph.node.insert(place + 1, make("Gather", ["before", "outside"], ["lost"], axis=0))
+        graph.node.insert(place + 2, make("ReduceSum", ["lost"], ["sum"], keepdims=0))
+        graph.node.insert(place + 3, make("Add", ["before", "sum"], [name]))
 
     said = r"\.onnx: graph cannot be evaluated: got .*indices"
     file = _changed(tiny_avatar, tmp_path / "constant.onnx", lambda model: point_outside(model, "albedo"))
