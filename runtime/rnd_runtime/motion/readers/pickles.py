@@ -73,7 +73,7 @@ def read_track(path: str | Path) -> Track:
             kind = "no keys" if isinstance(content, Mapping) else f"a {type(content).__name__}"
             raise InputError("motion", expected="a dict of arrays", got=kind, file=path)
         return _track(content, path)
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as error:
         got = f"arrays that do not fit together ({error})"
         raise InputError("motion", expected="poses over time", got=got, file=path) from error
 
