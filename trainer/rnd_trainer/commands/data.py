@@ -19,7 +19,7 @@ from .console import need_extra
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Turn a data set, or a video with body poses, into a capture. The layout of SOURCE is found out.
+    """Turn a data set, or a video with body poses, into a capture. The layout of SOURCE is detected.
 
     rnd-data import me.mp4 me --body SMPL_NEUTRAL.npz --poses wham_output.pkl
     """

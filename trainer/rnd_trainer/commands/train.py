@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from rnd_trainer.training.training import StepResult, Training
 
 PREVIEWS = 3
-"""rows of a preview: views spread over the training frames"""
+"""rows of a preview: evenly spaced training views"""
 UNKNOWN = {
     "view": "rnd-view RUN shows a training while it runs",
     "hdr": "the light is learned; --light capture takes the capture's own, rnd-play relights with --hdr",
@@ -169,7 +169,7 @@ def _train(options: TrainOptions) -> None:
 
 
 def _config(options: TrainOptions) -> TrainConfig:
-    """The preset with the changes in ``options``; raises ``InputError`` for what cannot be trained."""
+    """The preset with the changes of ``options``; raises ``InputError`` for invalid values."""
     from rnd_trainer.config import check_sizes, preset, resized
 
     schedule, ablations = options.schedule, options.ablations
@@ -199,7 +199,7 @@ def _config(options: TrainOptions) -> TrainConfig:
 
 @contextmanager
 def _memory_error_in_one_line() -> Iterator[None]:
-    """Turn torch's error of a full GPU into an ``InputError``; the last saved state stays."""
+    """Raise ``InputError`` when the GPU is out of memory."""
     import torch
 
     try:
@@ -210,7 +210,7 @@ def _memory_error_in_one_line() -> Iterator[None]:
 
 
 def _device(name: str) -> str:
-    """``name`` if torch can compute there; raises ``InputError`` otherwise."""
+    """``name`` if torch can use the device; raises ``InputError`` otherwise."""
     import torch
 
     from rnd_trainer.render.raster import gsplat_rasterization
@@ -255,7 +255,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
         if training.light_found is False and not warned:
             warned = True
             warn(
-                "no sky and sun found in these images (too little is seen of the person, or from one side only): "
+                "no sky and sun found in these images (too little of the person is visible, or one side only): "
                 "the light is learned from white, which costs several dB"
             )
         if step.skipped:
@@ -273,7 +273,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
-    """Score the held-out splits in the poses of the training, refined ones if they were."""
+    """Score the held-out splits in the training's poses, refined if ``--refine-poses``."""
     from rnd_trainer.evaluation.evaluate import HELD_OUT
     from rnd_trainer.training.training import REFINED_MOTION
 

@@ -24,7 +24,7 @@ class FrameSelection:
     train_camera: Annotated[str | None, option("NAME")] = None
     """camera whose first 4/5 train. Default: the first"""
     held_out_every: int = 30
-    """every so many frames, one of the other cameras is a novel view"""
+    """interval of novel views of the other cameras, frames"""
     every: int = 1
     """keep frames whose number is a multiple of this"""
     start: int = 0
@@ -44,7 +44,7 @@ class ImportOptions:
     body: Annotated[str | None, option("FILE|anny")] = None
     """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny"""
     layout: Annotated[str | None, option("LAYOUT", name="as")] = None
-    """layout of SOURCE, such as zju, nerfstudio or video. Default: found out"""
+    """layout of SOURCE, such as zju, nerfstudio or video. Default: detected"""
     root: Annotated[Literal["smpl", "easymocap"] | None, option("smpl|easymocap")] = None
     """root convention of the poses. Default: the layout's"""
     poses: OptionalFile = None
@@ -52,15 +52,15 @@ class ImportOptions:
     person: OptionalCount = None
     """track number in --poses. Default: the longest track"""
     masks: OptionalFolder = None
-    """masks (.png, .npy) by name or number of the frames, in a folder a camera. Default: the source's, else made"""
+    """masks (.png, .npy) by name or number of the frames, in a folder per camera. Default: the source's, or estimated"""
     mask_net: OptionalFile = None
-    """segmentation network (.onnx) that makes the masks"""
+    """segmentation network (.onnx) for the masks"""
     normals: OptionalFolder = None
-    """normal maps (.npy, .png), named as masks are. Default: the source's"""
+    """normal maps (.npy, .png), named as masks. Default: the source's"""
     normal_net: OptionalFile = None
-    """normal network (.onnx) that makes the normals"""
+    """normal network (.onnx) for the normals"""
     normal_axes: Annotated[str | None, option("AXES")] = None
-    """the maps' axes that are our right, down, forward, such as x,-y,-z. Default: found by the template"""
+    """the maps' axes that are right, down, forward, such as x,-y,-z. Default: found by the template"""
     intrinsics: Annotated[tuple[float, ...], option("N N N N")] = ()
     """fx fy cx cy of a video, in pixels"""
     distortion: Annotated[tuple[float, ...], option("N ...")] = ()

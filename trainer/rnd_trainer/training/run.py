@@ -40,11 +40,11 @@ def run(
     The first Ctrl-C, SIGTERM or SIGHUP finishes the current step and saves; resuming continues the same curve.
 
     Args:
-        folder: gets ``metrics.jsonl``, ``status.json``, the states and the checkpoint.
-        on_phase: called with name, done and total as a phase begins, and as the light's search advances.
+        folder: for ``metrics.jsonl``, ``status.json``, states and checkpoint.
+        on_phase: called with name, done and total when a phase begins, and during the light search.
 
     Returns:
-        Whether a signal left steps to do.
+        Whether a signal stopped the training.
     """
     config, total = training.config, training.schedule.total
     status = _Status(training, folder / STATUS_FILE)
