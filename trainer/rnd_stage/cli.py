@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StageOptions:
-    """Render a coded person on a light stage: many views, many lights, and the truth beside every image.
+    """Render a coded person on a light stage: many views, many lights, and ground truth for every image.
 
     rnd-stage out/lumberjack --frames 20 --cameras 4 --size 256
     """
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def stage(options: StageOptions) -> None:
-    """Render a shard, and write the manifest when all is there."""
+    """Render a shard, and write the manifest once all images exist."""
     need_extra()
     shard = parse_shard(options.shard)
     options.recipe.check()
@@ -65,7 +65,7 @@ def stage(options: StageOptions) -> None:
 
 
 def _film(production: Production, options: StageOptions, shard: tuple[int, int], progress: Progress) -> float | None:
-    """Render a shard; processor seconds per image, None where all was there."""
+    """Render a shard; processor seconds per image, None if nothing was missing."""
     from .film.film import film
     from .film.plan import image_count, missing
 
@@ -74,16 +74,12 @@ def _film(production: Production, options: StageOptions, shard: tuple[int, int],
     fresh = image_count([view for view in views if missing(options.out, view, production.recipe.visibility)])
     progress.phase("rendering", image_count(views))
     done = count(1)
-    spent = film(production, options.out, shard=shard, on_image=lambda name: progress.update(next(done)))
-    return spent.cpu_seconds / fresh if fresh else None
+    cpu_seconds = film(production, options.out, shard=shard, on_image=lambda name: progress.update(next(done)))
+    return cpu_seconds / fresh if fresh else None
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """ "K/N" as (K, N) with 0 ≤ K < N.
-
-    Raises:
-        InputError: anything else.
-    """
+    """ "K/N" as (K, N) with 0 ≤ K < N."""
     match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
     part, parts = (int(match[1]), int(match[2])) if match else (0, 0)
     if part >= parts:

@@ -1,9 +1,7 @@
 """Path tracing a posed surface with Mitsuba 3, in this project's conventions.
 
-The material is the project's model, formulated independently: Lambert plus a rough dielectric's first reflection,
-GGX with F0 = 0.04 and no transmission. ``rnd_runtime.shading.brdf`` has Schlick's Fresnel term where Mitsuba has the
-exact Fresnel equations. Mitsuba has no sum of two materials, only their blend, so both parts are scaled up by the
-share they get.
+The material is that of ``rnd_runtime.shading.brdf``, formulated independently: Lambert plus GGX with F0 = 0.04, with
+exact Fresnel equations instead of Schlick's term. Mitsuba blends two materials, so both are divided by their share.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ from rnd_runtime.core.camera import Camera
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SPECULAR_SHARE = 0.3  # of the blend, and of the sampled directions; any share gives the same mean
-MAX_SAMPLES = 2**24  # paths traced at once: LLVM keeps them all in memory, about 200 B each
+SPECULAR_SHARE = 0.3  # of the blend and of the sampled directions; any share gives the same mean
+MAX_SAMPLES = 2**24  # paths traced at once; LLVM needs about 200 B for each
 NEAR = 0.1  # m
-MASK_FLOOR = 0.05  # of coverage, below which truths are left at zero
-GRAZING = 0.05  # cosine below which a light counts as not visible: the surface turns away from it
+MASK_FLOOR = 0.05  # coverage below which ground truth is zero
+GRAZING = 0.05  # n·l below which a light counts as not visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +44,12 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What one camera sees of a surface, means over a pixel's samples.
+    """Ground truth of one camera, means over a pixel's samples.
 
     Attributes:
         coverage: [H, W].
         albedo: [H, W, 3] linear, premultiplied.
-        normals: [H, W, 3] unit, of the side that is seen, camera's OpenCV axes; zero where coverage is below 5 %.
+        normals: [H, W, 3] unit, of the visible side, camera's OpenCV axes; zero where coverage is below 5 %.
         roughness: [H, W] and depth: [H, W] m along the camera's z, both of the covered part; zero elsewhere.
     """
 
@@ -63,12 +61,7 @@ class Truth:
 
 
 class RenderSet:
-    """A surface on the stage, to be rendered by any camera under any light.
-
-    Args:
-        surface: meshed once for all images.
-        max_depth: of the paths; 2 is direct light alone.
-    """
+    """A surface on the stage, for any camera and light; a ``max_depth`` of 2 is direct light alone."""
 
     def __init__(self, surface: Surface, *, max_depth: int = 5) -> None:
         self.surface, self.max_depth = surface, max_depth
@@ -88,7 +81,7 @@ class RenderSet:
         return render(scene, camera, samples, seed)[..., :3]
 
     def truth(self, camera: Camera, *, samples: int, seed: int) -> Truth:
-        """Attributes of the visible surface; both passes see the same points."""
+        """Attributes of the visible surface; both passes sample the same points."""
         if not self._plain:
             self._plain = self._attribute_scenes()
         seen, extra = (render(scene, camera, samples, seed, film="rgb") for scene in self._plain)
@@ -96,18 +89,17 @@ class RenderSet:
         share = np.maximum(coverage, 1e-6)
         covered = coverage >= MASK_FLOOR
         positions = seen[..., 6:9] / share[..., None]
-        away = np.sum(seen[..., 9:12] * (positions - camera.position), axis=-1) > 0  # cloth seen from its inside
+        away = np.sum(seen[..., 9:12] * (positions - camera.position), axis=-1) > 0  # the inside of cloth
         facing = np.where(away, -1, 1)[..., None] * seen[..., 3:6] @ camera.world_to_camera[:3, :3].T
         facing /= np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-9)
         depth = positions @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
         return Truth(coverage, seen[..., :3], facing * covered[..., None], roughness / share * covered, depth * covered)
 
     def visibility(self, camera: Camera, directions: Floats, normals: Floats, *, samples: int, seed: int) -> Floats:
-        """Share [L, H, W] of each pixel's surface that distant lights at ``directions`` [L, 3] (towards them) reach.
+        """Visible share [L, H, W] of each pixel's surface for distant lights at ``directions`` [L, 3] (towards them).
 
-        ``normals`` [H, W, 3] are ``Truth``'s. Three lights at a time shine on a white, diffuse copy in red,
-        green and blue; what arrives is divided by what would without shadows. Zero where the light is below the
-        surface's horizon.
+        ``normals`` [H, W, 3] are ``Truth``'s. Three lights at a time illuminate a white, diffuse copy in red, green
+        and blue; the result is divided by n·l. Zero below the surface's horizon.
         """
         white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
         copy = mesh(self.surface, {"type": "twosided", "sides": white}, {})
@@ -127,7 +119,7 @@ class RenderSet:
         return result
 
     def _attribute_scenes(self) -> list[Any]:
-        """Two scenes without light: albedo, normals and positions; roughness and coverage."""
+        """Scenes of albedo, normals and positions, and of roughness and coverage."""
         surface = self.surface
         one = np.ones_like(surface.roughness)
         plain = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
@@ -135,38 +127,25 @@ class RenderSet:
             (surface.colour, "albedo:albedo,normal:sh_normal,place:position,side:geo_normal"),
             (np.stack([surface.roughness, one, 0 * one], axis=1), "albedo:albedo"),
         )
-        return [
-            mi.load_dict(
-                {
-                    "type": "scene",
-                    "integrator": {"type": "aov", "aovs": aovs},
-                    "figure": mesh(surface, plain, {"vertex_color": colour}),
-                }
+        scenes = []
+        for colour, aovs in passes:
+            figure = mesh(surface, plain, {"vertex_color": colour})
+            scenes.append(
+                mi.load_dict({"type": "scene", "integrator": {"type": "aov", "aovs": aovs}, "figure": figure})
             )
-            for colour, aovs in passes
-        ]
+        return scenes
 
 
 def layered() -> dict[str, Any]:
-    """The material, on both sides of the mesh; its attributes are those of ``_layers``."""
+    """The two-sided material with the attributes of ``_layers``."""
 
     def attribute(name: str) -> dict[str, Any]:
         return {"type": "mesh_attribute", "name": f"vertex_{name}"}
 
-    gloss = {
-        "type": "roughconductor",
-        "distribution": "ggx",
-        "alpha": attribute("alpha"),
-        "eta": 1.5,
-        "k": 0.0,
-        "specular_reflectance": attribute("gain"),
-    }
-    blend = {
-        "type": "blendbsdf",
-        "weight": SPECULAR_SHARE,
-        "first": {"type": "diffuse", "reflectance": attribute("color")},
-        "second": gloss,
-    }
+    specular = {"type": "roughconductor", "distribution": "ggx", "alpha": attribute("alpha"), "eta": 1.5, "k": 0.0}
+    specular["specular_reflectance"] = attribute("gain")
+    diffuse = {"type": "diffuse", "reflectance": attribute("color")}
+    blend = {"type": "blendbsdf", "weight": SPECULAR_SHARE, "first": diffuse, "second": specular}
     return {"type": "twosided", "sides": blend}
 
 
@@ -180,7 +159,7 @@ def _layers(surface: Surface) -> dict[str, Floats]:
 
 
 def mesh(surface: Surface, material: dict[str, Any], attributes: dict[str, Floats]) -> Any:
-    """A Mitsuba mesh with per-vertex ``attributes`` [V, 1 or 3] for ``material`` to read."""
+    """A Mitsuba mesh with per-vertex ``attributes`` [V, 1 or 3] of ``material``."""
     properties = mi.Properties()
     properties["material"] = mi.load_dict(material)
     result = mi.Mesh("figure", len(surface.vertices), len(surface.faces), has_vertex_normals=True, props=properties)
@@ -197,18 +176,18 @@ def mesh(surface: Surface, material: dict[str, Any], attributes: dict[str, Float
 def environment(radiance: Floats) -> dict[str, Any]:
     """An emitter from a lat-long map [H, W, 3] in this project's convention.
 
-    Mitsuba puts the first and the last row on the poles, we put them half a texel away. With rows at every
-    half texel, both read the same bilinear function.
+    In Mitsuba the first and the last row are at the poles, in ours half a texel away; with rows at every half texel
+    both are the same bilinear function.
     """
     doubled = np.empty((2 * len(radiance) + 1, *radiance.shape[1:]), np.float32)
     doubled[0], doubled[1::2], doubled[-1] = radiance[0], radiance, radiance[-1]
     doubled[2:-1:2] = 0.5 * (radiance[:-1] + radiance[1:])
-    # Mitsuba's map has u = atan2(x, −z)/2π. A quarter turn about Y makes that our u = 0.5 + atan2(z, x)/2π.
+    # Mitsuba's u = atan2(x, −z)/2π becomes our u = 0.5 + atan2(z, x)/2π by a rotation of 90° about Y.
     return {"type": "envmap", "bitmap": mi.Bitmap(doubled), "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 90)}
 
 
 def sensor(camera: Camera, samples: int, film: str = "rgba") -> dict[str, Any]:
-    """Mitsuba's camera for an OpenCV one; its x points left and its y up. The principal point is the centre."""
+    """Mitsuba's camera (x left, y up) for an OpenCV one with a centred principal point."""
     camera_to_world = np.linalg.inv(camera.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     return {
         "type": "perspective",
@@ -229,7 +208,7 @@ def sensor(camera: Camera, samples: int, film: str = "rgba") -> dict[str, Any]:
 
 
 def render(scene: Any, camera: Camera, samples: int, seed: int, film: str = "rgba") -> Floats:
-    """All channels [H, W, C] of ``scene`` seen by ``camera``; the same seed gives the same image."""
+    """All channels [H, W, C] of ``scene``; the same seed gives the same image."""
     passes = -(-samples * camera.width * camera.height // MAX_SAMPLES) if mi.variant() != "scalar_rgb" else 1
     each = -(-samples // passes)
     view = mi.load_dict(sensor(camera, each, film))
@@ -240,7 +219,7 @@ def render(scene: Any, camera: Camera, samples: int, seed: int, film: str = "rgb
 
 
 def probe() -> None:
-    """Render a lit triangle in the current variant: where LLVM is the wrong one, this is where it aborts."""
+    """Render a lit triangle in the current variant; an unsuitable LLVM aborts the process here."""
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
     facing = np.tile([0.0, 0, 1], (3, 1))
     surface = Surface(corners, facing, np.array([[0, 1, 2]]), np.full((3, 3), 0.5), np.full(3, 0.5))

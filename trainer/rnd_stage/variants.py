@@ -1,4 +1,4 @@
-"""Which of Mitsuba's back ends works: a wrong LLVM aborts the process, so a child process tries it first."""
+"""Choice of Mitsuba's back end. An unsuitable LLVM aborts the process, so a child process tries it first."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rnd_runtime.core.errors import InputError
 Variant = Literal["auto", "scalar_rgb", "llvm_ad_rgb"]
 
 LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
-OLDEST_LLVM = 16  # 14 and 15 cannot select instructions that Dr.Jit asks for on AVX-512, and abort
+OLDEST_LLVM = 16  # 14 and 15 abort on Dr.Jit's AVX-512 instructions
 PROBE_SECONDS = 120.0
 _FOLDERS = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib")
 _PROBE = """
@@ -27,33 +27,25 @@ probe()
 
 
 def need_extra() -> None:
-    """Raise ``InputError`` where a package of the extra is missing."""
+    """Raise ``InputError`` if a package of the extra is missing."""
     from importlib.util import find_spec
 
     for module, package in (("mitsuba", "mitsuba"), ("skimage", "scikit-image"), ("scipy", "scipy"), ("cv2", "opencv")):
         if find_spec(module) is None:
-            raise InputError(
-                f"{package} is not installed",
-                hint='needs the extra: pip install "rnd-avatar[stage]", in a clone ".[stage]"',
-            )
+            hint = 'needs the extra: pip install "rnd-avatar[stage]", in a clone ".[stage]"'
+            raise InputError(f"{package} is not installed", hint=hint)
 
 
 def use_variant(wanted: Variant = "auto") -> str:
-    """Switch Mitsuba to ``wanted`` and return its name; "auto" takes LLVM where a child process rendered with it.
-
-    Raises:
-        InputError: no such variant, or "llvm_ad_rgb" and no library that works.
-    """
+    """Set Mitsuba's variant and return its name; "auto" is LLVM if a child process can render with it."""
     if wanted not in get_args(Variant):
         raise InputError("--variant", expected=", ".join(get_args(Variant)), got=wanted)
     name = "scalar_rgb"
     if wanted != "scalar_rgb":
         library = working_llvm()
         if library is None and wanted == "llvm_ad_rgb":
-            raise InputError(
-                "no LLVM that works for Mitsuba",
-                hint=f"install libllvm19 or newer, or point {LIBRARY_VARIABLE} at its libLLVM.so",
-            )
+            hint = f"install libllvm19 or newer, or point {LIBRARY_VARIABLE} at its libLLVM.so"
+            raise InputError("no LLVM that works for Mitsuba", hint=hint)
         if library is not None:
             name = "llvm_ad_rgb"
             os.environ[LIBRARY_VARIABLE] = library
@@ -65,14 +57,13 @@ def use_variant(wanted: Variant = "auto") -> str:
 
 
 def working_llvm() -> str | None:
-    """The first LLVM library with which a child process renders an image; None where there is none."""
+    """The first LLVM library with which a child process can render."""
     return next((library for library in _candidates() if _renders(library)), None)
 
 
 def _candidates() -> Iterator[str]:
-    """What the user named, and nothing else; by default the system's libraries, the newest first."""
-    named = os.environ.get(LIBRARY_VARIABLE)
-    if named:
+    """The library of the environment variable; by default the system's, the newest first."""
+    if named := os.environ.get(LIBRARY_VARIABLE):
         yield named
         return
     found: dict[int, str] = {}

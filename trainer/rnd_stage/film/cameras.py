@@ -1,4 +1,4 @@
-"""The stage's cameras: three rings around the person, the first of them straight ahead."""
+"""The stage's cameras: three rings around the person."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ from rnd_runtime.core.errors import InputError
 
 DISTANCE = 4.4  # m
 TARGET = (0.0, 0.92, 0.0)
-VISIBLE_HEIGHT = 2.25  # m at the target: a person of 1.75 m with raised arms stays inside
+VISIBLE_HEIGHT = 2.25  # m at the target: a person of 1.75 m with raised arms
 RINGS = ((4.0, 0.5), (32.0, 0.3), (-12.0, 0.2))  # elevation in degrees, share of the cameras
 
 
 def ring_cameras(count: int, size: int) -> dict[str, Camera]:
-    """``count`` square cameras "cam00" …: the middle ring first, then the upper, then the lower.
+    """``count`` square cameras "cam00" …: the middle ring, the upper, the lower.
 
-    ``cam00`` looks from the front, slightly down. The rings are rotated against each other, so that cameras share no
-    azimuth where their numbers allow it.
-
-    Raises:
-        InputError: fewer than one camera or pixel.
+    ``cam00`` looks from the front, slightly down. The rings are rotated against each other to avoid equal azimuths.
     """
     if count < 1:
         raise InputError("--cameras", expected="at least 1", got=count)

@@ -1,8 +1,8 @@
-"""Two motions from joint-angle curves: a walking loop, and the turning dance of the capture.
+"""Two motions from joint-angle curves: a walking loop, and the dance of the capture.
 
-Angles are in degrees, written for the left side in anatomical terms and mirrored for the right. The sagittal curves
-of the walk follow the shape every gait laboratory reports (hip 30° to −10°, knee 18° in stance and 60° in swing,
-ankle 10° to −18°); the body's height follows from the lowest point of the soles.
+Angles are in degrees, given for the left side in anatomical terms and mirrored for the right. The walk's sagittal
+curves are those of normal gait (hip 30° to −10°, knee 18° in stance and 60° in swing, ankle 10° to −18°). The body's
+height follows from the lowest point of the soles.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ FPS = 30.0
 WALK_CYCLE = 33  # frames in two steps: 109 steps a minute
 WALK_CYCLES = 4
 TRAIN_SECONDS = 5.0
-DANCE_SECONDS = 7.5  # what follows the training part holds the novel poses
-TURN = 400.0  # degrees, so that the camera sees every side and the first one twice
+DANCE_SECONDS = 7.5  # the last third holds the novel poses
+TURN = 400.0  # degrees
 # per cent of the cycle from heel strike: hip flexion, knee flexion, ankle dorsiflexion, toe extension
 GAIT = np.array(
     [
@@ -89,10 +89,10 @@ TRUNK = np.array(
 
 
 def walk(skeleton: Skeleton) -> Motion:
-    """Walking in place (the floor would run backwards), facing +Z; frame F follows as frame 0."""
+    """Walking in place, facing +Z, periodic."""
     frames = WALK_CYCLE * WALK_CYCLES
     phase = np.arange(frames) / WALK_CYCLE
-    slow = 2 * np.pi * np.arange(frames) / frames  # what differs from one cycle to the next
+    slow = 2 * np.pi * np.arange(frames) / frames  # varies from cycle to cycle
     curve = CubicSpline(GAIT[:, 0] / 100, GAIT[:, 1:], bc_type="periodic")
     pose = _Pose(frames)
     for side, shift in (("left_", 0.0), ("right_", 0.5)):
@@ -118,7 +118,7 @@ def walk(skeleton: Skeleton) -> Motion:
 
 
 def dance(skeleton: Skeleton) -> Motion:
-    """The capture's motion: an A-pose, then arms, bends and lifted knees while the person rotates on the spot."""
+    """The capture's motion: an A-pose, then arms, bends and lifted knees while the person rotates in place."""
     times = np.arange(round(DANCE_SECONDS * FPS)) / FPS
     bend, twist, tilt, crouch, lift_left, lift_right = PchipInterpolator(TRUNK[:, 0], TRUNK[:, 1:])(times).T
     pose = _Pose(len(times))
@@ -156,7 +156,7 @@ class _Pose:
         self.rotations = np.tile(np.eye(3), (frames, len(SMPL_NAMES), 1, 1))
 
     def set(self, name: str, *angles: tuple[str, Floats | float]) -> None:
-        """The product, left to right, of rotations (axis, degrees); right limbs mirror: y and z change sign."""
+        """Product, left to right, of rotations (axis, degrees); y and z change sign for right limbs."""
         total = np.eye(3)
         for axis, degrees in angles:
             vector = np.zeros((len(self.rotations), 3))
@@ -167,7 +167,7 @@ class _Pose:
 
 
 def _grounded(skeleton: Skeleton, rotations: Floats, shift: Floats, *, periodic: bool) -> Motion:
-    """The motion with its root at such heights that the lowest point of the soles touches y = 0."""
+    """The motion with the root at heights at which the lowest point of the soles touches y = 0."""
     posed = skeleton.joint_transforms(rotations, shift)
     lowest = np.full(len(rotations), np.inf)
     for side, sign in (("left_", 1), ("right_", -1)):

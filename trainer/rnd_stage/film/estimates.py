@@ -1,4 +1,4 @@
-"""Estimated poses, normals and masks, from the truth, a seed and a strength."""
+"""Simulated estimates of poses, normals and masks: ground truth with noise of a seed and a strength."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Floats = NDArray[np.float64]
 
 # at strength 1
 POSE_JITTER = np.radians(1.0)  # per axis and joint, independent from frame to frame
-POSE_DRIFT = np.radians(2.5)  # the same, wandering over
+POSE_DRIFT = np.radians(2.5)  # per axis and joint, smooth over
 DRIFT_SECONDS = 1.5
 ROOT_JITTER, ROOT_DRIFT = 0.004, 0.015  # m
 NORMAL_BLUR = 1.5  # pixels of an image of 512
-NORMAL_TILT = 0.16  # of the smooth tilt's vector: about 8° on average
-NORMAL_ROTATION = np.radians(3.0)  # of the whole image, another one in every frame
-MASK_WANDER = 2.5  # pixels of an image of 512 by which the edge wanders in and out
-MASK_GRAIN = 9.0  # pixels of an image of 512 along the edge over which it does
+NORMAL_TILT = 0.16  # length of the smooth tilt's vector: about 8° on average
+NORMAL_ROTATION = np.radians(3.0)  # of all normals, sampled for every frame
+MASK_WANDER = 2.5  # pixels of an image of 512: amplitude of the edge's displacement
+MASK_GRAIN = 9.0  # pixels of an image of 512: its correlation length
 
 
 def estimated_motion(motion: Motion, seed: int, strength: float = 1.0) -> Motion:
-    """``motion`` with jitter and drift in every joint and in the root's position; strength 0 leaves it as it is."""
+    """``motion`` with jitter and drift of every joint and of the root's position; strength 0 changes nothing."""
     rng = np.random.default_rng((seed, 1))
     shape = (motion.frame_count, len(motion.joint_names), 3)
     sigma = DRIFT_SECONDS * motion.fps
@@ -41,9 +41,9 @@ def estimated_motion(motion: Motion, seed: int, strength: float = 1.0) -> Motion
 
 
 def estimated_normals(normals: Floats, coverage: Floats, seed: int, strength: float = 1.0) -> Floats:
-    """``normals`` [H, W, 3] (camera axes) as a network would give them: blurred, smoothly tilted, rotated a little.
+    """``normals`` [H, W, 3] (camera axes) blurred, smoothly tilted and rotated, as if by a network.
 
-    Unit where ``coverage`` [H, W] is at least 5 %, zero elsewhere, never facing away.
+    Unit and facing the camera where ``coverage`` [H, W] is at least 5 %, zero elsewhere.
     """
     rng = np.random.default_rng((seed, 2))
     height, width = coverage.shape
@@ -59,7 +59,7 @@ def estimated_normals(normals: Floats, coverage: Floats, seed: int, strength: fl
 
 
 def estimated_mask(coverage: Floats, seed: int, strength: float = 1.0) -> Floats:
-    """``coverage`` [H, W] as a segmentation would give it: hard, its edge ragged; strength 0 leaves it as it is."""
+    """``coverage`` [H, W] with a hard, ragged edge, as if by a segmentation; strength 0 changes nothing."""
     if strength == 0:
         return coverage
     rng = np.random.default_rng((seed, 3))
@@ -74,7 +74,7 @@ def estimated_mask(coverage: Floats, seed: int, strength: float = 1.0) -> Floats
 
 
 def _wandering(rng: np.random.Generator, shape: tuple[int, ...], sigma: float) -> Floats:
-    """Smooth noise over the first axis with a standard deviation of about one."""
+    """Smooth noise over the first axis, σ about 1."""
     margin = int(np.ceil(4 * sigma))
     noise = gaussian_filter1d(rng.normal(size=(shape[0] + 2 * margin, *shape[1:])), sigma, axis=0)
     return noise[margin:-margin] * np.sqrt(2 * np.sqrt(np.pi) * sigma)

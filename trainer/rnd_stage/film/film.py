@@ -1,4 +1,4 @@
-"""Rendering a recipe into a folder: view by view, resumable, in shards."""
+"""Rendering of a recipe into a folder, resumable and in shards."""
 
 from __future__ import annotations
 
@@ -31,17 +31,9 @@ from .plan import Recipe, View
 Floats = NDArray[np.float64]
 
 RECIPE_FILE = "stage.json"
-TRUTH_SAMPLES = 16  # truths have noise at edges alone
+TRUTH_SAMPLES = 16  # ground truth has noise at edges alone
 VISIBILITY_SAMPLES = 16
 FINEST, COARSEST = 0.003, 0.007  # m between a dressed surface's vertices
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Wall time and processor time of all cores."""
-
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
 
 
 @dataclass
@@ -62,10 +54,9 @@ class Production:
 
 
 def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Production:
-    """Load and dress what ``recipe`` names; ``template`` as in ``.dressing.dress``.
+    """Load and dress the parts of ``recipe``; a folder with another recipe's images is refused.
 
-    Raises:
-        InputError: an unusable part, or a folder that holds another recipe's images.
+    ``template`` as in ``.dressing.dress``.
     """
     recipe.check()
     lights = _chosen(recipe)
@@ -77,11 +68,12 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
     motion = dance(dressed.body.skeleton)
     if recipe.motion is not None:
         motion = load_motion(recipe.motion, dressed.body.skeleton)
-    motion = _on_the_spot(motion)
+    middle = np.median(motion.translations, axis=0) * [1, 0, 1]
+    motion = replace(motion, translations=motion.translations - middle)
     frames = plans.instants(recipe, motion.frame_count)
     if len(frames) < 5:
         raise InputError("motion", expected="at least 5 frames", got=motion.frame_count, file=motion.source)
-    write_json(folder / RECIPE_FILE, mine)  # now that it can be rendered
+    write_json(folder / RECIPE_FILE, mine)
     names = [light.name for light in lights]
     views = plans.plan(recipe, frames, list(ring_cameras(recipe.cameras, recipe.size)), names)
     return Production(recipe, dressed, title, motion, frames, lights, views)
@@ -89,8 +81,8 @@ def prepare(recipe: Recipe, folder: Path, template: Body | None = None) -> Produ
 
 def film(
     production: Production, folder: Path, *, shard: tuple[int, int] = (0, 1), on_image: Callable[[str], None]
-) -> Cost:
-    """Render what is missing of one shard (k, n): the instants whose number is k modulo n.
+) -> float:
+    """Render the missing images of shard (k, n), the instants with number k modulo n; return the processor seconds.
 
     ``on_image`` is called with the name of each image, rendered or found.
     """
@@ -99,15 +91,16 @@ def film(
     todo = [view for view in production.views if view.frame in own]
     missing = [view for view in todo if plans.missing(folder, view, production.recipe.visibility)]
     for light in production.lights:
-        if not (folder / _light_file(light.name)).exists():
-            write_image(folder / _light_file(light.name), light.file_radiance)
+        file = folder / f"lights/{light.name}.exr"
+        if not file.exists():
+            write_image(file, light.file_radiance)
     for view in todo:
         if view not in missing:
             for _, name in view.uses:
                 on_image(view.image(name))
     if not missing:
-        return Cost()
-    started, started_cpu = time.perf_counter(), time.process_time()
+        return 0.0
+    started = time.process_time()
     wearer = Wearer(production.dressed, production.motion, sorted({view.frame for view in missing}))
     for frame in sorted({view.frame for view in missing}):
         stage = RenderSet(wearer.surface(frame), max_depth=production.recipe.max_depth)
@@ -117,11 +110,11 @@ def film(
                 _render_view(production, stage, view, folder)
                 for _, name in view.uses:
                     on_image(view.image(name))
-    return Cost(time.perf_counter() - started, time.process_time() - started_cpu)
+    return time.process_time() - started
 
 
 def _render_view(production: Production, stage: RenderSet, view: View, folder: Path) -> None:
-    """One camera at one instant: the truth, then an image for each light."""
+    """Ground truth and images of one camera at one instant."""
     recipe, camera = production.recipe, production.cameras[view.camera]
     numbers = {light.name: k for k, light in enumerate(production.lights)}
     seed = 1000 * view.frame + 31 * int(view.camera[3:])
@@ -154,10 +147,7 @@ def _write_truth(folder: Path, view: View, truth: Truth, recipe: Recipe) -> None
 
 
 def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
-    """The recipe as JSON, with the digests of its files.
-
-    Raises ``InputError`` where ``folder`` holds images of another recipe or of files that were replaced.
-    """
+    """The recipe as JSON with the digests of its files; a folder with images of another recipe or files is refused."""
     file = output_folder(folder) / RECIPE_FILE
     mine = json.loads(json.dumps(asdict(recipe)))
     motion = [] if recipe.motion is None else map(str, motion_inputs(recipe.motion))
@@ -180,9 +170,9 @@ def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
 
 
 def _content(recipe: dict[str, Any], key: str, digests: dict[str, Any]) -> object:
-    """The value of a recipe's ``key``, of files their digests wherever they are.
+    """The value of a recipe's ``key``; for files their digests, for lights and people also their names.
 
-    Lights and people are named after their files, so the names count too; a motion may have an .asf beside it.
+    A motion may have an .asf beside it.
     """
     value = recipe.get(key)
     known = {Path(name): digest for name, digest in digests.items()}
@@ -217,12 +207,6 @@ def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:
     return dress(person, step, template), person.title
 
 
-def _on_the_spot(motion: Motion) -> Motion:
-    """The motion about the middle of the stage."""
-    middle = np.median(motion.translations, axis=0) * [1, 0, 1]
-    return replace(motion, translations=motion.translations - middle)
-
-
 def _chosen(recipe: Recipe) -> list[StageLight]:
     lights = stage_lights(tuple(Path(name) for name in recipe.hdr))
     names = [light.name for light in lights]
@@ -232,7 +216,3 @@ def _chosen(recipe: Recipe) -> list[StageLight]:
     given = {Path(name).stem for name in recipe.hdr}
     wanted = {WHITE, *given, *(recipe.lights or names)}
     return [light for light in lights if light.name in wanted]
-
-
-def _light_file(name: str) -> str:
-    return f"lights/{name}.exr"

@@ -1,4 +1,4 @@
-"""The stage's light: nineteen LED modules around the person, each a spherical Gaussian of its own colour."""
+"""The stage's lights: nineteen LED modules around the person, each a spherical Gaussian."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rnd_runtime.shading.light import Light, downsize, load_light, texel_directi
 
 Floats = NDArray[np.float64]
 
-SHARPNESS = 14.0  # λ of exp(λ(μ·d − 1)): half as bright 18° off its axis, so that neighbours blend
-AMBIENT = 0.02  # ambient radiance, in units of a module's peak
-MAP_HEIGHT = 64  # rows of the written maps: a Gaussian of 18° is smooth on texels of 3°
-EXPOSURE = 0.75  # the strongest channel's mean radiance: an albedo of 0.3 then shows as about 0.2
+SHARPNESS = 14.0  # λ of exp(λ(μ·d − 1)): half the peak at 18°
+AMBIENT = 0.02  # ambient radiance over a module's peak
+MAP_HEIGHT = 64  # rows of the written maps
+EXPOSURE = 0.75  # mean radiance of the strongest channel
 WHITE = "white"
-_MAX_ROWS = 256  # of a given HDR, before it is traced and written
+_MAX_ROWS = 256  # of a given HDR
 
-# elevation in degrees and number of modules evenly around, the first at azimuth 90° (+Z, before the person)
+# elevation in degrees and number of evenly spaced modules, the first at azimuth 90° (+Z, in front of the person)
 RINGS = ((90.0, 1), (45.0, 6), (5.0, 8), (-35.0, 4))
 
 RED, GREEN, BLUE = (1.0, 0.05, 0.03), (0.06, 0.9, 0.12), (0.05, 0.12, 1.0)
@@ -31,7 +31,7 @@ COOL, DARK = (0.45, 0.6, 1.0), (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class StageLight:
-    """A named light: what its file holds [H, 2H, 3], and the factor that makes it what falls on the person."""
+    """A named light: the map of its file [H, 2H, 3], and the factor to radiance."""
 
     name: str
     file_radiance: NDArray[np.float32]
@@ -39,12 +39,12 @@ class StageLight:
 
     @cached_property
     def radiance(self) -> Floats:
-        """[H, 2H, 3]; the same array every time, by which a set knows its lights."""
+        """[H, 2H, 3]; always the same array, by which ``RenderSet`` identifies lights."""
         return self.file_radiance.astype(np.float64) * self.scale
 
 
 def module_directions() -> Floats:
-    """Unit vectors [19, 3] from the person to the modules, ring by ring from the top."""
+    """Unit vectors [19, 3] from the person to the modules, by rings from the top."""
     result = []
     for elevation, count in RINGS:
         azimuth = np.pi / 2 + 2 * np.pi * np.arange(count) / count
@@ -56,7 +56,7 @@ def module_directions() -> Floats:
 
 
 def coloured() -> dict[str, Floats]:
-    """Amplitudes [19, 3] of the eight coloured lights; each has its own colours *and* its own directions."""
+    """Amplitudes [19, 3] of the eight coloured lights."""
     d = module_directions()
     front, left, up = d[:, 2], d[:, 0], d[:, 1]  # +X is the person's left
     hue = np.arctan2(front, left)
@@ -85,13 +85,7 @@ def spherical_gaussians(amplitudes: Floats, height: int = MAP_HEIGHT) -> NDArray
 
 
 def stage_lights(hdr_files: tuple[Path, ...] = ()) -> list[StageLight]:
-    """White, the eight coloured ones, and each of ``hdr_files`` by its stem.
-
-    All are exposed alike, without a test image: the strongest channel's mean radiance is ``EXPOSURE``.
-
-    Raises:
-        InputError: an HDR that cannot be read, gives no light, or shares a name.
-    """
+    """White, the eight coloured lights, and each of ``hdr_files`` by its stem, all of mean radiance ``EXPOSURE``."""
     amplitudes = {WHITE: np.ones((len(module_directions()), 3)), **coloured()}
     lights = [_exposed(name, spherical_gaussians(values)) for name, values in amplitudes.items()]
     for path in hdr_files:

@@ -1,4 +1,4 @@
-"""The manifest of a capture: capture.json, the README with its provenance, the contact sheet."""
+"""The manifest of a capture: capture.json, a README with its provenance, a contact sheet."""
 
 from __future__ import annotations
 
@@ -30,10 +30,9 @@ _TILE, _COLUMNS = 128, 10  # pixels, images in a row
 
 
 def write_manifest(production: Production, folder: Path, variant: str, cpu_seconds_per_image: float | None) -> bool:
-    """Write the manifest when every image of every shard is there; False when some are missing.
+    """Write the manifest if no image is missing; return whether it was written.
 
-    Where nothing was rendered, ``cpu_seconds_per_image`` is None: an existing capture.json and README, which have
-    machine and cost, stay.
+    If ``cpu_seconds_per_image`` is None, nothing was rendered: existing capture.json and README are kept.
     """
     if any(missing(folder, view, production.recipe.visibility) for view in production.views):
         return False
@@ -67,7 +66,7 @@ def write_manifest(production: Production, folder: Path, variant: str, cpu_secon
 
 
 def contact_sheet(folder: Path) -> None:
-    """``contact.png``: a row of each split, and the train camera's normals, albedo and roughness."""
+    """``contact.png``: a row for each split, and the train camera's normals and albedo."""
     capture = load_capture(folder)
     rows = []
     for split in ("train", "novel_view", "novel_pose", "relight"):

@@ -1,4 +1,4 @@
-"""What is rendered: the recipe of a capture, its splits, its images and their files."""
+"""The recipe of a capture, its splits, images and files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRAIN_CAMERA = "cam00"
 
 
 def check_step(step: float | None) -> None:
-    """Refuse metres between vertices that no person can be meshed with."""
+    """Refuse distances between vertices outside 1 mm to 3 cm."""
     check_option(step is None or 1e-3 <= step <= 0.03, "--step", "0.001 to 0.03 m", step)
 
 
@@ -73,10 +73,7 @@ class Recipe:
 
 @dataclass(frozen=True)
 class View:
-    """One camera at one instant, under one or more lights, each for a split.
-
-    ``frame`` indexes the motion.
-    """
+    """One camera at one frame of the motion, under one or more lights, each for a split."""
 
     camera: str
     frame: int
@@ -95,7 +92,7 @@ class View:
         return f"images/{light}/{self.name}.png"
 
     def truth_files(self, visibility: bool) -> list[str]:
-        """Everything beside the images themselves."""
+        """All files but the images."""
         files = [f"{kind}/{self.name}.png" for kind in ("masks", "normals_gt", "albedo", "roughness")]
         files.append(f"depth/{self.name}.exr")
         if self.trains:
@@ -105,7 +102,7 @@ class View:
         return files
 
     def records(self, *, estimated: bool) -> Iterator[Frame]:
-        """The rows of capture.json; ``estimated`` ones train on the estimated mask."""
+        """The frames of capture.json; with ``estimated`` masks of the train split."""
         for split, light in self.uses:
             exact = f"normals_gt/{self.name}.png"
             train = split == "train"
@@ -123,17 +120,17 @@ class View:
 
 
 def instants(recipe: Recipe, frame_count: int) -> list[int]:
-    """Indices into the motion, evenly spread; fewer than asked where the motion is shorter."""
+    """Evenly spaced indices into the motion, at most all."""
     count = min(recipe.frames, frame_count)
     return [int(i) for i in np.unique(np.round(np.linspace(0, frame_count - 1, count)).astype(int))]
 
 
 def plan(recipe: Recipe, frames: list[int], cameras: list[str], lights: list[str]) -> list[View]:
-    """Every view, instant by instant.
+    """Every view, by instants.
 
-    As in the paper: the first four fifths of one camera's frames train, under white light. Those instants from all
-    other cameras are the novel views; the last fifth from every camera are the novel poses, and from some cameras,
-    under the other lights, the relit images.
+    As in the paper, the first four fifths of one camera's frames under white light train. These instants from all
+    other cameras are the novel views; the last fifth from every camera are the novel poses, and from some cameras
+    under the other lights the relit images.
     """
     split_at = max(1, int(TRAIN_SHARE * len(frames)))
     spread = np.linspace(0, len(cameras), min(recipe.relight_cameras, len(cameras)), endpoint=False)
@@ -158,11 +155,10 @@ def plan(recipe: Recipe, frames: list[int], cameras: list[str], lights: list[str
 
 
 def image_count(views: list[View]) -> int:
-    """Number of path-traced images, without the truths."""
     return sum(len(view.uses) for view in views)
 
 
 def missing(folder: Path, view: View, visibility: bool) -> bool:
-    """Whether any file of ``view`` is not there yet; files appear whole or not at all."""
+    """Whether any file of ``view`` is missing."""
     names = [*view.truth_files(visibility), *(view.image(light) for _, light in view.uses)]
     return not all((folder / name).exists() for name in names)

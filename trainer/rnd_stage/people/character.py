@@ -1,4 +1,4 @@
-"""A rigged, textured character as its file holds it, and this project's .npz layout of one.
+"""A rigged, textured character, and this project's .npz layout of one.
 
 The .npz has ``vertices``, ``faces``, ``uv``, ``face_uv``, ``material``, ``material_names``, ``textures``, ``weights``,
 ``joint_names``, ``parents`` and ``joints``.
@@ -20,12 +20,12 @@ from rnd_runtime.core.npz import Npz
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MAX_VERTICES = 60_000  # before triangles are halved for the sake of their textures
+MAX_VERTICES = 60_000  # triangles are subdivided below half of it, to resolve textures
 
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """What a file holds, one texture coordinate to a vertex.
+    """A character, one texture coordinate per vertex.
 
     Attributes:
         vertices: [V, 3] m; faces: [F, 3]; weights: [V, J].
@@ -82,10 +82,10 @@ def read_npz(path: Path) -> Character:
 def _finer(
     vertices: Floats, faces: Ints, values: dict[str, Floats], material: Ints
 ) -> tuple[Floats, Ints, dict[str, Floats], Ints]:
-    """Triangles cut in four until there are vertices enough to hold the textures."""
+    """Triangles subdivided until the vertices resolve the textures."""
     while len(vertices) < MAX_VERTICES / 2:
         vertices, faces, values = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=values)
-        material = np.repeat(material, 4)  # the four parts of a triangle follow each other
+        material = np.repeat(material, 4)  # the four parts of a triangle are consecutive
     return vertices, faces, values, material
 
 

@@ -1,7 +1,7 @@
-"""Rigged, textured characters of other makers, brought to the stage: SMPL's joints, a T-pose, the stage's cloth.
+"""Rigged, textured characters on the stage: with SMPL's joints, in a T-pose, with simulated cloth.
 
-Files are .npz (``.character``) or skinned glTF (``.gltf``). Joints are known by their usual names (Mixamo's, CMU's,
-SMPL's); others pass their weights to the nearest known ancestor.
+Files are .npz (``.character``) or skinned glTF (``.gltf``). Joints are identified by their names (Mixamo's, CMU's,
+SMPL's); the weights of others go to their nearest known ancestor.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ SKIN = re.compile(r"skin|body", re.I)
 SHOES = re.compile(r"shoe|boot", re.I)
 HAIR = re.compile(r"hair|braid|short0|long0|bob0|pony|afro", re.I)
 ROUGHNESS = ((SKIN, 0.45), (SHOES, 0.40), (re.compile(r"eye", re.I), 0.35), (UNWORN, 0.52), (CLOTH, 0.80))
-OVER, UNDER = 0.03, 0.01  # m that a cover may be above, or below where it comes through
-ASIDE = 0.012  # m from a point's normal to the covering vertex: the usual distance of these
-SUNK = 0.012  # m that what is covered is sunk: cloth may move 7 mm inwards
-RIM = (0.012, 0.03)  # m from what is bare over which it sinks
-CLEAR = 0.5  # opacity below which a triangle of a hair card is left out
+OVER, UNDER = 0.03, 0.01  # m; range of a cover above and below a covered point
+ASIDE = 0.012  # m; largest distance of the covering vertex from the point's normal
+SUNK = 0.012  # m by which covered skin is moved inwards; cloth may move 7 mm inwards
+RIM = (0.012, 0.03)  # m from bare skin over which the displacement rises
+CLEAR = 0.5  # opacity below which triangles are dropped
 RADIUS, SLACK, GAP = 0.015, 0.035, 0.010  # of the cloth: m, share, m
 WELD = 1e-5  # m
-HEIGHTS = (0.4, 2.6)  # m: others are in centimetres, or on the ground
+HEIGHTS = (0.4, 2.6)  # m
 
-# what a joint of SMPL is called elsewhere, left side; lower case, without "mixamorig:" and punctuation
+# other names of SMPL's joints, left side; lower case, without "mixamorig:" and punctuation
 _ALIASES = {
     "pelvis": ("hips", "hip", "root"),
     "spine1": ("lowerback",),
@@ -60,7 +60,7 @@ _ALIASES = {
     "left_hand": ("leftfingerbase", "lefthandmiddle1", "lefthandindex1"),
 }
 
-# joints that a file may lack: their position follows from the bone before them, by a share of its length
+# joints that may be missing: (parent, its parent, extrapolation by this share of the bone)
 _SPARE = {
     "left_hand": ("left_wrist", "left_elbow", 0.3),
     "right_hand": ("right_wrist", "right_elbow", 0.3),
@@ -71,12 +71,9 @@ _SPARE = {
 
 
 def load_character(path: Path) -> Dressed:
-    """Read a character and make it ready for the stage.
+    """Read a character and prepare it for the stage.
 
-    Its template is its own surface without hair, eyes and lashes: what lies under its clothes is not in the file.
-
-    Raises:
-        InputError: unreadable, or without the joints of a person.
+    Its template is its own surface without hair, eyes and lashes; the body under its clothes is unknown.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -89,7 +86,7 @@ def load_character(path: Path) -> Dressed:
 
 
 def dress_character(character: Character, path: Path) -> Dressed:
-    """Rename the joints, stand in a T-pose, weld, and give cloth its freedom."""
+    """Map the joints to SMPL's, pose in a T-pose, weld vertices, and set up the cloth."""
     groups, joints = _smpl_joints(character, path)
     weights = character.weights @ groups
     weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
@@ -141,10 +138,7 @@ def dress_character(character: Character, path: Path) -> Dressed:
 
 
 def _tucked_in(vertices: Floats, faces: Ints, weights: Floats, of_vertex: Ints, materials: tuple[str, ...]) -> Floats:
-    """The vertices with skin below clothes and shoes, shoes below trousers, and the scalp below hair sunk a little.
-
-    Makers cut clothes for the rest pose only; in others the skin would come through them.
-    """
+    """Vertices with covered skin, shoes and scalp moved inwards, so that they do not penetrate covers when posed."""
 
     def named(pattern: re.Pattern[str]) -> NDArray[np.bool_]:
         return np.array([bool(pattern.search(name)) for name in materials])[of_vertex]
@@ -172,7 +166,7 @@ def _tucked_in(vertices: Floats, faces: Ints, weights: Floats, of_vertex: Ints, 
 
 
 def _smpl_joints(character: Character, path: Path) -> tuple[Floats, Floats]:
-    """[J, 24] ones where a joint of the file belongs to one of SMPL's, and SMPL's joints at rest [24, 3] m."""
+    """Assignment [J, 24] of the file's joints to SMPL's, and SMPL's joints at rest [24, 3] m."""
     plain = [re.sub(r"mixamorig|[^a-z0-9]", "", name.lower()) for name in character.joint_names]
     known = _known_names(plain)
     own = [SMPL_NAMES.index(known[name]) if name in known else -1 for name in plain]
@@ -197,7 +191,7 @@ def _smpl_joints(character: Character, path: Path) -> tuple[Floats, Floats]:
 
 
 def _known_names(plain: list[str]) -> dict[str, str]:
-    """What SMPL calls each of the file's joints ``plain`` (lower case, letters and digits)."""
+    """SMPL's names of joints ``plain`` (lower case, letters and digits)."""
     own = {name.replace("_", ""): name for name in SMPL_NAMES}
     if set(own) <= set(plain):
         return own
@@ -205,7 +199,7 @@ def _known_names(plain: list[str]) -> dict[str, str]:
     for smpl, names in _ALIASES.items():
         for side in ("left", "right"):
             known |= {name.replace("left", side): smpl.replace("left", side) for name in names}
-    if "lowerback" in plain:  # CMU's spine begins with it, Mixamo counts from 0
+    if "lowerback" in plain:  # CMU; Mixamo's spine counts from 0
         known |= {"spine": "spine2", "spine1": "spine3"}
     else:
         known |= {"spine": "spine1", "spine1": "spine2", "spine2": "spine3"}
@@ -213,7 +207,7 @@ def _known_names(plain: list[str]) -> dict[str, str]:
 
 
 def _t_pose(vertices: Floats, weights: Floats, joints: Floats) -> tuple[Floats, Floats]:
-    """The character with straight, level arms and upright legs, which is what SMPL's poses start from."""
+    """Vertices and joints in SMPL's rest pose: straight, level arms and upright legs."""
     skeleton = smpl_skeleton(joints)
     rotations = np.tile(np.eye(3), (len(SMPL_NAMES), 1, 1))
     limbs = [("shoulder", "elbow", "arm"), ("elbow", "wrist", "arm"), ("hip", "knee", "leg"), ("knee", "ankle", "leg")]
@@ -246,7 +240,7 @@ def _between(a: Floats, b: Floats) -> Floats:
 
 
 def _roughness(character: Character, of_vertex: Ints, colour: Floats) -> Floats:
-    """By the material's name, a little lower where it is darker than its mean (worn, oily) and higher where paler."""
+    """Roughness by the material's name, lower where it is darker than its mean, higher where brighter."""
     base = np.array(
         [next((value for pattern, value in ROUGHNESS if pattern.search(name)), 0.7) for name in character.materials]
     )

@@ -1,10 +1,10 @@
-"""Cloth by position-based dynamics of points on the garments.
+"""Cloth by position-based dynamics of points on the garments, 1 cm apart.
 
-Müller et al., "Position based dynamics" (2007) with the compliance and small steps of Macklin et al. (XPBD, 2016;
-"Small steps", 2019). Points are about a centimetre apart. Springs to their neighbours, a little longer than at rest,
-resist stretching; weak ones across resist bending. Each point is tied softly to its skinned position, stays within its
-own radius of it, above the plane of the skin and outside the legs' capsules. Gravity and the skinned motion move the
-cloth, so that folds depend on pose and history. Cloth does not collide with cloth.
+Springs to neighbours resist stretching, weak ones to the next neighbours bending. Each point is softly attached to its
+skinned position, within a radius of it, above the plane of the skin and outside the legs' capsules. Cloth does not
+collide with cloth.
+
+Source: Müller et al., "Position based dynamics" (2007); Macklin et al., XPBD (2016) and "Small steps" (2019).
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ Ints = NDArray[np.int64]
 
 SPACING = 0.010  # m between simulated points
 SUBSTEPS = 10  # a frame at 30 fps
-WARM_UP = 1.0  # s: from the rest pose into the first pose, then hanging still
+WARM_UP = 1.0  # s: from the rest pose to the first pose, then at rest
 GRAVITY = 9.81
 STRETCH, BEND = 2e-8, 2e-5  # compliances, m/N for a unit mass
-TIE = 6e-4  # of the pull towards the skinned position where the radius is 2 cm; grows with the square of the radius
+TIE = 6e-4  # compliance of the attachment for a radius of 2 cm; proportional to the radius squared
 DRAG = 6.0  # 1/s, towards the skinned position's velocity
-SKIN_GAP = 0.003  # m that stays between cloth and body
-NEIGHBOURS = 4  # simulated points a vertex follows
-NEAR = 1.75 * SPACING  # m within which points are neighbours in the weave
+SKIN_GAP = 0.003  # m; least distance of cloth and body
+NEIGHBOURS = 4  # simulated points that move a vertex
+NEAR = 1.75 * SPACING  # m; largest distance of neighbours
 MIN_SPRINGS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Drape:
-    """How a garment's vertices may move: all [V].
+    """Limits of the motion of a garment's vertices: all [V].
 
     Attributes:
-        radius: m, the farthest a vertex moves from its skinned position; 0 for skin.
-        gap: m between the garment and the body below it, at rest.
-        slack: share by which its springs are longer than at rest.
-        piece: garments of different numbers are not joined.
-        hangs: what falls free of the legs and only meets them as capsules.
+        radius: m, largest distance from the skinned position; 0 for skin.
+        gap: m between the garment and the body at rest.
+        slack: share by which springs are longer than at rest.
+        piece: garments of different numbers are not connected.
+        hangs: vertices that collide with the legs' capsules.
     """
 
     radius: Floats
@@ -53,7 +53,7 @@ class Drape:
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """Legs as capsules: the joints that carry them [C], their ends at rest [C, 2, 3] m, their radii [C] m."""
+    """Legs as capsules: their joints [C], ends at rest [C, 2, 3] m, radii [C] m."""
 
     joints: Ints
     ends: Floats
@@ -61,12 +61,7 @@ class Capsules:
 
 
 class Cloth:
-    """The simulated points of one dressed surface.
-
-    Args:
-        vertices, normals: [V, 3] of the surface at rest; weights: [V, J] of its skinning.
-        drape: how it may move.
-    """
+    """The simulated points of a surface with ``vertices`` and ``normals`` [V, 3] at rest and ``weights`` [V, J]."""
 
     def __init__(
         self, vertices: Floats, normals: Floats, weights: Floats, drape: Drape, capsules: Capsules, seed: int = 0
@@ -81,16 +76,12 @@ class Cloth:
         self.follows, self.shares = _interpolation(vertices, drape, self.rest, drape.piece[chosen])
 
     def simulate(self, bones: NDArray[np.float32], fps: float, keep: list[int]) -> dict[int, Floats]:
-        """Displacements [P, 3] m from the skinned positions, of the frames ``keep``.
-
-        Args:
-            bones: [F, J, 3, 4] what skins each frame, from the first on; the person comes out of the rest pose before.
-        """
+        """Displacements [P, 3] m from the skinned positions in the frames ``keep``; ``bones`` [F, J, 3, 4]."""
         warm = max(2, round(WARM_UP * fps))
         identity = np.broadcast_to(np.eye(3, 4), bones.shape[1:])
         first, first_normals = self._skinned(bones[0])
         start, start_normals = self._skinned(identity)
-        start = start + first.mean(axis=0) - start.mean(axis=0)  # moved, not dragged, to where the motion begins
+        start = start + first.mean(axis=0) - start.mean(axis=0)
         rotation = _best_rotation(start, first)
         middle = first.mean(axis=0)
         start, start_normals = (start - middle) @ rotation.T + middle, start_normals @ rotation.T
@@ -116,7 +107,7 @@ class Cloth:
         return result
 
     def displaced(self, skinned: Floats, displacement: Floats) -> Floats:
-        """Skinned vertices [V, 3] moved along with the points: ``displacement`` [P, 3]."""
+        """Skinned vertices [V, 3] moved by the points' ``displacement`` [P, 3]."""
         moved = skinned.copy()
         free = self.shares[:, 0] > 0
         moved[free] += np.einsum("vk,vkc->vc", self.shares[free], displacement[self.follows[free]])
@@ -134,7 +125,7 @@ class Cloth:
 
 
 def _sampled(points: Floats, spacing: float, seed: int) -> Ints:
-    """Indices of a subset of ``points`` at least ``spacing`` apart that leaves no larger hole (dart throwing)."""
+    """Indices of a maximal subset of ``points`` at least ``spacing`` apart (dart throwing)."""
     order = np.random.default_rng(seed).permutation(len(points))
     near = cKDTree(points).query_ball_point(points, spacing)
     taken, blocked = [], np.zeros(len(points), bool)
@@ -146,7 +137,7 @@ def _sampled(points: Floats, spacing: float, seed: int) -> Ints:
 
 
 def _springs(points: Floats, normals: Floats, slack: Floats, piece: Ints) -> tuple[Ints, Floats, Floats]:
-    """Pairs [S, 2], their lengths [S] m and compliances [S]; shuffled once, so that no direction is solved first."""
+    """Pairs [S, 2], lengths [S] m and compliances [S], shuffled to avoid a bias of direction."""
     pairs = cKDTree(points).query_pairs(2.6 * SPACING, output_type="ndarray")
     i, j = pairs.T
     length = np.linalg.norm(points[i] - points[j], axis=1)
@@ -161,7 +152,7 @@ def _springs(points: Floats, normals: Floats, slack: Floats, piece: Ints) -> tup
 
 
 def _connected(points: Floats, normals: Floats, piece: Ints) -> NDArray[np.bool_]:
-    """Which points [P] have enough neighbours to hold them: a rim that faces another way would dangle from its edge."""
+    """Whether points [P] have at least ``MIN_SPRINGS`` neighbours of the same sheet."""
     pairs = cKDTree(points).query_pairs(NEAR, output_type="ndarray")
     pairs = pairs[_same_sheet(pairs, normals, piece)]
     return np.bincount(pairs.ravel(), minlength=len(points)) >= MIN_SPRINGS
@@ -173,7 +164,7 @@ def _same_sheet(pairs: Ints, normals: Floats, piece: Ints) -> NDArray[np.bool_]:
 
 
 def _interpolation(vertices: Floats, drape: Drape, points: Floats, piece: Ints) -> tuple[Ints, Floats]:
-    """Which simulated points [V, 4] each vertex follows, and by how much [V, 4]; rows of zeros where it does not."""
+    """The simulated points [V, 4] that move each vertex and their weights [V, 4], zero for fixed vertices."""
     follows = np.zeros((len(vertices), NEIGHBOURS), np.int64)
     shares = np.zeros((len(vertices), NEIGHBOURS))
     for number in np.unique(piece):
@@ -187,7 +178,7 @@ def _interpolation(vertices: Floats, drape: Drape, points: Floats, piece: Ints) 
 
 
 def _best_rotation(source: Floats, target: Floats) -> Floats:
-    """Rotation [3, 3] about the vertical that turns ``source`` onto ``target`` best (both centred)."""
+    """Least-squares rotation [3, 3] about the vertical of ``source`` onto ``target``, both centred."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     angle = np.arctan2((a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]).sum(), (a[:, 0] * b[:, 0] + a[:, 2] * b[:, 2]).sum())
     c, s = np.cos(angle), np.sin(angle)
@@ -201,7 +192,7 @@ def _advance(x, v, before, now, springs, bounds, body, duration):
     Args:
         before, now: skinned positions and normals [P, 3] at the frame's start and end.
         springs: pairs [S, 2], lengths [S] m, compliances [S].
-        bounds: how far each point may move m, its gap to the body m, whether it hangs free of a limb, [P] each.
+        bounds: radius m, gap m and hangs of ``Drape``, [P] each.
         body: axes [C, 2, 3] and radii [C] m of the capsules.
         duration: s.
     """
@@ -219,7 +210,7 @@ def _advance(x, v, before, now, springs, bounds, body, duration):
             px, py, pz = x[i, 0] - dx, x[i, 1] - dy, x[i, 2] - dz
             away = dx * (1 - tie), dy * (1 - tie), dz * (1 - tie)
             away = _above_skin(away, normal, gap[i])
-            if hangs[i]:  # sleeves and legs have their planes
+            if hangs[i]:
                 for c in range(len(body[0])):
                     away = _out_of(body[0][c], body[1][c], (px, py, pz), away, normal)
             away = _within(away, radius[i])
@@ -230,7 +221,7 @@ def _advance(x, v, before, now, springs, bounds, body, duration):
 
 @njit(inline="always")
 def _fall(x, v, old, before, now, duration, dt):
-    """Air that moves with the body drags, and weight pulls; the positions at which the step began go to ``old``."""
+    """Drag by air that moves with the body, and gravity; the positions before the step go to ``old``."""
     drag = 1.0 - np.exp(-DRAG * dt)
     for i in range(len(x)):
         for c in range(3):
@@ -244,7 +235,7 @@ def _fall(x, v, old, before, now, duration, dt):
 
 @njit(inline="always")
 def _pull(x, springs, dt):
-    """Each spring in turn towards its length, as far as its compliance lets it (XPBD, one iteration)."""
+    """One XPBD iteration over the springs."""
     pairs, lengths, compliances = springs
     for s in range(len(pairs)):
         i, j = pairs[s, 0], pairs[s, 1]
@@ -266,7 +257,7 @@ def _between(a, b, i, t):
 
 @njit(inline="always")
 def _above_skin(away, normal, gap):
-    """A displacement that does not reach through the skin below."""
+    """The displacement, limited to the outside of the skin's plane."""
     dx, dy, dz = away
     nx, ny, nz = normal
     deep = -(gap - SKIN_GAP) - (dx * nx + dy * ny + dz * nz)
@@ -279,7 +270,7 @@ def _above_skin(away, normal, gap):
 
 @njit(inline="always")
 def _out_of(axis, radius, anchor, away, normal):
-    """A displacement from ``anchor`` that does not end inside a capsule."""
+    """The displacement from ``anchor``, limited to the outside of a capsule."""
     dx, dy, dz = away
     ax, ay, az = axis[0, 0], axis[0, 1], axis[0, 2]
     bx, by, bz = axis[1, 0] - ax, axis[1, 1] - ay, axis[1, 2] - az
@@ -289,7 +280,7 @@ def _out_of(axis, radius, anchor, away, normal):
     ex, ey, ez = qx - share * bx, qy - share * by, qz - share * bz
     inside = radius * radius - (ex * ex + ey * ey + ez * ez)
     if inside > 0.0:
-        # out of the leg and away from the body: straight out of the axis would tear a skirt at a knee
+        # a push along the axis' normal alone would tear a skirt at a knee
         mx, my, mz = ex + 2 * radius * normal[0], ey + 2 * radius * normal[1], ez + 2 * radius * normal[2]
         norm = np.sqrt(mx * mx + my * my + mz * mz)
         mx, my, mz = mx / norm, my / norm, mz / norm
@@ -303,7 +294,7 @@ def _out_of(axis, radius, anchor, away, normal):
 
 @njit(inline="always")
 def _within(away, radius):
-    """A displacement no longer than ``radius``."""
+    """The displacement, limited to ``radius``."""
     dx, dy, dz = away
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     if length > radius:

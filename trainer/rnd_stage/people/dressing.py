@@ -1,4 +1,4 @@
-"""A dressed person: one closed surface over a template, its skinning, its look, and how its cloth may move."""
+"""A dressed person: one closed surface over a template, its skinning, materials and cloth."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Dressed:
-    """A person at rest, ready to be moved.
+    """A dressed person at rest.
 
     Attributes:
-        body: the unclothed template, which is what a trainer is given.
+        body: the unclothed template.
         vertices: [V, 3] m; faces: [F, 3]; weights: [V, J] skinning.
         colour: [V, 3] linear albedo; roughness: [V].
-        drape: how the cloth may move; capsules: what keeps it out of the legs.
+        drape, capsules: parameters of the cloth.
     """
 
     body: Body
@@ -48,11 +48,7 @@ class Dressed:
 
 
 class Wearer:
-    """A dressed person in motion: cloth is simulated once, from the first frame on, for all frames that are asked for.
-
-    Args:
-        frames: indices into ``motion`` that ``surface`` may be asked for.
-    """
+    """A dressed person in motion; cloth is simulated once, from the first frame on, for all ``frames``."""
 
     def __init__(self, dressed: Dressed, motion: Motion, frames: list[int]) -> None:
         self.dressed, self.motion = dressed, motion
@@ -65,7 +61,7 @@ class Wearer:
             self._moves = self._cloth.simulate(self._bones, motion.fps, frames)
 
     def surface(self, frame: int) -> Surface:
-        """The posed, draped surface of one frame, in the world."""
+        """The posed surface with cloth of one of ``frames``, in the world."""
         d = self.dressed
         blend = np.tensordot(d.weights, self._bones[frame].astype(np.float64), axes=1)
         vertices = np.einsum("vij,vj->vi", blend[:, :, :3], d.vertices) + blend[:, :, 3]
@@ -75,10 +71,9 @@ class Wearer:
 
 
 def dress(subject: PersonDesign, step: float = 0.005, template: Body | None = None) -> Dressed:
-    """Mesh, skin and paint ``subject``; ``step`` is the distance of its vertices in metres.
+    """Mesh, skin and paint ``subject`` with vertices ``step`` metres apart.
 
-    The clothes are cut on the template; then body, joints and clothes take on the subject's shape together.
-    ``template`` is ``.template.template_body``'s, for who has it already.
+    Clothes are made on the template, by default ``template_body()``, and warped to the subject's shape with it.
     """
     garments, shape = subject.garments, subject.shape
     garments = replace(garments, shell=max(garments.shell, 1.7 * step))
@@ -126,7 +121,7 @@ def _drape(body: Body, vertices: Floats, normals: Floats, material: Ints, garmen
 
 
 def _hang_free(vertices: Floats, material: Ints, weights: Floats, garments: Garments) -> Floats:
-    """Skirts follow the pelvis and a little of the nearer thigh, smoothly across the middle; hair follows the head."""
+    """Weights with skirts bound to the pelvis and the thighs, smoothly across the middle, and hair to the head."""
     weights = weights.copy()
     x, y = vertices[:, 0], vertices[:, 1]
     pelvis, left, right, head = (SMPL_NAMES.index(n) for n in ("pelvis", "left_hip", "right_hip", "head"))
@@ -158,7 +153,7 @@ def _leg_capsules(body: Body, limbs: float) -> Capsules:
 
 
 def transferred_weights(body: Body, vertices: Floats, faces: Ints) -> Floats:
-    """Skinning weights [V, 24] from the nearest template vertices of the same side, smoothed over the cloth."""
+    """Skinning weights [V, 24] of the nearest template vertices of the same side, smoothed over the surface."""
     weights = np.zeros((len(vertices), len(body.skeleton)))
     for sign in (-1, 1):
         here = sign * vertices[:, 0] >= 0

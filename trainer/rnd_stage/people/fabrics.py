@@ -1,7 +1,6 @@
-"""Procedural cloth: linear colour, roughness and relief as functions of cloth coordinates.
+"""Procedural fabrics: linear colour [N, 3], roughness [N] and relief [N] m as functions of cloth coordinates.
 
-``u`` runs around the body or limb, ``v`` along it, both in metres of the template's rest pose; a pattern continues from
-the shoulder down the sleeve. Every fabric returns colour [N, 3], roughness [N] and relief [N] m.
+``u`` is around the body or limb, ``v`` along it, both in metres of the template's rest pose.
 """
 
 from __future__ import annotations
@@ -20,34 +19,25 @@ Kind = Literal["plaid", "print", "denim", "knit", "stripes", "dots", "plain"]
 
 @dataclass(frozen=True)
 class Fabric:
-    """A kind of cloth and its three colours (linear): ground, second, accent."""
+    """A kind of fabric, its three linear colours, and the scale of its pattern."""
 
     kind: Kind
     ground: Colour
     second: Colour
     accent: Colour
     scale: float = 1.0
-    """of the pattern"""
 
 
 def weave(fabric: Fabric, u: Floats, v: Floats, seed: int) -> Look:
     """The look of ``fabric`` at ``u``, ``v`` [N]."""
     u, v = u / fabric.scale, v / fabric.scale
-    painted = {
-        "plaid": _plaid,
-        "print": _print,
-        "denim": _denim,
-        "knit": _knit,
-        "stripes": _stripes,
-        "dots": _dots,
-        "plain": _plain,
-    }[fabric.kind](fabric, u, v, seed)
-    colour, roughness, relief = painted
+    kinds = {"plaid": _plaid, "print": _print, "denim": _denim, "knit": _knit, "stripes": _stripes, "dots": _dots}
+    colour, roughness, relief = kinds.get(fabric.kind, _plain)(fabric, u, v, seed)
     return colour, roughness, relief * fabric.scale
 
 
 def blend(colour: Floats, over: Floats | Colour, amount: NDArray[np.floating]) -> Floats:
-    """``colour`` [N, 3] with ``over`` laid on by ``amount`` [N]."""
+    """``colour`` [N, 3] mixed with ``over`` by ``amount`` [N]."""
     return colour + amount[:, None] * (np.asarray(over, np.float64) - colour)
 
 
@@ -69,7 +59,7 @@ def _filled(colour: Colour, like: Floats) -> Floats:
 
 
 def _plaid(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
-    """A sett of 84 mm: broad stripes both ways that darken where they cross, a fine accent over them."""
+    """A sett of 84 mm: broad stripes in both directions, darker where they cross, and a fine accent."""
     del seed
 
     def threads(t: Floats) -> tuple[Floats, Floats]:
@@ -85,7 +75,7 @@ def _plaid(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
 
 
 def _print(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
-    """Five-petalled flowers of two colours with leaves, one to a jittered cell of 62 mm; ink is smoother than cloth."""
+    """Five-petalled flowers of two colours with leaves, one in each jittered cell of 62 mm; ink is smoother."""
     cell = 0.062
     row = np.floor(v / cell)
     shifted = u / cell + 0.5 * np.mod(row, 2)
@@ -109,7 +99,7 @@ def _print(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
 
 
 def _denim(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
-    """Twill of blue over white, unevenly washed: what is paler is also a little smoother."""
+    """Twill of blue over white, unevenly washed; paler parts are smoother."""
     wash = np.clip(0.25 + 0.30 * mottle(u + seed, v, 0.09) + 0.22 * mottle(3 * u, v, 0.02), 0, 1)
     colour = blend(_filled(f.ground, u), f.second, 0.55 * wash)
     twill = 1 + 0.10 * np.sin(700 * (u + v)) * np.sin(260 * v)
@@ -142,7 +132,7 @@ def _stripes(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
 
 
 def _dots(f: Fabric, u: Floats, v: Floats, seed: int) -> Look:
-    """Dots of 14 mm, every fourth in the accent, glossy as rubber print."""
+    """Glossy dots of 14 mm, every fourth in the accent."""
     cell = 0.036
     row = np.floor(v / cell)
     shifted = u / cell + 0.5 * np.mod(row, 2)

@@ -1,7 +1,7 @@
-"""The person: 1.75 m tall, seven and a half heads, in a T-pose facing +Z with the soles on y = 0.
+"""The person: 1.75 m tall, in a T-pose facing +Z with the soles on y = 0.
 
-Lengths come from the usual proportions of artists' anatomy (head = height / 7.5, crotch near the middle, arm span =
-height, foot = 0.15 height), widths from round adult figures. Only the left half (x >= 0) is written down.
+Proportions are those of artists' anatomy (head = height / 7.5, arm span = height, foot = 0.15 height). Only the left
+half (x >= 0) is given.
 """
 
 from __future__ import annotations
@@ -34,14 +34,10 @@ JOINTS = {  # rest positions in metres; right_* are mirrored
 
 @cache
 def person() -> SolidModel:
-    """All solids of the body; the same object every time, not to be changed."""
+    """All solids of the body; shared, not to be changed."""
     figure = SolidModel()
-    _torso(figure)
-    _leg(figure)
-    _foot(figure)
-    _arm(figure)
-    _hand(figure)
-    _head(figure)
+    for part in (_torso, _leg, _foot, _arm, _hand, _head):
+        part(figure)
     return figure
 
 

@@ -1,7 +1,6 @@
-"""Even triangles of a wanted size: Botsch and Kobbelt, "A remeshing approach to multiresolution modeling" (2004).
+"""Isotropic remeshing of half a symmetric body that is open along x = 0; vertices of that seam remain on it.
 
-Long edges are split, short ones collapsed, edges flipped towards six neighbours, and vertices slid along the surface.
-The input is half a symmetric body, open along x = 0: vertices of that seam stay on it, so that the mirrored half fits.
+Source: Botsch and Kobbelt, "A remeshing approach to multiresolution modeling" (2004).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ Ints = NDArray[np.int64]
 def remesh(
     vertices: Floats, faces: Ints, size: Callable[[Floats], Floats], project: Callable[[Floats], Floats], rounds: int
 ) -> tuple[Floats, Ints]:
-    """Triangles with edges of about ``size(points)`` metres on the surface that ``project`` moves points to."""
+    """Triangles with edges of about ``size(points)`` metres on the surface onto which ``project`` moves points."""
     for _ in range(rounds):
         mesh = _Mesh(vertices, faces, size(vertices))
         mesh.split()
@@ -34,8 +33,8 @@ def remesh(
 def mirror(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     """Both halves of a mesh that is open at x = 0, welded there."""
     n, seam = len(vertices), vertices[:, 0] == 0.0
-    twin = np.where(seam, np.arange(n), n + np.cumsum(~seam) - 1)
-    return np.vstack([vertices, vertices[~seam] * [-1, 1, 1]]), np.vstack([faces, twin[faces[:, ::-1]]])
+    mirrored = np.where(seam, np.arange(n), n + np.cumsum(~seam) - 1)
+    return np.vstack([vertices, vertices[~seam] * [-1, 1, 1]]), np.vstack([faces, mirrored[faces[:, ::-1]]])
 
 
 def vertex_normals(vertices: Floats, faces: Ints) -> Floats:
@@ -68,7 +67,7 @@ def _slide(vertices: Floats, faces: Ints, project: Callable[[Floats], Floats]) -
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
         step = neighbours @ vertices / neighbours.sum(axis=1)[:, None] - vertices
         step -= np.sum(step * normals, axis=1, keepdims=True) * normals
-        step[seam] *= [0.0, 0.5, 0.5]  # the seam sees neighbours on one side only
+        step[seam] *= [0.0, 0.5, 0.5]  # the seam has neighbours on one side only
         vertices = vertices + 0.6 * step
     vertices = project(vertices)
     vertices[seam, 0] = 0.0
@@ -76,7 +75,7 @@ def _slide(vertices: Floats, faces: Ints, project: Callable[[Floats], Floats]) -
 
 
 class _Mesh:
-    """Triangles that can be edited: for every vertex the set of its faces."""
+    """Editable triangles, with the set of faces of every vertex."""
 
     def __init__(self, vertices: Floats, faces: Ints, sizes: Floats) -> None:
         self.points = list(vertices)
@@ -89,7 +88,7 @@ class _Mesh:
                 self.around[v].add(i)
 
     def split(self) -> None:
-        """Cut edges longer than 4/3 of the wanted length in two."""
+        """Split edges longer than 4/3 of the target length."""
         for a, b in self._edges():
             if self._length(a, b) <= 4 / 3 * self._size(a, b):
                 continue
@@ -105,7 +104,7 @@ class _Mesh:
                 self._append(tuple(middle if v == a else v for v in face))
 
     def collapse(self) -> None:
-        """Merge the ends of edges shorter than 4/5 of the wanted length where that keeps a manifold."""
+        """Collapse edges shorter than 4/5 of the target length where the mesh remains a manifold."""
         for a, b in sorted(self._edges(), key=lambda e: self._length(*e)):
             shared = self.around[a] & self.around[b]
             if not shared or self._length(a, b) >= 4 / 5 * self._size(a, b):
@@ -126,7 +125,7 @@ class _Mesh:
             self.points[a] = target
 
     def flip(self) -> None:
-        """Turn edges where that brings the four vertices closer to six neighbours (four on the seam)."""
+        """Flip edges where that brings the four vertices closer to six neighbours (four on the seam)."""
         for a, b in self._edges():
             shared = list(self.around[a] & self.around[b])
             if len(shared) != 2:
@@ -154,7 +153,7 @@ class _Mesh:
             self._replace(shared[1], new[1])
 
     def arrays(self) -> tuple[Floats, Ints]:
-        """Vertices and faces, without what collapses left behind."""
+        """Used vertices and their faces."""
         faces = np.array([f for f in self.faces if f is not None], np.int64)
         used, faces = np.unique(faces, return_inverse=True)
         return np.array(self.points)[used], faces.reshape(-1, 3)
@@ -181,7 +180,7 @@ class _Mesh:
         return np.array([by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx])
 
     def _spoils(self, moved: int, other: int, target: Floats) -> bool:
-        """Whether moving one end of a collapsing edge to ``target`` turns a face over or makes an edge too long."""
+        """Whether moving one end of a collapsing edge to ``target`` inverts a face or makes an edge too long."""
         if any(np.linalg.norm(self.points[n] - target) > 4 / 3 * self._size(n, moved) for n in self._neighbours(moved)):
             return True
         old = self.points[moved]

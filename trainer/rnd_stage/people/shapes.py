@@ -17,7 +17,7 @@ SHOULDER, ARM_HEIGHT, ARM_DEPTH = JOINTS["left_shoulder"][0], 1.416, -0.02
 
 @dataclass(frozen=True)
 class Shape:
-    """How a body differs from the template: factors on lengths across, and metres that belly and bust add."""
+    """A body's difference from the template: factors on lengths across, and metres added by belly and bust."""
 
     height: float = 1.0
     shoulders: float = 1.0
@@ -57,5 +57,5 @@ class Shape:
         return self.height * np.stack([new_x, new_y, new_z], axis=1)
 
     def _shoulder_scale(self, across: Floats, y: Floats) -> Floats:
-        """Arms hang on the shoulders: at their height the scale is the shoulders' all over."""
+        """The scale across, at the arms' height that of the shoulders."""
         return across + (self.shoulders - across) * ramp(y, 1.33, 1.40) * ramp(y, 1.50, 1.47)

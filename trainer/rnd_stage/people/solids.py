@@ -1,9 +1,7 @@
-"""Signed distances (metres, negative inside) of solids that blend smoothly into one another.
+"""Signed distances (metres, negative inside) of smoothly blended solids, mirrored at x = 0.
 
-Three solids are enough for a person: the rounded cone, the ellipsoid, and the *loft*, a tube whose cross-section
-is a superellipse given by a table along its axis. Everything is mirrored at x = 0: solids describe the left half
-(x >= 0) and the middle. The distances are exact to first order at the surface, which is what meshing and
-projection need.
+Solids are rounded cones, ellipsoids, and *lofts*: tubes whose cross-section is a superellipse given by a table along
+the axis. Distances are exact to first order at the surface.
 """
 
 from __future__ import annotations
@@ -25,20 +23,20 @@ LOFT_SAMPLES = 128
 
 @dataclass
 class SolidModel:
-    """An ordered list of solids, each with a part name and the radius over which it blends with those before."""
+    """An ordered list of solids, each with a part name and the radius of its blend with those before."""
 
     rows: list[list[float]] = field(default_factory=list)
     parts: list[str] = field(default_factory=list)
     lofts: list[Floats] = field(default_factory=list)
 
     def cone(self, part: str, a: tuple, ra: float, b: tuple, rb: float, blend: float, cut: bool = False) -> None:
-        """The hull of two balls: centres ``a``, ``b`` and radii in metres. ``cut`` takes it away instead."""
+        """The hull of two balls: centres ``a``, ``b`` and radii in metres; ``cut`` subtracts it."""
         self._add(part, CONE, [*a, ra, *b, rb], blend, cut)
 
     def ellipsoid(
         self, part: str, centre: tuple, radii: tuple, blend: float, *, tilt: tuple = (0, 0, 0), cut: bool = False
     ) -> None:
-        """An ellipsoid turned by ``tilt`` (Euler XYZ, degrees) about its centre."""
+        """An ellipsoid rotated by ``tilt`` (Euler XYZ, degrees) about its centre."""
         self._add(part, ELLIPSOID, [*centre, *radii, *np.radians(tilt)], blend, cut)
 
     def loft(self, part: str, axis: str, rows: list[tuple], blend: float) -> None:
@@ -64,7 +62,7 @@ class SolidModel:
 
 
 def smooth_min(a: Floats, b: Floats, blend: float) -> Floats:
-    """The smaller of two distances, rounded where they differ by less than ``blend`` (quadratic polynomial)."""
+    """Smooth minimum of two distances (quadratic polynomial), over differences below ``blend``."""
     h = np.maximum(blend - np.abs(a - b), 0.0) / blend
     return np.minimum(a, b) - h * h * blend / 4
 
@@ -85,9 +83,9 @@ def project(distance, points: Floats, steps: int = 3) -> Floats:
 
 
 def surface(distance, low: tuple, high: tuple, step: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Marching cubes over a box: vertices [V, 3] and faces [F, 3], seen from outside counter-clockwise.
+    """Marching cubes over a box: vertices [V, 3] and faces [F, 3], counter-clockwise from outside.
 
-    Only cells near the surface are evaluated: a grid four times coarser says which.
+    Only cells near the surface of a grid four times coarser are evaluated.
     """
     coarse = 4 * step
     counts = np.ceil((np.array(high) - low) / coarse).astype(int) + 1
@@ -102,7 +100,7 @@ def surface(distance, low: tuple, high: tuple, step: float) -> tuple[Floats, NDA
 
 @njit(cache=True, fastmath=True)
 def _cone(x, y, z, q):
-    """Distance to the ball of linearly growing radius along a segment (parameter taken at the foot point)."""
+    """Distance to a ball of linearly growing radius along a segment, at the point's projection."""
     dx, dy, dz = q[4] - q[0], q[5] - q[1], q[6] - q[2]
     length2 = dx * dx + dy * dy + dz * dz + 1e-12
     t = ((x - q[0]) * dx + (y - q[1]) * dy + (z - q[2]) * dz) / length2

@@ -1,4 +1,4 @@
-"""People made by code: four composed by hand, and random ones."""
+"""People made by code: four designed by hand, and random ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .shapes import Shape
 
 @dataclass(frozen=True)
 class PersonDesign:
-    """A person: body, cut of the clothes, what everything is made of."""
+    """A person: body shape, clothes, materials."""
 
     title: str
     shape: Shape
@@ -25,11 +25,7 @@ class PersonDesign:
 
 
 def subject(seed: int) -> PersonDesign:
-    """Seeds 0 to 3 are composed by hand; every other is sampled from the same vocabulary.
-
-    Raises:
-        InputError: a negative seed.
-    """
+    """The person of a seed: 0 to 3 are designed by hand, others random."""
     if seed < 0:
         raise InputError("--subject", expected="0 or more", got=seed)
     chosen = (_lumberjack, _flowers, _knitwear, _summer)
@@ -158,7 +154,6 @@ _HAIRS = ((0.035, 0.031, 0.030), (0.060, 0.038, 0.025), (0.23, 0.105, 0.045), (0
 
 
 def _sampled(seed: int) -> PersonDesign:
-    """A random person; the same for the same seed."""
     rng = np.random.default_rng(seed)
 
     def pick(options):

@@ -24,7 +24,7 @@ def rest_joints() -> Floats:
 
 
 def edge_length(points: Floats) -> Floats:
-    """Wanted edge length [N] m: 17.5 mm on the body, finer where the form is: face, hands, feet."""
+    """Target edge length [N] m: 17.5 mm on the body, finer on face, hands and feet."""
     x, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
 
     def ramp(t: Floats) -> Floats:
@@ -37,17 +37,17 @@ def edge_length(points: Floats) -> Floats:
 
 
 def template() -> tuple[Floats, Ints, Floats]:
-    """Vertices [V, 3], faces [F, 3] and skinning weights [V, 24]; exactly symmetric, watertight."""
+    """Vertices [V, 3], faces [F, 3] and skinning weights [V, 24]; symmetric, watertight."""
     figure = person()
     half = surface(figure.distance, (0, -0.02, -0.16), (0.92, 1.78, 0.24), MARCHING_STEP)
     half = remesh(*half, edge_length, lambda points: project(figure.distance, points, 2), REMESH_ROUNDS)
     vertices, faces = mirror(*half)
-    middle = np.interp(vertices[:, 1], [0.755, 0.80], [0.006, 0.03])  # the pelvis blends, the thighs do not
+    middle = np.interp(vertices[:, 1], [0.755, 0.80], [0.006, 0.03])  # pelvis blended, thighs not
     return vertices, faces, skinning_weights(vertices, faces, _bones(rest_joints()), list(SMPL_NAMES), middle)
 
 
 def _bones(joints: Floats) -> list[tuple[int, Floats, Floats, float]]:
-    """Capsules (joint, a, b, radius): the bones of the skeleton, and a trunk that is as wide as its ribs."""
+    """Capsules (joint, a, b, radius) of the bones, and of the trunk as wide as its ribs."""
     at = dict(zip(SMPL_NAMES, joints))
     bones = []
 
@@ -84,7 +84,7 @@ def _bones(joints: Floats) -> list[tuple[int, Floats, Floats, float]]:
 
 
 def template_body() -> Body:
-    """The template as a ``Body``, rounded to 0.1 µm; a quarter of a minute."""
+    """The template as a ``Body``, rounded to 0.1 µm; takes 15 s."""
     vertices, faces, weights = template()
     rounded = vertices.astype(np.float32).astype(np.float64)
     skeleton = smpl_skeleton(rest_joints())

@@ -1,8 +1,6 @@
-"""Smooth skinning weights by heat over the surface.
+"""Smooth skinning weights by heat diffusion over the surface.
 
-Baran and Popović, "Automatic rigging and animation of 3D characters" (2007), section 4: every bone is held at
-temperature 1, its heat reaches the vertices nearest to it and spreads along the skin. Heat flows over the surface,
-not through the air, so one leg does not warm the other; what crosses the middle line is taken away at the end.
+Source: Baran and Popović, "Automatic rigging and animation of 3D characters" (2007), section 4.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from scipy.sparse.linalg import splu
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NEGLIGIBLE = 0.01  # weights below this are dropped, so that most vertices follow two or three bones
+NEGLIGIBLE = 0.01  # weights below this are dropped
 
 
 def skinning_weights(
@@ -23,9 +21,9 @@ def skinning_weights(
 ) -> Floats:
     """Weights [V, J], rows summing to one.
 
-    ``bones``: (joint, end a [3], end b [3], radius m): a bone is a capsule whose surface is what a vertex is near to,
-    so that a thick chest is not lost to the thin bones of the arm. ``middle`` [V] m: how far beyond the middle line
-    the influence of the other side's joints ends.
+    Args:
+        bones: capsules (joint, end a [3], end b [3], radius m); distances are to their surfaces.
+        middle: [V] m beyond the middle line at which the influence of the other side's joints ends.
     """
     gaps = np.stack([_segment_distance(vertices, a, b) - radius for _, a, b, radius in bones], axis=1)
     depths = np.stack([_segment_distance(vertices, a, b) for _, a, b, _ in bones], axis=1)
@@ -38,8 +36,8 @@ def skinning_weights(
     conductance = 1.0 / np.maximum(depths[np.arange(len(vertices)), nearest], 0.01) ** 2
 
     stiffness, area = _laplacian(vertices, faces)
-    held = diags_array(conductance * area)
-    weights = splu(csc_array(stiffness + held)).solve(held @ source)
+    coupling = diags_array(conductance * area)
+    weights = splu(csc_array(stiffness + coupling)).solve(coupling @ source)
 
     across = np.clip(0.5 + side[None, :] * vertices[:, :1] / (2 * middle[:, None]), 0, 1)
     weights *= across * across * (3 - 2 * across)
