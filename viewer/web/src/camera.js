@@ -1,4 +1,4 @@
-// Pinhole cameras in OpenCV's axes and the view that shows a whole motion (rnd_runtime/core/camera.py, rnd_viewer/inputs/cameras.py).
+// Pinhole cameras in OpenCV's axes, and the view of a whole motion (rnd_runtime/core/camera.py, playback/framing.py).
 
 import { ELEVATION, FIELD_OF_VIEW, PADDING } from "./constants.js";
 import { jointsAt } from "./posing/avatar.js";
@@ -24,7 +24,7 @@ export function cameraOf({ azimuth, elevation, distance, target, fov, width, hei
   return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), rotation, translation, position };
 }
 
-/** The same view for points in a frame {rotation [9], translation [3]} → world. */
+/** The camera for points in a frame {rotation [9], translation [3]} → world. */
 export function inFrame(camera, frame) {
   const rotation = new Float64Array(9), moved = rotate(camera.rotation, frame.translation);
   multiply(camera.rotation, 0, frame.rotation, 0, rotation, 0);

@@ -1,16 +1,16 @@
-// The frames come from a worker of this page: nothing is asked of any server once the files are here.
+// Frames are rendered by a worker of this page; no server is needed once the files are loaded.
 
 const MAX_CLIP_FRAMES = 900;
-const MAX_CLIP_FPS = 30;  // a recorder codes them as they are shown, and 900 are half a minute
-const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder; it halves the chroma as well
-const KEEP_IN_VIEW = " · keep this tab in view";  // browsers slow a hidden one down to about a frame a second
-// H.264 of level 4.0, which 1024² at 30 fps need, before 3.0; then what has none
+const MAX_CLIP_FPS = 30;
+const FRAME_QUALITY = 0.95;  // of JPEG, in which frames wait for the recorder
+const KEEP_IN_VIEW = " · keep this tab in view";  // browsers limit a hidden tab to about one frame per second
+// H.264 of level 4.0 (1024² at 30 fps), then 3.0, then others
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E028", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
- * Start the worker. `on` gets: scene, frame, progress, clip, error as from rnd-view, message(text), and refused(text) of
- * files that cannot be used. `load` takes files in once they are read and `idle()`, a promise, is kept.
- * Files named in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
+ * Start the worker. Callbacks `on`: scene, frame, progress, clip and error as from rnd-view, message(text), and
+ * refused(text) for unusable files. `load` sends files once they are read and the promise `idle()` is fulfilled.
+ * Files in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
  */
 export async function connect(on) {
   const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" });
@@ -71,7 +71,7 @@ function addressed() {
   return ["avatar", "motion", "hdr"].flatMap(names).map((text) => new URLSearchParams(`name=${text}`).get("name"));
 }
 
-/** What is fetched for a name: itself where it is a whole address, else a path that may have # % ? and : in it. */
+/** The URL of a name: a complete address, or a path that may contain # % ? and :. */
 function addressOf(name) {
   if (/^([a-z][a-z0-9+.-]*:\/\/|blob:|data:)/i.test(name)) return new URL(name);
   const path = name.replaceAll("%", "%25").replaceAll("#", "%23").replaceAll("?", "%3F");
@@ -83,7 +83,7 @@ function shownName(address) {
   try {
     return decodeURIComponent(name);
   } catch {
-    return name;  // bytes that are no UTF-8
+    return name;  // not UTF-8
   }
 }
 
@@ -95,7 +95,7 @@ function fetchFiles(names) {
   }));
 }
 
-/** All frames first, then played to a recorder at their own pace: it stamps them with the time of day. */
+/** Render all frames, then play them to a recorder in real time: it uses the time of day as timestamps. */
 async function record(renderFrame, state, { fps, turn, duration }, on) {
   const type = CLIP_TYPES.find((name) => globalThis.MediaRecorder?.isTypeSupported(name));
   if (!type) throw new Error("this browser cannot record a clip");
@@ -107,7 +107,7 @@ async function record(renderFrame, state, { fps, turn, duration }, on) {
     context.drawImage(image, 0, 0);
     image.close();
   };
-  const frames = [];  // coded: 900 of 1024² pixels would be 3.8 GB
+  const frames = [];  // compressed: 900 of 1024² pixels would be 3.8 GB
   for (let k = 0; k < count; k++) {
     show((await renderFrame({ ...state, time: k / fps, azimuth: state.azimuth + turn * k / count })).image);
     frames.push(await new Promise((done) => { canvas.toBlob(done, "image/jpeg", FRAME_QUALITY); }));

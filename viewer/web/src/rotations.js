@@ -32,7 +32,7 @@ export function matrixToAxisAngle(m, at) {
   return [scale * q[1], scale * q[2], scale * q[3]];
 }
 
-/** out = a · b, 3×3 each, at their places. */
+/** out = a · b, 3×3 each, at their offsets. */
 export function multiply(a, atA, b, atB, out, at) {
   for (let i = 0; i < 3; i++)
     for (let j = 0; j < 3; j++)

@@ -1,4 +1,4 @@
-// Everything but the page: reads the files, renders states; the same states and answers as rnd-view's.
+// Reads files and renders states; states and answers are those of rnd-view.
 
 import { CLAY, COSINE_LOBE, LARGEST_SKY, PROBE_SHAPE } from "./constants.js";
 import { Avatar } from "./posing/avatar.js";
@@ -13,15 +13,14 @@ import { shBasis } from "./shading/sh.js";
 import { makeShader } from "./shading/shader.js";
 import { Splatter } from "./raster/splat.js";
 
-const SIZE = [512, 512], SIZES = [64, 1024];  // px: to begin with, the least and the largest
+const SIZE = [512, 512], SIZES = [64, 1024];  // px: default, least and largest
 
 let splatter = new Splatter();
-// What is shown: the motion as its file has it (null: at rest) and for the avatar, and
-// lights {name, light, notes, shaders: Map of shade → function}
+// record: the motion in its file's axes (null: at rest); lights: {name, light, notes, shaders: Map of shade → function}
 let scene = { avatar: null, record: null, motion: null, lights: [] };
 let posed = null, shownSky = null;
 
-/** Take in files [{name, bytes}], all of them or none; the page learns of the new scene. */
+/** Load files [{name, bytes}], all or none, and post the new scene. */
 async function load(files) {
   const before = scene, next = { ...scene }, opened = [];
   let answer = { kind: "message", text: "drop an avatar (.onnx) too" };
@@ -31,8 +30,8 @@ async function load(files) {
       const { skeleton } = next.avatar;
       next.motion = next.record ? fitMotion(next.record, skeleton) : restMotion(skeleton);
       const count = next.lights.length, dropped = files.some(({ name }) => /\.(hdr|exr)$/i.test(name));
-      let light;  // stays
-      if (!before.avatar && count > 1) light = 1;  // as in rnd-view: the first beside the avatar's own
+      let light;  // undefined: unchanged
+      if (!before.avatar && count > 1) light = 1;  // as in rnd-view: the first but the avatar's own
       else if (dropped) light = count - 1;
       answer = { kind: "scene", scene: description(next, light) };
     }
@@ -60,7 +59,7 @@ async function take({ name, bytes }, next, opened) {
 
 const lightEntry = (name, light) => ({ name, light, notes: lightNotes(light), shaders: new Map() });
 
-/** What the page needs to know; `light` is the number of the one that is to shine, undefined where it stays. */
+/** The scene for the page; `light` is the index of the new light, undefined if unchanged. */
 function description({ avatar, motion, lights }, light) {
   return {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
@@ -86,7 +85,7 @@ async function render({ number, state }) {
   clock("shading");
   const records = project(gaussians, count, features, beside, grown, avatar.cull);
   clock("sorting");
-  if (splatter.isLost()) {  // the driver was reset; what a canvas without its context shows is blank
+  if (splatter.isLost()) {  // the driver was reset
     splatter = new Splatter();
     shownSky = null;
   }
@@ -100,7 +99,7 @@ async function render({ number, state }) {
   postMessage(answer, [image]);
 }
 
-/** `count` Gaussians at even steps through the file, whose neighbours are the body's. */
+/** `count` Gaussians at even steps through the file, which is in spatial order. */
 function fewer(gaussians, count) {
   const total = gaussians.count, kept = { ...gaussians, count };
   if (count === total) return gaussians;

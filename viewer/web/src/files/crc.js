@@ -1,4 +1,4 @@
-// Whether a member of a zip is as it was written, which fflate does not look at (PKWARE's APPNOTE, 4.3 and 4.4.7).
+// CRC-32 of a zip's members, which fflate does not check (PKWARE's APPNOTE, 4.3 and 4.4.7).
 
 const END = 0x06054b50, ENTRY = 0x02014b50, END_LENGTH = 22;
 const TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
@@ -14,7 +14,7 @@ export function crc32(data) {
   return (crc ^ -1) >>> 0;
 }
 
-/** Map of member → CRC-32 as the archive's directory has it; nothing of archives of more than 4 GB. */
+/** Map of member → CRC-32 from the archive's directory; empty for archives of more than 4 GB. */
 export function crcs(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength), found = new Map();
   let end = bytes.length - END_LENGTH;

@@ -1,5 +1,4 @@
-// OpenEXR images ("OpenEXR File Layout", the Academy Software Foundation): their header is held against what parse-exr
-// reads rightly, the pixels are parse-exr's.
+// OpenEXR images ("OpenEXR File Layout", Academy Software Foundation): headers are checked for what parse-exr supports.
 
 import parseExr from "parse-exr";
 import { refusal } from "../errors.js";
@@ -8,11 +7,11 @@ const MAGIC = 20000630, TILED = 0x200, DEEP = 0x800, PARTS = 0x1000;
 const FLOAT_TYPE = 1015;  // parse-exr's name for 32-bit floats
 const UINT = 0, DECREASING_Y = 1;
 const COMPRESSIONS = ["none", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"];
-const BLOCK_LINES = { none: 1, RLE: 1, ZIPS: 1, ZIP: 16, PIZ: 32, PXR24: 16, DWAA: 32, DWAB: 256 };  // of those that it reads
+const BLOCK_LINES = { none: 1, RLE: 1, ZIPS: 1, ZIP: 16, PIZ: 32, PXR24: 16, DWAA: 32, DWAB: 256 };  // supported ones
 
 /**
- * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat image with channels R, G and B; the last
- * [8] are x and y of red, green, blue and white, where the file states them.
+ * {height, width, radiance: Float32Array [H·W·3], chromaticities} of one flat image with channels R, G and B;
+ * chromaticities [8]: x and y of red, green, blue and white, if given.
  */
 export function readExr(file) {
   const bytes = file.slice(), header = readHeader(bytes);
@@ -20,15 +19,14 @@ export function readExr(file) {
   if (header.lineOrder === DECREASING_Y && !header.tiled) turnOver(bytes, header);
   const { width, height, data } = parseExr(bytes.buffer, FLOAT_TYPE);
   const channels = data.length / (width * height), radiance = new Float32Array(width * height * 3);
-  for (let row = 0; row < height; row++)  // the reader's rows run bottom to top
+  for (let row = 0; row < height; row++)  // parse-exr's rows run bottom to top
     for (let column = 0; column < width; column++)
       for (let c = 0; c < 3; c++)
         radiance[3 * (row * width + column) + c] = data[channels * ((height - 1 - row) * width + column) + c];
   return { width, height, radiance, chromaticities: header.chromaticities };
 }
 
-/** What the file says of itself: {tiled, flat, channels, chromaticities, compression, lineOrder, lineOrderAt, data and
- * canvas windows, end}. */
+/** The header: {tiled, flat, channels, chromaticities, compression, lineOrder, lineOrderAt, data and canvas windows, end}. */
 function readHeader(bytes) {
   const view = new DataView(bytes.buffer), decoder = new TextDecoder("latin1");
   if (bytes.length < 8 || view.getUint32(0, true) !== MAGIC) throw refusal("light probe", { expected: "an OpenEXR file" });
@@ -56,9 +54,9 @@ function readHeader(bytes) {
   };
   try {
     for (let name = word(); name; name = word()) {
-      word();  // its type, which its name tells
+      word();  // its type
       const end = number() + at;
-      if (end < at) throw refusal("the .exr file is damaged");  // a negative size would lead back here for ever
+      if (end < at) throw refusal("the .exr file is damaged");  // a negative size would loop forever
       readers[name]?.(end);
       at = end;
     }
@@ -85,7 +83,7 @@ function check({ flat, channels, compression, data, canvas }) {
     throw refusal("compression", { expected: Object.keys(BLOCK_LINES).join(", "), got: compression });
 }
 
-/** Put blocks of lines that are stored bottom to top into the order of the file's table, which always runs downwards. */
+/** Reorder blocks of lines stored bottom to top into the order of the file's table, which is top to bottom. */
 function turnOver(bytes, { data: [, top, , bottom], compression, end, lineOrderAt }) {
   const view = new DataView(bytes.buffer), count = Math.ceil((bottom - top + 1) / BLOCK_LINES[compression]);
   const stored = bytes.slice();

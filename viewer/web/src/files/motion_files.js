@@ -1,4 +1,4 @@
-// The array layouts motions come in, read into one record in the file's own axes (rnd_runtime/motion/readers/arrays.py).
+// Array layouts of motions, read into one record in the file's axes (rnd_runtime/motion/readers/arrays.py).
 
 import {
   AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT,
@@ -10,8 +10,8 @@ import { axisAngleToMatrix, multiply, rotate } from "../rotations.js";
 const [MIN_FPS, MAX_FPS] = FPS_LIMITS;
 const FINGERS = 30;
 
-/** {name, rotations [F·J·9] local, translations [F·3] m, added to the root's rest position, restRoot [3] m that they were made
- *  for or null for the avatar's own, frames, joints, jointNames, fps, zUp, notes}; throws where it cannot be a person's motion. */
+/** {name, rotations [F·J·9] local, translations [F·3] m relative to the root's rest position, restRoot [3] m of the file's
+ *  skeleton or null, frames, joints, jointNames, fps, zUp, notes}; throws for anything but a person's motion. */
 export function readMotionFile(bytes, name) {
   const members = new Npz(bytes, name, "motion"), notes = [];
   const easymocap = members.firstOf("Rh", "Rh_all") !== undefined;
@@ -36,7 +36,7 @@ export function readMotionFile(bytes, name) {
   return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, zUp, notes };
 }
 
-/** Axis-angles [F·J·3] rad with the root first, from whichever member holds the poses: {frames, joints, angles}. */
+/** Axis-angles [F·J·3] rad with the root first: {frames, joints, angles}. */
 function readAngles(members, notes) {
   const { file } = members, key = members.firstOf("poses", "poses_all", "pose_body", "body_pose");
   if (!key) {
@@ -52,14 +52,14 @@ function readAngles(members, notes) {
   return joined(frames, [readRoot(members, frames, notes), numbers, ...readFingers(members, frames, joints, notes)]);
 }
 
-/** The root's axis-angles [F·3] beside a body without it. */
+/** The root's axis-angles [F·3] for a body without them. */
 function readRoot(members, frames, notes) {
   if (members.firstOf("root_orient", "global_orient")) return perFrame(members, frames, "root_orient", "global_orient");
   if (!members.firstOf("Rh", "Rh_all")) notes.push("no root orientation in the file: the root stays upright");
   return new Float64Array(3 * frames);
 }
 
-/** Thirty finger joints beside a split body of 21, where the file has them: the parts of [F·90], side by side. */
+/** Poses of thirty finger joints for a body of 21, if given: the parts of [F·90]. */
 function readFingers(members, frames, bodyJoints, notes) {
   if (bodyJoints !== 21 || !members.firstOf("pose_hand", "left_hand_pose")) return [];
   const sides = members.has("pose_hand") ? ["pose_hand"] : ["left_hand_pose", "right_hand_pose"];
@@ -70,7 +70,7 @@ function readFingers(members, frames, bodyJoints, notes) {
   return [];
 }
 
-/** Parts [F·3J] of F poses side by side. */
+/** Concatenation of parts [F·3J] of F poses. */
 function joined(frames, parts) {
   const widths = parts.map((part) => part.length / frames), width = widths.reduce((a, b) => a + b);
   const angles = new Float64Array(frames * width);
@@ -96,7 +96,7 @@ function readNames(members, joints) {
   return names;
 }
 
-/** [F·3] of the first member present; F×1×3 is how EasyMocap's users store it. */
+/** [F·3] of the first member present; EasyMocap has F×1×3. */
 function perFrame(members, frames, ...names) {
   const { file } = members, key = members.firstOf(...names);
   if (!key) throw refusal(`${names[0]} is missing`, { got: members.names.join(", "), file });
@@ -107,7 +107,7 @@ function perFrame(members, frames, ...names) {
   return numbers;
 }
 
-/** EasyMocap's Rh turns about the origin: the roots of `rotations` [F·J·9] are turned, and transl = Th + Rh·J0 − J0 returned. */
+/** EasyMocap's Rh rotates about the origin: rotates the roots of `rotations` [F·J·9], returns transl = Th + Rh·J0 − J0. */
 function turnAboutOrigin(members, rotations, frames, joints, restRoot) {
   const angles = perFrame(members, frames, "Rh", "Rh_all"), turn = new Float64Array(9), turned = new Float64Array(9);
   const translations = perFrame(members, frames, "Th", "Th_all");

@@ -1,4 +1,4 @@
-// .npz archives: zip (fflate) of .npy, one member at a time when asked for, numbers and strings only (rnd_runtime/core/npz.py).
+// .npz archives: zip (fflate) of .npy, read by member, numbers and strings only (rnd_runtime/core/npz.py).
 
 import { unzipSync } from "fflate";
 import { crc32, crcs } from "./crc.js";
@@ -13,12 +13,12 @@ const READERS = {  // bytes, and the number at a place of a view
   u2: [2, (view, at, little) => view.getUint16(at, little)], u1: [1, (view, at) => view.getUint8(at)],
   b1: [1, (view, at) => (view.getUint8(at) ? 1 : 0)],
 };
-const KINDS = { f: "float", i: "int", u: "uint", c: "complex" };  // numpy's names, the number of bits behind
-// A Python dict of three, which may come in any order
+const KINDS = { f: "float", i: "int", u: "uint", c: "complex" };  // numpy's names, without the number of bits
+// A Python dict of three keys in any order
 const HEADER = /^\{(\s*'(descr|fortran_order|shape)':\s*('[^']*'|\[.*\]|True|False|\([\dL,\s]*\))\s*,?){3}\s*\}\s*$/;
 const MAGIC = "\x93NUMPY", NEWEST = 3;  // version of the format
 
-/** The members of an archive; whatever is asked for and cannot be read throws, naming file and member. */
+/** The members of an archive; errors name file and member. */
 export class Npz {
   /** `what` the file is, for messages. */
   constructor(bytes, file, what) {
@@ -82,8 +82,8 @@ export class Npz {
 
 const startsWithMagic = (data) => [...MAGIC].every((letter, k) => data[k] === letter.charCodeAt(0));
 
-/** What a .npy says of itself: {type such as f8, dtype as numpy shows it, size of an element in bytes, little, shape, count,
- *  fortran, view of the elements}; null where it is none, or shorter than it says. */
+/** The header of a .npy: {type such as f8, dtype as in numpy, size of an element in bytes, little, shape, count, fortran,
+ *  view of the elements}; null if it is invalid or too short. */
 function readHeader(data) {
   const view = new DataView(data.buffer, data.byteOffset, data.byteLength), version = view.getUint16(6, true);
   if (!startsWithMagic(data) || version < 1 || version > NEWEST) return null;
@@ -105,7 +105,7 @@ function dtypeName(descr, order, kind, digits) {
   return KINDS[kind] && order !== ">" ? KINDS[kind] + 8 * digits : descr.replace(/^'(.*)'$/, "$1");
 }
 
-/** `values` with the last axis fastest: in Fortran's order the first is. */
+/** `values` in C order, from Fortran's. */
 function inRows(values, { shape, count, fortran }) {
   if (!fortran) return values;
   return values.map((_, k) => {
@@ -125,14 +125,14 @@ function readNumbers({ type, little, count, view }) {
   return numbers;
 }
 
-/** Sixteen bits: sign, five of exponent, ten of fraction. */
+/** A half float: sign, five bits of exponent, ten of fraction. */
 function half(bits) {
   const exponent = bits >> 10 & 31, fraction = bits & 1023, sign = bits >> 15 ? -1 : 1;
   if (exponent === 31) return fraction ? NaN : sign * Infinity;
   return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
 }
 
-/** Strings without the zeros that fill them up; null where a code is no character. */
+/** Strings without padding; null for invalid code points. */
 function readStrings({ type, size, little, count, view }) {
   const decoder = new TextDecoder("utf-8", { ignoreBOM: true });
   return Array.from({ length: count }, (_, k) => {

@@ -1,4 +1,4 @@
-// Cutting what one wants out of an ONNX file (rnd_runtime/avatar/onnx_parts.py): onnxruntime computes every node of a graph.
+// Subgraphs of an ONNX file (rnd_runtime/avatar/onnx_parts.py): onnxruntime computes every node of a graph.
 
 // Field numbers of onnx.proto
 const MODEL_GRAPH = 7, MODEL_METADATA = 14;
@@ -9,7 +9,7 @@ const LENGTH = 2;  // wire type
 const text = (bytes) => new TextDecoder().decode(bytes);
 
 export class OnnxFile {
-  /** `metadata`: of metadata_props; `outputs`: names. Throws where the file is no ONNX file or cut short. */
+  /** `metadata`: of metadata_props; `outputs`: names. Throws for other or truncated files. */
   constructor(bytes) {
     Object.assign(this, { head: [], graphHead: [], nodes: [], constants: new Map(), inputs: new Map(), outputs: new Set(), metadata: new Map() });
     for (const [field, value, whole] of fields(bytes)) {
@@ -29,11 +29,11 @@ export class OnnxFile {
       else if (field === GRAPH_INITIALIZER) this.constants.set(named(TENSOR_NAME)[0], whole);
       else if (field === GRAPH_INPUT) this.inputs.set(named(NAME)[0], whole);
       else if (field === GRAPH_OUTPUT) this.outputs.add(named(NAME)[0]);
-      else if (field !== GRAPH_VALUE_INFO) this.graphHead.push(whole);  // shapes that onnxruntime infers anyway
+      else if (field !== GRAPH_VALUE_INFO) this.graphHead.push(whole);  // onnxruntime infers shapes
     }
   }
 
-  /** A model that makes `outputs`, any values of the graph, and nothing else; `inputs`: names of those it needs. */
+  /** A model that computes only `outputs`, any values of the graph; `inputs`: the names it needs. */
   cut(outputs) {
     const wanted = new Set(outputs), kept = [];
     for (const node of this.nodes.toReversed()) {  // ONNX demands topological order

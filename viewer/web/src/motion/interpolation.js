@@ -43,7 +43,7 @@ export function pointAt(points, frames, position) {
 /** The cubic from 0 to `step` with slopes `start` and `end`. */
 const cubic = (step, start, end, t) => t * (start + t * (3 * step - 2 * start - end + t * (start + end - 2 * step)));
 
-/** Slopes with those of the recording's own ends chosen so that the curvature there vanishes. */
+/** Slopes of a natural spline: the curvature vanishes at the motion's ends. */
 function endSlopes(step, start, end, innerStart, innerEnd) {
   if (innerEnd && !innerStart) return [1.5 * step - 0.5 * end, end];
   if (innerStart && !innerEnd) return [start, 1.5 * step - 0.5 * start];

@@ -1,4 +1,4 @@
-// Motions: a file's poses on an avatar's skeleton (rnd_runtime/motion/motion.py), and the window its skinning looks at (window.py).
+// Motions: poses of a file on an avatar's skeleton (rnd_runtime/motion/motion.py), and the encoder's window (posing/window.py).
 
 import { SMPL_REST_ROOT, STAND_INS, TURNS, Z_UP_TO_Y_UP } from "../constants.js";
 import { refusal } from "../errors.js";
@@ -6,7 +6,7 @@ import { pointAt, rotationsAt } from "./interpolation.js";
 import { matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
 
 /** A record of motion_files.js for `skeleton` ({names, rest}), Y up: {rotations [F·J·9], translations [F·3] m, frames, joints,
- *  fps, duration in s, name, notes}. The record stays as it is. */
+ *  fps, duration in s, name, notes}. */
 export function fitMotion(record, skeleton) {
   const { name, frames, fps, zUp } = record, notes = [...record.notes];
   const rotations = matchJoints(record, skeleton, notes), translations = record.translations.slice();
@@ -16,14 +16,14 @@ export function fitMotion(record, skeleton) {
   return motion;
 }
 
-/** One frame: the pose at rest. */
+/** A motion of one frame in the rest pose. */
 export function restMotion(skeleton) {
   const joints = skeleton.names.length;
   const rotations = Float64Array.from({ length: 9 * joints }, (_, k) => (k % 9 % 4 === 0 ? 1 : 0));
   return { name: "at rest", rotations, translations: new Float64Array(3), frames: 1, joints, fps: 30, duration: 0, notes: [] };
 }
 
-/** Its translations from the avatar's own rest position, where the file's are from `restRoot`. */
+/** Translations relative to the avatar's rest position, from those relative to `restRoot`. */
 function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, skeleton) {
   const turned = new Float64Array(9);
   for (let f = 0; f < frames; f++) {
@@ -36,7 +36,7 @@ function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, s
   }
 }
 
-/** The record's rotations in the order of `skeleton`, those it lacks at rest and noted; a joint above the root turns it. */
+/** The record's rotations in the order of `skeleton`; missing joints are at rest and noted, a joint above the root rotates it. */
 function matchJoints({ name: file, rotations, frames, joints, jointNames }, skeleton, notes) {
   const columns = new Map(jointNames.map((name, column) => [name, column]));
   for (const [hand, finger] of Object.entries(STAND_INS))
@@ -65,7 +65,7 @@ function matchJoints({ name: file, rotations, frames, joints, jointNames }, skel
   return result;
 }
 
-/** Whether a file's first joint turns at all. */
+/** Whether the file's first joint rotates. */
 function firstTurns(rotations, frames, joints) {
   for (let f = 0; f < frames; f++)
     for (let k = 0; k < 9; k++)
@@ -73,7 +73,7 @@ function firstTurns(rotations, frames, joints) {
   return false;
 }
 
-/** Local rotations [J·9] and the root's translation [3] at `time` seconds; the end poses beyond the ends. */
+/** Local rotations [J·9] and the root's translation [3] at `time` seconds, clamped to the motion. */
 export function poseAt(motion, time) {
   const place = Math.min(Math.max(time * motion.fps, 0), motion.frames - 1);
   return { rotations: rotationsAt(motion, place), translation: pointAt(motion.translations, motion.frames, place) };

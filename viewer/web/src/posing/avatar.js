@@ -1,4 +1,4 @@
-// avatar.onnx: its metadata, its skeleton, and posing it: networks in onnxruntime, the rest in posing.js (rnd_runtime/avatar/file.py, avatar.py, skeleton.py).
+// avatar.onnx: metadata, skeleton, and posing by onnxruntime and posing.js (rnd_runtime/avatar, motion/skeleton.py).
 
 import * as ort from "./ort/ort.wasm.min.mjs";
 import {
@@ -11,17 +11,17 @@ import { OnnxFile } from "../files/onnx.js";
 import { RestPose } from "./posing.js";
 import { multiply, rotate } from "../rotations.js";
 
-const EVERYTHING = -2;  // n·v that nothing is below
+const EVERYTHING = -2;  // below every n·v
 
 export class Avatar {
-  /** Read the file; throws with a reason when it is no avatar of ours. */
+  /** Read the file; other files are refused. */
   static async load(bytes, name) {
     const file = new OnnxFile(bytes), text = file.metadata.get(METADATA_KEY);
     if (!text) throw new Error(`${name} is not an RnD avatar`);
     const about = JSON.parse(text);
     if (about.schema !== SCHEMA) throw new Error(`${name}: schema ${about.schema}, expected ${SCHEMA}`);
     ort.env.wasm.wasmPaths = new URL("./ort/", import.meta.url).href;
-    // Threads need the headers COOP and COEP, which a static host may not send.
+    // threads need the headers COOP and COEP, which static hosts may not send
     ort.env.wasm.numThreads = globalThis.crossOriginIsolated ? Math.min(navigator.hardwareConcurrency, 4) : 1;
     const avatar = new Avatar();
     avatar.name = name;
@@ -41,10 +41,10 @@ export class Avatar {
     return avatar;
   }
 
-  /** Give onnxruntime's memory back; the avatar cannot pose any more. */
+  /** Release onnxruntime's memory; the avatar is unusable afterwards. */
   release() { return this.session.release(); }
 
-  /** What the networks say at `time` of `motion`, for `posed`. */
+  /** Outputs of the networks at `time` of `motion`, for `posed`. */
   async encode(motion, time) {
     const { window, velocity } = motionWindow(motion, time, this.windowPoses, this.windowSeconds);
     const now = poseAt(motion, time);
@@ -73,7 +73,7 @@ export class Avatar {
   }
 }
 
-/** n·v below which the file advises to leave Gaussians out (PlayerAdvice of rnd_runtime/avatar/file.py). */
+/** The n·v of the file's advice below which Gaussians are culled (PlayerAdvice of rnd_runtime/avatar/file.py). */
 function advisedCull(file) {
   const advice = JSON.parse(file.metadata.get(ADVICE_KEY) ?? "{}"), cull = advice?.cull ?? -1;
   if (advice?.constructor !== Object || !(typeof cull === "number" && cull >= -1 && cull <= 1))
@@ -81,13 +81,13 @@ function advisedCull(file) {
   return cull > -1 ? cull : EVERYTHING;
 }
 
-/** A session that makes `outputs` of `file` and no more, and the names of its inputs. */
+/** A session that computes only `outputs` of `file`, and the names of its inputs. */
 async function sessionOf(file, outputs) {
   const { model, inputs } = file.cut(outputs);
   return [await ort.InferenceSession.create(model, { executionProviders: ["wasm"], graphOptimizationLevel: "all" }), inputs];
 }
 
-/** Values of `file` that need no inputs. */
+/** Constant values of `file`. */
 async function constants(file, names) {
   const [session] = await sessionOf(file, names);
   try {

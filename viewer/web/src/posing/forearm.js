@@ -1,11 +1,11 @@
-// Forearms that share a twist between elbow and wrist (rnd_runtime/posing/forearm.py, which has the formulas).
+// Distribution of forearm twists between elbow and wrist (formulas in rnd_runtime/posing/forearm.py).
 
 import { FREE, MAX_SHARE } from "../constants.js";
 import { axisAngleToMatrix, multiply, transposed, unit } from "../rotations.js";
 
 const SIDES = ["left", "right"];
 
-/** Turn the forearms of local rotations [J·9] about themselves, and their hands back, in place. */
+/** Twist the forearms of local rotations [J·9] and untwist their hands, in place. */
 export function shareTwists({ names, parents, rest }, rotations) {
   for (const side of SIDES) {
     const elbow = names.indexOf(`${side}_elbow`), wrist = names.indexOf(`${side}_wrist`);
@@ -24,7 +24,7 @@ export function shareTwists({ names, parents, rest }, rotations) {
   }
 }
 
-/** How much of its twist about `axis` the rotation at `at` hands on, radians. */
+/** The share of the twist about `axis` that the rotation at `at` passes to the forearm, radians. */
 function handedOn(m, at, axis) {
   let along = 0;
   for (let row = 0; row < 3; row++) for (let k = 0; k < 3; k++) along += axis[row] * m[at + 3 * row + k] * axis[k];

@@ -1,4 +1,4 @@
-// Node fields → posed Gaussians (rnd_runtime/posing/posing.py has the formulas).
+// Node fields → posed Gaussians (formulas in rnd_runtime/posing).
 
 import { DEEPEST, SHORTEST, SH_COUNT, SMALLEST_SQUARE, TWIST_STEPS } from "../constants.js";
 import { multiply } from "../rotations.js";
@@ -108,7 +108,7 @@ export class RestPose {
   }
 }
 
-/** Of every node what is interpolated for the floor, [M·14]. */
+/** The blend of every node that is interpolated for the floor, [M·14]. */
 function blendsOf(changes, nodes, joints, bones) {
   const blends = new Float64Array(TERMS * nodes);
   for (let m = 0; m < nodes; m++) {
@@ -132,7 +132,7 @@ function cofactorsOf(m) {
     }
 }
 
-/** κ / share of the blend `a` about a limb's axis: by how much it is widened there, less 1. */
+/** κ / share of the blend `a` about a limb's axis: its widening there, less 1. */
 function widening(ux, uy, uz) {
   const square = (m) => row(m, 0, ux, uy, uz) ** 2 + row(m, 3, ux, uy, uz) ** 2 + row(m, 6, ux, uy, uz) ** 2;
   let pinched = Math.min(Math.sqrt(square(cofactors)) / Math.max(square(a), SMALLEST_SQUARE), 1), factor = 1;

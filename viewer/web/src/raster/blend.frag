@@ -1,6 +1,5 @@
 // The Gaussians of a pixel's tile, blended front to back by the rule of rnd_runtime/raster/oracle.py: a pixel stops before
-// the one that would leave less than 1e-4 of its light, which no blending unit can do. Then the background, and sRGB; or
-// what a material map shows (rnd_runtime/playback/aov.py).
+// its transmittance falls below 1e-4. Then background and sRGB, or a material map (rnd_runtime/playback/aov.py).
 
 uniform sampler2D records;   // TEXELS for each Gaussian; see project.js
 uniform usampler2D pairs;    // Gaussians, tile by tile, front to back

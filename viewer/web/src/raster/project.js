@@ -1,4 +1,4 @@
-// Gaussians → records and, tile by tile, which of them reach it (rnd_runtime/raster/project.py, tiles.py).
+// Gaussians → records and lists of Gaussians by tile (rnd_runtime/raster/project.py, tiles.py).
 
 import { ALPHA_MIN, DILATION, FIELD_OF_VIEW_MARGIN, HALF_LOG2_E, LOG2_ALPHA_MIN, NEAR, RADIX_BITS } from "../constants.js";
 
@@ -9,10 +9,9 @@ const HALF = 0.5 * (TILE - 1), LEAST = LOG2_ALPHA_MIN - 1e-3;  // no tile is los
 const DIGITS = 1 << RADIX_BITS;
 
 /**
- * What the shader reads, whole rows of each: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians, tile by tile,
- * front to back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
- * A Gaussian with a number that is not finite, or of no extent, is not drawn: NaN fails every guard. Nor is one whose n·v
- * is below `cull` (rnd_runtime/raster/in_view.py).
+ * Inputs of the shader in complete rows: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians by tile, front to
+ * back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
+ * Gaussians with numbers that are not finite, without extent, or with n·v below `cull` are skipped: NaN fails every guard.
  */
 export function project({ means, covariances, opacities, normals }, count, features, camera, grown, cull) {
   const { rotation: r, translation: t, position: eye, focal, width, height } = camera;
@@ -48,7 +47,7 @@ export function project({ means, covariances, opacities, normals }, count, featu
     if (!(left < width && top < height && right >= 0 && bottom >= 0)) continue;
     if (Math.floor(left) > Math.floor(right) || Math.floor(top) > Math.floor(bottom)) continue;
     if (!Number.isFinite(features[3 * i] + features[3 * i + 1] + features[3 * i + 2])) continue;
-    boxes[4 * i] = left / TILE;  // whole tiles: what is stored is cut off
+    boxes[4 * i] = left / TILE;  // truncated to integers
     boxes[4 * i + 1] = top / TILE;
     boxes[4 * i + 2] = right / TILE;
     boxes[4 * i + 3] = bottom / TILE;
@@ -80,7 +79,7 @@ function sortIntoTiles(order, boxes, records, width, height) {
     const fallY = records[at + 5], fallX = records[at + 6], slack = HALF * (1 + Math.abs(shear));
     const left = boxes[4 * i], right = boxes[4 * i + 2], last = boxes[4 * i + 3];
     for (let row = boxes[4 * i + 1]; row <= last; row++) {
-      // whether α may come to 1/255 in the tile: pixels are within HALF of its middle
+      // whether α may reach 1/255 in the tile: pixels are within HALF of its centre
       const dy = TILE * row - y, v = Math.max(Math.abs(dy) - HALF, 0), lost = fallY * v * v, middle = x + shear * dy;
       for (let column = left, tile = row * columns + left; column <= right; column++, tile++) {
         const u = Math.max(Math.abs(TILE * column - middle) - slack, 0);
@@ -105,7 +104,7 @@ function sortIntoTiles(order, boxes, records, width, height) {
 
 const wholeRows = (count, row) => Math.max(Math.ceil(count / row), 1) * row;
 
-/** `drawn` by depth: a stable radix sort of 32-bit keys that span just the visible range. */
+/** `drawn` by depth: a stable radix sort of 32-bit keys over the visible range. */
 function frontToBack(depths, drawn) {
   let near = Infinity, far = -Infinity;
   for (const i of drawn) {

@@ -1,4 +1,4 @@
-// WebGL2: each pixel goes through the Gaussians of its tile.
+// WebGL2 rasteriser: each pixel blends the Gaussians of its tile.
 
 import { ALPHA_MAX, LOG2_ALPHA_MIN, MIN_COVERAGE, TRANSMITTANCE_MIN } from "../constants.js";
 import blendFragment from "./blend.frag";
@@ -32,17 +32,17 @@ export class Splatter {
     this.setSky({ width: 1, height: 1, radiance: new Float32Array(3) });
   }
 
-  /** Whether the browser has taken the context away, as after a driver's reset: nothing is drawn any more. */
+  /** Whether the context was lost, as after a driver's reset. */
   isLost() { return this.gl.isContextLost(); }
 
-  /** The map of the background. */
+  /** Set the map of the background. */
   setSky({ width, height, radiance }) {
     const texels = new Float32Array(4 * width * height);
     for (let k = 0; k < width * height; k++) texels.set(radiance.subarray(3 * k, 3 * k + 3), 4 * k);
     this.upload("sky", width, texels);
   }
 
-  /** Draw what `project` made and show it as `look` says; the image is then on `canvas`. */
+  /** Render the result of `project` to `canvas`, with the uniforms `look`. */
   draw({ records, pairs, tiles, columns }, width, height, look) {
     const { gl, canvas } = this;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -84,7 +84,7 @@ class Program {
         [gl.SAMPLER_2D]: (value) => gl.uniform1i(at, value), [gl.UNSIGNED_INT_SAMPLER_2D]: (value) => gl.uniform1i(at, value),
         [gl.INT]: (value) => gl.uniform1i(at, value), [gl.INT_VEC2]: (value) => gl.uniform2iv(at, value),
         [gl.FLOAT]: (value) => gl.uniform1f(at, value), [gl.FLOAT_VEC3]: (value) => gl.uniform3fv(at, value),
-        [gl.FLOAT_MAT3]: (value) => gl.uniformMatrix3fv(at, true, value),  // rows come first
+        [gl.FLOAT_MAT3]: (value) => gl.uniformMatrix3fv(at, true, value),  // row-major
       }[type]);
     }
   }

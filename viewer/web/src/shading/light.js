@@ -1,4 +1,4 @@
-// Light probes, lat-long and linear: reading, repairing and downsizing them (rnd_runtime/shading/light.py).
+// Lat-long, linear light probes: read, repair, downsize (rnd_runtime/shading/light.py).
 
 import { DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
 import { refusal, short } from "../errors.js";
@@ -17,7 +17,7 @@ export function readLight(bytes, name) {
   return repair({ ...image, name });
 }
 
-/** What the user should know of a light, one sentence each (rnd_runtime/shading/light.py). */
+/** Notes on a light for the user. */
 export function lightNotes({ radiance, repaired, chromaticities, exposure = 1 }) {
   const notes = [];
   if (exposure !== 1) notes.push(`the light's pixels are divided by the exposure that its file states, ${short(exposure, 4)}`);
@@ -50,7 +50,7 @@ function readHdr(bytes) {
     const [name, value = ""] = text.split("="), numbers = value.trim().split(/\s+/).map((word) => Number(word || NaN));
     if (name === "EXPOSURE") exposure *= numbers.length === 1 ? numbers[0] : NaN;
     if (name === "PRIMARIES" && numbers.length === 8 && numbers.every(Number.isFinite) && numbers.some(Boolean))
-      chromaticities = numbers;  // zeros state nothing
+      chromaticities = numbers;  // zeros are ignored
   }
   if (!(exposure >= 1 / MAX_EXPOSURE && exposure <= MAX_EXPOSURE)) {
     const expected = `numbers whose product is ${short(1 / MAX_EXPOSURE, 6)} to ${short(MAX_EXPOSURE, 6)}`;
@@ -71,7 +71,7 @@ function readHdr(bytes) {
   return { width, height, radiance, chromaticities, exposure };
 }
 
-/** One scanline into `row`, plane by plane; where the next one starts. */
+/** Read one scanline into `row`, by planes; returns the offset of the next one. */
 function readScanline(bytes, at, width, row) {
   const coded = bytes[at] === 2 && bytes[at + 1] === 2 && bytes[at + 2] * 256 + bytes[at + 3] === width;
   const need = (count) => { if (at + count > bytes.length) throw new Error("the .hdr file is cut short"); };
@@ -96,7 +96,7 @@ function readScanline(bytes, at, width, row) {
   return at;
 }
 
-/** NaN, infinite and negative values filled from their valid neighbours, holes from the rim inwards. */
+/** Fill NaN, infinite and negative values from their valid neighbours, from the rim of holes inwards. */
 function repair(light) {
   const { height, width, radiance } = light;
   const invalid = (value) => !(value >= 0 && value <= LARGEST_FLOAT);
@@ -144,7 +144,7 @@ export function texelSolidAngles(height, width) {
     (Math.cos(row / height * Math.PI) - Math.cos((row + 1) / height * Math.PI)) * 2 * Math.PI / width);
 }
 
-/** The light on another grid, each texel the mean over its solid angle, so that no energy is lost. */
+/** The light on another grid, each texel the mean over its solid angle; conserves energy. */
 export function downsize(light, height, width) {
   const vertical = overlaps(edges(light.height, height, (t) => 1 - Math.cos(t * Math.PI)));
   const horizontal = overlaps(edges(light.width, width, (t) => t));
@@ -169,7 +169,7 @@ function edges(from, to, place) {
   return [from, to].map((count) => Float64Array.from({ length: count + 1 }, (_, k) => place(k / count)));
 }
 
-/** For each target interval the sources it covers and their shares of it. */
+/** For each target interval, the covered source intervals and their shares. */
 function overlaps([source, target]) {
   const parts = [];
   for (let k = 0, first = 0; k + 1 < target.length; k++) {

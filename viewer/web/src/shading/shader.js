@@ -8,8 +8,8 @@ import { buildSky, shadeSky } from "./tables.js";
 import { extractSuns } from "./sun.js";
 
 /**
- * A light made ready for the mode `shade`: a function (gaussians, count, eye, lightToRoot, grown) → radiance [count·3].
- * `grown`: by how much covariances are multiplied.
+ * The shader of a light and the mode `shade`: a function (gaussians, count, eye, lightToRoot, grown) → radiance [count·3];
+ * `grown` scales covariances.
  */
 export function makeShader(light, shade) {
   const { sky, suns } = shade === "table+sun" ? extractSuns(light) : { sky: light, suns: [] };

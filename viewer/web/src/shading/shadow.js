@@ -1,4 +1,4 @@
-// Suns: a hard shadow from a depth map splatted from the Gaussians (rnd_runtime/shading/shadow.py), and their own shading.
+// Directional lights: hard shadows from a depth map of the Gaussians (rnd_runtime/shading/shadow.py), and their shading.
 
 import {
   AT_SILHOUETTE, CASTING_OPACITY, CLEARANCE, CLEARANCE_TEXELS, DISC_SIGMAS, DROP, EDGE_ON, RIM_TEXELS, SHADOW_RESOLUTION, SLOPE_FLOOR,
@@ -7,13 +7,13 @@ import {
 import { cross, unit } from "../rotations.js";
 import { clampRoughness, ggx } from "./brdf.js";
 
-/** Add to `radiance` [count·3] what `suns` ({direction in the root's frame, irradiance, spread}) lay on the Gaussians. */
+/** Add to `radiance` [count·3] that of `suns` ({direction in the root's frame, irradiance, spread}). */
 export function addSuns(suns, gaussians, count, eye, grown, radiance) {
   const radii = suns.length ? discRadii(gaussians, count, grown) : null;
   for (const sun of suns) shadeSun(sun, gaussians, count, eye, sunVisibility(sun.direction, gaussians, count, radii), radiance);
 }
 
-/** Disc radius [count] m of each Gaussian in a depth map; `grown`: by how much its covariance is multiplied. */
+/** Disc radius [count] m of each Gaussian in a depth map; `grown` scales covariances. */
 function discRadii({ covariances, opacities }, count, grown) {
   const radii = new Float32Array(count);
   for (let i = 0; i < count; i++) {
@@ -23,7 +23,7 @@ function discRadii({ covariances, opacities }, count, grown) {
   return radii;
 }
 
-/** Visibility [count]; a Gaussian with a number that is not finite neither casts nor receives. */
+/** Visibility [count]; Gaussians with numbers that are not finite neither cast nor receive. */
 function sunVisibility(direction, { means, normals }, count, radii) {
   const [x, y, z] = frameOf(direction), position = new Float32Array(3 * count), normal = new Float32Array(3 * count);
   const visibility = new Float32Array(count);
@@ -89,7 +89,7 @@ function drawDisc({ depth, width, height, texel }, position, normal, k, radius) 
   }
 }
 
-/** Bilinear share of the four texels around a point that lies open: what rises above its plane hides it. */
+/** Bilinear visibility of a point from the four texels around it; texels above its plane occlude it. */
 function lookUp({ depth, width, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
   const clearance = Math.max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], SLOPE_FLOOR);
@@ -104,7 +104,7 @@ function lookUp({ depth, width, texel }, position, normal, k, radius) {
   return Math.min(lit, 1);
 }
 
-/** Lambert and GGX under one sun, whose disc widens the highlight (sunlight.py, add_directional). */
+/** Lambert and GGX under one sun, whose disc widens the highlight (rnd_runtime/shading/direct.py). */
 function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibility, radiance) {
   const [lx, ly, lz] = sun.direction, spread = sun.spread ** 2;
   for (let i = 0; i < count; i++) {

@@ -1,4 +1,4 @@
-// The sum over distant lights, each with the whole BRDF and its own visibility (rnd_runtime/shading/sum.py).
+// The sum over distant lights with the full BRDF and the visibility of each (rnd_runtime/shading/sum.py).
 
 import { CUT_TEXELS, HALF_FLOOR, PROBE_SHAPE } from "../constants.js";
 import { clampRoughness, ggx } from "./brdf.js";
@@ -12,7 +12,7 @@ export function allTexels(light) {
   return { directions, flux };
 }
 
-/** `count` lights of about equal luminance (Debevec 2005): the brightest region is halved until there are enough. */
+/** `count` lights of about equal luminance by median cut (Debevec 2005). */
 export function medianCut(light, count) {
   const [height, width] = CUT_TEXELS, { directions, flux } = gridOf(light, CUT_TEXELS);
   const bright = Float64Array.from({ length: height * width }, (_, k) => luminance(flux[3 * k], flux[3 * k + 1], flux[3 * k + 2]));
@@ -46,7 +46,7 @@ function gridOf(light, [height, width]) {
   return { directions: texelDirections(height, width), flux };
 }
 
-/** A function of (bottom, right): the sum over all above and to the left. */
+/** Summed-area table: a function of (bottom, right). */
 function summedArea(values, height, width) {
   const sums = new Float64Array((height + 1) * (width + 1)), at = (row, column) => sums[row * (width + 1) + column];
   for (let row = 1; row <= height; row++)  // down the columns, then along the rows
@@ -57,7 +57,7 @@ function summedArea(values, height, width) {
   return at;
 }
 
-/** A region cut where its luminance halves, across the side that is longer on the sphere. */
+/** A region split at half its luminance, across the side that is longer on the sphere. */
 function halves({ top, bottom, left, right }, total, height, width) {
   const wide = (right - left) / width * 2 * Math.sin((top + bottom) / 2 / height * Math.PI) > (bottom - top) / height;
   const upright = (wide && right - left > 1) || bottom - top === 1, [first, last] = upright ? [left, right] : [top, bottom];

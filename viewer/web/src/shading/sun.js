@@ -1,4 +1,4 @@
-// Taking the sun out of a light probe (rnd_runtime/shading/sun.py): sky + suns = map.
+// Separation of a light probe into sky and suns (rnd_runtime/shading/directional.py): sky + suns = map.
 
 import { CAP, LAMP, LARGEST, MIN_SHARE, MAX_PEAKS, RING, RING_AREA } from "../constants.js";
 import { downsize, luminance, texelDirections, texelSolidAngles } from "./light.js";
@@ -10,7 +10,7 @@ export function extractSuns(light) {
   const map = light.height > LARGEST[0] ? downsize(light, ...LARGEST) : light;
   const { height, width } = map, radiance = Float64Array.from(map.radiance);
   const angles = texelSolidAngles(height, width), directions = texelDirections(height, width);
-  const bright = new Float64Array(height * width);  // luminance, -Infinity where a peak was passed over
+  const bright = new Float64Array(height * width);  // luminance, -Infinity at rejected peaks
   let total = 0;
   for (let k = 0; k < height * width; k++) {
     bright[k] = luminance(radiance[3 * k], radiance[3 * k + 1], radiance[3 * k + 2]);
@@ -40,10 +40,10 @@ export function extractSuns(light) {
   return { sky: { ...map, radiance: Float32Array.from(radiance) }, suns };
 }
 
-/** The excess near `centre` over its surroundings, and the texels [index, r, g, b] without it. */
+/** The peak near `centre` above its surroundings, and the texels [index, r, g, b] without it. */
 function peakAround({ radiance, directions, angles, height, width }, centre) {
   let sun = null, sky = [];
-  for (let pass = 0; pass < 3; pass++) {  // the brightest texel is not the middle of a lamp
+  for (let pass = 0; pass < 3; pass++) {  // the brightest texel is not the centre of a lamp
     const inside = [], ring = [[], [], []];
     const polar = Math.acos(Math.min(Math.max(centre[1], -1), 1));
     const first = Math.max(Math.floor((polar - RING) / Math.PI * height), 0);
@@ -53,7 +53,7 @@ function peakAround({ radiance, directions, angles, height, width }, centre) {
       if (cosine > Math.cos(CAP)) inside.push(k);
       else if (cosine > Math.cos(RING)) for (let c = 0; c < 3; c++) ring[c].push(radiance[3 * k + c]);
     }
-    if (!inside.length || !ring[0].length) return null;  // a map too coarse to hold a sun
+    if (!inside.length || !ring[0].length) return null;  // the map is too coarse for a sun
     const background = ring.map(median);
     const irradiance = [0, 0, 0], mean = [0, 0, 0];
     let weights = 0;

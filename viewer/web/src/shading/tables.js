@@ -1,4 +1,4 @@
-// Shading by tables over the normal that depend on the light alone (rnd_runtime/shading/tables.py).
+// Shading by tables over the normal that depend on the light alone (rnd_runtime/shading/lookup.py).
 
 import { DIFFUSE_SIZE as DIFFUSE, LOBE_WIDTHS, PROBE_SHAPE, SH_DEGREES, SPECULAR_SIZE as SPECULAR } from "../constants.js";
 import { downsize, texelDirections, texelSolidAngles } from "./light.js";
@@ -58,7 +58,7 @@ function specularTable(directions, flux) {
   return table;
 }
 
-/** Unit directions [size²·3] of the nodes of a square grid folded into an octahedron. */
+/** Unit directions [size²·3] of the nodes of an octahedral grid. */
 function octahedralNodes(size) {
   const nodes = new Float64Array(3 * size * size);
   for (let row = 0; row < size; row++)
@@ -71,7 +71,7 @@ function octahedralNodes(size) {
   return nodes;
 }
 
-/** Cell of the octahedral grid for the direction in `d` and the position within it, into `out`: node, s, t. */
+/** Cell of the octahedral grid for a direction, and the position in it, into `out`: node, s, t. */
 function octahedralCell(x, y, z, size, out) {
   const scale = 1 / Math.max(Math.abs(x) + Math.abs(y) + Math.abs(z), 1e-12);
   let a = x * scale, b = y * scale;
@@ -84,7 +84,7 @@ function octahedralCell(x, y, z, size, out) {
   out[2] = b - row;
 }
 
-/** Radiance [count·3] that the Gaussians send to the camera at `eye` under `sky`, rotated by the 3×3 `lightToRoot`. */
+/** Radiance [count·3] towards `eye` under `sky`, rotated by the 3×3 `lightToRoot`. */
 export function shadeSky(sky, gaussians, count, eye, lightToRoot, radiance) {
   const { means, normals, albedo, roughness, visibility } = gaussians, r = lightToRoot;
   const diffuse = rotated(sky.diffuse, shRotation(transposed(r))), { specular } = sky;
@@ -124,7 +124,7 @@ function bilinear(table, corner, s, t) {
   return top + t * (table[next] + s * (table[next + 3] - table[next]) - top);
 }
 
-/** The diffuse tables for coefficients of the root's frame: each of their rows times `rotation` [16·16], degree by degree. */
+/** The diffuse tables for SH coefficients in the root's frame: rows times `rotation` [16·16], by degrees. */
 function rotated(diffuse, rotation) {
   const result = new Float32Array(diffuse.length);
   for (let degree = 0; degree < 4; degree++) {
