@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from rnd_runtime.avatar.avatar import Avatar
@@ -31,7 +31,7 @@ from .lights import sun_and_sky
 from .poses import APART, ARMS_DOWN, FPS, Angles, motion_of_poses
 from .psnr import Floats, srgb
 
-Floats32 = NDArray[np.float32]
+Floats32, Numbers = NDArray[np.float32], NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class Subject:
                 yield images, self.capture.cameras[frame.camera], frame.frame / self.capture.motion.fps
 
 
-def blend_skinned(weights: ArrayLike, bones: ArrayLike, points: ArrayLike) -> tuple[Floats, Floats]:
+def blend_skinned(weights: Numbers, bones: Numbers, points: Numbers) -> tuple[Floats, Floats]:
     """Points [N, 3] after linear blend skinning, and the blended 3×3 matrices [N, 3, 3], in float64."""
     blend = np.einsum("nj,jrc->nrc", weights, np.asarray(bones, np.float64))
     return np.einsum("nrc,nc->nr", blend[:, :, :3], points) + blend[:, :, 3], blend[:, :, :3]

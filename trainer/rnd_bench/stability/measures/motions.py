@@ -130,8 +130,8 @@ def wrong_camera(subject: Subject) -> Result:
         "the wrong up axis": (lifted, "above", "z", 2),
     }
     wrong, runs = [], []
-    for number, (file, camera, up, _) in enumerate(cases.values()):
-        options = ("--format", "png", "--camera", files[camera], "--motion-up", up)
+    for number, (file, viewed, up, _) in enumerate(cases.values()):
+        options = ("--format", "png", "--camera", files[viewed], "--motion-up", up)
         runs.append(play(subject.avatar_file, file, subject.work / f"out_view_{number}", *options))
     for (name, (*_, code)), done in zip(cases.items(), run_commands(subject.work, runs), strict=True):
         if done.code != code or (code == 2 and "nothing of the avatar is in view" not in done.errors):
