@@ -1,1 +1,1 @@
-"""What is wrong with a capture, before training."""
+"""Checks of a capture before training."""

@@ -52,7 +52,7 @@ UNKNOWN = {
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long, and on what."""
+    """Schedule and device."""
 
     preset: Literal["quick", "standard", "full"] = "standard"
     """Some seven minutes, half an hour, or hours on two cores."""
@@ -65,14 +65,14 @@ class Schedule:
     save_every: OptionalCount = None
     """Steps between saved states, from which --resume continues. Default: the preset's."""
     seed: Count = 0
-    """Of all random numbers."""
+    """Seed of all random numbers."""
     device: Annotated[str, option("cpu|cuda[:N]")] = "cpu"
     """cuda trains on a GPU with gsplat as the rasteriser (extra [cuda])."""
 
 
 @dataclass(frozen=True)
 class Learning:
-    """What is learned, and from what."""
+    """Losses, poses and motion."""
 
     perceptual_weights: OptionalFile = None
     """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses."""

@@ -52,7 +52,7 @@ class ImportOptions:
     person: OptionalCount = None
     """track number in --poses. Default: the longest track"""
     masks: OptionalFolder = None
-    """masks (.png, .npy) by name or number of the frames, in a folder per camera. Default: the source's, or estimated"""
+    """masks (.png, .npy) by name or number of the frames, one folder per camera. Default: the source's, or estimated"""
     mask_net: OptionalFile = None
     """segmentation network (.onnx) for the masks"""
     normals: OptionalFolder = None
