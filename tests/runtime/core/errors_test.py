@@ -28,6 +28,14 @@ def test_message(error, line):
     assert str(error) == line
 
 
+def test_what_a_file_wrote_neither_reaches_the_terminal_raw_nor_fills_it():
+    line = str(InputError("name", got="\x1b]0;pwned\x07\x1b[2J\u202ea\tb\u00a0é\udcff"))
+    assert line == "name: got \\x1b]0;pwned\\x07\\x1b[2J\\u202ea\\tb\u00a0é\\udcff"
+    long = str(InputError("name", got="x" * 5_000_000, file="a.npz", hint="rename it"))
+    assert len(long) == 500 and long.startswith("a.npz: name") and long.endswith("(rename it)")
+    assert len(str(InputError("name", got="\x1b" * 499))) == 500
+
+
 def test_a_place_found_later_is_added_once():
     error = InputError("size", expected=1, got=2, hint="resize it").at(file="a.png", frame=3)
     assert str(error) == "a.png: frame 3: size: expected 1, got 2 (resize it)"

@@ -10,7 +10,16 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
-from rnd_runtime.shading.light import REC709, Light, downsize, load_light, repair, texel_directions, texel_solid_angles
+from rnd_runtime.shading.light import (
+    REC709,
+    Light,
+    downsize,
+    light_notes,
+    load_light,
+    repair,
+    texel_directions,
+    texel_solid_angles,
+)
 from support.paths import SHARED
 
 SHARED_DATA = SHARED / "data"
@@ -225,6 +234,34 @@ def test_suns_beyond_half_floats_pass_unharmed(tmp_path):
         write_image(tmp_path / "a.exr", pixels)
         light = load_light(tmp_path / "a.exr")
         assert light.repaired == 0 and light.maximum == np.float32(sun)
+
+
+def test_a_sun_that_half_floats_cut_is_their_largest_number():
+    cases = Path(__file__).parents[2] / "cases/reliability/hdr"
+    light, reference = load_light(cases / "half_overflow.exr"), load_light(cases / "float_overflow_ref.exr")
+    sun = reference.radiance > 65504
+    assert (light.radiance[sun] == 65504).all() and light.repaired == 0
+    assert_allclose(light.radiance[~sun], reference.radiance[~sun], rtol=1e-3)
+    (note,) = light_notes(light)
+    assert note.startswith(f"{sun.any(-1).sum()} texels") and "a sun was cut" in note
+    assert not light_notes(reference)
+
+
+@pytest.mark.parametrize("rows", [128, 99, 33])
+def test_large_maps_are_averaged_while_they_are_read(tmp_path, monkeypatch, rows):
+    monkeypatch.setattr("rnd_runtime.shading.light._MAX_ROWS", 32)
+    monkeypatch.setattr("rnd_runtime.core.images._STRIP", 24)
+    pixels = np.random.default_rng(0).gamma(0.5, 2, (rows, 2 * rows, 3)).astype(np.float32)
+    pixels[5, 7] = 1e6
+    write_image(tmp_path / "a.exr", pixels)
+    light = load_light(tmp_path / "a.exr")
+    assert_allclose(light.radiance, downsize(pixels, 32, 64), rtol=1e-6)
+    assert_allclose(light.mean_radiance, Light(pixels).mean_radiance, rtol=ENERGY)
+
+    pixels[3:20, 10:40], pixels[25, 0, 1] = np.nan, -1
+    write_image(tmp_path / "a.exr", pixels)
+    light = load_light(tmp_path / "a.exr")
+    assert light.repaired == 17 * 30 + 1 and np.isfinite(light.radiance).all()
 
 
 def test_exposure_is_in_stops_and_scale_per_channel(tmp_path):

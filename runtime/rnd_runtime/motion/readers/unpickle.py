@@ -513,7 +513,7 @@ def _numpy(name: str, leaf: str, args: Any, state: Any, reader: _Reader) -> Any:
         dtype = np.dtype(args[0])  # a name such as "f8": fields would come with the state, and are refused
         if dtype.kind not in _ARRAY_KINDS or dtype.names:
             raise InputError("dtype", expected="numbers, strings or objects", got=args[0])
-        order = state[1] if state else "="
+        order: Any = state[1] if state else "="
         return dtype.newbyteorder(order) if order in ("<", ">") else dtype
     if leaf == "_reconstruct":
         _, shape, dtype, fortran, content = state
