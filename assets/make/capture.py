@@ -22,7 +22,7 @@ SIZE = 256
 SAMPLES = {"train": 48, "novel_view": 64, "novel_pose": 64, "relight": 64}
 TARGET_LUMINANCE = 0.20  # of the subject, mean over the exposure frames
 EXPOSURE_FRAMES = (0, 40, 90, 130)
-CLIPPED_AT_MOST = 0.03  # of those pixels; a light that clips more is exposed for less
+CLIPPED_AT_MOST = 0.03  # share of clipped pixels; more reduces the exposure
 TRAIN_LIGHT = "noon"
 NOVEL_VIEW_FRAMES = (24, 70, 122)
 NOVEL_POSE_FRAMES = (158, 172, 186, 200, 214)
@@ -35,7 +35,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def cameras() -> dict[str, Camera]:
-    """``cam00`` films the training part from the front; four more look from around, below and above."""
+    """``cam00``, the training camera, in front; four more around, below and above."""
     places = {"cam00": (0, 4), "cam01": (50, -4), "cam02": (-65, 14), "cam03": (128, 8), "cam04": (-150, 30)}
     target, distance = np.array([0.0, 0.95, 0.0]), 4.4
     result = {}
@@ -48,7 +48,7 @@ def cameras() -> dict[str, Camera]:
 
 
 def views() -> list[tuple[Split, str, int, str]]:
-    """Every picture as (split, camera, frame, light)."""
+    """Every image as (split, camera, frame, light)."""
     train = range(0, round(TRAIN_SECONDS * FPS), 2)
     return [
         *(("train", "cam00", frame, TRAIN_LIGHT) for frame in train),
@@ -88,7 +88,7 @@ def make_capture(folder: Path, body: Body) -> None:
 
 
 def contact_sheet(folder: Path) -> None:
-    """``contact.png``: pictures of every split, with their normals and albedo."""
+    """``contact.png``: images of every split, with normals and albedo."""
     capture = load_capture(folder)
     train = capture.split("train")
     rows = [train[::7], capture.split("novel_view")[:11], [*capture.split("novel_pose"), train[-1]]]
@@ -104,7 +104,7 @@ def contact_sheet(folder: Path) -> None:
 
 
 class _Filming:
-    """The dressed figure in motion before its cameras."""
+    """The dressed figure in motion, and its cameras."""
 
     def __init__(self, body: Body) -> None:
         self.dressed = dress(body)
@@ -114,7 +114,7 @@ class _Filming:
         self.cameras = cameras()
 
     def exposure(self, radiance: Floats) -> float:
-        """The factor on ``radiance`` that brings the subject to the wanted luminance, or less if it would clip."""
+        """The factor on ``radiance`` for the target luminance of the subject, or less to limit clipping."""
         colours = []
         for frame in EXPOSURE_FRAMES:
             view = self._view("cam00", frame, radiance, samples=16)
@@ -124,7 +124,7 @@ class _Filming:
         return float(min(TARGET_LUMINANCE / (pixels @ LUMINANCE).mean(), 1.0 / white))
 
     def shoot(self, folder: Path, split: Split, camera: str, index: int, light: str, scale: float) -> Frame:
-        """Render and write one picture with what belongs to it."""
+        """Render and write one image with its ground truth."""
         view = self._view(camera, index, scale * LIGHTS[light](), samples=SAMPLES[split])
         place = f"{camera}_{index:03d}"
         image, mask = f"images/{split}/{light}_{place}.png", f"masks/{place}.png"
@@ -155,12 +155,12 @@ class _Filming:
 
 
 def _estimated(normals: Floats, coverage: Floats, seed: int) -> Floats:
-    """What an off-the-shelf estimator would give: ``normals`` [H, W, 3] a little blurred, smoothly tilted."""
+    """``normals`` [H, W, 3] blurred and smoothly tilted, as if by an estimator."""
     weight = cv2.GaussianBlur(coverage, (0, 0), NORMAL_BLUR)[..., None]
     blurred = cv2.GaussianBlur(normals * coverage[..., None], (0, 0), NORMAL_BLUR) / np.maximum(weight, 1e-3)
     coarse = np.random.default_rng(seed).normal(size=(6, 6, 3))
     tilted = blurred + NORMAL_TILT * cv2.resize(coarse, (SIZE, SIZE), interpolation=cv2.INTER_CUBIC)
-    tilted[..., 2] = np.minimum(tilted[..., 2], -0.02)  # estimators never look through a surface
+    tilted[..., 2] = np.minimum(tilted[..., 2], -0.02)  # facing the camera
     return tilted / np.maximum(np.linalg.norm(tilted, axis=-1, keepdims=True), 1e-9)
 
 

@@ -22,9 +22,9 @@ from rnd_stage.people.remesh import Floats, Ints, vertex_normals
 from rnd_stage.people.solids import project, smooth_min, surface
 
 SKIN, SHIRT, TROUSERS, SHOES, HAIR = range(5)
-STEP = 0.005  # m between the dressed mesh's vertices: finer than a pixel of the capture (9 mm)
+STEP = 0.005  # m between the dressed mesh's vertices; a pixel of the capture is 9 mm
 LAG_SECONDS = 0.15  # cloth follows the joint angles through a first-order low-pass
-TRAIL_SECONDS = 0.012  # and trails behind the surface's velocity by this much
+TRAIL_SECONDS = 0.012  # delay of cloth behind the surface's velocity
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ def dress(body: Body) -> Dressed:
 
 
 class Wardrobe:
-    """Poses a dressed figure along a motion, with folds that depend on the pose and on what came before."""
+    """Poses a dressed figure along a motion, with folds that depend on pose and history."""
 
     def __init__(self, dressed: Dressed, body: Body, motion: Motion) -> None:
         self.dressed, self.body, self.motion = dressed, body, motion
@@ -129,7 +129,7 @@ class Wardrobe:
         return np.einsum("vij,vj->vi", blended[:, :, :3], self.dressed.vertices) + blended[:, :, 3]
 
     def _folds(self, angles: Floats) -> Floats:
-        """How far [V] m the cloth stands off its rest shape, from the joints' lagged axis-angles [24, 3]."""
+        """Offset [V] m of the cloth from its rest shape, from the joints' delayed axis-angles [24, 3]."""
         p, normal = self.dressed.vertices, self.normals
         x, y, z = np.abs(p[:, 0]), p[:, 1], p[:, 2]
         turn = {name: angles[i] for i, name in enumerate(SMPL_NAMES)}

@@ -12,7 +12,7 @@ from rnd_stage.people.remesh import Floats
 
 HEIGHT, WIDTH = 128, 256
 SUBSAMPLES = 8  # per texel and axis, so that the sun's disc has the right area
-SUN_RADIUS = np.radians(1.0)  # four times the real one: it must cover whole texels of 1.4°
+SUN_RADIUS = np.radians(1.0)  # four times the real one, to cover texels of 1.4°
 SUN_RADIANCE = 1.0e4
 
 

@@ -18,7 +18,7 @@ MAX_DEPTH = 4
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one camera sees, linear, premultiplied by coverage.
+    """Images of one camera, linear, premultiplied by coverage.
 
     ``radiance`` [H, W, 3], ``coverage`` [H, W], ``normals`` [H, W, 3] in the world, ``albedo`` [H, W, 3].
     """
@@ -49,7 +49,7 @@ def render(surface: Surface, camera: Camera, radiance: Floats, *, samples: int, 
 
 
 def check_environment() -> float:
-    """Look at single lit texels and return the worst error in degrees between where they are and should be."""
+    """Largest error in degrees of the rendered positions of single lit texels."""
     from rnd_runtime.shading.light import texel_directions
 
     height, width = 16, 32

@@ -43,7 +43,7 @@ FRONT = CameraOptions(512, 512)
 
 
 def convert(options: Options) -> None:
-    """Write the files of ``options`` and report them. Raises ``InputError``; files finished before stay."""
+    """Write the files of ``options`` and report them."""
     if isinstance(options, SplatOptions):
         _splats(options)
     elif isinstance(options, MeshOptions):
@@ -135,7 +135,7 @@ def _mesh(options: MeshOptions) -> None:
     body = Body.load(options.body)
     motion = options.reading.read_motion(options.motion, body.skeleton)
     _log_notes(motion.notes)
-    motion = replace(motion, rotations=share_twists(body.skeleton, motion.rotations))  # as an avatar is posed
+    motion = replace(motion, rotations=share_twists(body.skeleton, motion.rotations))  # as in the avatar
     frames = parse_frames(options.frames, motion.frame_count)
     out = output_folder(options.out)
     if "glb" in formats:

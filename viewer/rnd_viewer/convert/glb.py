@@ -18,7 +18,7 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 class GlbBuilder:
-    """Accessors, and the file that ``write`` makes of them."""
+    """Accessors of a file."""
 
     def __init__(self) -> None:
         self._chunks: list[bytes] = []

@@ -16,7 +16,7 @@ from rnd_runtime.motion.motion import Motion
 from .glb import ELEMENT_ARRAY_BUFFER, FLOAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT, GlbBuilder
 
 Floats = NDArray[np.float64]
-PER_SET = 4  # joints that one JOINTS_n attribute holds
+PER_SET = 4  # joints in one JOINTS_n attribute
 
 
 def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
@@ -83,13 +83,13 @@ def write_rigged_glb(path: Path, body: Body, motion: Motion) -> None:
 
 
 def _weight_sets(glb: GlbBuilder, weights: NDArray[np.float32]) -> dict[str, int]:
-    """JOINTS_n and WEIGHTS_n, as many as the vertex with the most joints needs."""
+    """JOINTS_n and WEIGHTS_n, as many sets as the vertex with the most joints needs."""
     sets = -(-int((weights > 0).sum(axis=1).max()) // PER_SET)
     order = np.argsort(-weights, axis=1, kind="stable")[:, : PER_SET * sets]
     order = np.pad(order, ((0, 0), (0, PER_SET * sets - order.shape[1])))
     strongest = np.take_along_axis(weights, order, axis=1)
     strongest[:, weights.shape[1] :] = 0
-    order[strongest == 0] = 0  # glTF asks for joint 0 where the weight is 0
+    order[strongest == 0] = 0  # glTF requires joint 0 where the weight is 0
     component = UNSIGNED_BYTE if weights.shape[1] <= 256 else UNSIGNED_SHORT
     attributes = {}
     for k in range(sets):
@@ -100,14 +100,14 @@ def _weight_sets(glb: GlbBuilder, weights: NDArray[np.float32]) -> dict[str, int
 
 
 def _animation(glb: GlbBuilder, rest_root: Floats, motion: Motion) -> dict[str, Any]:
-    """Rotations of all joints and root positions at every frame of ``motion``, a closed one with its first again."""
+    """Joint rotations and root positions in every frame of ``motion``; a closed one ends with its first frame."""
     keys = np.arange(motion.frame_count + motion.closed)
     times = glb.accessor(keys / motion.fps, "SCALAR", FLOAT, target=None, bounds=True)
     frames = keys % motion.frame_count
     quaternions = matrix_to_quaternion(motion.rotations[frames])  # [K, J, 4]
     dots = (quaternions[1:] * quaternions[:-1]).sum(axis=-1)
     signs = np.cumprod(np.where(dots < 0, -1.0, 1.0), axis=0)
-    quaternions[1:] *= signs[..., None]  # neighbours on one hemisphere, for players that lerp
+    quaternions[1:] *= signs[..., None]  # consecutive ones on one hemisphere, for players that lerp
     positions = glb.accessor(rest_root + motion.translations[frames], "VEC3", FLOAT, target=None)
     samplers = [{"input": times, "output": positions, "interpolation": "LINEAR"}]
     channels: list[dict[str, Any]] = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]

@@ -15,7 +15,7 @@ from rnd_runtime.core.images import srgb_to_linear
 from .glb import FLOAT, GlbBuilder
 from .splats import SH_0, Coding, Splats
 
-# The order of the 3DGS authors' writer, with all 45 higher coefficients: some readers count bytes.
+# order of the 3DGS writer, with all 45 higher coefficients: some readers count bytes
 PLY_FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz"),
     *(f"f_dc_{k}" for k in range(3)),
@@ -86,7 +86,7 @@ def write_splat_glb(path: Path, splats: Splats, coding: Coding) -> None:
 
 
 def splat_transform() -> str:
-    """The path of PlayCanvas' converter, or ``InputError`` with the line that installs it."""
+    """The path of PlayCanvas' converter; refused with an installation hint if it is missing."""
     program = shutil.which(TRANSFORM)
     if program is None:
         raise InputError(f"spz and sog need {TRANSFORM}, which is not installed", hint=INSTALL)

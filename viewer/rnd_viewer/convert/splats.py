@@ -25,18 +25,18 @@ Floats32 = NDArray[np.float32]
 Colour = Literal["lit", "albedo"]
 Coding = Literal["srgb", "linear"]
 
-SH_0 = 0.28209479177387814  # Y_00, which the formats multiply the first coefficient by
-VIEWS = 64  # directions of the view-dependent colour's fit: four times the unknowns
+SH_0 = 0.28209479177387814  # Y_00
+VIEWS = 64  # directions of the fit of view-dependent colour: four times the unknowns
 BACK_WEIGHT, RIDGE = 0.01, 1e-4  # weight of views from behind; ridge of the coefficients
-FAR = 100.0  # m: a body's view directions then differ by half a degree
+FAR = 100.0  # m; view directions within the body differ by 0.5°
 CELL_SPACINGS = 2.5  # a cell's side, in spacings: the best of 1 to 4
 GRID_OFFSETS = (0.0, 0.25, 0.5, 0.75)  # of a cell, along its diagonal: as good as all eight half offsets
-MIN_SIGMA = 1e-6  # m: a logarithm is stored
+MIN_SIGMA = 1e-6  # m; logarithms are stored
 
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """N Gaussians ready to be stored.
+    """N Gaussians for storage.
 
     Attributes:
         means: [N, 3] m. scales: [N, 3] standard deviations, m. quaternions: [N, 4] wxyz, unit, w ≥ 0.
@@ -53,7 +53,7 @@ class Splats:
 
 
 def are_finite(gaussians: Gaussians) -> NDArray[np.bool_]:
-    """[N] whether all numbers of a Gaussian are finite."""
+    """Whether all numbers of each Gaussian are finite [N]."""
     arrays = (array for name, array in vars(gaussians).items() if name != "root_rotation")
     rows = np.concatenate([array.reshape(len(array), -1) for array in arrays], axis=1)
     return np.asarray(np.isfinite(rows).all(axis=1))
@@ -94,7 +94,7 @@ def stored_colours(gaussians: Gaussians, linear: Floats32, coding: Coding, spaci
 
 
 def fixed_colour(colours: Floats) -> Floats:
-    """SH coefficients [N, 16, 3] of one stored colour [N, 3] for all views."""
+    """SH coefficients [N, 16, 3] of a colour [N, 3] that is constant over views."""
     sh = np.zeros((len(colours), SH_COUNT, 3))
     sh[:, 0] = (colours - 0.5) / SH_0
     return sh

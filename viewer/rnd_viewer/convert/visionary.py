@@ -31,7 +31,7 @@ ROW_BYTES = 40
 _IR_VERSION, _OPSET = 8, 18
 _FLOAT, _INT32, _INT64 = 1, 6, 7  # TensorProto.DataType
 _ATTRIBUTE_INT = 2  # AttributeProto.AttributeType
-_LATE = 1e-3  # of a frame: a rounded frame time picks its own frame
+_LATE = 1e-3  # of a frame, so that rounded times select their frame
 
 
 def packed(splats: Splats) -> tuple[Floats32, Floats32]:
@@ -54,7 +54,7 @@ def packed(splats: Splats) -> tuple[Floats32, Floats32]:
 
 
 def check_clip(frames: int, gaussians: int) -> None:
-    """Refuse a clip that no WebGPU buffer holds."""
+    """Refuse a clip too large for a WebGPU buffer."""
     limit = MAX_BYTES // (gaussians * ROW_BYTES)
     if frames > limit:
         raise InputError("--frames", expected=f"at most {limit} of this avatar for visionary", got=frames)
@@ -92,7 +92,7 @@ def _model(gaussians: Floats32, colours: Floats32, fps: float) -> bytes:
         _node("Mul", ["time", "fps"], "exact_frame"),
         _node("Add", ["exact_frame", "late"], "late_frame"),
         _node("Floor", ["late_frame"], "frame"),
-        _node("Add", ["frame", "half"], "frame_middle"),  # so that rounding of the ratio cannot matter
+        _node("Add", ["frame", "half"], "frame_middle"),  # robust against rounding of the ratio
         _node("Div", ["frame_middle", "frames"], "clips"),
         _node("Floor", ["clips"], "whole_clips"),
         _node("Mul", ["whole_clips", "frames"], "clip_start"),

@@ -16,7 +16,7 @@ from rnd_runtime.shading.light import Light
 
 Floats32 = NDArray[np.float32]
 MAX_RADIANCE = float(np.finfo(np.float32).max)
-STRIP = 8  # rows sampled at once, so that they stay in the cache: 67 ms instead of 103 at 512²
+STRIP = 8  # rows sampled at once, within the cache: 67 ms instead of 103 at 512²
 _NAMES = {  # of CSS, sRGB
     "black": "000",
     "white": "fff",
@@ -77,7 +77,9 @@ class Background:
         """Linear radiance of the background at every pixel of ``camera``: [H, W, 3] or, for one colour, [3]."""
         if self.kind != "hdr":
             return np.array(self.colour, np.float32)
-        x, y, z = np.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]  # the world's share of each pixel axis
+        x, y, z = (
+            np.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]
+        )  # world direction = column · x + row · y + z
         columns = (np.arange(camera.width) + 0.5)[:, None] * x
         rows = (np.arange(camera.height) + 0.5)[:, None, None] * y + z
         image = np.empty((camera.height, camera.width, 3), np.float32)
@@ -87,14 +89,14 @@ class Background:
 
 
 class Backdrop:
-    """Puts a background behind frames; its radiance is cached while camera and light stay the same."""
+    """Composites frames over a background; its radiance is cached while camera and light are the same."""
 
     def __init__(self, background: Background) -> None:
         self.background = background
         self._cached: tuple[Camera, Light, Floats32] | None = None
 
     def behind(self, frame: RenderedFrame, camera: Camera, light: Light) -> RenderedFrame:
-        """``frame``, seen by ``camera`` under ``light``, with the background."""
+        """``frame`` of ``camera`` under ``light``, over the background."""
         if self.background.kind == "none":
             return frame
         if self._cached is None or self._cached[0] is not camera or self._cached[1] is not light:

@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
-    """One camera as captures store it."""
+    """One camera, as in captures."""
 
     width: int
     height: int
@@ -40,13 +40,13 @@ class _CameraRecord(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _CameraFile(msgspec.Struct):
-    """A file with several cameras: a list holds one for each frame, a mapping names them."""
+    """A file with several cameras: a list with one for each frame, or a mapping of names."""
 
     cameras: list[_CameraRecord] | dict[str, _CameraRecord]
 
 
 def file_path(text: str, size: tuple[int, int | None] | None, frames: range) -> CameraPath:
-    """A camera path read from ``FILE.json`` or, for a camera with a name, ``FILE.json:NAME``.
+    """The camera path of ``FILE.json`` or ``FILE.json:NAME``.
 
     The file holds one camera ``{"width", "height", "K", "world_to_camera"}``, or ``{"cameras": [...]}`` with
     one for each frame, or ``{"cameras": {name: ...}}`` as ``capture.json`` has. ``size`` (width, height) in
@@ -69,7 +69,7 @@ def file_path(text: str, size: tuple[int, int | None] | None, frames: range) -> 
 
 
 def split_camera(text: str) -> tuple[Path, str]:
-    """``FILE.json:NAME`` as file and name, which may be missing. Raises ``InputError`` for anything else."""
+    """``FILE.json:NAME`` or ``FILE.json`` as file and name."""
     match = re.fullmatch(r"(.+?\.json)(?::(.*))?", text)
     if match is None:
         raise InputError("--camera", expected="front, orbit (rnd-play), FILE.json or FILE.json:NAME", got=text)

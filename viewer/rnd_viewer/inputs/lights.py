@@ -10,7 +10,7 @@ from rnd_runtime.shading.light import Light, Up, load_light
 
 
 def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, exposure: float) -> Light:
-    """The light in ``probe``, or the one that was learnt with ``avatar``.
+    """The light of ``probe``, or the learned light of ``avatar``.
 
     Args:
         up: which axis points up in the probe's file; the learnt light is Y up.

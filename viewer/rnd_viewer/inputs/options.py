@@ -56,18 +56,18 @@ class MotionOptions:
 
     @property
     def edits(self) -> MotionEdits:
-        """What is done to the motion once it is read."""
+        """Edits of the motion after it is read."""
         return MotionEdits(**{name: getattr(self, name) for name in _EDITS})
 
     def read_motion(self, path: Path, skeleton: Skeleton) -> Motion:
-        """Read and edit the motion in ``path`` for ``skeleton``. Raises ``InputError``."""
+        """Read and edit the motion in ``path`` for ``skeleton``."""
         from rnd_runtime.motion.motion import load_motion  # loads numba, which run_command prepares for
 
         motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
         return edit_motion(motion, self.edits)
 
     def refuse_unread(self, why: str, *, edited: bool = False) -> None:
-        """Raise ``InputError`` for options of a motion's file where none is given; edits too unless one is edited."""
+        """Refuse options of a motion's file if there is none, and edits unless a motion is edited."""
         names = (field.name for field in fields(MotionOptions))
         refuse_changed(self, (name for name in names if not (edited and name in _EDITS)), why)
 

@@ -1,4 +1,4 @@
-"""What a report shows of ``rnd-bench``: one chart of speed against accuracy, and the table of stability."""
+"""The parts of a report from ``rnd-bench``: the speed–accuracy chart and the table of stability."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .html_parts import data_uri, figure, missing, number, table
 from .run_files import read_rows
 
 TITLE = "Speed, accuracy, stability"
-CHARTS = ("crossed.svg", "grid.svg")  # the first that exists: both show the same, with more or fewer points
+CHARTS = ("crossed.svg", "grid.svg")  # the first that exists
 STABILITY = "stability.json"
 HEAD = ("id", "failure", "what was measured", "measured", "limit", "verdict", "baseline")
 WORDS = (0, 1, 2, 5, 6)
@@ -40,7 +40,7 @@ def _chart(file: Path, run: Path) -> str:
         "Time of a frame against its accuracy; each point is one configuration. "
         f"From {file}{machines and f', measured on {machines}'}. {measured_on(rows, run)}"
     )
-    # as an image, not inline: its ids could be those of the page
+    # as an image: inline, its ids could collide with those of the page
     source = data_uri(file.read_bytes(), "image/svg+xml")
     return figure(f'<img class="chart" alt="{escape(file.stem)}" src="{source}">', caption)
 
@@ -64,7 +64,7 @@ def _stability(file: Path, run: Path) -> str:
 
 
 def _amount(row: dict[str, Any], name: str = "measured") -> str:
-    """A figure with its unit. JSON has null for NaN; the verdict distinguishes it from an unmeasured row."""
+    """A figure with its unit; null in JSON is NaN unless the verdict is "not measured"."""
     if row.get(name) is None:
         return "not measured" if row.get("verdict") == "not measured" else "not a number"
     return f"{number(row[name])}\N{NO-BREAK SPACE}{row.get('unit') or ''}".rstrip()

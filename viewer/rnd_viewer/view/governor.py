@@ -1,13 +1,13 @@
-"""Holding a frame rate: resolution is given up before a frame would be dropped."""
+"""Control of the frame rate by the resolution."""
 
 from __future__ import annotations
 
 import numpy as np
 
-LADDER = (1.0, 0.75, 0.5)  # shares of the full width and height, from the best to the fastest
-_WINDOW = 4  # frames whose median decides to give something up: one slow frame does not
-_SMOOTH = 24  # frames that must all have been fast before something is taken back
-_HEADROOM = 0.6  # of the budget: what is taken back costs up to as much again
+LADDER = (1.0, 0.75, 0.5)  # scales of width and height
+_WINDOW = 4  # frames whose median decides on a lower scale
+_SMOOTH = 24  # frames that must all be fast before a higher scale
+_HEADROOM = 0.6  # of the budget; the largest time of a fast frame
 
 
 class Governor:
@@ -27,7 +27,7 @@ class Governor:
         return LADDER[self._level]
 
     def observe(self, seconds: float) -> None:
-        """Take in how long the last frame took to render."""
+        """Add the time of the last frame."""
         self._seconds = [*self._seconds, seconds][-_SMOOTH:]
         if len(self._seconds) >= _WINDOW and np.median(self._seconds[-_WINDOW:]) > self._budget:
             self._go(1)
@@ -36,4 +36,4 @@ class Governor:
 
     def _go(self, step: int) -> None:
         self._level = min(max(self._level + step, 0), len(LADDER) - 1)
-        self._seconds = []  # what frames of another scale took says nothing of this one
+        self._seconds = []  # times of other scales do not count

@@ -1,4 +1,4 @@
-"""What ``rnd-view`` shows: an avatar, a motion, lights, a capture; and one image for each state."""
+"""The content of ``rnd-view``: an avatar, a motion, lights, a capture; and an image for each state."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from .state import ViewState
 Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-CLAY = np.float32(0.8)  # albedo of a body that shows the light alone
+CLAY = np.float32(0.8)  # albedo of the output "light"
 MAX_SHADERS = 12  # tables of up to 1.5 MB each; building one takes 30–300 ms
-LARGEST_SKY = 1024  # rows of a background map that is cached: 25 MB
+LARGEST_SKY = 1024  # rows of a cached background map: 25 MB
 
 
 class View:
@@ -80,7 +80,7 @@ class Scene:
         self.renderer = FrameRenderer(self.avatar, first, raster=options.raster)
 
     def description(self) -> dict[str, Any]:
-        """What a page needs to know before it asks for frames."""
+        """The description of the scene for a page."""
         framing = frame_motion(self.avatar.skeleton, self.motion)
         view = CameraOptions(*self.size)
         home = front_path(framing, view)(0, 0.0)
@@ -112,7 +112,7 @@ class Scene:
         self.render(ViewState(time=0.0, width=width, height=height, light=about["light"], **about["view"]))
 
     def render(self, state: ViewState) -> View:
-        """The image of ``state`` with the time that each stage took."""
+        """The image of ``state`` with the times of its stages."""
         seconds: dict[str, float] = {}
         if state.truth is not None:
             state = structs.replace(state, yaw=0.0, exposure=0.0)
@@ -136,7 +136,7 @@ class Scene:
         return View(srgb, self._joints(motion, time_s, camera), seconds)
 
     def notes_of_light(self, state: ViewState) -> list[str]:
-        """Notes on the light of a ``state`` that was rendered."""
+        """Notes on the light of a rendered ``state``."""
         return self._light_notes[self._light_name(state)]
 
     def truth_file(self, index: int) -> Path:
@@ -213,7 +213,7 @@ class Scene:
 
     def _build_shader(self, name: str | Path | None, shade: str) -> Shader:
         shader = Shader(self._light(name), shade)
-        # it is only rotated from here on: its texels need not stay
+        # from here on the light is only rotated: its texels can be freed
         shader.light = replace(shader.light, radiance=np.zeros((1, 2, 3), np.float32))
         self._light.cache_clear()
         return shader
@@ -239,7 +239,7 @@ class Scene:
         return replace(light, radiance=downsize(light.radiance, LARGEST_SKY, 2 * LARGEST_SKY))
 
     def _background_radiance(self, state: ViewState, camera: Camera) -> Floats32:
-        """The background; a map's is cached while neither it nor the camera moves."""
+        """The background; a map's is cached while map and camera are the same."""
         background = Background.parse(state.background)
         if background.kind != "hdr":
             return np.array(background.colour, np.float32)
@@ -262,7 +262,7 @@ class Scene:
 
 
 def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
-    """``count`` at even steps through the file, whose neighbours are the body's, grown to cover the same area."""
+    """``count`` Gaussians at even steps through the file, which is in spatial order, scaled to cover the same area."""
     total = len(gaussians.means)
     if count is None or count >= total:
         return gaussians
@@ -272,7 +272,7 @@ def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
 
 
 def _probes(paths: tuple[Path, ...]) -> list[Path]:
-    """The light probes among ``paths``, folders opened."""
+    """The light probes among ``paths`` and in their folders."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():

@@ -1,4 +1,4 @@
-"""What a page may ask of ``rnd-view``: one message for each frame, one for each clip."""
+"""Requests of a page to ``rnd-view``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
 
 
 class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that one frame depends on.
+    """All parameters of a frame.
 
     Attributes:
         time: s into the motion. width, height: px.
@@ -66,7 +66,7 @@ class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="render", tag_field="ask"):
-    """One frame. ``number`` comes back with it; a ``live`` one may be smaller, to hold ``--fps-floor``."""
+    """One frame, answered with its ``number``; a ``live`` one may be smaller, to hold ``--fps-floor``."""
 
     number: int
     state: ViewState
@@ -74,7 +74,7 @@ class RenderRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag
 
 
 class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="clip", tag_field="ask"):
-    """The whole motion as an mp4, seen as ``state`` says; ``turn``: rad that the camera orbits meanwhile."""
+    """The whole motion as an mp4 in the view of ``state``; ``turn``: rad by which the camera orbits."""
 
     state: ViewState
     fps: Annotated[float, Meta(ge=1, le=240)]
@@ -82,7 +82,7 @@ class ClipRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
 
 class TruthRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="truth", tag_field="ask"):
-    """The capture's image ``index`` as its file has it."""
+    """The capture's image ``index`` as in its file."""
 
     index: Annotated[int, Meta(ge=0)]
 

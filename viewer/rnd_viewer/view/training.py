@@ -18,7 +18,7 @@ from .scene import Scene
 
 METRICS, STATUS, CONFIG, PREVIEWS = "metrics.jsonl", "status.json", "config.json", "previews"
 AVATAR = "avatar.onnx"
-POINTS = 300  # of a curve: the page has no more pixels for it
+POINTS = 300  # of a curve, as many as its pixels
 _PREVIEW = re.compile(r"step_\d+\.png")
 _NO_LOSSES = ("step", "stage", "seconds", "skipped")
 
@@ -40,7 +40,7 @@ class Training:
         self._reading, self._loading = threading.Lock(), threading.Lock()
 
     def state(self) -> dict[str, Any]:
-        """What the page shows: the status that rnd-train writes, one curve ``[[step, mean], …]`` a loss, file names."""
+        """Content of the page: the status of rnd-train, a curve ``[[step, mean], …]`` for each loss, file names."""
         with self._reading:
             rows = self._read_metrics()
         status, last = _json(self.folder / STATUS), rows[-1] if rows else {}
@@ -60,7 +60,7 @@ class Training:
         }
 
     def preview(self, name: str) -> bytes | None:
-        """The preview image ``name``; None where there is none of this name."""
+        """The preview image ``name``, or None."""
         file = self.folder / PREVIEWS / name
         return file.read_bytes() if _PREVIEW.fullmatch(name) and file.is_file() else None
 
@@ -82,7 +82,7 @@ class Training:
             scene.close()
 
     def _read_metrics(self) -> list[dict[str, Any]]:
-        """All rows so far. A line still being written waits; a file that --resume replaced is read anew."""
+        """All complete rows so far; a file replaced by --resume is read again."""
         try:
             with (self.folder / METRICS).open("rb") as stream:
                 file = os.fstat(stream.fileno()).st_ino
@@ -103,13 +103,13 @@ class Training:
         return sorted(file.name for file in folder.glob("step_*.png")) if folder.is_dir() else []
 
     def _silence(self) -> float | None:
-        """Seconds since rnd-train last wrote something."""
+        """Seconds since rnd-train's last write."""
         times = [file.stat().st_mtime for name in (METRICS, STATUS) if (file := self.folder / name).exists()]
         return max(time.time() - max(times), 0) if times else None
 
 
 def _parse(text: str | bytes) -> dict[str, Any]:
-    """A JSON object; empty for whatever is none, as a line that a crash cut."""
+    """A JSON object; empty for anything else, such as a truncated line."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):

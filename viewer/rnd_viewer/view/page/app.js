@@ -1,11 +1,11 @@
-// The page: its controls make a state, an engine renders states.
+// The page: controls define a state, an engine renders it.
 
 import { connect } from "./engine.js";
 import { orbit, wrapped } from "./orbit.js";
 
 const IN_FLIGHT = 2;  // one frame is shown while the next is rendered
-const LONG_MS = 1000;  // after which a frame in the making is announced
-const MAX_CLIP_FPS = 60;  // what most screens show; motions have 120
+const LONG_MS = 1000;  // time after which a pending frame is announced
+const MAX_CLIP_FPS = 60;
 const RADIANS = Math.PI / 180;
 const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
 const $ = (id) => document.getElementById(id);
@@ -16,10 +16,10 @@ const state = {
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
-let waiting = [];  // {number, done, failed} of those who await a frame
+let waiting = [];  // {number, done, failed} of awaited frames
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [], shownAt = 0;
-let passing = true;  // the message goes when a frame comes
+let passing = true;  // the next frame clears the message
 
 function redraw() { wanted = true; }
 
@@ -44,9 +44,9 @@ function ask(exact) {
 }
 
 function show(frame) {
-  if (frame.number < shown) return frame.image.close?.();  // it took longer to decode than the one after it
+  if (frame.number < shown) return frame.image.close?.();  // decoded after a later frame
   shown = frame.number;
-  const sent = flying.get(frame.number) ?? performance.now();  // forgotten where the one before it failed
+  const sent = flying.get(frame.number) ?? performance.now();  // missing if the frame before failed
   for (const old of [...flying.keys()]) if (old <= frame.number) flying.delete(old);
   const canvas = $("frame"), context = canvas.getContext("2d");
   if (canvas.width !== frame.width || canvas.height !== frame.height) {
@@ -68,9 +68,9 @@ function show(frame) {
   if ($("message").textContent && passing) say("");
 }
 
-/** Announce a frame that takes long; it clears the message. */
+/** Announce a frame that takes long; the frame clears the message. */
 function announceSlowFrame() {
-  const since = Math.max(Math.min(...flying.values()), shownAt);  // infinite where nothing is asked for
+  const since = Math.max(Math.min(...flying.values()), shownAt);  // infinite without pending frames
   if (!$("message").textContent && performance.now() - since > LONG_MS) say("rendering …", { untilFrame: true });
 }
 
@@ -141,7 +141,7 @@ function play(on) {
   redraw();
 }
 
-/** Show a message until the next one, or until the next frame where it is `untilFrame`. */
+/** Show a message until the next one or, with `untilFrame`, until the next frame. */
 function say(text, { wrong = false, untilFrame = false } = {}) {
   passing = untilFrame;
   $("message").textContent = text;
@@ -157,7 +157,7 @@ function home() {
   redraw();
 }
 
-/** The first camera, and the light neither rotated nor exposed. */
+/** Reset camera, light rotation and exposure. */
 function reset() {
   Object.assign(state, { yaw: 0, exposure: 0 });
   home();
@@ -174,7 +174,7 @@ function setScene(description) {
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
   $("time").step = 1 / scene.motion.fps;
-  $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // a slider stops short of an end that rounding put off its steps
+  $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // the end of a slider must be on one of its steps
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
   freeMotion();
   state.time = Math.min(state.time, scene.motion.duration);
@@ -210,7 +210,7 @@ async function setTruth() {
 }
 
 function showTruth(index, bitmap) {
-  if (index !== state.truth) return bitmap?.close();  // another was asked for since
+  if (index !== state.truth) return bitmap?.close();  // another one was requested meanwhile
   const canvas = $("truth"), { label, width, height } = scene.truths[index];
   canvas.dataset.index = index;
   canvas.width = bitmap?.width ?? width;  // and it is blank
@@ -228,7 +228,7 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
 }
 
-/** A promise of the current state's frame, with exact pixels by default. */
+/** A promise of the current state's frame, by default with exact pixels. */
 function frame(exact = true) {
   return new Promise((done, failed) => { waiting.push({ number: ask(exact), done, failed }); });
 }
@@ -261,7 +261,7 @@ function endClip() {
   freeMotion();
 }
 
-/** Controls that move or film the avatar are off beside a truth, whose pose and camera are shown. */
+/** Disable controls of motion, camera and clips while a ground-truth image with its own pose and camera is shown. */
 function freeMotion() {
   const compared = state.truth !== null, still = !scene?.motion.duration;
   $("play").disabled = $("time").disabled = compared || still;
@@ -317,7 +317,7 @@ function bind() {
 function bindFiles() {
   $("files").hidden = false;
   const load = async (files) => {
-    const list = [...files];  // the browser takes its own list away when this function waits
+    const list = [...files];  // the browser clears its list when this function awaits
     if (!list.length) return say("expected files, got something else", { wrong: true });
     const idle = async () => { while (clipMade) await clipMade.promise; };  // a clip is of one scene
     if (clipMade) await idle();
@@ -326,7 +326,7 @@ function bindFiles() {
   };
   $("choose").addEventListener("change", () => {
     load($("choose").files);
-    $("choose").value = "";  // or the same file, changed meanwhile, could not be chosen again
+    $("choose").value = "";  // so that a changed file of the same name can be chosen again
   });
   document.addEventListener("dragover", (event) => { event.preventDefault(); document.body.classList.add("over"); });
   document.addEventListener("dragleave", () => document.body.classList.remove("over"));

@@ -1,4 +1,4 @@
-// Frames come from rnd-view over a websocket. A page served without it brings an engine.js of its own.
+// Frames from rnd-view over a websocket. Static pages have another engine.js.
 
 const WITH_BODY = ["frame", "clip", "truth"];
 const UNREACHABLE = "rnd-view does not answer; is it still running?";
@@ -24,7 +24,7 @@ export async function connect(on) {
     receive(header, data, on);
   };
   socket.onclose = () => on.error(UNREACHABLE);
-  // Raw pixels are exact, and no slower while no wire is in between.
+  // raw pixels are exact, and as fast on the same machine
   const local = ["127.0.0.1", "localhost", "[::1]"].includes(location.hostname);
   const encoding = new URLSearchParams(location.search).get("encoding") ?? (local ? "raw" : "jpeg");
   const send = (request) => {

@@ -1,4 +1,4 @@
-// The page of a training: what rnd-view reads in the run's folder, asked for every other second.
+// The page of a training: content of the run's folder, requested every two seconds.
 
 const PERIOD_MS = 2000, SILENT_S = 120;
 const WIDTH = 300, HEIGHT = 70;  // of a curve, in its own units
