@@ -1,7 +1,7 @@
-"""Neighbours on the body side by side in the file, so that caches of a player hold what comes next.
+"""Spatial order of Gaussians and nodes in the file, for the caches of players.
 
-Gaussians and nodes are stored along a Z-curve (Morton 1966) through the pose in which their positions are encoded.
-The checkpoint's farthest-point order, of which any prefix covers the body, puts neighbours far apart.
+They are stored along a Z-curve (Morton 1966) through their encoded positions, instead of the checkpoint's
+farthest-point order.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_trainer.model.template import along_curve
+from rnd_trainer.model.template import z_curve_order
 
 from .bake import PER_GAUSSIAN, BakedAvatar
 
@@ -20,7 +20,7 @@ Integers = NDArray[np.int64]
 
 def order_gaussians(baked: BakedAvatar) -> BakedAvatar:
     """``baked`` with its Gaussians along the curve."""
-    order = along_curve(baked.all_codes)
+    order = z_curve_order(baked.all_codes)
     moved = {name: getattr(baked, name)[order] for name in PER_GAUSSIAN}
     return dataclasses.replace(baked, node_rows=_inverse(order)[baked.node_rows], **moved)
 
@@ -28,7 +28,7 @@ def order_gaussians(baked: BakedAvatar) -> BakedAvatar:
 def order_nodes(baked: BakedAvatar) -> BakedAvatar:
     """``baked`` with its nodes along the curve, those with dynamic skinning before the others."""
     moving = baked.dynamic_nodes
-    order = [along_curve(baked.codes[:moving]), moving + along_curve(baked.codes[moving:])]
+    order = [z_curve_order(baked.codes[:moving]), moving + z_curve_order(baked.codes[moving:])]
     return permute_nodes(baked, np.concatenate(order))
 
 

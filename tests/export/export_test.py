@@ -28,7 +28,7 @@ from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_runtime.posing.window import motion_window
 from rnd_trainer.model.checkpoint import SCHEMA, load_checkpoint, read_tensors, save_checkpoint, write_tensors
 from rnd_trainer.model.model import AvatarModel
-from rnd_trainer.model.template import along_curve, sample_template
+from rnd_trainer.model.template import sample_template, z_curve_order
 from rnd_trainer.training.data import pose_input
 from support.tiny import body, motion
 
@@ -137,7 +137,7 @@ def test_coarse_is_the_model_on_fewer_nodes(tiny_checkpoint, tmp_path) -> None:
     variant = Avatar.load(half).metadata.variant
     assert (variant.encoder, variant.nodes) == ("coarse", 50)
     codes = bake(checkpoint.model).all_codes
-    few, many = along_curve(codes[:50]), along_curve(codes[:200])  # the file's order of nodes
+    few, many = z_curve_order(codes[:50]), z_curve_order(codes[:200])  # the file's order of nodes
     for name in ("node_logits", "node_offsets", "node_visibility"):
         coarse, truth = (_output(path, motion(body()), checkpoint, name) for path in (half, whole))
         same, others = truth[np.argsort(many)[few]], truth[:50]

@@ -11,7 +11,7 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.shading.brdf import ROUGHNESS_RANGE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.encoders import SH_DC_OF_ONE, JointAttention, positional_encoding
-from rnd_trainer.model.model import ALBEDO_RANGE, GLOSSIEST_RESIDUAL, AvatarModel, PoseInput
+from rnd_trainer.model.model import ALBEDO_RANGE, MIN_ROUGHNESS_RESIDUAL, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.training.data import pose_input
 from support.tiny import body, motion
@@ -86,7 +86,7 @@ def test_evaluation_bounds_the_roughness_residual(model) -> None:
         model.appearance_residual[:, -1] = torch.tensor([-9, -0.3, 0, 9.0]).repeat(150)
         trained = model.attributes(model.encoded_nodes()).roughness
         played = model.eval().attributes(model.encoded_nodes()).roughness
-        model.appearance_residual[:, -1].clamp_(min=GLOSSIEST_RESIDUAL)
+        model.appearance_residual[:, -1].clamp_(min=MIN_ROUGHNESS_RESIDUAL)
         bounded = model.train().attributes(model.encoded_nodes()).roughness
     assert torch.equal(played, bounded)
     drifted = torch.tensor([True, False, False, False]).repeat(150)

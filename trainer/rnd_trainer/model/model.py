@@ -23,13 +23,13 @@ TANGENT_SCALE = (0.25, 2.0)
 """range of the standard deviations along the surface, in units of the spacing"""
 NORMAL_SCALE = (0.05, 0.5)
 """range of the standard deviation across the surface, in units of the spacing"""
-START_OPACITY = 2.2
+INITIAL_RAW_OPACITY = 2.2
 """initial raw opacity; its sigmoid is 0.90"""
 
 GEOMETRY_COLUMNS = {"opacity": 1, "rotation": 3, "scale": 3, "normal": 3, "offset": 3}
 LIMB_BUFFERS = ("limb_axes", "limb_levers", "limb_shares")
 APPEARANCE_COLUMNS = {"colour": 3, "albedo": 3, "roughness": 1}
-GLOSSIEST_RESIDUAL = -0.6
+MIN_ROUGHNESS_RESIDUAL = -0.6
 """lower bound, in evaluation mode, of the raw roughness residual"""
 
 
@@ -132,13 +132,13 @@ class AvatarModel(nn.Module):
         """D_g and D_a with residuals, activated.
 
         ``max_static_offset`` bounds the surface's offset from the template, one spacing a Gaussian's from the surface.
-        In evaluation mode ``GLOSSIEST_RESIDUAL`` bounds the residual of roughness, the last column.
+        In evaluation mode ``MIN_ROUGHNESS_RESIDUAL`` bounds the residual of roughness, the last column.
         """
         columns = {**GEOMETRY_COLUMNS, **APPEARANCE_COLUMNS}
         smooth = self.interpolate(torch.cat([self.geometry(encoded), self.appearance(encoded)], dim=-1))
         residual = torch.cat([self.geometry_residual, self.appearance_residual], dim=-1)
         if not self.training:
-            residual = torch.cat([residual[:, :-1], residual[:, -1:].clamp(min=GLOSSIEST_RESIDUAL)], dim=-1)
+            residual = torch.cat([residual[:, :-1], residual[:, -1:].clamp(min=MIN_ROUGHNESS_RESIDUAL)], dim=-1)
         part = _by_name(smooth + residual, columns)
         surface_offset = _by_name(smooth, columns)["offset"]
         tilt = 0.8 * torch.tanh(part["normal"]) if self.config.learned_normals else 0.0
@@ -149,7 +149,7 @@ class AvatarModel(nn.Module):
         low, high = ALBEDO_RANGE
         glossy, rough = ROUGHNESS_RANGE
         return Attributes(
-            opacity=torch.sigmoid(part["opacity"][:, 0] + START_OPACITY),
+            opacity=torch.sigmoid(part["opacity"][:, 0] + INITIAL_RAW_OPACITY),
             rotation=torch.tanh(part["rotation"]),
             scales=self.spacing * scales,
             normals=normals,

@@ -118,7 +118,7 @@ def node_interpolation(codes: Floats, nodes: Floats, area: float) -> tuple[NDArr
     return neighbours.astype(np.int64), kernel / kernel.sum(axis=1, keepdims=True)
 
 
-def along_curve(points: Floats) -> NDArray[np.int64]:
+def z_curve_order(points: Floats) -> NDArray[np.int64]:
     """Indices [N] of ``points`` [N, 3] m along a Z-curve (Morton 1966), stable within a cell."""
     low = points.min(axis=0, initial=np.inf)
     extent = max(float((points - low).max(initial=0)), 1e-9)
@@ -144,7 +144,7 @@ def farthest_points(points: NDArray[np.float32], count: int, first: int) -> NDAr
     Ties go to the lowest index. Bounding boxes of buckets skip points far from the newest one, as in QuickFPS (Han et
     al. 2023); the ordering is that of exhaustive search.
     """
-    curve = along_curve(points.astype(np.float64))
+    curve = z_curve_order(points.astype(np.float64))
     return _farthest_along(points[curve], curve, count, int(np.flatnonzero(curve == first)[0]))
 
 

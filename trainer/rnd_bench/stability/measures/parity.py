@@ -20,7 +20,7 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, save_motion
 from rnd_trainer.evaluation.evaluator import to_gaussians
 from rnd_trainer.model.checkpoint import load_checkpoint
-from rnd_trainer.model.template import along_curve
+from rnd_trainer.model.template import z_curve_order
 from rnd_trainer.training.data import pose_input
 
 PRECISIONS = {"f16": 1.0, "int8": 3.0}  # mm; limit of the positions' p99
@@ -38,7 +38,7 @@ def wild_motion(subject: Subject, frames: int) -> Motion:
 def torch_against_onnx(subject: Subject) -> Result:
     """R1: weights, positions and images by torch and by onnxruntime."""
     checkpoint = load_checkpoint(subject.checkpoint)
-    rows = along_curve(checkpoint.model.codes.double().numpy())
+    rows = z_curve_order(checkpoint.model.codes.double().numpy())
     count = subject.few(30, 200)
     motion = wild_motion(subject, count)
     weights, positions, worst, pair = 0.0, 0.0, np.inf, None
