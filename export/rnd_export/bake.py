@@ -1,7 +1,7 @@
-"""Everything of a model that does not depend on the pose, folded as far as it makes the file smaller.
+"""The constants of a model, evaluated in float64.
 
-What networks compute from a node's position alone is not stored: onnxruntime folds it when it loads the file. Stored,
-it would be more than half of the file.
+Outputs of networks that depend on a node's position alone are not stored: onnxruntime folds them when it loads the
+file. They would be more than half of the file.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ class BakedAvatar:
     area: float
 
 
-PER_GAUSSIAN = (
+# fields of ``BakedAvatar`` with a row per Gaussian
+PER_GAUSSIAN: tuple[str, ...] = (
     "all_codes",
     "neighbours",
     "neighbour_weights",
@@ -93,20 +94,13 @@ PER_GAUSSIAN = (
     "points",
     "factors",
     "normals",
-    "limb_axes",
-    "limb_levers",
-    "limb_shares",
-    "opacities",
-    "albedo",
-    "roughness",
-    "rows",
 )
-"""fields of ``BakedAvatar`` with a row per Gaussian"""
+PER_GAUSSIAN += ("limb_axes", "limb_levers", "limb_shares", "opacities", "albedo", "roughness", "rows")
 
 
 @torch.no_grad()
 def bake(model: AvatarModel) -> BakedAvatar:
-    """Evaluate in float64 all that does not depend on the pose."""
+    """Evaluate everything that does not depend on the pose."""
     model = copy.deepcopy(model).double()
     config = model.config
     static = model.attributes(model.encoded_nodes())
@@ -140,7 +134,7 @@ def bake(model: AvatarModel) -> BakedAvatar:
 
 def _skinning(model: AvatarModel) -> BakedSkinning:
     skinning, width = model.skinning, model.config.width
-    assert skinning.temporal is not None, "ablations are refused before"
+    assert skinning.temporal is not None
     for_t, for_s, for_x = skinning.merge.weight.split([width, width, width], dim=1)
     bias = skinning.merge.bias
     bias = bias + skinning.temporal.out.bias @ for_t.T + skinning.spatial.out.bias @ for_s.T

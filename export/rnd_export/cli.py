@@ -106,10 +106,8 @@ def _export(options: Options) -> None:
         from .export import export
         from .parity import MAX_FRAMES, random_motion
     except ModuleNotFoundError as error:
-        raise InputError(
-            f"{error.name} is not installed",
-            hint='needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"',
-        ) from error
+        hint = 'needs the extra: pip install "rnd-avatar[export]", in a clone ".[export]"'
+        raise InputError(f"{error.name} is not installed", hint=hint) from error
     from rnd_runtime.avatar.file import advice_of
     from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
     from rnd_runtime.motion.motion import load_motion
@@ -153,7 +151,7 @@ def _log_all(notes: Iterable[str]) -> None:
 
 
 def _files(options: Options) -> tuple[Path, Path]:
-    """The checkpoint, and the file to write, which is none of those that are read."""
+    """The checkpoint, and the file to write, which differs from all inputs."""
     from rnd_runtime.capture.capture import capture_file
     from rnd_runtime.core.files import existing_file, output_file, refuse_input
 
@@ -172,7 +170,7 @@ def _files(options: Options) -> tuple[Path, Path]:
 
 
 def _check(options: Options, bounds: dict[str, float]) -> None:
-    """Raise ``InputError`` for options outside their range, or without effect beside the others."""
+    """Refuse options outside their range or without effect."""
     check_cull(options.cull)
     search, reduction = options.search, options.reduction
     sides = [side for side in search.size if side is not None]

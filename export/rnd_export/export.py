@@ -1,4 +1,4 @@
-"""avatar.ckpt → avatar.onnx: bake, order, reduce, build, and compare with torch before the file takes its name."""
+"""avatar.ckpt → avatar.onnx: bake, order, reduce, build, and compare with torch before the file is renamed."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ def export(
 
     Args:
         motion: by default 120 random frames.
-        variant: what the file leaves out. Only precision is bounded; other reductions are measured.
-        cull: n·v below which the file tells players to leave Gaussians out; −1 for none, by default ``find_cull``.
+        variant: reductions; errors of the precision are limited, those of others only measured.
+        cull: n·v below which players are advised to cull Gaussians; −1: none, by default ``find_cull``.
 
     Raises:
-        InputError: the difference exceeds what the variant's precision allows. Nothing stays under ``out``.
+        InputError: the difference exceeds the limit of the precision; ``out`` is not written.
     """
     refuse_ablations(checkpoint)
     variant = variant or Variant()
@@ -73,12 +73,8 @@ def export(
             raise InputError("export refused: positions", expected="finite numbers", got="NaN or infinity", file=out)
         for what, got, allowed in error.limits(variant):
             if not got <= allowed:
-                raise InputError(
-                    f"export refused: {what} of onnxruntime and torch differ",
-                    expected=f"at most {allowed:g}",
-                    got=f"{got:.3g}",
-                    file=out,
-                )
+                what = f"export refused: {what} of onnxruntime and torch differ"
+                raise InputError(what, expected=f"at most {allowed:g}", got=f"{got:.3g}", file=out)
         if cull is None:
             add_advice(model, find_cull(avatar, motion))
             onnx.save_model(model, str(temporary))
@@ -86,7 +82,7 @@ def export(
 
 
 def refuse_ablations(checkpoint: Checkpoint) -> None:
-    """Raise ``InputError`` for a checkpoint that lacks what players need; rnd-eval alone reads such ones."""
+    """Raise ``InputError`` for checkpoints of ablations, which players do not support."""
     config = checkpoint.config
     for field, got, wanted in (
         ("visibility", config.model.visibility, "pose"),

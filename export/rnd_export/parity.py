@@ -1,4 +1,4 @@
-"""Difference between an exported file, run by onnxruntime, and the model that torch evaluates."""
+"""Difference between an exported file, run by onnxruntime, and the model in torch."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ from rnd_runtime.posing.window import motion_window
 from rnd_trainer.model.checkpoint import Checkpoint
 from rnd_trainer.training.data import pose_input
 
-MAX_FRAMES = 1_000  # compared at most: half a minute with 30 000 Gaussians
+MAX_FRAMES = 1_000  # 30 s with 30 000 Gaussians
 MAX_WEIGHT_ERROR = 1e-4  # of a skinning weight
-MAX_POSITION_ERROR_M = 1e-4  # 0.1 mm, a tenth of a pixel at 512² and arm's length
+MAX_POSITION_ERROR_M = 1e-4
 MAX_RELATIVE_ERROR = 1e-3  # of a unit normal, a visibility coefficient, and a covariance over its longest axis
-MAX_P99_M: dict[Precision, float] = {"f32": MAX_POSITION_ERROR_M, "f16": 1e-3, "int8": 3e-3}
-"""99th percentile of the position errors of all Gaussians in all frames"""
+MAX_P99_M: dict[Precision, float] = {"f32": MAX_POSITION_ERROR_M, "f16": 1e-3, "int8": 3e-3}  # of positions
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class ParityError:
     covariance_relative: float
 
     def limits(self, variant: Variant) -> list[tuple[str, float, float]]:
-        """(name, measured, allowed) of everything that ``variant`` does not change by choice."""
+        """(name, measured, allowed) of the values that ``variant`` does not reduce."""
         if variant != Variant(precision=variant.precision):
             return []
         if variant.precision != "f32":
@@ -78,7 +77,7 @@ def measure_parity(avatar: Avatar, checkpoint: Checkpoint, motion: Motion, rows:
 
 
 def random_motion(skeleton: Skeleton, *, frames: int, seed: int) -> Motion:
-    """A smooth random motion at 30 fps that bends every joint by up to about a radian and rotates the root once."""
+    """A smooth random motion at 30 fps with joint angles up to about 1 rad and one rotation of the root."""
     rng = np.random.default_rng(seed)
     time = np.arange(frames)[:, None, None] / 30
     shape = (1, len(skeleton), 3)

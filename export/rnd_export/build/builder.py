@@ -1,4 +1,4 @@
-"""A thin writer of ONNX graphs: every node and tensor gets a name that reads well in Netron."""
+"""A writer of ONNX graphs with readable names of nodes and tensors."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ Storage = Literal["f32", "f16", "u16", "u8"]
 
 
 class GraphBuilder:
-    """Collects nodes and constants; values are referred to by their names.
-
-    ``scope`` prefixes names ("skinning/temporal/keys").
-    """
+    """Collects nodes and constants; values are identified by their names."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -30,7 +27,7 @@ class GraphBuilder:
         self._names: set[str] = set()
 
     def scope(self, name: str) -> _Scope:
-        """A context within which all names begin with ``name/``."""
+        """A context that prefixes names with ``name/``."""
         return _Scope(self._scope, name)
 
     def input(self, name: str, shape: tuple[int, ...]) -> str:
@@ -42,7 +39,7 @@ class GraphBuilder:
         """Name ``value`` as an output of the graph."""
         if value in self._constants:
             self._nodes.append(helper.make_node("Identity", [value], [name], name=f"output/{name}"))
-        else:  # renamed where it is made and read: an Identity would be a copy at every frame
+        else:  # renamed, since an Identity would copy the value in every frame
             for node in self._nodes:
                 for ends in (node.input, node.output):
                     ends[:] = [name if end == value else end for end in ends]
@@ -58,7 +55,7 @@ class GraphBuilder:
         return full
 
     def stored(self, name: str, value: Any, storage: Storage) -> str:
-        """A float32 constant stored in fewer bits, which onnxruntime unpacks when it loads the file.
+        """A float32 constant stored in fewer bits, unpacked by onnxruntime at load.
 
         ``u8`` and ``u16`` quantise each row along the first axis of ``value`` over its range.
         """
@@ -78,7 +75,7 @@ class GraphBuilder:
         return self.op("Add", scaled, self.constant(f"{name}_low", low), name=name)
 
     def packed(self, name: str, value: Any) -> str:
-        """An int32 constant of non-negative numbers, stored in the fewest bits that hold them."""
+        """An int32 constant of non-negative numbers in the smallest sufficient integer type."""
         array: NDArray[Any] = np.asarray(value)
         smallest = next(kind for kind in (np.uint8, np.uint16, np.int32) if array.max() <= np.iinfo(kind).max)
         packed = self.constant(f"{name}_packed", array.astype(smallest))
@@ -98,20 +95,17 @@ class GraphBuilder:
         return outputs
 
     def rows(self, value: str, rows: Any, name: str, axis: int = 0) -> str:
-        """``value`` at ``rows`` of ``axis``."""
         return self.op("Gather", value, self.constant(f"{name}_rows", np.asarray(rows, np.int64)), name=name, axis=axis)
 
     def sum(self, value: str, axis: int, name: str, *, keepdims: bool = False) -> str:
-        """Σ along ``axis``."""
         axes = self.constant(f"{name}_axis", np.array([axis], np.int64))
         return self.op("ReduceSum", value, axes, name=name, keepdims=int(keepdims))
 
     def reshape(self, value: str, shape: tuple[int, ...], name: str) -> str:
-        """``value`` in another shape."""
         return self.op("Reshape", value, self.constant(f"{name}_shape", np.array(shape, np.int64)), name=name)
 
     def filled(self, name: str, shape: tuple[int, ...], value: float) -> str:
-        """A float32 constant that is ``value`` everywhere."""
+        """A float32 constant of equal values."""
         size = self.constant(f"{name}_shape", np.array(shape, np.int64))
         filler = helper.make_tensor("value", TensorProto.FLOAT, [1], [value])
         return self.op("ConstantOfShape", size, name=name, value=filler)

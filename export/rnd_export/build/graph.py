@@ -1,4 +1,4 @@
-"""The avatar's graph: the same mathematics as ``rnd_trainer.model.model``, arranged for onnxruntime on a CPU."""
+"""The avatar's graph: the mathematics of ``rnd_trainer.model.model``, arranged for onnxruntime on a CPU."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _node_fields(
             if still:
                 sites = graph.rows(encoded, np.arange(baked.dynamic_nodes), "sites")
             logits = networks.skinning(baked.skinning, sites, window, velocity)
-            if still:  # the last ones have the template's weights
+            if still:  # the last nodes have the template's weights
                 zeros = graph.filled("static_logits", (still, baked.weights.shape[1]), 0.0)
                 logits = graph.op("Concat", logits, zeros, name="padded_logits", axis=0)
             fields["node_logits"] = logits

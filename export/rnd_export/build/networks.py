@@ -1,9 +1,9 @@
 """The networks of ``rnd_trainer.model.encoders`` as ONNX nodes, evaluated at the template's nodes.
 
-What depends on a node's position alone is an expression of constants, which onnxruntime folds when it loads the file.
-Of the two cross-attentions of skinning that leaves two matrix products over all heads of both: f_x [M, width] times the
-joints' keys [width, 2·heads·(J−1)], which contain the query projection, and the shares times values that contain
-everything up to the next layer.
+Expressions of a node's position alone are constant, and folded by onnxruntime at load. Of the two cross-attentions of
+skinning remain two matrix products over all heads of both: f_x [M, width] times the joints' keys
+[width, 2·heads·(J−1)], which contain the query projection, and attention weights times values that contain everything
+up to the next layer.
 
 Each head's joints are padded to a multiple of eight: a softmax of 24 takes a fifth less time than one of 23.
 """
@@ -36,11 +36,10 @@ class Networks:
         """Positional encoding [M, E] of codes [M, 3] m; constant."""
         graph = self.graph
         with graph.scope("nodes"):
-            position = graph.constant("positions", codes)  # float32: in the highest band a millimetre is 0.2 rad
+            position = graph.constant("positions", codes)  # float32: 1 mm is 0.2 rad in the highest band
             bands = graph.constant("bands", np.pi * 2.0 ** np.arange(frequencies)[:, None])
-            angles = graph.op(
-                "Mul", graph.reshape(position, (-1, 1, 3), "positions_row"), bands, name="angles"
-            )  # [M, frequencies, 3]
+            row = graph.reshape(position, (-1, 1, 3), "positions_row")
+            angles = graph.op("Mul", row, bands, name="angles")  # [M, frequencies, 3]
             parts = [position]
             for kind in ("Sin", "Cos"):
                 wave = graph.op(kind, angles, name=kind.lower())
@@ -100,15 +99,9 @@ class Networks:
         padding = -joints % LANES
         embedded = self._layer(tokens, w, "embed")
         embedded = graph.op("Add", embedded, graph.constant("joint_embedding", w["joint"]), name="with_joint")
-        normed = graph.op(
-            "LayerNormalization",
-            embedded,
-            graph.constant("norm_scale", w["norm.weight"]),
-            graph.constant("norm_bias", w["norm.bias"]),
-            name="norm",
-            axis=-1,
-            epsilon=LAYER_NORM_EPSILON,
-        )
+        affine = graph.constant("norm_scale", w["norm.weight"]), graph.constant("norm_bias", w["norm.bias"])
+        options = {"axis": -1, "epsilon": LAYER_NORM_EPSILON}
+        normed = graph.op("LayerNormalization", embedded, *affine, name="norm", **options)
         parts = {"self_query": width, "self_key": width, "self_value": width}
         query, key, value = graph.split(self._layer(normed, w, "self_qkv"), parts, axis=1)
         scale = graph.constant("self_scale", np.float32((width // heads) ** -0.5))

@@ -20,11 +20,11 @@ STORAGE: dict[Precision, tuple[Storage, Storage, Storage]] = {
 }
 """storage of most constants, of lengths, and of the networks"""
 
-SMALLEST_LOG = 1e-4  # log weights this near to the smallest of their row are stored as it
+SMALLEST_LOG = 1e-4  # log weights closer than this to their row's minimum are stored as the minimum
 
 
 class RestConstants:
-    """Constants by name; all become outputs of the graph for players that pose by themselves (``avatar.file``)."""
+    """Constants by name, and outputs of the graph for players that pose by themselves (``avatar.file``)."""
 
     def __init__(self, graph: GraphBuilder, baked: BakedAvatar, precision: Precision) -> None:
         self._graph = graph
@@ -84,7 +84,7 @@ class RestConstants:
             logs = np.log(weights)
             flat = (logs - logs.min(axis=1, keepdims=True)).reshape(-1)
             entries = np.flatnonzero(flat > SMALLEST_LOG)
-            if len(entries) == 0:  # one joint, or all alike
+            if len(entries) == 0:  # one joint, or equal weights
                 return graph.reshape(graph.filled("zeros", (flat.size,), 0.0), weights.shape, "log_template")
             indices = graph.packed("steps", np.diff(entries, prepend=0))
             indices = graph.op("CumSum", indices, graph.constant("step_axis", np.int64(0)), name="indices")

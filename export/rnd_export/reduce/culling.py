@@ -1,4 +1,4 @@
-"""Advice to players: below which n·v Gaussians of the body's far side may be left out."""
+"""Advice to players: the n·v below which Gaussians of the body's far side may be culled."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from rnd_runtime.shading.light import Light
 
 from .views import views_around
 
-COSINES = (-0.3, -0.4, -0.5, -0.6, -0.7, -0.8)  # candidates; nearer to 0 outlines begin to fray
+COSINES = (-0.3, -0.4, -0.5, -0.6, -0.7, -0.8)  # candidates; closer to 0 outlines fray
 MAX_DIFFERENCE = 1 / 255  # root mean square over all pixels, of sRGB from 0 to 1
 SIZE = 512
 
 
 def find_cull(avatar: Avatar, motion: Motion) -> float | None:
-    """The greatest of ``COSINES`` that changes images of ``avatar`` by ``MAX_DIFFERENCE`` at most; None for none.
+    """The largest of ``COSINES`` that changes images of ``avatar`` by at most ``MAX_DIFFERENCE``, or None.
 
-    The views are all along ``motion`` and all around, ``SIZE`` pixels wide, under the learned light.
+    The views are along ``motion`` and all around, ``SIZE`` pixels wide, under the learned light.
     """
     around = views_around(motion, (SIZE, SIZE), lambda time: avatar.pose(motion, time))
     views = [*around.seen, *around.held_out]
@@ -47,7 +47,7 @@ def find_cull(avatar: Avatar, motion: Motion) -> float | None:
 
 
 def add_advice(model: onnx.ModelProto, cull: float | None) -> None:
-    """Write ``cull`` into ``model``; nothing for None or −1, which leave nothing out."""
+    """Write ``cull`` into ``model``, unless it is None or −1."""
     if cull is not None and cull > -1:
         advice = msgspec.json.encode(PlayerAdvice(cull=cull)).decode()
         model.metadata_props.add(key=ADVICE_KEY, value=advice)

@@ -1,4 +1,4 @@
-"""Fewer Gaussians: unseen ones are dropped, others merged into their neighbours, and albedo is fitted again."""
+"""Fewer Gaussians: unseen ones are dropped, others merged into their neighbours, and albedo is refitted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rnd_runtime.raster import cpu as raster_cpu
 Floats = NDArray[np.float64]
 PosedView = tuple[Gaussians, Camera]
 
-MIN_CONTRIBUTION = 1e-3  # of the mean: below it a Gaussian makes no difference that 8 bits can show
-CG_STEPS = 8  # of conjugate gradients; the residual falls little after six
-RIDGE = 1e-3  # of the mean contribution, for the albedo of what is hardly seen
+MIN_CONTRIBUTION = 1e-3  # of the mean contribution; less is invisible at 8 bits
+CG_STEPS = 8  # of conjugate gradients; the residual hardly decreases after six
+RIDGE = 1e-3  # of the mean contribution, for Gaussians that are hardly seen
 ALBEDO = (0.0, 1.0)
 MERGED_FIELDS = ("points", "factors", "normals", "opacities", "albedo", "roughness")
 
@@ -38,8 +38,8 @@ def contributions(views: Sequence[PosedView]) -> Floats:
 def merged(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
     """``baked`` reduced to ``count`` Gaussians, or to its nodes if they are more.
 
-    Gaussians at nodes stay. The others are ranked by the sum of two ranks: farthest-point order and contribution. On
-    the dancer's other poses the sum is better than either rank alone: by 0.7 and 0.5 dB at 12 000 Gaussians. A removed
+    Gaussians at nodes are kept. Others are ranked by the sum of their ranks in farthest-point order and contribution,
+    which on the dancer's other poses gains 0.7 and 0.5 dB over either rank alone at 12 000 Gaussians. A removed
     Gaussian is merged into its nearest neighbour: positions and covariances by moments, materials by contribution.
 
     Args:
@@ -86,7 +86,7 @@ def merged(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
 
 
 def fitted_albedo(albedo: Floats, views: Sequence[PosedView], wanted: Sequence[NDArray[np.float32]]) -> Floats:
-    """Albedo [n, 3] whose images in ``views`` are nearest to ``wanted`` [H, W, 3], by linear least squares.
+    """Albedo [n, 3] whose images in ``views`` are closest to ``wanted`` [H, W, 3], by linear least squares.
 
     Conjugate gradients on the normal equations; the rasteriser's backward pass multiplies with the transpose.
     """

@@ -1,4 +1,4 @@
-"""What an exported file may leave out for speed or size."""
+"""Reductions of an exported file for speed or size."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from rnd_runtime.core.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
 
-COARSE_SHARE = 4  # ``coarse`` evaluates the networks at one of this many nodes
+COARSE_SHARE = 4  # nodes per node of ``coarse``
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way of writing an avatar; the defaults leave nothing out.
+    """Reductions of a file, by default none.
 
     Attributes:
         encoder: ``full``; ``coarse``: networks at ``nodes`` points, by default a quarter of the checkpoint's;
@@ -30,7 +30,7 @@ class Variant:
         precision: of stored constants; arithmetic is float32.
         nodes: M, a prefix of the farthest-point order; for ``coarse``.
         window_poses: d; fewer poses span the same seconds.
-        visibility_degree: 0 to 3; higher SH coefficients are left out.
+        visibility_degree: 0 to 3; higher SH coefficients are dropped.
     """
 
     encoder: EncoderKind = "full"
@@ -46,7 +46,7 @@ class Variant:
         return self.nodes or max(NEIGHBOURS, config.nodes // COARSE_SHARE)
 
     def check(self, config: ModelConfig) -> None:
-        """Raise ``InputError`` for what no file of this checkpoint can be."""
+        """Refuse variants that are impossible for ``config``."""
         limits = {
             "nodes": (NEIGHBOURS, config.nodes),
             "window_poses": (min(2, config.window_poses), config.window_poses),
@@ -65,7 +65,7 @@ class Variant:
 
 
 def reduced(baked: BakedAvatar, config: ModelConfig, variant: Variant) -> BakedAvatar:
-    """``baked`` without what ``variant`` leaves out."""
+    """``baked`` reduced to ``variant``."""
     changes: dict[str, Any] = {}
     nodes, skinning = variant.node_count(config), baked.skinning
     if nodes < len(baked.codes):
@@ -101,9 +101,8 @@ def _shorter(skinning: BakedSkinning, poses: int, fewer: int) -> BakedSkinning:
     module = dict(skinning.temporal.module)
     weight = module["embed.weight"]  # [width, poses · 6]
     interpolation = line_through(poses, fewer)
-    module["embed.weight"] = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), interpolation).reshape(
-        len(weight), fewer * 6
-    )
+    embedded = np.einsum("wpc,pf->wfc", weight.reshape(len(weight), poses, 6), interpolation)
+    module["embed.weight"] = embedded.reshape(len(weight), fewer * 6)
     return dataclasses.replace(skinning, temporal=dataclasses.replace(skinning.temporal, module=module))
 
 

@@ -1,4 +1,4 @@
-"""Views that a search looks at: some to search in, more to fit merged Gaussians to, and held-out ones."""
+"""Views of a search: some to search in, more to fit merged Gaussians to, and held-out ones."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from rnd_runtime.motion.motion import Motion
 COUNT = 6  # views to search in, and held-out ones
 FIT_COUNT = 24  # views to fit in; with six the dancer loses 1 to 2 dB in other views
 FIELD_OF_VIEW = 0.6
-GOLDEN_ANGLE = 2 * np.pi * 0.381966  # rad, between one view and the next: no two from one side
+GOLDEN_ANGLE = 2 * np.pi * 0.381966  # rad, between consecutive views
 
 
 @dataclass(frozen=True, eq=False)
 class SearchView:
-    """A time of the motion (s) and a camera; compared by identity, since views of a still pose share a time."""
+    """A time of the motion (s) and a camera; compared by identity."""
 
     time: float
     camera: Camera
@@ -49,12 +49,9 @@ def views_around(motion: Motion, size: tuple[int, int], pose: Callable[[float], 
 
 
 def views_of(capture: Capture, size: int) -> SearchViews:
-    """Training views of ``capture``; its novel poses, or every other training view, are held out.
+    """Training views of ``capture``, ``size`` pixels on the longer side.
 
-    ``size`` is the longer side in pixels.
-
-    Raises:
-        InputError: for fewer than two training views.
+    Its novel poses, or else every other training view, are held out.
     """
     train, others = capture.split("train"), capture.split("novel_pose")
     if len(train) < 2:

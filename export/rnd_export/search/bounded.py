@@ -1,4 +1,4 @@
-"""rnd-export with a bound: run the search, print its steps, write the file and a row of what was found."""
+"""rnd-export with a bound: run the search, print its steps, write the file and a row of results."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from .candidates import SearchScene, Workbench
 
 @dataclass(frozen=True)
 class BoundedSearch:
-    """A bound, the ``option`` that gave it, and in what it is searched: views of ``capture`` or around ``motion``.
+    """A bound, its ``option``, and the views of the search: those of ``capture``, or around ``motion``.
 
     ``size`` is (width, height or None); ``hdr`` by default the learned light; a row is added to the file ``json``.
     """
@@ -53,12 +53,12 @@ def export_bounded(
     """Write the cheapest file of ``checkpoint`` that keeps the bound; ``show`` the steps and return a summary.
 
     Raises:
-        InputError: no file keeps the bound, or the whole avatar's file differs from torch.
+        InputError: no file keeps the bound, or the full avatar's file differs from torch.
     """
     rows = [] if what.json is None else earlier_rows(what.json, what="rows of an earlier search", names=("bound",))
     started = perf_counter()
     scene = _scene(checkpoint, what, warn)
-    with temporary_folder() as folder:  # the reference of the search has to agree with torch
+    with temporary_folder() as folder:  # checks the reference of the search against torch
         export(checkpoint, folder / "avatar.onnx", what.motion, cull=-1)
     bench, steps = Workbench(checkpoint, scene), []
 
@@ -73,7 +73,7 @@ def export_bounded(
             show("the machine was busy when the search began: it begins again")
             steps.clear()
             found = search(bench, what.bound, on_step)
-        else:  # times did not decide; only those reported are measured again
+        else:  # only the reported times are measured again
             found = replace(found, held_out=bench.measure(found.model, bench.held_out))
             steps[0] = replace(steps[0], measured=bench.measure(steps[0].model, bench.seen))
     with atomic_path(out) as temporary:

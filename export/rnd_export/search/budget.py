@@ -1,8 +1,8 @@
 """Greedy search for the cheapest file of an avatar that keeps a bound, on this machine.
 
-It starts from the whole avatar and takes, one after another, the step that saves most for its loss of PSNR. Under a
-bound of time or size, steps that turn out not to be needed are taken back. PSNR is the worst view's, against the whole
-avatar under the same player, light and poses. The result must keep the bound in held-out views.
+From the full avatar on, each step is the one that saves most cost per loss of PSNR. Under a bound of time or size,
+unnecessary steps are taken back. PSNR is the worst view's, against the full avatar. The result keeps the bound in
+held-out views.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LADDERS: dict[str, tuple[float, ...]] = {
 }
 """steps of each choice; nodes, Gaussians and window poses as shares of the checkpoint's"""
 MARGIN_DB = 0.3  # above a required PSNR: held-out views are a little worse
-MIN_GAIN = 0.01  # share of the cost that a step must save; smaller steps are taken when none is left
+MIN_GAIN = 0.01  # share of the cost that a step must save; smaller steps only when none is left
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,13 @@ class Bound:
     value: float
 
     def kept_by(self, found: Measured) -> bool:
-        """Whether a file with these measurements keeps the bound."""
         value: float = getattr(found, self.kind)
         return value >= self.value if self.kind == "psnr" else value <= self.value
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A file, as the number of steps down each of ``LADDERS``."""
+    """A file as the number of steps on each of ``LADDERS``."""
 
     precision: int = 0
     cull: int = 0
@@ -82,7 +81,6 @@ class Plan:
 
 
 def _nodes(share: float | None, count: int) -> int | None:
-    """That share of ``count`` nodes."""
     return None if share is None else min(max(16, int(share * count)), count)
 
 
@@ -97,11 +95,7 @@ class Found:
 
 
 def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> Found:
-    """The cheapest file that keeps ``bound``, in held-out views too; ``on_step`` gets every step taken.
-
-    Raises:
-        InputError: no file of the ladders keeps it.
-    """
+    """The cheapest file that keeps ``bound``, in held-out views too; ``on_step`` is called with every step."""
     path, worths = [_make(bench, Plan())], dict.fromkeys(LADDERS, np.inf)
     on_step(path[-1])
     while True:
@@ -129,7 +123,7 @@ def search(bench: Workbench, bound: Bound, on_step: Callable[[Found], None]) -> 
 
 
 def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Found], None]) -> Found:
-    """``found`` with steps taken back while ``bound`` holds; in each round the one that gains most PSNR."""
+    """``found`` with steps taken back while ``bound`` holds, in each round the one that gains most PSNR."""
     while True:
         plans = [_next(bench, found.plan, name, -1) for name in LADDERS]
         made = [_make(bench, plan) for plan in plans if plan is not None]
@@ -145,7 +139,7 @@ def _relaxed(bench: Workbench, bound: Bound, found: Found, on_step: Callable[[Fo
 
 
 def _tested(bench: Workbench, found: Found) -> Found:
-    """``found``, measured in held-out views too; once, since a repeated time differs."""
+    """``found``, measured in held-out views too, once."""
     return found if found.held_out else replace(found, held_out=bench.measure(found.model, bench.held_out))
 
 
@@ -154,10 +148,10 @@ def _holds(bound: Bound, found: Found) -> bool:
 
 
 def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, float]) -> Found | None:
-    """The step down that saves most cost per loss of PSNR.
+    """The step that saves most cost per loss of PSNR.
 
     Args:
-        worths: of each ladder in earlier rounds, an upper bound in practice; only the most promising are measured.
+        worths: savings per loss of each ladder in earlier rounds; only the most promising ladders are measured.
     """
     made: dict[str, Found] = {}
     while True:
@@ -175,14 +169,14 @@ def _best_step(bench: Workbench, bound: Bound, now: Found, worths: dict[str, flo
 
 
 def _mildest_step(bench: Workbench, bound: Bound, now: Found) -> Found | None:
-    """The step down that loses least PSNR; under a bound of size, one that makes the file smaller."""
+    """The step that loses least PSNR; under a bound of size, one that makes the file smaller."""
     least = 0.0 if bound.kind == "mb" else -np.inf  # a saved time may be noise
     steps = [_further(bench, bound, now, name, least) for name in LADDERS]
     return min((step for step in steps if step is not None), key=_squared_error, default=None)
 
 
 def _further(bench: Workbench, bound: Bound, now: Found, name: str, least: float) -> Found | None:
-    """The first rung further down ladder ``name`` that saves more than ``least`` of the cost, or None.
+    """The next rung of ladder ``name`` that saves more than ``least`` of the cost, or None.
 
     Early rungs may save nothing: dynamic skinning saves size only once all of it is static.
     """
@@ -202,7 +196,7 @@ def _saved(bound: Bound, now: Found, found: Found) -> float:
 
 
 def _next(bench: Workbench, plan: Plan, name: str, direction: Literal[1, -1]) -> Plan | None:
-    """The next rung of ladder ``name``, down (1) or up (−1), that makes a different, allowed file; None at its end."""
+    """The next rung of ladder ``name``, down (1) or up (−1), with a different, allowed file; None at its end."""
     last = len(LADDERS[name]) if direction > 0 else 0
     for rung in range(getattr(plan, name) + direction, last + direction, direction):
         other = replace(plan, **{name: rung})
@@ -222,7 +216,7 @@ def _squared_error(found: Found) -> float:
 
 
 def given_up(bench: Workbench, plan: Plan) -> list[str]:
-    """What a file of ``plan`` leaves out, a phrase each."""
+    """The reductions of ``plan``, a phrase each."""
     recipe, config = plan.recipe(bench.config), bench.config
     lines = []
     if recipe.cull is not None:

@@ -1,4 +1,4 @@
-"""Making and measuring smaller files of one checkpoint, in one scene."""
+"""Smaller files of one checkpoint, made and measured in one scene."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from .timing import PairedTimer, milliseconds
 Floats = NDArray[np.float64]
 
 USUAL_FRAMES = 90
-FIT_SIDE = 256  # longer side, px, of the images that contributions and albedo are computed from
+FIT_SIDE = 256  # px, longer side of the images for contributions and albedo
 
 
 @dataclass(frozen=True)
 class SearchScene:
-    """Where files are measured; ``views`` are by default those of ``views_around``, ``size`` pixels wide."""
+    """Motion, light and views of the measurements; by default the views of ``views_around``, of ``size`` pixels."""
 
     motion: Motion
     light: Light
@@ -52,10 +52,12 @@ class SearchScene:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a file leaves out, beyond its ``Variant``.
+    """Reductions of a file.
 
-    gaussians: N, None for all. dynamic_mm: nodes whose dynamic skinning moves nothing by as much get the template's.
-    cull: n·v below which players leave Gaussians out, or None.
+    Attributes:
+        gaussians: N, None for all.
+        dynamic_mm: nodes at which dynamic skinning moves Gaussians by less get the template's weights.
+        cull: n·v below which players cull Gaussians, or None.
     """
 
     variant: Variant = field(default_factory=Variant)
@@ -65,7 +67,7 @@ class Recipe:
 
 
 class Measured(NamedTuple):
-    """psnr: of the worst image against the whole avatar's, dB. ms: per frame. mb: 1e6 bytes."""
+    """PSNR of the worst image against the full avatar's, dB; ms per frame; 1e6 bytes."""
 
     psnr: float
     ms: float
@@ -108,16 +110,15 @@ class Workbench:
         return self._allowed[precision]
 
     def model(self, recipe: Recipe) -> onnx.ModelProto:
-        """The file of ``recipe``."""
         baked = reduced(self._baked, self.config, recipe.variant)
         if recipe.dynamic_mm and baked.skinning is not None:
             baked = static_where(baked, self._node_moves(baked) < recipe.dynamic_mm)
         if recipe.gaussians is not None:
             baked = merged(baked, recipe.gaussians, self._shares)
-            fewer = _loaded(self._built(baked, recipe.variant))
+            fewer = _loaded(build(self._checkpoint, baked, recipe.variant))
             wanted = [_albedo_image(*view) for view in self._posed(self._whole)]
             baked = dataclasses.replace(baked, albedo=fitted_albedo(baked.albedo, self._posed(fewer), wanted))
-        model = self._built(baked, recipe.variant)
+        model = build(self._checkpoint, baked, recipe.variant)
         add_advice(model, recipe.cull)
         return model
 
@@ -130,7 +131,7 @@ class Workbench:
         return Measured(float(psnr), self._clock(avatar), model.ByteSize() / 1e6)
 
     def usual_times(self, model: onnx.ModelProto) -> Floats:
-        """Times of ``USUAL_FRAMES`` frames of ``model`` as the machine is now, ms."""
+        """Times of ``USUAL_FRAMES`` frames of ``model`` at the machine's current load, ms."""
         return milliseconds(self._frames(_loaded(model)), USUAL_FRAMES)
 
     def recalibrated(self) -> bool:
@@ -138,12 +139,9 @@ class Workbench:
         return self._timer is not None and self._timer.recalibrated()
 
     def still_share(self, recipe: Recipe) -> float:
-        """Share of the skinning network's nodes to which ``recipe`` gives the template's weights."""
+        """Share of the nodes with the template's weights."""
         baked = reduced(self._baked, self.config, recipe.variant)
         return float((self._node_moves(baked) < recipe.dynamic_mm).mean())
-
-    def _built(self, baked: BakedAvatar, variant: Variant) -> onnx.ModelProto:
-        return build(self._checkpoint, baked, variant)
 
     def _renderer(self, avatar: Avatar) -> FrameRenderer:
         return FrameRenderer(avatar, self._scene.light, self.seen[0].camera, shade=self._scene.shade)

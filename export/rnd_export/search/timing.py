@@ -1,4 +1,4 @@
-"""Milliseconds of a frame on a machine that does other work too."""
+"""Milliseconds of a frame on a machine with other load."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 TIMED, UNTIMED = 12, 2  # measured frames, and warm-up frames before them
-CALIBRATED = 36  # frames of the reference at the start; their fastest sixth is its time
-RECALIBRATION_GAIN = 0.1  # by what share the reference must become faster to be calibrated again
+CALIBRATED = 36  # frames of the reference at the start; the mean of the fastest sixth is its time
+RECALIBRATION_GAIN = 0.1  # share by which the reference must become faster to be calibrated again
 
 
 def milliseconds(
@@ -27,13 +27,14 @@ def _timed(draw: Callable[[int], object], frame: int, clock: Callable[[], float]
 
 
 class PairedTimer:
-    """Times a player alternating with a reference, so that a busy moment slows both.
+    """Times of a player that alternates with a reference, so that other load slows both.
 
-    A time is the ratio to the reference, times what the reference took while the machine was idle. Times of one
-    calibration can therefore be compared whenever they were taken.
+    A time is the ratio to the reference, times the reference's time on the idle machine: times of one calibration are
+    comparable.
 
     Args:
-        reference: draws frame k of the reference. clock: in seconds.
+        reference: renders frame k of the reference.
+        clock: in seconds.
     """
 
     def __init__(self, reference: Callable[[int], object], clock: Callable[[], float] = perf_counter) -> None:
@@ -50,7 +51,7 @@ class PairedTimer:
         return float(np.median(times / reference)) * self._idle_ms
 
     def recalibrated(self) -> bool:
-        """Calibrate again if the machine was busy at the start; True if so: earlier times cannot be compared."""
+        """Calibrate again if the machine was busy at the start; if True, earlier times are not comparable."""
         fastest = self._fastest()
         faster = fastest < (1 - RECALIBRATION_GAIN) * self._idle_ms
         if faster:
