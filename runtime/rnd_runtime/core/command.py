@@ -62,13 +62,15 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
     SIGTERM, 129 for SIGHUP (``core.signals``); 141, silently, where the reader of stdout has gone
     (``rnd-play --help | head``); otherwise what ``main`` returns. A letter that the terminal lacks becomes ``?``.
     """
-    prepare_process()
+    note = prepare_process()
     _running.name, _running.quiet = name, False
     for stream in ("stdout", "stderr"):
         if getattr(sys, stream) is None:  # closed by the parent process
             setattr(sys, stream, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+    if note is not None and "--quiet" not in sys.argv:  # options are not parsed yet
+        log(note)
     try:
         try:
             with handled(name):

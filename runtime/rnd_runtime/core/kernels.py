@@ -7,13 +7,18 @@ at once, and numba's own cache serves.
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import os
 import shutil
+import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+
+from .signals import at_end
 
 COMPILING = "compiling kernels for this machine, once: up to two minutes"
 
@@ -25,15 +30,25 @@ _PACKAGE = Path(__file__).parents[1]
 _ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "5000", "ORT_DISABLE_TELEMETRY": "1"}
 
 
-def prepare_process() -> None:
+def prepare_process() -> str | None:
     """Set this process's environment for a command: threads that wait, no telemetry, a kernel cache by sources.
 
     Variables that are set stay. For commands and tests, before numba, torch or onnxruntime is loaded.
+
+    Returns:
+        A sentence for the user where only a temporary folder can hold the kernels.
     """
     for name, value in _ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    if "NUMBA_CACHE_DIR" not in os.environ and "numba" not in sys.modules and (folder := _cache_of_sources()):
+    if "NUMBA_CACHE_DIR" in os.environ or "numba" in sys.modules:
+        return None
+    folder, note = _cache_of_sources(), None
+    if folder is None and not _numba_can_write():
+        folder = _temporary_cache()
+        note = f"compiled kernels are kept in {folder}: no cache folder can be written; NUMBA_CACHE_DIR names one"
+    if folder is not None:
         os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    return note
 
 
 def kernels_are_cold() -> bool:
@@ -61,10 +76,40 @@ def _cache_of_sources() -> Path | None:
         folder = clone / ".cache" / "kernels" / digest.hexdigest()[:16]
         new = not folder.is_dir()
         folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):  # numba refuses a folder that it cannot write
+            return None
         if new:
             _remove_oldest(folder.parent)
         return folder
     return None
+
+
+def _numba_can_write() -> bool:
+    """Whether one of numba's own places can be written: beside the sources, or the user's cache folder."""
+    if os.name == "nt":
+        return True
+    mac = sys.platform == "darwin"
+    users = "~/Library/Caches" if mac else os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    for folder in (_PACKAGE / "raster" / "__pycache__", Path(os.path.expanduser(users), "numba")):  # noqa: PTH111
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK | os.X_OK):
+                return True
+    return False
+
+
+def _temporary_cache() -> Path:
+    """A folder that is this user's alone, and the same one next time; else one that goes with the process."""
+    folder = Path(tempfile.gettempdir()) / f"rnd-kernels-{os.getuid()}"
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()  # whoever made it before us could put code into it
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            return folder
+    folder = Path(tempfile.mkdtemp(prefix="rnd-kernels-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    at_end(lambda: shutil.rmtree(folder, ignore_errors=True)).__enter__()
+    return folder
 
 
 def _remove_oldest(caches: Path) -> None:

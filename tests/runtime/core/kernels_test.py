@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rnd_runtime.core import kernels
+from rnd_runtime.core import kernels, signals
 from rnd_runtime.core.kernels import kernels_are_cold
 
 KERNEL = """
@@ -45,7 +45,8 @@ def clone(tmp_path) -> Path:
         (package / room / "__init__.py").touch()
     (package / "__init__.py").touch()
     (tmp_path / "pyproject.toml").touch()
-    shutil.copy(kernels.__file__, package / "core")
+    for module in (kernels, signals):
+        shutil.copy(module.__file__, package / "core")
     (package / "raster" / "kernel.py").write_text(KERNEL)
     return tmp_path
 
