@@ -31,6 +31,18 @@ def test_the_grid_varies_one_factor_at_a_time_and_a_crossed_core() -> None:
     assert len(settings(quick=True)) < len(points) / 2
 
 
+def test_factors_that_are_crossed_come_in_all_combinations() -> None:
+    points = settings(cross=("n", "size", "shade", "encoder"))
+    assert points[0] == Setting() and len(points) == len(set(points)) == 5 * 3 * 5 * 3
+    assert Setting(n=60_000, size=1024, shade="brute", encoder="static") in points
+    windows = settings(cross=("encoder", "window"))
+    assert {p.window for p in windows if p.encoder == "static"} == {None} and len(windows) == 7
+    with pytest.raises(InputError, match=r"--cross: expected of n, size, .*cull, got colour"):
+        settings(cross=("n", "colour"))
+    with pytest.raises(InputError, match="--cross: expected each factor once, got n,n"):
+        settings(cross=("n", "n"))
+
+
 @pytest.fixture
 def pretended(monkeypatch):
     """Points that take no time and have no chart."""
@@ -40,24 +52,22 @@ def pretended(monkeypatch):
     monkeypatch.setattr(speed_cli, "_line", lambda row: "")
 
 
-def test_a_grid_logs_its_progress(tmp_path, monkeypatch, capsys, pretended) -> None:
-    moments = itertools.count(0.0, 60.0)  # a minute between two readings of the clock
+def test_a_crossed_grid_logs_its_progress(tmp_path, monkeypatch, capsys, pretended) -> None:
+    moments = itertools.count(0.0, 60.0)  # a minute between two looks at the clock
     monkeypatch.setattr(speed_cli, "perf_counter", lambda: next(moments))
     out, image = tmp_path / "grid[a].json", tmp_path / "grid[/a].svg"
-    line = ["grid", str(ASSETS), "--quick", "--work", str(tmp_path / "work")]
+    line = ["grid", str(ASSETS), "--cross", "threads, shade", "--work", str(tmp_path / "work")]
     line += ["--json", str(out), "--chart", str(image)]
-    count = len(settings(True))
 
     def states() -> list[str]:
         assert main(line) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert lines[-1] == f"{out}, {image}"
-        return [text.strip() for text in lines[:count]]
+        said = capsys.readouterr().out.splitlines()
+        assert said[-1] == f"{out}, {image}"
+        return [text.strip() for text in said[:10]]
 
-    left = count - 1
-    assert states()[:2] == [f"({left} left)", f"({left - 1} left, about {left - 1} min)"]
-    out.write_text(json.dumps(json.loads(out.read_text())[:-2]))
-    assert states()[-3:] == ["(stored)", "(1 left)", "(0 left, about 0 min)"]
+    assert states()[::4] == ["(9 left)", "(5 left, about 5 min)", "(1 left, about 1 min)"]
+    out.write_text(json.dumps(json.loads(out.read_text())[:7]))
+    assert states()[5:] == ["(stored)", "(stored)", "(2 left)", "(1 left, about 1 min)", "(0 left, about 0 min)"]
 
 
 def test_points_of_earlier_grids_stay_in_the_file_and_are_counted(tmp_path, capsys, pretended) -> None:
@@ -174,6 +184,23 @@ def test_the_chart_holds_every_point_and_every_stage(tmp_path) -> None:
     assert "99.0 dB" not in svg  # the front is of the usual scene
     with pytest.raises(InputError, match="at least one measured point"):
         draw_chart([{"failed": "x"}], files)
+
+
+def test_a_point_may_be_measured_again_and_again(tmp_path, monkeypatch, capsys) -> None:
+    times = iter([9.0, 14.0, 10.0])
+
+    def row(setting: Setting, *_: object, **__: object) -> dict[str, object]:
+        taken = next(times)
+        measures = {"ms_median": taken, "ms_p95": taken + 2, "cold_start_ms": 100 * taken}
+        return dataclasses.asdict(setting) | measures | {"stages": {}, "peak_mb": 1.0, "file_mb": 1.0}
+
+    monkeypatch.setattr(point, "measured", row)
+    out = tmp_path / "runs.json"
+    line = ["frame", str(ASSETS), "--runs", "3", "--json", str(out), "--work", str(tmp_path / "work")]
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    assert [r["ms_median"] for r in json.loads(out.read_text())] == [9, 14, 10]
+    assert "median of 3 runs: 9.0 to 14.0 ms, median 10.0" in said and "p95 of 3 runs: 11.0 to 16.0 ms" in said
 
 
 @pytest.mark.parametrize("words", [[], ["study"]])

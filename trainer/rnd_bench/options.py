@@ -54,7 +54,9 @@ class Frame:
 
     files: tyro.conf.OmitArgPrefixes[Files]
     json: OptionalFile = None
-    """write the row here"""
+    """write the row here, a list of them with --runs"""
+    runs: Count = 1
+    """measurements, each in a process of its own"""
     n: Count = 30_000
     """Gaussians"""
     size: Count = 512
@@ -92,6 +94,9 @@ class Grid:
     files: tyro.conf.OmitArgPrefixes[Files]
     quick: Flag = False
     """the small grid, in two minutes"""
+    cross: Annotated[str, option("LIST")] = ""
+    """factors to combine with one another instead of one at a time, such as n,size,shade,encoder (300 points, half an
+    hour); also precision, window, raster, threads, cull"""
     json: File = Path("out/bench/grid.json")
     """rows; those of this machine, of the same files and code, are not measured again"""
     fresh: Flag = False

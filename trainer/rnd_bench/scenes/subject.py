@@ -31,7 +31,8 @@ from .lights import sun_and_sky
 from .poses import APART, ARMS_DOWN, FPS, Angles, motion_of_poses
 from .psnr import Floats, srgb
 
-Floats32, Numbers = NDArray[np.float32], NDArray[np.floating]
+Floats32 = NDArray[np.float32]
+Numbers = NDArray[np.floating]
 
 
 @dataclass(frozen=True, eq=False)

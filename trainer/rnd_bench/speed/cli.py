@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -40,16 +41,24 @@ def run_frame(options: Frame) -> None:
 
     from .point import Setting, measured
 
-    _check(options, "n", "size")
+    _check(options, "n", "size", "runs")
     check_cull(options.cull)
     check_mode(options.shade)
     given = {name: getattr(options, name) for name in Setting.__dataclass_fields__}
     setting = Setting(**given | {"threads": _threads(options.threads)})
-    row = measured(setting, _inputs(options.files), seconds=6.0, compare=not options.no_compare, file=options.avatar)
-    _write(options.json, row)
-    show(_line(row))
-    for name, milliseconds in row["stages"].items():
-        show(f"  {name:16} {milliseconds:6.2f} ms")
+    inputs, rows = _inputs(options.files), list[dict[str, Any]]()
+    for _ in range(options.runs):
+        row = measured(setting, inputs, seconds=6.0, compare=not options.no_compare, file=options.avatar)
+        rows.append(row)
+        _write(options.json, rows if options.runs > 1 else row)
+        show(_line(row))
+        for name, milliseconds in row["stages"].items():
+            show(f"  {name:16} {milliseconds:6.2f} ms")
+    if options.runs > 1:
+        for column, what in {"ms_median": "median", "ms_p95": "p95", "cold_start_ms": "cold start"}.items():
+            values = sorted(float(each[column]) for each in rows)
+            middle = statistics.median(values)
+            show(f"{what} of {len(rows)} runs: {values[0]:.1f} to {values[-1]:.1f} ms, median {middle:.1f}")
 
 
 def run_grid(options: Grid) -> None:
@@ -58,6 +67,7 @@ def run_grid(options: Grid) -> None:
 
     _check(options)
     check_chart(*options.chart)
+    cross = [name.strip() for name in options.cross.split(",")] if options.cross else []
     done: list[float] = []  # times at which new points were done; the first is no measure, as it compiles kernels
 
     def on_row(row: dict[str, Any], new: bool, left: int) -> None:
@@ -69,7 +79,7 @@ def run_grid(options: Grid) -> None:
         show(f"{_line(row)}  ({state})")
 
     inputs = _inputs(options.files)
-    rows = grid(inputs, options.json, quick=options.quick, fresh=options.fresh, on_row=on_row)
+    rows = grid(inputs, options.json, quick=options.quick, cross=cross, fresh=options.fresh, on_row=on_row)
     draw_chart(rows, options.chart)
     show(f"{options.json}, {', '.join(map(str, options.chart))}")
     others = len(earlier_rows(options.json, what="rows of rnd-bench", names=())) - len(rows)

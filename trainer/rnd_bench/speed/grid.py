@@ -1,11 +1,11 @@
-"""The grid of the speed–accuracy chart: one factor at a time around the usual case, and a crossed core.
+"""The grid of the speed–accuracy chart: one factor at a time and a crossed core, or all combinations of given factors.
 
 Every point is one row of JSON. Rows of the same machine, files and code are not measured again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from rnd_bench.scenes.avatars import forget
 from rnd_bench.scenes.scenes import HARDEST
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import earlier_rows, write_json
 from rnd_runtime.playback.doctor import machine
 
@@ -43,9 +43,16 @@ QUICK: dict[str, tuple[Any, ...]] = {
 }
 
 
-def settings(quick: bool = False) -> list[Setting]:
-    """The points, the usual case first, none twice."""
+def settings(quick: bool = False, cross: Sequence[str] = ()) -> list[Setting]:
+    """The points, the usual case first, none twice; with ``cross`` all combinations of those factors."""
     usual = Setting(n=8_000, size=256) if quick else Setting()
+    for name in cross:
+        check_option(name in FACTORS, "--cross", f"of {', '.join(FACTORS)}", name)
+    check_option(len(set(cross)) == len(cross), "--cross", "each factor once", ",".join(cross))
+    if cross:
+        points = [replace(usual, **dict(zip(cross, values))) for values in product(*(FACTORS[name] for name in cross))]
+        windowed = [replace(point, window=None) if point.encoder == "static" else point for point in points]
+        return list(dict.fromkeys([usual, *windowed]))
     factors = QUICK if quick else FACTORS
     points = [usual, *(replace(usual, **{name: value}) for name, values in factors.items() for value in values)]
     if not quick:
@@ -57,7 +64,13 @@ def settings(quick: bool = False) -> list[Setting]:
 
 
 def grid(
-    inputs: Inputs, out: Path, *, quick: bool = False, fresh: bool = False, on_row: Callable[[Row, bool, int], None]
+    inputs: Inputs,
+    out: Path,
+    *,
+    quick: bool = False,
+    cross: Sequence[str] = (),
+    fresh: bool = False,
+    on_row: Callable[[Row, bool, int], None],
 ) -> list[Row]:
     """Measure the points missing in ``out``, or with ``fresh`` all; write ``out`` after each.
 
@@ -67,7 +80,7 @@ def grid(
     if fresh:
         forget(inputs.work)
     rows = [] if fresh else earlier_rows(out, what="rows of rnd-bench", names=("machine", *FACTORS))
-    wanted, key = settings(quick), inputs.key()
+    wanted, key = settings(quick, cross), inputs.key()
     here = {
         _key(row): row
         for row in rows
@@ -80,7 +93,7 @@ def grid(
         new = row is None
         if row is None:
             try:
-                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick)
+                row = measured(setting, inputs, seconds=2.0 if quick else 4.0, with_suns=not quick, full_n=wanted[0].n)
             except InputError as error:  # such as a missing rasteriser
                 row = {**asdict(setting), "machine": machine(), "failed": str(error)}
             row["inputs"], left = key, left - 1

@@ -99,6 +99,7 @@ def measured(
     seconds: float = 4.0,
     compare: bool = True,
     with_suns: bool = True,
+    full_n: int | None = None,
     file: Path | None = None,
 ) -> Row:
     """One row: the setting, times and sizes, and the errors against the full avatar's reference.
@@ -106,6 +107,7 @@ def measured(
     Args:
         seconds: time to spend on frames.
         compare: measure errors too.
+        full_n: add ``psnr_full_db``, against the same kind of avatar with ``full_n`` Gaussians.
         with_suns: add ``psnr_suns_db`` to ``table+sun``: against the reference with the same shadows of suns.
         file: an avatar.onnx exported from one of the checkpoints, instead of the setting's.
     """
@@ -136,6 +138,11 @@ def measured(
             truths[""] = reference(full, scene, setting.size, inputs.work)
             if setting.shade == "table+sun" and with_suns:
                 truths["suns"] = reference(full, scene, setting.size, inputs.work, with_suns=True)
+            if which != "exported":
+                largest, kind = inputs.source(full_n or setting.n)
+                if kind == which:
+                    whole = exported(largest, Encoders(), inputs.work)
+                    truths["full"] = reference(whole, scene, setting.size, inputs.work)
         compiled.result()
     result = measure(point)
     row: Row = {**asdict(setting), "avatar": which, **result.row, "machine": machine(), "version": __version__}
@@ -144,4 +151,6 @@ def measured(
     if "suns" in truths:
         off = errors(result, truths["suns"])
         row |= {f"psnr_suns_db{part}": off[f"psnr_db{part}"] for part in ("", "_worst")}
+    if "full" in truths:
+        row["psnr_full_db"], row["full_n"] = errors(result, truths["full"])["psnr_db"], full_n or setting.n
     return row
