@@ -49,8 +49,8 @@ def motion(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def scene(motion):
     """The embedded avatar with its capture."""
-    files = ASSETS / "avatar.onnx", motion, (ASSETS / "sky.exr",), ASSETS / "capture"
-    scene = Scene(ViewOptions(*files, size=(SIZE, None), raster="cpu"))
+    files = ASSETS / "avatar.onnx", motion, (ASSETS / "sky.exr",)
+    scene = Scene(ViewOptions(*files, capture=ASSETS / "capture", size=(SIZE, None), raster="cpu"))
     yield scene
     scene.close()
 
