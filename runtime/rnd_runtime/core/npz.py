@@ -144,16 +144,20 @@ class Npz(Members):
         path = existing_file(path, what=what)
         self._stream = path.open("rb")  # ours to close: numpy leaves its own open when a file is cut
         try:
-            archive = np.load(self._stream, allow_pickle=False)
+            begins = self._stream.read(len(np.lib.format.MAGIC_PREFIX))
+            self._stream.seek(0)
+            if begins == np.lib.format.MAGIC_PREFIX:  # numpy would read it whole
+                raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
+            self._archive: np.lib.npyio.NpzFile = np.load(self._stream, allow_pickle=False)
         except _UNREADABLE as error:
             self._stream.close()
             raise InputError(f"{what} cannot be read", expected="an .npz archive", file=path) from error
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+        except InputError:
             self._stream.close()
-            raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
-        self._archive, self._budget = archive, Budget.of(path)
+            raise
+        self._budget = Budget.of(path)
         self._counted: set[str] = set()
-        super().__init__(archive, path)
+        super().__init__(self._archive, path)
 
     def __enter__(self) -> Self:
         return self

@@ -134,6 +134,16 @@ def test_a_header_of_more_than_the_archive_is_refused(tmp_path, kind, shape):
         held.strings("poses")
 
 
+def test_an_array_in_place_of_an_archive_is_not_read(tmp_path):
+    with (tmp_path / "a.npz").open("wb") as stream:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 40,)}
+        np.lib.format.write_array_header_1_0(stream, header)
+    with pytest.raises(InputError, match=r"a\.npz: motion cannot be read: expected an \.npz archive, got an array"):
+        Npz(tmp_path / "a.npz", what="motion")
+    with pytest.raises(InputError, match=r"a\.npz: array expands too far"):
+        read_pickle(tmp_path / "a.npz")
+
+
 def test_an_image_of_more_than_its_budget_is_refused():
     with pytest.raises(InputError, match=r"16k_dwab\.exr: image expands too far"):
         read_image(CASES / "hdr/16k_dwab.exr")

@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rnd_runtime.core.budget import Budget
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_header, read_image
+from rnd_runtime.core.npz import array_bytes, array_header
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -75,8 +77,11 @@ def mask_reader(path: Path | None) -> Callable[[], Bytes] | None:
 
 def load_array(path: Path, what: str) -> NDArray[Any]:
     """The array of an ``.npy`` file."""
+    path = existing_file(path, what=what)
     try:
-        return np.asarray(np.load(existing_file(path, what=what), allow_pickle=False))
+        with path.open("rb") as stream:
+            Budget.of(path).take(array_bytes(*array_header(stream)), what)
+        return np.asarray(np.load(path, allow_pickle=False))
     except (ValueError, OSError, EOFError) as error:
         raise InputError(f"{what} cannot be read", expected="an array of numbers", file=path) from error
 
