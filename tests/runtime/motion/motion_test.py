@@ -40,7 +40,7 @@ def _flat(axis_angles: np.ndarray) -> np.ndarray:
     return axis_angles.reshape(len(axis_angles), -1)
 
 
-TRANS = np.random.default_rng(9).normal(size=(FRAMES, 3))
+TRANS = np.random.default_rng(9).normal(size=(FRAMES, 3)) * 0.05  # 5 m/s at 30 frames per second
 
 
 # Layouts
@@ -287,6 +287,28 @@ POSES = _flat(_axis_angles(24))
 
 
 @pytest.mark.parametrize(
+    ("step", "height", "noted"),
+    [(0.1, 1.0, False), (0.3, 1.0, False), (100.0, 1.0, True), (0.001, 950.0, True), (0.001, 2.0, False)],
+)
+def test_millimetres_are_noted(tmp_path, step, height, noted):
+    """Steps in m (or mm) at 30 frames per second: a sprinter's is 0.4 m."""
+    trans = np.stack([np.arange(FRAMES) * step, np.full(FRAMES, height), np.zeros(FRAMES)], 1)
+    file = _save(tmp_path / "a.npz", poses=POSES, trans=trans, mocap_framerate=30.0)
+    notes = load_motion(file, _skeleton()).notes
+    assert any("millimetres" in note for note in notes) == noted
+
+
+def test_times_that_increase_and_names_of_frames_are_no_reason_to_refuse(tmp_path):
+    members = {"poses": POSES, "trans": TRANS, "mocap_framerate": 30.0}
+    for name, values in {
+        "times": np.arange(FRAMES) / 30,
+        "frame_ids": ["b", "a", "c", "d", "e"],
+        "frame_id": [1],
+    }.items():
+        load_motion(_save(tmp_path / "a.npz", **members, **{name: values}), _skeleton())
+
+
+@pytest.mark.parametrize(
     ("members", "words"),
     [
         ({"poses": POSES[:0], "trans": TRANS[:0]}, ["poses", "at least one frame"]),
@@ -320,6 +342,8 @@ POSES = _flat(_axis_angles(24))
         ({"poses": POSES, "trans": TRANS, "fps": [30.0, 30.0]}, ["fps"]),
         ({"poses": POSES, "trans": TRANS, "fps": "30"}, ["fps", "numbers"]),
         ({"poses": POSES, "trans": TRANS, "up_axis": "x"}, ["up_axis", "y or z"]),
+        ({"poses": POSES, "trans": TRANS, "times": [0, 1, 2, 2, 3]}, ["frame 3", "times", "increase", "2 after 2"]),
+        ({"poses": POSES, "trans": TRANS, "frame_ids": [4, 3, 2, 1, 0]}, ["frame 1", "frame_ids", "3 after 4"]),
     ],
 )
 def test_bad_motion_is_one_line_naming_file_field_and_frame(tmp_path, members, words):

@@ -21,6 +21,8 @@ _AMASS_MEMBERS = ("surface_model_type", "mocap_frame_rate", "mocap_framerate", "
 _MAX_ANGLE = 100.0  # rad, beyond what fits contain
 _MANY_BEYOND_A_TURN = 0.2  # share of rotations; half of all in degrees, 1/22 with a spinning root
 _MAX_DISTANCE = 1000.0  # m; more suggests millimetres
+_MAX_HEIGHT, _MAX_SPEED = 100.0, 20.0  # m, m/s, of the median frame: a sprinter has 12 m/s
+_ORDERS = ("times", "timestamps", "frame_ids", "frame_id")
 _DEFAULT_FPS = 60.0
 PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
 FPS_LIMITS = (1e-3, 1e4)
@@ -118,6 +120,9 @@ def _read(
         notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
         fps = _DEFAULT_FPS
     up = _up_axis(members, default="z" if amass or easymocap else "y")
+    _check_order(members, len(rotations))
+    if _look_like_millimetres(translations, fps, up):
+        notes.append("trans is higher or faster than a person in metres: these look like millimetres")
     if rest_root is None and (amass or easymocap):
         rest_root = smpl_root
     return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
@@ -235,6 +240,36 @@ def check_translations(translations: Floats, path: str | Path, first: int = 0) -
             frame=first + frame,
             hint="are these millimetres?",
         )
+
+
+def _check_order(archive: Members, frames: int) -> None:
+    """Raise ``InputError`` where the file's times or frame numbers do not increase from frame to frame."""
+    for member in _ORDERS:
+        if member not in archive.names:
+            continue
+        try:
+            values = archive.numbers(member)
+        except InputError:  # names of images, say
+            continue
+        if values.shape != (frames,):
+            continue
+        back = np.flatnonzero(np.diff(values) <= 0)
+        if len(back):
+            before, after = values[back[0] : back[0] + 2]
+            raise InputError(
+                member,
+                expected="numbers that increase from frame to frame",
+                got=f"{after:g} after {before:g}",
+                file=archive.path,
+                frame=int(back[0]) + 1,
+                hint="sort the frames, and remove those that occur twice",
+            )
+
+
+def _look_like_millimetres(translations: Floats, fps: float, up: str) -> bool:
+    heights = np.abs(translations[:, "xyz".index(up)])
+    speeds = np.linalg.norm(np.diff(translations, axis=0), axis=1) * fps
+    return bool(np.median(heights) > _MAX_HEIGHT or (len(speeds) > 0 and np.median(speeds) > _MAX_SPEED))
 
 
 def frame_rate(archive: Members) -> float | None:
