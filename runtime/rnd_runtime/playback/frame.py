@@ -160,7 +160,7 @@ class FrameRenderer:
         rendered = camera
         if scale != 1 and not aovs:
             rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
-        raster = self._raster(body, rendered, aovs, lit)
+        raster = self._raster(body, rendered, aovs, lit, antialias=rendered is camera)
         seconds = dict(raster.seconds)
         layers = aov_layers(aovs, raster, 3 if lit else 0)
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
@@ -187,10 +187,12 @@ class FrameRenderer:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _raster(self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool) -> Raster:
-        """In the root's frame; a body of few pixels on a finer grid, averaged."""
+    def _raster(
+        self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool, *, antialias: bool
+    ) -> Raster:
+        """In the root's frame; with ``antialias`` a body of few pixels is rendered on a finer grid and averaged."""
         shader, camera = in_root_frame(body.root, self.shader, camera)
-        fine = fine_view(camera, self._extent(body))
+        fine = fine_view(camera, self._extent(body)) if antialias else None
         if fine is None:
             return self._splat(body, shader, camera, aovs, lit)
         return fine.averaged(self._splat(body, shader, fine.camera, aovs, lit))
