@@ -405,6 +405,9 @@ def _check_keys(keys: Iterable[Any]) -> None:
             raise InputError("key of a dictionary", expected="a string or a number", got="a set")
 
 
+_LEAVES = {float, int, bool, type(None)}  # most of what lists hold
+
+
 def _understand(value: Any, known: dict[int, tuple[Any, Any]], reader: _Reader) -> Any:
     """``value`` with every note taken for what it means; ``known`` holds (note, meaning) by the note's id."""
     if not isinstance(value, dict | list | tuple | set | frozenset | _Made | _Name):
@@ -418,7 +421,7 @@ def _understand(value: Any, known: dict[int, tuple[Any, Any]], reader: _Reader) 
         _check_keys(keys)
         meaning: Any = dict(zip(keys, [_understand(item, known, reader) for item in value.values()]))
     elif isinstance(value, list | tuple | set | frozenset):
-        items = [_understand(item, known, reader) for item in value]
+        items = [item if type(item) in _LEAVES else _understand(item, known, reader) for item in value]
         meaning = items if isinstance(value, list) else tuple(items)
     elif isinstance(value, _Name):
         meaning = str(value)
@@ -442,7 +445,10 @@ def _copied_size(value: Any, known: dict[int, tuple[Any, int]]) -> int:
     if id(value) not in known:
         known[id(value)] = (value, 0)
         parts = [*value.keys(), *value.values()] if isinstance(value, dict) else value
-        known[id(value)] = (value, _ELEMENT + sum(_copied_size(part, known) for part in parts))
+        known[id(value)] = (
+            value,
+            _ELEMENT + sum(_ELEMENT if type(part) in _LEAVES else _copied_size(part, known) for part in parts),
+        )
     return known[id(value)][1]
 
 
