@@ -71,7 +71,7 @@ def test_an_image_too_small_for_the_body_is_refused() -> None:
         next(compare("ball", thin, ring_cameras(1, 16)["cam00"], 2))
 
 
-def test_fitted_visibility_keeps_the_light_that_arrives() -> None:
+def test_fitted_visibility_preserves_irradiance() -> None:
     """Of two balls that shade each other, the irradiance under a white sky is that of traced shadows."""
     one = true_gaussians(ball(rings=40))
     points = np.concatenate([one.means, one.means + np.float32([1.05, 0, 0])]).astype(np.float64)

@@ -61,9 +61,9 @@ def test_a_crossed_grid_logs_its_progress(tmp_path, monkeypatch, capsys, pretend
 
     def states() -> list[str]:
         assert main(line) == 0
-        said = capsys.readouterr().out.splitlines()
-        assert said[-1] == f"{out}, {image}"
-        return [text.strip() for text in said[:10]]
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[-1] == f"{out}, {image}"
+        return [text.strip() for text in lines[:10]]
 
     assert states()[::4] == ["(9 left)", "(5 left, about 5 min)", "(1 left, about 1 min)"]
     out.write_text(json.dumps(json.loads(out.read_text())[:7]))
@@ -198,9 +198,9 @@ def test_a_point_may_be_measured_again_and_again(tmp_path, monkeypatch, capsys) 
     out = tmp_path / "runs.json"
     line = ["frame", str(ASSETS), "--runs", "3", "--json", str(out), "--work", str(tmp_path / "work")]
     assert main(line) == 0
-    said = capsys.readouterr().out
+    text = capsys.readouterr().out
     assert [r["ms_median"] for r in json.loads(out.read_text())] == [9, 14, 10]
-    assert "median of 3 runs: 9.0 to 14.0 ms, median 10.0" in said and "p95 of 3 runs: 11.0 to 16.0 ms" in said
+    assert "median of 3 runs: 9.0 to 14.0 ms, median 10.0" in text and "p95 of 3 runs: 11.0 to 16.0 ms" in text
 
 
 @pytest.mark.parametrize("words", [[], ["study"]])

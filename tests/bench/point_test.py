@@ -118,7 +118,7 @@ def test_a_point_may_leave_the_back_out(tiny_avatar) -> None:
     assert np.abs(culled[0] - ours).max() < LAST_BITS and np.abs(culled - full).max() > 0.01
 
 
-def test_the_hardest_scenes_are_what_they_say(tiny_avatar, tmp_path) -> None:
+def test_the_hardest_scenes_match_their_names(tiny_avatar, tmp_path) -> None:
     scenes = {name: bench_scene(name, ASSETS / "body.npz", WALK, SKY, tmp_path, "key") for name in (USUAL, *HARDEST)}
     assert scenes[USUAL] == BenchScene(WALK, SKY, USUAL) and scenes[INSIDE] == BenchScene(WALK, SKY, INSIDE)
     assert load_light(scenes[SUN].hdr).radiance.max() > 0.5e6 and scenes[SUN].motion == WALK

@@ -62,7 +62,7 @@ def test_the_table_holds_other_rows_and_replaces_its_own(tmp_path):
         rows_of(file)
 
 
-def test_a_row_that_is_not_of_the_avatar_does_not_borrow_its_size(bare):
+def test_only_rows_of_the_avatar_have_its_size(bare):
     assert {"gaussians", "size", "checkpoint_sha256"} <= set(measured_on(AVATAR, bare))
     assert set(measured_on("a ball", bare)) == {"on", "threads", "machine"}
 
@@ -88,14 +88,14 @@ def test_missing_figures_and_nan_never_pass(tmp_path):
     assert line_of("L11", figures[1]) == "✗ L11  pace: nan × < 1  (plain: nan)"
 
 
-def test_a_short_soak_has_no_slope_of_memory():
+def test_a_short_soak_has_no_memory_slope():
     segment = {"frames": 300, "memory": [1, 2], "seconds": [1.0] * 300, "loads": [], "wrong": 0}
     figures = soak._figures("playback", [segment], True, ())
     assert figures[0].what == "playback, 300: memory a frame (too few in one go)" and not figures[0].line
     assert figures[0].measured is None and len(figures) == 2 and figures[1].passes
 
 
-def test_memory_that_a_kind_of_step_asks_for_once_is_no_leak_and_one_that_grows_is():
+def test_a_leak_is_growth_and_no_single_allocation():
     """Readings every twenty steps from the 200th on; the second kind begins with step 800."""
     once, leak = [0] * 30 + [10**6] * 60, [2_000 * 20 * k for k in range(90)]
     for memory, passes in ((once, True), (leak, False)):
@@ -144,7 +144,7 @@ def test_what_a_capture_lacks_is_not_measured(bare):
     assert len(_missing(captures.bad_masks(bare).figures)) == 2
 
 
-def test_flipped_normals_are_of_captures_that_have_normals(bare, tiny_capture, tmp_path):
+def test_flipped_normals_need_normals(bare, tiny_capture, tmp_path):
     subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, tiny_capture.frames)
     assert captures.flipped_normals(subject).passes
     record = captures._record(tiny_capture.folder)
@@ -156,7 +156,7 @@ def test_flipped_normals_are_of_captures_that_have_normals(bare, tiny_capture, t
     assert len(_missing((captures.flipped_normals(subject),))) == 1
 
 
-def test_a_copy_is_of_the_file_that_was_read(bare, tiny_capture, tmp_path):
+def test_a_copy_is_of_the_loaded_file(bare, tiny_capture, tmp_path):
     record = captures._record(tiny_capture.folder)
     record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"][1:4]]
     night = _linked(tiny_capture, tmp_path / "plain") / "night.json"
@@ -175,7 +175,7 @@ def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture
     assert [figure.measured is None for figure in figures] == [False, True, False, True]
 
 
-def test_frames_without_light_or_person_are_passed_over(bare, tiny_capture, tmp_path):
+def test_frames_without_light_or_person_are_skipped(bare, tiny_capture, tmp_path):
     camera = tiny_capture.cameras["front"]
     write_image(tmp_path / "empty.png", np.zeros((camera.height, camera.width, 1), np.uint8))
     train = msgspec.structs.replace(tiny_capture.frames[0], albedo=tiny_capture.frames[0].image, light=None)

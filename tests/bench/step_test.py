@@ -17,11 +17,11 @@ from rnd_bench.speed.step import KINDS, OPTIMISER, OUTSIDE, REST, bench_step, ki
         ("aten::convolution_backward", "perceptual network"),
     ],
 )
-def test_operations_are_told_apart_by_name(operation, kind):
+def test_operations_are_classified_by_name(operation, kind):
     assert kind_of(operation) == kind
 
 
-def test_what_an_optimiser_does_is_the_optimisers():
+def test_operations_within_an_optimiser_are_the_optimisers():
     weights = torch.ones(200, 200, requires_grad=True)
     optimizer = torch.optim.Adam([weights], foreach=False)
     for _ in range(2):

@@ -25,7 +25,7 @@ from rnd_trainer.training.training import Training
 @pytest.mark.parametrize(
     ("differences", "shows"), [((2.0, 2.2), True), ((-2.0, -2.2), True), ((-0.1, 0.3), False), ((2.0,), None)]
 )
-def test_a_loss_shows_as_a_gain_does(differences, shows) -> None:
+def test_losses_and_gains_are_significant_alike(differences, shows) -> None:
     variants = (StudyRow("ours", "", None), StudyRow("less", "", "ours"))
     common = {"split": "novel_view", "encoder_gflop": 1.0, "encoder_ms": 1.0}
     rows = [

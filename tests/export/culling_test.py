@@ -79,7 +79,7 @@ def test_of_what_is_seen_through_nothing_is_left_out(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize(("cull", "said"), [(None, COSINES), (-0.25, (-0.25,)), (-1, (None,))])
-def test_the_exporter_writes_what_it_found_or_what_it_was_told(tiny_checkpoint, tmp_path, cull, said) -> None:
+def test_the_exporter_writes_found_or_given_advice(tiny_checkpoint, tmp_path, cull, said) -> None:
     export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", cull=cull)
     advice = Avatar.load(tmp_path / "a.onnx").advice
     assert advice.cull in said or (cull is None and advice.cull is None)
@@ -87,9 +87,7 @@ def test_the_exporter_writes_what_it_found_or_what_it_was_told(tiny_checkpoint, 
     assert (ADVICE_KEY in keys) == (advice.cull is not None)
 
 
-def test_the_command_says_what_it_writes_and_that_kernels_are_compiled(
-    tiny_checkpoint, tmp_path, monkeypatch, capsys
-) -> None:
+def test_the_command_reports_its_advice_and_compilation(tiny_checkpoint, tmp_path, monkeypatch, capsys) -> None:
     out = tmp_path / "a.onnx"
     monkeypatch.setattr("rnd_runtime.core.kernels.kernels_are_cold", lambda: True)
     words = [str(tiny_checkpoint), "--out", str(out), "--frames", "2", "--cull", "-0.3"]
@@ -100,7 +98,7 @@ def test_the_command_says_what_it_writes_and_that_kernels_are_compiled(
     assert said.err.splitlines() == [f"rnd-export: {COMPILING}"]
 
 
-def test_players_follow_it_unless_they_are_told_otherwise(advised) -> None:
+def test_players_follow_it_by_default(advised) -> None:
     plain, own = Avatar.load(ASSETS / "avatar.onnx"), Avatar.load(advised)
     assert plain.advice == PlayerAdvice() and own.advice == PlayerAdvice(CULL)
     motion, light = load_motion(ASSETS / "walk.npz", plain.skeleton), Light(plain.trained_light)

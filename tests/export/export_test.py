@@ -35,7 +35,7 @@ from support.tiny import body, motion
 export = functools.partial(exports.export, cull=-1)  # tests/culling_test.py is about the other part
 
 
-def test_onnxruntime_says_what_torch_says(tiny_avatar, tiny_checkpoint) -> None:
+def test_onnxruntime_agrees_with_torch(tiny_avatar, tiny_checkpoint) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     moves = random_motion(checkpoint.skeleton, frames=60, seed=3)
     error = measure_parity(Avatar.load(tiny_avatar), checkpoint, moves, _rows(checkpoint))
@@ -260,7 +260,7 @@ def test_constants_are_unpacked_when_the_file_is_loaded_not_at_every_frame(tiny_
 @pytest.mark.parametrize(
     "variant", [Variant(), Variant("static", "int8", visibility_degree=2), Variant("coarse", "f16")]
 )
-def test_the_compiled_posing_says_what_the_graph_says(tiny_checkpoint, tmp_path, variant) -> None:
+def test_the_compiled_posing_agrees_with_the_graph(tiny_checkpoint, tmp_path, variant) -> None:
     export(load_checkpoint(tiny_checkpoint), tmp_path / "a.onnx", motion(body()), variant)
     avatar, moves, time = Avatar.load(tmp_path / "a.onnx"), motion(body()), 0.1
     assert {"node_offsets", "rest_limbs", "neighbours"} <= {o.name for o in onnx.load(tmp_path / "a.onnx").graph.output}

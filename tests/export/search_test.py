@@ -51,7 +51,7 @@ def bench(tiny_checkpoint) -> Workbench:
 
 
 @pytest.mark.slow
-def test_a_least_psnr_holds_in_held_out_views(bench) -> None:
+def test_a_minimum_psnr_holds_in_held_out_views(bench) -> None:
     steps = []
     found = search(bench, Bound("psnr", 32.0), steps.append)
     again = bench.measure(found.model, bench.held_out)
@@ -63,7 +63,7 @@ def test_a_least_psnr_holds_in_held_out_views(bench) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_keeps_the_bound_and_adds_a_row(
+def test_the_command_keeps_the_bound_and_adds_a_row(
     tiny_checkpoint, tiny_avatar, tmp_path, monkeypatch, capsys
 ) -> None:
     def run(*options: str) -> int:
@@ -321,7 +321,7 @@ def test_rows_of_nodes_may_be_reordered(tiny_checkpoint) -> None:
     assert (other.all_codes[other.node_rows] == other.codes).all()
 
 
-def test_merging_keeps_mass_and_valid_gaussians(tiny_checkpoint) -> None:
+def test_merging_conserves_mass_and_valid_gaussians(tiny_checkpoint) -> None:
     baked = bake(load_checkpoint(tiny_checkpoint).model)
     rng = np.random.default_rng(0)
     seen = rng.uniform(0.5, 1.5, len(baked.points))
@@ -364,7 +364,7 @@ def test_sides_that_are_fitted_are_of_the_searchs_moments(bench) -> None:
     assert len({view.camera.position.tobytes() for view in fitted}) == FIT_COUNT
 
 
-def test_merging_keeps_the_moments(tiny_checkpoint) -> None:
+def test_merging_conserves_the_moments(tiny_checkpoint) -> None:
     """Σ mass, Σ mass·x and Σ mass·(Σ + x xᵀ) of all Gaussians are those of the fewer."""
     baked = bake(load_checkpoint(tiny_checkpoint).model)
     seen = np.random.default_rng(1).uniform(0.5, 1.5, len(baked.points))
@@ -380,15 +380,17 @@ def test_merging_keeps_the_moments(tiny_checkpoint) -> None:
         assert np.allclose(ours, theirs, rtol=1e-9)
 
 
-def test_colours_are_fitted_to_the_pictures(bench) -> None:
+def test_colours_are_fitted_to_the_images(bench) -> None:
     views = bench._posed(bench._whole)
     truth = views[0][0].albedo.astype(np.float64)
     wanted = [rasterize(g.means, g.covariances, g.opacities, g.albedo, c, depth=False).image for g, c in views]
     fitted = fitted_albedo(np.full_like(truth, 0.5), views, wanted)
 
     def off(albedo: np.ndarray) -> float:
-        drawn = (rasterize(g.means, g.covariances, g.opacities, np.float32(albedo), c, depth=False) for g, c in views)
-        return float(np.mean([(d.image - w) ** 2 for d, w in zip(drawn, wanted)]))
+        rendered = (
+            rasterize(g.means, g.covariances, g.opacities, np.float32(albedo), c, depth=False) for g, c in views
+        )
+        return float(np.mean([(d.image - w) ** 2 for d, w in zip(rendered, wanted)]))
 
     assert off(fitted) < 0.02 * off(np.full_like(truth, 0.5))
 

@@ -31,7 +31,7 @@ def test_there_are_nineteen_modules_eight_colours_and_a_white_light() -> None:
     assert apart.min() > 0.02 and np.abs(np.corrcoef(patterns) - np.eye(9)).max() < 0.99
 
 
-def test_cameras_stand_on_three_rings_and_see_the_whole_person() -> None:
+def test_cameras_are_on_three_rings_and_show_the_whole_person() -> None:
     cameras = ring_cameras(30, 128)
     assert len(cameras) == 30
     heights = {round(float(camera.position[1]), 3) for camera in cameras.values()}

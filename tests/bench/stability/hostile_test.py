@@ -61,7 +61,7 @@ for number in itertools.count():
 """
 
 
-def test_a_killed_writer_leaves_whole_files_under_final_names(tmp_path):
+def test_a_killed_writer_leaves_complete_files(tmp_path):
     rng = np.random.default_rng(1)
     for _ in range(3):
         process = subprocess.Popen(
@@ -78,7 +78,7 @@ def test_a_killed_writer_leaves_whole_files_under_final_names(tmp_path):
     assert list(tmp_path.glob("[0-2].png"))
 
 
-def test_half_a_file_is_told_from_a_whole_one(tmp_path):
+def test_incomplete_files_are_found(tmp_path):
     (tmp_path / "half.json").write_text('{"a": ')
     (tmp_path / "whole.json").write_text("{}")
     assert incomplete_files(tmp_path) == ["half.json: JSONDecodeError"]

@@ -1,4 +1,4 @@
-"""rnd-convert: every file is read back by code that knows the format and not our writer, and drawn or posed again."""
+"""rnd-convert: every file is read back by code independent of the writer, and rendered or posed again."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ def _covariances(quaternions_xyzw: np.ndarray, scales: np.ndarray) -> np.ndarray
     return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
-def _drawn(means, covariances, opacities, colours) -> np.ndarray:
+def _rendered(means, covariances, opacities, colours) -> np.ndarray:
     arrays = (np.ascontiguousarray(a, np.float32) for a in (means, covariances, opacities, colours))
     return sharpened(rasterize(*arrays, _camera())).image
 
 
-def _drawn_ply(path: Path, half_turn: bool) -> np.ndarray:
+def _rendered_ply(path: Path, half_turn: bool) -> np.ndarray:
     """The image of a PLY with colours of one view, as 3DGS says; blended as stored."""
     ply = _ply(path)
     means = np.stack([ply[k] for k in "xyz"], axis=-1)
@@ -105,7 +105,7 @@ def _drawn_ply(path: Path, half_turn: bool) -> np.ndarray:
         means = means * [-1, -1, 1]
         covariances = covariances * [1, 1, -1, 1, -1, 1]
     colours = 0.5 + 0.28209479177387814 * np.stack([ply[f"f_dc_{k}"] for k in range(3)], axis=-1)
-    return _drawn(means, covariances, 1 / (1 + np.exp(-ply["opacity"])), colours)
+    return _rendered(means, covariances, 1 / (1 + np.exp(-ply["opacity"])), colours)
 
 
 def _camera():
@@ -131,7 +131,7 @@ def _splats(folder: Path, *words: str, light: tuple[str, ...] = ("--hdr", str(SK
 def test_a_ply_shows_the_players_image(played, tmp_path):
     for words, half_turn in (((), True), (("--ply-axes", "y-up"), False)):
         path = _splats(tmp_path, "--coding", "linear", *words)
-        again = to_bytes(linear_to_srgb(_drawn_ply(path, half_turn))).astype(int)
+        again = to_bytes(linear_to_srgb(_rendered_ply(path, half_turn))).astype(int)
         assert (played.alpha > INSIDE).sum() > 500
         assert np.abs(again - played.srgb).max() <= ONE_STEP
 
@@ -140,7 +140,7 @@ def test_a_ply_for_viewers_blends_coded_colours(played, tmp_path):
     """Nearer by far than colours that are merely coded, and near enough to look the same."""
     inside = played.alpha > INSIDE
     path = _splats(tmp_path)
-    corrected = to_bytes(_drawn_ply(path, True)).astype(int)
+    corrected = to_bytes(_rendered_ply(path, True)).astype(int)
     psnr = 10 * np.log10(255**2 / np.mean((corrected - played.srgb)[inside] ** 2.0))
     assert psnr > CODED_PSNR
     _splats(tmp_path, "--coding", "linear")
@@ -148,7 +148,7 @@ def test_a_ply_for_viewers_blends_coded_colours(played, tmp_path):
     merely = linear_to_srgb(0.5 + 0.28209479177387814 * np.stack([ply[f"f_dc_{k}"] for k in range(3)], -1))
     gaussians = Avatar.load(AVATAR, threads=1)
     posed = gaussians.pose(load_motion(WALK, gaussians.skeleton), FRAME / 30)
-    plain = to_bytes(_drawn(posed.means, posed.covariances, posed.opacities, merely)).astype(int)
+    plain = to_bytes(_rendered(posed.means, posed.covariances, posed.opacities, merely)).astype(int)
     assert np.mean((plain - played.srgb)[inside] ** 2.0) > 3 * np.mean((corrected - played.srgb)[inside] ** 2.0)
 
 
@@ -185,7 +185,7 @@ def test_fitted_sh_gives_the_colour_of_any_view(played, tmp_path):
         colours[:, k] = 0.5 + sum(c * b for c, b in zip(coefficients, basis))
     wxyz = np.stack([ply[f"rot_{k}"] for k in range(4)], axis=-1)
     covariances = _covariances(wxyz[:, [1, 2, 3, 0]], np.exp(np.stack([ply[f"scale_{k}"] for k in range(3)], -1)))
-    image = _drawn(
+    image = _rendered(
         means * [-1, -1, 1], covariances * [1, 1, -1, 1, -1, 1], 1 / (1 + np.exp(-ply["opacity"])), colours.clip(0)
     )
     again = to_bytes(linear_to_srgb(image)).astype(int)
@@ -204,7 +204,7 @@ def test_gltf_splats_show_the_players_image(played, tmp_path):
     assert primitive["extensions"] == {"KHR_gaussian_splatting": extension}
     named = {name.split(":")[-1]: arrays[index] for name, index in primitive["attributes"].items()}
     assert set(named) == {"POSITION", "COLOR_0", "ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"}
-    image = _drawn(
+    image = _rendered(
         named["POSITION"],
         _covariances(named["ROTATION"], named["SCALE"]),
         named["OPACITY"],
@@ -238,7 +238,7 @@ def test_splats_rotate_by_half_a_turn():
     np.testing.assert_allclose(over.as_matrix(), expected, atol=1e-12)
 
 
-def test_colours_of_gaussians_that_nobody_sees_are_numbers():
+def test_colours_of_unseen_gaussians_are_finite():
     avatar = Avatar.load(AVATAR, threads=1)
     posed = avatar.pose(load_motion(WALK, avatar.skeleton), 0.0)
     unseen = replace(posed, opacities=np.zeros_like(posed.opacities))
@@ -261,7 +261,7 @@ def test_gaussians_that_are_not_finite_are_left_out_and_counted(tmp_path, monkey
     assert "note: Gaussians with numbers that are not finite were left out, 2 of" in capsys.readouterr().err
 
 
-def test_what_is_wrong_with_a_light_is_told(tmp_path, capsys):
+def test_faults_of_a_light_are_reported(tmp_path, capsys):
     broken = np.ones((16, 32, 3), np.float32)
     broken[3, 4] = np.nan
     write_image(tmp_path / "nan.exr", broken)
@@ -302,8 +302,8 @@ def test_a_clip_for_visionary_is_its_frames(tmp_path):
         gaussians, colours, points = session.run(None, {"time": np.array([time], np.float32)})
         assert points == count and (colours[:, 3] == 1).all()
         covariances = gaussians[:, 4:] * [1, 1, -1, 1, -1, 1]
-        image = _drawn(gaussians[:, :3] * [-1, -1, 1], covariances, gaussians[:, 3], colours[:, :3])
-        wanted = _drawn_ply(tmp_path / f"{frame:06d}.ply", True)
+        image = _rendered(gaussians[:, :3] * [-1, -1, 1], covariances, gaussians[:, 3], colours[:, :3])
+        wanted = _rendered_ply(tmp_path / f"{frame:06d}.ply", True)
         assert np.abs(to_bytes(image).astype(int) - to_bytes(wanted)).max() <= ONE_STEP, time
 
 
@@ -348,12 +348,12 @@ def test_splat_transform_understands_our_ply(tmp_path):
 def test_compressed_splats_show_the_same_image(tmp_path):
     """SPZ and SOG as we have them made, and its compressed PLY: read back by it, they are our image."""
     ply = _splats(tmp_path, "--format", "ply,spz,sog")
-    wanted = to_bytes(_drawn_ply(ply, True)).astype(int)
+    wanted = to_bytes(_rendered_ply(ply, True)).astype(int)
     packed = [ply.with_suffix(".spz"), ply.with_suffix(".sog"), _transformed(ply, tmp_path / "of.compressed.ply")]
     for path in packed:
         assert path.stat().st_size < 0.3 * ply.stat().st_size, path.name
         back = _transformed(path, tmp_path / f"from_{path.suffix[1:]}.ply")
-        again = to_bytes(_drawn_ply(back, True)).astype(int)
+        again = to_bytes(_rendered_ply(back, True)).astype(int)
         assert np.abs(again - wanted)[wanted.any(-1)].mean() < PACKED_MEAN, path.name
 
 

@@ -82,7 +82,7 @@ def _strip() -> np.ndarray:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Path:
-    """The folder of a training, as far as the report reads it; small pictures of the avatar; no assets here."""
+    """The folder of a training, as far as the report reads it; small images of the avatar; no assets here."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(renders, "SIDE", 64)
     monkeypatch.setattr(renders, "SECONDS", 0.1)
@@ -180,7 +180,7 @@ def test_one_chart_of_speed_is_shown_and_no_other(run, shown):
         ((None,), "The rows do not name the avatar"),
     ],
 )
-def test_the_stability_table_says_on_whose_avatar_it_was_measured(run, checkpoints, words):
+def test_the_stability_table_names_its_avatar(run, checkpoints, words):
     (run / "avatar.onnx").unlink()
     (run / "avatar.ckpt").write_bytes(b"trained")
     own = sha256_of(run / "avatar.ckpt")
@@ -202,7 +202,7 @@ def test_the_stability_table_says_on_whose_avatar_it_was_measured(run, checkpoin
         ({"steps": None, "step": 240}, "800 Gaussians · 6.5 minutes"),
     ],
 )
-def test_the_facts_count_steps_with_and_without_a_picture(run, counts, words):
+def test_the_facts_count_steps_with_and_without_an_image(run, counts, words):
     (run / "eval.json").write_text(json.dumps([ROW | counts | {"capture": "capture"}]))
     _, page = _write(run)
     assert words in page.text
@@ -210,7 +210,7 @@ def test_the_facts_count_steps_with_and_without_a_picture(run, counts, words):
     assert "flicker 24.09 of 255 (change from frame to frame" in page.text
 
 
-def test_pictures_of_a_split_that_are_those_of_another_are_left_out(run, tmp_path):
+def test_images_of_a_split_equal_to_those_of_another_are_omitted(run, tmp_path):
     (run / "avatar.onnx").unlink()
     (run / "eval/novel_view").rename(run / "eval/relight")
     scaled = run / "eval/relight_albedo_scaled"

@@ -143,7 +143,7 @@ def test_it_plays_and_stops(page):
     assert (_frame(page) != first).any()
 
 
-def test_drag_turns_and_reset_comes_back(page):
+def test_drag_rotates_and_reset_restores_the_view(page):
     before = _frame(page)
     page.drag((300, 300), (80, 30))
     turned = _frame(page)

@@ -133,7 +133,7 @@ def test_a_light_is_spoken_of_in_the_same_words(tmp_path, primaries, brightest, 
     assert _page(tmp_path / "sky.exr")["notes"] == notes
 
 
-def test_texels_that_are_filled_in_are_told(tmp_path):
+def test_repaired_texels_are_reported(tmp_path):
     pixels = RADIANCE.astype(np.float32)
     pixels[3, 4:6, 1] = np.nan
     _assert_the_same(_exr(tmp_path / "sky.exr", pixels, kind="float"))

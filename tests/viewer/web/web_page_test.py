@@ -301,7 +301,7 @@ def _python_frame(page: Page, scene: Scene) -> np.ndarray:
 
 
 def _assert_agreed(page: Page, got: np.ndarray, scene: Scene) -> None:
-    """The page's picture ``got`` is rnd-view's."""
+    """The page's image ``got`` is rnd-view's."""
     _assert_close(got, _python_frame(page, scene))
 
 
@@ -343,7 +343,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         {"shade": "lights:16", "background": "hdr", "width": 2 * SIZE},
         {"light": 0, "shade": "lights:128"},
         {"shade": "brute", "exposure": 1.0},
-        {"distance": 0.9, "elevation": 0.3, "shade": "table"},  # the body reaches beyond the picture
+        {"distance": 0.9, "elevation": 0.3, "shade": "table"},  # the body exceeds the image
         # rounding puts the outermost Gaussian of the sun's map on a texel's centre
         {"light": 0, "yaw": -3.136260264236736, "time": 0.8695288902257207, "fov": 0.7, "distance": 3.6},
     ]
@@ -356,7 +356,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
     scene.close()
 
 
-def test_gaussians_that_are_not_finite_are_not_drawn_and_neither_cast_nor_receive_shadows(fresh, site):
+def test_gaussians_that_are_not_finite_are_neither_rendered_nor_shadowed(fresh, site):
     _drop(fresh, "holes.onnx", "walk.npz", "sky.exr")
     avatar, sky = site / "holes.onnx", site / "sky.exr"
     scene = Scene(ViewOptions(avatar, site / "walk.npz", (sky,), size=(SIZE, None), raster="cpu"))
@@ -471,7 +471,7 @@ def test_without_webgl_the_reason_stays(address, site, tmp_path):
 
 
 def test_a_lost_context_is_asked_for_again(address, site, tmp_path):
-    """As after a reset of the driver: a canvas whose context is lost gives blank pictures."""
+    """As after a reset of the driver: a canvas whose context is lost gives blank images."""
     (site / "lost").mkdir()
     for entry in DIST.iterdir():
         if entry.name != "worker.js":
@@ -557,7 +557,7 @@ def test_a_refused_drop_changes_nothing(fresh):
         (("amass.npz", "index.html"), "expected .onnx, .npz, .hdr or .exr"),
     ]:
         assert reason in _drop(fresh, *names) and _is_refusal(fresh), names
-        assert (_frame(fresh, time=0.1) != before).any()  # and not a picture kept from before
+        assert (_frame(fresh, time=0.1) != before).any()  # not a cached image
         assert (_frame(fresh, **state) == before).all(), names
     fresh.wait("sessions.opened === sessions.released + 1")
     assert _drop(fresh, "walk.npz") == ""
