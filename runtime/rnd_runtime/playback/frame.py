@@ -201,7 +201,9 @@ class FrameRenderer:
         """Points [N, 3] m in the root's frame, from which no part of the body is far."""
         if isinstance(body, PosedAvatar):
             return body.gaussians.means
-        return np.einsum("jab,jb->ja", body.bones[:, :, :3], self.avatar.skeleton.rest_joints) + body.bones[:, :, 3]
+        rest = self.avatar.skeleton.rest_joints
+        joints: NDArray[np.floating[Any]] = np.einsum("jab,jb->ja", body.bones[:, :, :3], rest) + body.bones[:, :, 3]
+        return joints
 
     def _splat(
         self, body: Encoded | PosedAvatar, shader: Shader, camera: Camera, aovs: Sequence[str], lit: bool
