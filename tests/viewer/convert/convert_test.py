@@ -41,7 +41,7 @@ from support.tiny import ASSETS, body, motion
 
 AVATAR, BODY = ASSETS / "avatar.onnx", ASSETS / "body.npz"
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
-SIDE = 128
+SIDE = 288  # px; smaller bodies are rendered on a finer grid by the player
 FRAME = 20
 ONE_STEP = 1  # of 255: float32 logarithms and back
 INSIDE = 0.99  # alpha above which nothing behind the body shows
@@ -149,7 +149,7 @@ def test_a_ply_for_viewers_blends_coded_colours(played, tmp_path):
     gaussians = Avatar.load(AVATAR, threads=1)
     posed = gaussians.pose(load_motion(WALK, gaussians.skeleton), FRAME / 30)
     plain = to_bytes(_rendered(posed.means, posed.covariances, posed.opacities, merely)).astype(int)
-    assert np.mean((plain - played.srgb)[inside] ** 2.0) > 3 * np.mean((corrected - played.srgb)[inside] ** 2.0)
+    assert np.mean((plain - played.srgb)[inside] ** 2.0) > 2.5 * np.mean((corrected - played.srgb)[inside] ** 2.0)
 
 
 def test_ply_has_the_fields_of_3dgs_in_their_order(tmp_path):
