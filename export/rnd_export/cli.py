@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from rnd_runtime.avatar.file import EncoderKind, Precision
-from rnd_runtime.core.command import (
+from rnd_runtime.cli.command import (
     MAX_SIDE,
     Count,
     OptionalCount,
@@ -28,8 +28,8 @@ from rnd_runtime.core.command import (
     show,
     size_text,
 )
+from rnd_runtime.cli.lock import file_lock
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed
-from rnd_runtime.core.lock import file_lock
 from rnd_runtime.shading.light import Up
 
 BOUNDS = {"ms": "target_ms", "psnr": "min_psnr", "mb": "max_mb"}  # options of the search, by kind of bound

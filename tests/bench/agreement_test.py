@@ -17,7 +17,7 @@ pytest.importorskip("skimage")
 from rnd_runtime.capture.body import Body  # noqa: E402
 from rnd_runtime.core.errors import InputError  # noqa: E402
 from rnd_runtime.core.images import read_image  # noqa: E402
-from rnd_runtime.core.sh import sh_basis, sphere_quadrature  # noqa: E402
+from rnd_runtime.shading.sh import sh_basis, sphere_quadrature  # noqa: E402
 from rnd_runtime.shading.shadow import directional_visibility  # noqa: E402
 
 mi.set_variant("scalar_rgb")

@@ -48,7 +48,7 @@ import importlib, os, sys
 for module in {modules}:
     importlib.import_module(module)
 assert not {{"numba", "torch", "onnxruntime"}} & set(sys.modules)
-from rnd_runtime.core.command import run_command
+from rnd_runtime.cli.command import run_command
 run_command("rnd-x", lambda: None)
 print([name for name in {OURS} if name not in os.environ])
 """

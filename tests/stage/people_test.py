@@ -17,8 +17,8 @@ mi.set_variant("scalar_rgb")
 from rnd_runtime.capture.body import Body  # noqa: E402
 from rnd_runtime.core.errors import InputError  # noqa: E402
 from rnd_runtime.motion.skeleton import bone_transforms  # noqa: E402
+from rnd_stage.cloth import SKIN_GAP, Capsules, Cloth, Drape  # noqa: E402
 from rnd_stage.people import subjects  # noqa: E402
-from rnd_stage.people.cloth import SKIN_GAP, Capsules, Cloth, Drape  # noqa: E402
 from rnd_stage.people.dressing import Wearer  # noqa: E402
 
 pytestmark = pytest.mark.slow

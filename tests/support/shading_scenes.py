@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import SH_COUNT, sh_basis, sphere_quadrature
 from rnd_runtime.shading.light import Light, texel_directions
+from rnd_runtime.shading.sh import SH_COUNT, sh_basis, sphere_quadrature
 
 COUNT = 1500
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rnd_runtime.core.command import parse_subcommand, run_command
+from rnd_runtime.cli.command import parse_subcommand, run_command
 from rnd_runtime.core.errors import InputError
 
 from .options import Compare, Frame, Grid, Raster, Step

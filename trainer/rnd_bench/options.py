@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import Count, File, Flag, Folder, OptionalCount, OptionalFile, OptionalNumber, option
-from rnd_runtime.core.command import Files as Paths
+from rnd_runtime.cli.command import Count, File, Flag, Folder, OptionalCount, OptionalFile, OptionalNumber, option
+from rnd_runtime.cli.command import Files as Paths
 
 SceneName = Literal["usual", "inside the body", "squat", "sun of 1e6"]
 

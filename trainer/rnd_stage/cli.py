@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rnd_runtime.core.command import finish, log, option, parse, run_command
+from rnd_runtime.cli.command import finish, log, option, parse, run_command
+from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.progress import Progress
 
 from .film.plan import Recipe
 from .variants import Variant, need_extra, use_variant

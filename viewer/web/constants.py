@@ -32,7 +32,7 @@ SHARED = {
     "rnd_runtime.posing.forearm": "FREE MAX_SHARE",
     "rnd_runtime.posing.skinning": "SHORTEST TWIST_STEPS SMALLEST_SQUARE",
     "rnd_runtime.posing.rest": "_DEEPEST",
-    "rnd_runtime.core.sh": "SH_COUNT SH_DEGREES COSINE_LOBE _C0 _C1 _C2_SIDE _C2_ZONAL _C3_3 _C3_2 _C3_1 _C3_0",
+    "rnd_runtime.shading.sh": "SH_COUNT SH_DEGREES COSINE_LOBE _C0 _C1 _C2_SIDE _C2_ZONAL _C3_3 _C3_2 _C3_1 _C3_0",
     "rnd_runtime.shading.light": "REC709 REC709_LUMINANCE _SAME_COLOUR _MAX_EXPOSURE _DIM",
     "rnd_runtime.shading.brdf": "F0 ROUGHNESS_RANGE COSINE_FLOOR LARGEST_ALBEDO",
     "rnd_runtime.shading.specular_lobe": "LOBE_WIDTHS ROUGHNESS_COUNT COSINE_COUNT",

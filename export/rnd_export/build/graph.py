@@ -7,7 +7,7 @@ import onnx
 
 from rnd_export.bake import BakedAvatar
 from rnd_runtime.avatar.file import Precision
-from rnd_runtime.core.sh import SH_COUNT
+from rnd_runtime.shading.sh import SH_COUNT
 from rnd_trainer.model.template import NEIGHBOURS
 
 from .builder import GraphBuilder

@@ -13,7 +13,7 @@ from rnd_export.bake import BakedAvatar, BakedSkinning
 from rnd_export.order import permute_nodes
 from rnd_runtime.avatar.file import EncoderKind, Precision
 from rnd_runtime.core.errors import InputError, flag
-from rnd_runtime.core.sh import SH_DEGREE
+from rnd_runtime.shading.sh import SH_DEGREE
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.model.template import NEIGHBOURS, node_interpolation
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rnd_runtime.avatar.inference import open_session, run_session
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
-from rnd_runtime.core.inference import open_session, run_session
 from rnd_runtime.core.kinds import explained
 from rnd_runtime.core.threads import cores
 

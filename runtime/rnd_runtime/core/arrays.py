@@ -1,14 +1,16 @@
-"""Checks and conversions of kernel inputs."""
+"""Checks and conversions of kernel inputs, and copies of what changes from frame to frame."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
-from .gaussians import Floats32
+
+T = TypeVar("T")
+Floats32 = NDArray[np.float32]
 
 
 def floats(array: ArrayLike) -> Floats32:
@@ -44,3 +46,10 @@ def checked(
     for array, (name, shape) in zip(arrays, shapes.items()):
         check_shape(name, array, shape)
     return arrays
+
+
+def shallow_copy(original: T, **changes: Any) -> T:
+    """A copy of an object, frozen or not, with other attributes; no check of its class runs."""
+    copied = object.__new__(type(original))
+    copied.__dict__.update(original.__dict__, **changes)
+    return copied

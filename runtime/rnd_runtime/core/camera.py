@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .copies import shallow_copy
+from .arrays import shallow_copy
 from .errors import InputError
 
 Floats = NDArray[np.float64]

@@ -9,9 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import Floats32
 from .camera import Camera
-
-Floats32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

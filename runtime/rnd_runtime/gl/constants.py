@@ -6,10 +6,9 @@ from functools import cache
 from math import pi
 from typing import Any
 
-from rnd_runtime.core import sh
 from rnd_runtime.posing import skinning
 from rnd_runtime.raster import oracle, project
-from rnd_runtime.shading import brdf, direct, lanes, lookup, shader, shadow, specular_lobe
+from rnd_runtime.shading import brdf, direct, lanes, lookup, sh, shader, shadow, specular_lobe
 from rnd_runtime.shading import sum as light_sum
 
 _SH = ("_C0", "_C1", "_C2_SIDE", "_C2_ZONAL", "_C3_3", "_C3_2", "_C3_1", "_C3_0")

@@ -11,8 +11,8 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.gaussians import Floats32
 from rnd_runtime.raster.tone import code_steps
 
 from .context import is_software

@@ -8,8 +8,8 @@ from __future__ import annotations
 import moderngl
 import numpy as np
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.gaussians import Floats32
 from rnd_runtime.core.simd import WIDTH
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.skinning import NEVER

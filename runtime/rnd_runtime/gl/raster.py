@@ -18,10 +18,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rnd_runtime.core.arrays import checked
+from rnd_runtime.core.arrays import Floats32, checked
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.gaussians import Raster
 from rnd_runtime.raster.project import Pinhole, pinhole, project_range
 from rnd_runtime.raster.tiles import front_to_back
 

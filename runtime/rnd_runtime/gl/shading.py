@@ -12,9 +12,9 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.sh import SH_COUNT, sh_basis, sh_rotation
 from rnd_runtime.shading.ambient import AmbientLight
 from rnd_runtime.shading.lookup import DIFFUSE_SIZE, SPECULAR_SIZE
+from rnd_runtime.shading.sh import SH_COUNT, sh_basis, sh_rotation
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.shadow import axes_towards
 from rnd_runtime.shading.specular_lobe import COSINE_COUNT, LOBE_WIDTHS, ROUGHNESS_COUNT, lobe_table

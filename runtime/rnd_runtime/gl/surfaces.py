@@ -10,7 +10,7 @@ import numpy as np
 from rnd_runtime.core.arrays import checked, floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import SH_COUNT
+from rnd_runtime.shading.sh import SH_COUNT
 from rnd_runtime.shading.shader import shadow_radii
 
 from .passes import GaussianTexture

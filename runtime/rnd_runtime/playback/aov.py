@@ -21,11 +21,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.gaussians import Floats32, Gaussians, Raster
+from rnd_runtime.core.gaussians import Gaussians, Raster
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
-from rnd_runtime.core.sh import COSINE_LOBE, sh_basis
+from rnd_runtime.shading.sh import COSINE_LOBE, sh_basis
 
 # EXR channels of each output
 CHANNELS = {

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.gaussians import Raster
 from rnd_runtime.raster.oracle import NEAR
 
 MIN_PIXELS_PER_METRE = 110.0

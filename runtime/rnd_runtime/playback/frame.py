@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar, Encoded
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
-from rnd_runtime.core.gaussians import Floats32, Gaussians, Raster, Rasterizer
+from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.enlarge import enlarged

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, get_args
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.gaussians import Raster
 from rnd_runtime.raster import cpu as raster_cpu
 
 if TYPE_CHECKING:  # importing OpenGL takes 1/20 of a start

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.sh import SH_COUNT
+from rnd_runtime.shading.sh import SH_COUNT
 
 from .rest import RestPose
 from .skinning import SMALLEST_SQUARE, TWIST_STEPS

@@ -29,7 +29,6 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from rnd_runtime.core.sh import SH_COUNT
 from rnd_runtime.core.simd import (
     WIDTH,
     aligned_floats,
@@ -44,6 +43,7 @@ from rnd_runtime.core.simd import (
     store,
     transpose,
 )
+from rnd_runtime.shading.sh import SH_COUNT
 
 Floats32 = NDArray[np.float32]
 

@@ -14,9 +14,9 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.arrays import check_shape, checked, floats, mask
+from rnd_runtime.core.arrays import Floats32, check_shape, checked, floats, mask
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.gaussians import Raster
 
 from .blend import blend, blend_backward
 from .project import Pinhole, pinhole, project, project_backward

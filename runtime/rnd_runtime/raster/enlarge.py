@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from rnd_runtime.core.gaussians import Floats32
+from rnd_runtime.core.arrays import Floats32
 
 
 def enlarged(image: Floats32, height: int, width: int) -> Floats32:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.gaussians import Raster
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,8 @@ from time import perf_counter
 import numpy as np
 from numba import njit, prange
 
-from rnd_runtime.core.gaussians import Floats32, Raster
+from rnd_runtime.core.arrays import Floats32
+from rnd_runtime.core.gaussians import Raster
 
 _ZERO, _ONE, _TWO, _THREE = (np.float32(x) for x in (0, 1, 2, 3))
 

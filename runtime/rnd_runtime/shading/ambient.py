@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
 from rnd_runtime.core.simd import WIDTH, aligned_floats, at_least, lanes, load, store
+from rnd_runtime.shading.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
 
 from .lanes import (
     ALBEDO,

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.copies import shallow_copy
+from rnd_runtime.core.arrays import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import ImageHeader, read_header, read_image, read_strips

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from rnd_runtime.core.sh import compiled_sh_columns
 from rnd_runtime.core.simd import (
     WIDTH,
     aligned_floats,
@@ -20,6 +19,7 @@ from rnd_runtime.core.simd import (
     store,
     transpose,
 )
+from rnd_runtime.shading.sh import compiled_sh_columns
 
 from .lanes import (
     ALBEDO,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import sh_basis
+from rnd_runtime.shading.sh import sh_basis
 
 from .brdf import specular
 from .direct import AT_SILHOUETTE, TURNED_AWAY

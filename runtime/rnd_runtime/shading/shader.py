@@ -19,8 +19,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.arrays import floats, mask
-from rnd_runtime.core.copies import shallow_copy
+from rnd_runtime.core.arrays import floats, mask, shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import sh_basis
+from rnd_runtime.shading.sh import sh_basis
 
 from .brdf import ggx_scalar, roughness_to_alpha
 from .light import REC709_LUMINANCE, Light, texel_directions, texel_solid_angles

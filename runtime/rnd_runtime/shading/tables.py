@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import SH_COUNT, rotation_matrix, sh_basis, sh_quadrature
 from rnd_runtime.core.simd import WIDTH, lanes, load, reduce_add, store
+from rnd_runtime.shading.sh import SH_COUNT, rotation_matrix, sh_basis, sh_quadrature
 
 from .light import Light, texel_directions, texel_solid_angles
 from .lookup import DIFFUSE_SIZE, SPECULAR_SIZE, rotated, shade_from_tables

@@ -33,7 +33,7 @@ READ_LIGHT = "from rnd_runtime.shading.light import load_light as read"
 def _command(reader: str, path: Path) -> tuple[int, str, int]:
     """Exit code, stderr and KB of memory of a command that reads ``path``."""
     program = (
-        f"import resource, sys\n{reader}\nfrom rnd_runtime.core.command import run_command\n"
+        f"import resource, sys\n{reader}\nfrom rnd_runtime.cli.command import run_command\n"
         f"code = run_command('rnd-x', lambda: (read({str(path)!r}), None)[1])\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\nsys.exit(code)"
     )

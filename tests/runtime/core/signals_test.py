@@ -20,7 +20,7 @@ from support.paths import ASSETS
 BIN = Path(sys.executable).parent
 HEAD = """
 import os, signal, subprocess, sys, threading, time
-from rnd_runtime.core.command import run_command
+from rnd_runtime.cli.command import run_command
 from rnd_runtime.core.files import atomic_path
 from rnd_runtime.core.signals import at_end, on_signal, temporary_folder
 def ready():

@@ -5,10 +5,10 @@ import pytest
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.sh import sh_rotation
 from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.light import Light, texel_directions, texel_solid_angles
 from rnd_runtime.shading.reference import shade_reference, shade_reference_with_directional
+from rnd_runtime.shading.sh import sh_rotation
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.sum import DistantLights
 from rnd_runtime.shading.tables import octahedral_nodes

@@ -13,9 +13,9 @@ import pytest
 from PIL import Image
 
 import rnd_viewer.play.play
+from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.core.kernels import COMPILING
-from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.doctor import Finding
 from rnd_runtime.playback.frame import FrameRenderer

@@ -12,12 +12,12 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_runtime.core.sh import sh_basis, sphere_quadrature
 from rnd_runtime.playback.aov import CHANNELS, ambient_visibility, parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light
+from rnd_runtime.shading.sh import sh_basis, sphere_quadrature
 from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.options import parse_frames
 from rnd_viewer.play.run_folder import mark_of, refuse_others

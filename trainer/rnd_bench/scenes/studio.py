@@ -13,9 +13,9 @@ from rnd_runtime.capture.capture import Capture, CaptureLight, Frame, load_captu
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb, to_bytes, write_image
-from rnd_runtime.core.sh import SH_COUNT
 from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.shading.sh import SH_COUNT
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.model.template import sample_template
 

@@ -13,10 +13,10 @@ from rich.table import Table
 
 from rnd_bench.options import Compare, Files, Frame, Grid, Raster, Step
 from rnd_bench.scenes.scenes import USUAL
-from rnd_runtime.core.command import show
+from rnd_runtime.cli.command import show
+from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import check_cull, check_option, flag
 from rnd_runtime.core.files import earlier_rows, existing_file, sha256_of, write_json
-from rnd_runtime.core.progress import Progress
 from rnd_runtime.core.threads import check_threads, max_threads
 from rnd_runtime.playback.doctor import machine
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from rnd_runtime.core.command import Count, File, Flag, OptionalFile, OptionalFolder, option, show
+from rnd_runtime.cli.command import Count, File, Flag, OptionalFile, OptionalFolder, option, show
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import sha256_of, write_json
 from rnd_runtime.core.signals import temporary_folder
@@ -143,7 +143,7 @@ def _long_runs(options: Stability, subject: Subject) -> Iterable[tuple[str, str,
 
 
 def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
-    from rnd_runtime.core.progress import Progress
+    from rnd_runtime.cli.progress import Progress
 
     from .fuzz import batches, fuzz
     from .hostile import READERS, prepare

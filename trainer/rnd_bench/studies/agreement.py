@@ -20,9 +20,9 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb
-from rnd_runtime.core.sh import sh_basis, sphere_quadrature
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light
+from rnd_runtime.shading.sh import sh_basis, sphere_quadrature
 from rnd_runtime.shading.shader import SHADOW_RESOLUTION, Shader
 from rnd_runtime.shading.shadow import directional_visibility
 from rnd_stage.film.lights import stage_lights

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from rnd_runtime.capture.capture import capture_file, load_capture
-from rnd_runtime.core.command import log, warn
+from rnd_runtime.cli.command import log, warn
+from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import output_file, output_folder, refuse_input, write_json
 from rnd_runtime.core.images import to_bytes, write_image
-from rnd_runtime.core.progress import Progress
 from rnd_runtime.playback.doctor import machine
 from rnd_runtime.shading.shader import check_mode
 from rnd_stage.film.plan import check_step

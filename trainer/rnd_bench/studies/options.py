@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import Count, Number, OptionalCount, OptionalFile, option
+from rnd_runtime.cli.command import Count, Number, OptionalCount, OptionalFile, option
 from rnd_runtime.core.errors import check_option, flag
 from rnd_stage.film.plan import Recipe
 from rnd_stage.variants import Variant

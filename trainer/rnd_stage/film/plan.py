@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from rnd_runtime.capture.format import TRAIN_SHARE, Frame, Split
-from rnd_runtime.core.command import Count, Number, OptionalNumber, option
+from rnd_runtime.cli.command import Count, Number, OptionalNumber, option
 from rnd_runtime.core.errors import check_option, flag, refuse_changed
 
 from .lights import WHITE

@@ -18,9 +18,9 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.skeleton import bone_transforms, smpl_skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES
 from rnd_runtime.shading.light import REC709_LUMINANCE
+from rnd_stage.cloth import Capsules, Drape
 
 from .character import Character, Floats, Ints, read_npz
-from .cloth import Capsules, Drape
 from .dressing import Dressed
 from .garments import ramp
 from .gltf import read_gltf

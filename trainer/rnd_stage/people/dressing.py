@@ -12,9 +12,9 @@ from rnd_runtime.capture.body import Body
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import bone_transforms, smpl_skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES
+from rnd_stage.cloth import Capsules, Cloth, Drape
 from rnd_stage.render import Surface
 
-from .cloth import Capsules, Cloth, Drape
 from .garments import BOTTOM, HAIR, TOP, Garments, layers, ramp
 from .paint import paint
 from .remesh import adjacency, vertex_normals

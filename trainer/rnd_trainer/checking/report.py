@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from rnd_runtime.core.command import finish, show
+from rnd_runtime.cli.command import finish, show
+from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.files import write_json
-from rnd_runtime.core.progress import Progress
 
 from .check import CheckReport, check_capture
 from .overlay import save_overlay

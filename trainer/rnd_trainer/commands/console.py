@@ -6,7 +6,7 @@ import importlib.util
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from rnd_runtime.core.command import log
+from rnd_runtime.cli.command import log
 from rnd_runtime.core.errors import InputError
 
 if TYPE_CHECKING:

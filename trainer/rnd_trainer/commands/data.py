@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.core.command import OptionalFolder, finish, option, parse_subcommand, run_command
+from rnd_runtime.cli.command import OptionalFolder, finish, option, parse_subcommand, run_command
 from rnd_runtime.core.files import is_folder
 from rnd_trainer.importing.options import ImportOptions
 

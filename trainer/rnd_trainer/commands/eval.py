@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rnd_runtime.core.command import OptionalFile, OptionalFolder, is_quiet, log, option, parse, run_command, warn
+from rnd_runtime.cli.command import OptionalFile, OptionalFolder, is_quiet, log, option, parse, run_command, warn
 from rnd_runtime.core.errors import InputError, check_cull
 from rnd_runtime.core.files import is_folder, output_file, output_folder, refuse_input, write_json
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import (
+from rnd_runtime.cli.command import (
     Count,
     Flag,
     Folder,
@@ -30,10 +30,10 @@ from rnd_runtime.core.command import (
     show,
     warn,
 )
+from rnd_runtime.cli.lock import folder_lock
+from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError, check_option, refuse_changed
 from rnd_runtime.core.files import existing_file, output_folder, write_json
-from rnd_runtime.core.lock import folder_lock
-from rnd_runtime.core.progress import Progress
 
 from .console import log_all, need_extra
 from .eval import EvalOptions, evaluate_run

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.core.errors import InputError, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.core.files import output_folder
-from rnd_runtime.core.lock import folder_lock
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
 from rnd_trainer.importing.layouts import (
     arah,

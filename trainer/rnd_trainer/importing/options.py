@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from rnd_runtime.core.command import OptionalCount, OptionalFile, OptionalFolder, OptionalNumber, group, option
+from rnd_runtime.cli.command import OptionalCount, OptionalFile, OptionalFolder, OptionalNumber, group, option
 
 Up = Literal["x", "-x", "y", "-y", "z", "-z"]
 OnProgress = Callable[[str, int, int], None]

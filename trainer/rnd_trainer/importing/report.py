@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rnd_runtime.core.command import show
-from rnd_runtime.core.progress import Progress
+from rnd_runtime.cli.command import show
+from rnd_runtime.cli.progress import Progress
 from rnd_trainer.checking.report import check_and_report
 
 from .importer import import_source

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rnd_runtime.core.sh import sh_columns
 from rnd_runtime.shading.brdf import specular
+from rnd_runtime.shading.sh import sh_columns
 from rnd_runtime.shading.shadow import directional_visibility
 
 from .probe import Texels

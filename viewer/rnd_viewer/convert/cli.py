@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rnd_runtime.core.command import parse_subcommand, run_command
+from rnd_runtime.cli.command import parse_subcommand, run_command
 
 from .options import COMMANDS
 

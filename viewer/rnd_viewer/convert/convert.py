@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.capture.body import Body, posed_vertices
-from rnd_runtime.core.command import finish, log
+from rnd_runtime.cli.command import finish, log
+from rnd_runtime.cli.progress import track
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import existing_file, output_folder, refuse_input
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.progress import track
 from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.amass import write_amass
 from rnd_runtime.motion.edit import resampled

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import File, Folder, Number, OptionalFile, OptionalNumber, option
+from rnd_runtime.cli.command import File, Folder, Number, OptionalFile, OptionalNumber, option
 from rnd_runtime.core.errors import check_option, refuse_changed, refuse_outside
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
 from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp

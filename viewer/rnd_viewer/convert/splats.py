@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import linear_to_srgb
 from rnd_runtime.core.rotations import matrix_to_quaternion
-from rnd_runtime.core.sh import SH_COUNT, sh_basis
+from rnd_runtime.shading.sh import SH_COUNT, sh_basis
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

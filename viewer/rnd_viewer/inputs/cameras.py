@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.cli.command import MAX_SIDE
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.command import MAX_SIDE
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.playback.framing import CameraPath

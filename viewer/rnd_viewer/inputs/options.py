@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.core.command import (
+from rnd_runtime.cli.command import (
     Flag,
     Number,
     OptionalCount,

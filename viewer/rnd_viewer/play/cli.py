@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rnd_runtime.core.command import parse, run_command, show
+from rnd_runtime.cli.command import parse, run_command, show
 from rnd_runtime.playback.start import load_ahead
 from rnd_viewer.inputs.options import PlayOptions
 

@@ -18,13 +18,13 @@ from rich.table import Table
 from rnd_runtime import __version__
 from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.avatar.networks import Networks
+from rnd_runtime.cli.command import finish, is_quiet, log, size_text, warn
+from rnd_runtime.cli.lock import folder_lock
+from rnd_runtime.cli.progress import track
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.command import finish, is_quiet, log, size_text, warn
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
-from rnd_runtime.core.lock import folder_lock
-from rnd_runtime.core.progress import track
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs

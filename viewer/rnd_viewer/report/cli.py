@@ -10,17 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.core.command import (
-    Count,
-    Files,
-    OptionalFile,
-    OptionalFolder,
-    finish,
-    option,
-    parse,
-    run_command,
-    warn,
-)
+from rnd_runtime.cli.command import Count, Files, OptionalFile, OptionalFolder, finish, option, parse, run_command, warn
 from rnd_runtime.core.errors import InputError, check_option, flag, refuse_changed
 from rnd_runtime.core.files import is_folder, output_file
 from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 from rich.console import Console
 
-from rnd_runtime.core.command import is_quiet, log, parse, run_command
+from rnd_runtime.cli.command import is_quiet, log, parse, run_command
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.signals import on_signal
 from rnd_runtime.core.threads import set_threads

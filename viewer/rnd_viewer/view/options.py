@@ -8,15 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.core.command import (
-    OptionalCount,
-    OptionalFile,
-    OptionalFolder,
-    OptionalNumber,
-    Size,
-    option,
-    size_text,
-)
+from rnd_runtime.cli.command import OptionalCount, OptionalFile, OptionalFolder, OptionalNumber, Size, option, size_text
 from rnd_runtime.core.errors import InputError, refuse_changed, refuse_outside
 from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
 

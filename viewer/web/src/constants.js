@@ -38,7 +38,7 @@ export const TWIST_STEPS = 3;
 export const SMALLEST_SQUARE = 9.999999974752427e-07;
 // rnd_runtime.posing.rest
 export const DEEPEST = 60.0;
-// rnd_runtime.core.sh
+// rnd_runtime.shading.sh
 export const SH_COUNT = 16;
 export const SH_DEGREES = [0, 1, 1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3];
 export const COSINE_LOBE = [1.0, 0.6666666865348816, 0.6666666865348816, 0.6666666865348816, 0.25, 0.25, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];

@@ -14,10 +14,10 @@ from rnd_bench.stability.figures import Figure, Result, at_most, below, not_meas
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import srgb_to_linear, to_bytes
-from rnd_runtime.core.sh import sh_basis
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.directional import DirectionalLight, extract_directional
 from rnd_runtime.shading.light import Light, texel_directions, texel_solid_angles
+from rnd_runtime.shading.sh import sh_basis
 from rnd_runtime.shading.shader import Shader
 from rnd_runtime.shading.shadow import directional_visibility
 from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate

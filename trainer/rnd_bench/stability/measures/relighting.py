@@ -15,7 +15,6 @@ from rnd_bench.stability.figures import Result, above, at_least, at_most, below,
 from rnd_bench.stability.processes import play, run_commands
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import to_bytes, write_image
-from rnd_runtime.core.sh import SH_COUNT
 from rnd_runtime.shading.brdf import F0, LARGEST_ALBEDO, ROUGHNESS_RANGE, specular
 from rnd_runtime.shading.light import (
     REC709_LUMINANCE,
@@ -27,6 +26,7 @@ from rnd_runtime.shading.light import (
     texel_solid_angles,
 )
 from rnd_runtime.shading.reference import shade_reference
+from rnd_runtime.shading.sh import SH_COUNT
 from rnd_runtime.shading.shader import Shader
 
 from .captures import flipped_normals

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.avatar.inference import open_session, run_session
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
-from rnd_runtime.core.inference import open_session, run_session
 
 _FREE_SIZE = 512  # pixels, for networks that take any
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}

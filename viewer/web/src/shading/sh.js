@@ -1,4 +1,4 @@
-// Real spherical harmonics of degree 3, in the order and with the signs of rnd_runtime/core/sh.py.
+// Real spherical harmonics of degree 3, in the order and with the signs of rnd_runtime/shading/sh.py.
 
 import { C0, C1, C2_SIDE as C2, C2_ZONAL as C20, C3_0 as C30, C3_1 as C31, C3_2 as C32, C3_3 as C33, SH_DEGREES } from "../constants.js";
 

@@ -9,8 +9,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from .errors import InputError, first_line
-from .threads import cores
+from rnd_runtime.core.errors import InputError, first_line
+from rnd_runtime.core.threads import cores
 
 
 def open_session(model: bytes | Path, threads: int | None = None) -> Any:

@@ -14,8 +14,8 @@ import pytest
 import tyro
 
 from rnd_runtime import __version__
-from rnd_runtime.core import command
-from rnd_runtime.core.command import (
+from rnd_runtime.cli import command
+from rnd_runtime.cli.command import (
     MAX_SIDE,
     Count,
     File,
@@ -214,7 +214,7 @@ def test_our_own_mistakes_keep_their_traceback():
 @pytest.mark.parametrize("ending", ["", "; raise SystemExit(0)"])
 def test_a_reader_who_has_gone_ends_the_command_in_silence(lines, ending):
     program = (
-        "import sys; from rnd_runtime.core.command import run_command\n"
+        "import sys; from rnd_runtime.cli.command import run_command\n"
         f"def main():\n    print('line\\n' * {lines}){ending}\n"
         "sys.exit(run_command('rnd-x', main))"
     )
@@ -229,7 +229,7 @@ def test_a_reader_who_has_gone_ends_the_command_in_silence(lines, ending):
 
 _COMMAND = """
 import os, signal, sys, time
-from rnd_runtime.core.command import run_command
+from rnd_runtime.cli.command import run_command
 from rnd_runtime.core.files import atomic_path
 
 def main():
@@ -255,7 +255,7 @@ def test_a_program_that_is_ended_takes_its_half_files_away(tmp_path, ignored, en
 
 
 def test_a_terminal_without_our_letters_still_shows_the_rest():
-    words = "from rnd_runtime.core.command import run_command; run_command('rnd-x', lambda: print('\u03b1 \u2264 1'))"
+    words = "from rnd_runtime.cli.command import run_command; run_command('rnd-x', lambda: print('\u03b1 \u2264 1'))"
     environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, env=environment)
     assert (done.stdout, done.stderr) == ("? ? 1\n", "")
@@ -277,6 +277,6 @@ def test_a_name_that_the_file_system_takes_is_written_and_a_longer_one_is_one_li
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_streams_that_are_closed_end_nothing(closed):
-    words = "from rnd_runtime.core.command import run_command; exit(run_command('rnd-x', lambda: print('done')))"
+    words = "from rnd_runtime.cli.command import run_command; exit(run_command('rnd-x', lambda: print('done')))"
     done = subprocess.run(f'"{sys.executable}" -c "{words}" {closed}', shell=True, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

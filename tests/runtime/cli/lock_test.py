@@ -5,12 +5,12 @@ import sys
 
 import pytest
 
+from rnd_runtime.cli.lock import LOCK_FILE, file_lock, folder_lock
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.lock import LOCK_FILE, file_lock, folder_lock
 
 HOLD = """
 import sys
-from rnd_runtime.core.lock import folder_lock
+from rnd_runtime.cli.lock import folder_lock
 with folder_lock(sys.argv[1], "rnd-train", shared_by=sys.argv[2] or None):
     print("held", flush=True)
     sys.stdin.read()
@@ -80,7 +80,7 @@ def test_a_file_is_locked_by_its_name_and_rid_of_what_killed_writers_left(tmp_pa
 def test_parts_that_start_at_once_all_share(tmp_path):
     code = """
 import sys, time
-from rnd_runtime.core.lock import folder_lock
+from rnd_runtime.cli.lock import folder_lock
 print("ready", flush=True)
 sys.stdin.readline()
 with folder_lock(sys.argv[1], "rnd-play", shared_by="clip"):

@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic, sleep, strftime
 
-from .errors import InputError
-from .files import temporary_stem
-from .signals import at_end
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.files import temporary_stem
+from rnd_runtime.core.signals import at_end
 
 try:
     import fcntl

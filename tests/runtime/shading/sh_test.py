@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from rnd_runtime.core.sh import SH_COUNT, SH_DEGREES, sh_basis, sh_columns, sh_rotation, sphere_quadrature
+from rnd_runtime.shading.sh import SH_COUNT, SH_DEGREES, sh_basis, sh_columns, sh_rotation, sphere_quadrature
 
 ROUNDING = 1e-10  # float64 sums of some hundred terms of order one stay four decades below
 

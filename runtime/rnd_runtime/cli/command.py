@@ -26,11 +26,12 @@ from typing import Annotated, Any, TypeVar
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from .budget import set_max_expanded
-from .errors import InputError, printable, withheld
-from .kernels import prepare_process
+from rnd_runtime.core.budget import set_max_expanded
+from rnd_runtime.core.errors import InputError, printable, withheld
+from rnd_runtime.core.kernels import prepare_process
+from rnd_runtime.core.signals import handled, received
+
 from .parsing import names, refusal, refuse_unknown, registry
-from .signals import handled, received
 
 Options = TypeVar("Options")
 MAX_SIDE = 16384

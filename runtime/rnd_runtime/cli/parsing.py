@@ -12,7 +12,7 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from .errors import InputError, flag
+from rnd_runtime.core.errors import InputError, flag
 
 # What other programs call our options; the first that the command has is suggested.
 _MEANT = {

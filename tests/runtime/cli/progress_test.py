@@ -2,9 +2,9 @@
 
 import pytest
 
-from rnd_runtime.core import progress
-from rnd_runtime.core.command import run_command
-from rnd_runtime.core.progress import Progress, track
+from rnd_runtime.cli import progress
+from rnd_runtime.cli.command import run_command
+from rnd_runtime.cli.progress import Progress, track
 
 
 @pytest.fixture
@@ -45,6 +45,6 @@ def test_a_resumed_phase_does_not_count_what_was_done_before(clock, capsys):
 
 
 def test_quiet_is_silent_and_items_pass(monkeypatch, capsys):
-    monkeypatch.setattr("rnd_runtime.core.command._running.quiet", True)
+    monkeypatch.setattr("rnd_runtime.cli.command._running.quiet", True)
     assert list(track("counting", range(3), 3)) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
