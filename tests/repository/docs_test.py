@@ -26,7 +26,7 @@ FRONT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "viewer/web/RE
 PAGES = [*FRONT, *DOCS]
 MAX_LINES = {"README.md": 110, "CHANGELOG.md": 40}
 MAX_PAGE_LINES = 250
-MAX_README_WORDS, MAX_DOCS_WORDS = 1_000, 12_000
+MAX_README_WORDS, MAX_DOCS_WORDS = 1_000, 15_000
 LOOKS_LIKE_A_COMMAND = re.compile(r"^ +(?:rnd-\w+|python|pip|npm|\./scripts/\w+) .*|^ +\./scripts/\w+$", re.MULTILINE)
 FLOAT32_STEPS = 1e-5  # m: the example computes its bones in float64, the player in its own order
 
