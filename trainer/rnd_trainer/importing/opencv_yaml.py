@@ -24,7 +24,7 @@ class _Loader(yaml.SafeLoader):
     """YAML 1.1 with OpenCV's matrices as mappings."""
 
 
-_Loader.add_constructor(MATRIX_TAG, lambda loader, node: loader.construct_mapping(node, deep=True))  # type: ignore[arg-type]
+_Loader.add_constructor(MATRIX_TAG, lambda loader, node: loader.construct_mapping(node, deep=True))
 
 
 class Calibration:
