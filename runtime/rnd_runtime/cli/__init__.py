@@ -1,1 +1,1 @@
-"""What commands share: exit codes, options and help, progress, locks. A library does not need this room."""
+"""What commands share: exit codes, options and help, progress, locks. A library does not need this package."""

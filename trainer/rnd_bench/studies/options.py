@@ -72,7 +72,7 @@ class Lengths(Trainings):
 
 @dataclass(frozen=True)
 class PeopleSizes:
-    """Sizes of the study: by default two cores take some forty minutes for all of it, half of it trainings."""
+    """Sizes of the study: by default two cores take 70 minutes for all of it, two thirds of it trainings."""
 
     subjects: Count = 4
     """people, by their seeds from 0 on"""
