@@ -16,7 +16,7 @@ from rnd_export.bake import BakedAvatar, bake
 from rnd_export.cli import main
 from rnd_export.order import order_gaussians
 from rnd_export.parity import random_motion
-from rnd_export.reduce.merge import fitted_albedo, merged
+from rnd_export.reduce.merge import fitted_albedo, merge_gaussians
 from rnd_export.reduce.variant import Variant, static_where
 from rnd_export.reduce.views import COUNT, FIT_COUNT, resized, views_around, views_of
 from rnd_export.search.budget import LADDERS, Bound, Found, Plan, given_up, search
@@ -326,13 +326,13 @@ def test_merging_conserves_mass_and_valid_gaussians(tiny_checkpoint) -> None:
     rng = np.random.default_rng(0)
     seen = rng.uniform(0.5, 1.5, len(baked.points))
     seen[::7] = 0.0
-    fewer = merged(baked, 400, seen)
+    fewer = merge_gaussians(baked, 400, seen)
     assert len(fewer.points) == 400 and len(fewer.node_rows) == len(baked.codes)
     assert (fewer.all_codes[fewer.node_rows] == baked.codes).all()
     unseen_kept = np.isin(fewer.all_codes[:, 0], baked.all_codes[seen == 0, 0])
     assert set(np.flatnonzero(unseen_kept)) <= set(fewer.node_rows)  # only where a node needs one
     assert np.allclose(np.linalg.norm(fewer.normals, axis=1), 1)
-    same = merged(baked, len(baked.points), np.ones(len(baked.points)))
+    same = merge_gaussians(baked, len(baked.points), np.ones(len(baked.points)))
     assert np.abs(same.points - baked.points).max() < 1e-12
     assert (
         np.abs(same.factors @ same.factors.transpose(0, 2, 1) - baked.factors @ baked.factors.transpose(0, 2, 1)).max()
@@ -345,7 +345,7 @@ def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> Non
     seen = np.random.default_rng(3).uniform(0.1, 1, len(baked.points))
     seen[np.isin(baked.rows, baked.rows[baked.node_rows], invert=True) & (baked.rows % 5 == 0)] = 0
     count = (len(seen) + len(baked.node_rows)) // 2
-    left = np.isin(baked.rows, merged(baked, count, seen).rows)
+    left = np.isin(baked.rows, merge_gaussians(baked, count, seen).rows)
     own = left.copy()
     own[baked.node_rows] = False  # which stay for the networks' sake
     assert left.sum() == count and (seen[own] > 0).all()
@@ -368,7 +368,7 @@ def test_merging_conserves_the_moments(tiny_checkpoint) -> None:
     """Σ mass, Σ mass·x and Σ mass·(Σ + x xᵀ) of all Gaussians are those of the fewer."""
     baked = bake(load_checkpoint(tiny_checkpoint).model)
     seen = np.random.default_rng(1).uniform(0.5, 1.5, len(baked.points))
-    fewer = merged(baked, 300, seen)
+    fewer = merge_gaussians(baked, 300, seen)
     owner = cKDTree(fewer.all_codes).query(baked.all_codes)[1]
     mass = np.bincount(owner, seen, len(fewer.points))
 

@@ -1,4 +1,4 @@
-"""rnd-bench: the laboratory. Speed, stability and studies, as JSON rows, tables and charts."""
+"""rnd-bench: speed, stability and studies, as JSON rows, tables and charts."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ SHARED = {
     "rnd_runtime.shading.sum": "HALF_FLOOR _CUT_TEXELS",
     "rnd_runtime.shading.directional": "_CAP _RING _RING_AREA _LARGEST _MIN_SHARE _MAX_PEAKS _LAMP",
     "rnd_runtime.shading.shader": "SHADOW_RESOLUTION DISC_SIGMAS CASTING_OPACITY",
-    "rnd_runtime.shading.shadow": "CLEARANCE CLEARANCE_TEXELS DROP RIM_TEXELS EDGE_ON SOFTNESS SLOPE_FLOOR",
+    "rnd_runtime.shading.shadow": "DEPTH_BIAS CLEARANCE_TEXELS DROP RIM_TEXELS EDGE_ON SOFTNESS SLOPE_FLOOR",
     "rnd_runtime.shading.direct": "TURNED_AWAY AT_SILHOUETTE",
     "rnd_runtime.raster.oracle": "NEAR DILATION ALPHA_MIN ALPHA_MAX TRANSMITTANCE_MIN FIELD_OF_VIEW_MARGIN",
     "rnd_runtime.raster.project": "HALF_LOG2_E LOG2_ALPHA_MIN",

@@ -35,7 +35,7 @@ def contributions(views: Sequence[PosedView]) -> Floats:
     return total
 
 
-def merged(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
+def merge_gaussians(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
     """``baked`` reduced to ``count`` Gaussians, or to its nodes if they are more.
 
     Gaussians at nodes are kept. Others are ranked by the sum of their ranks in farthest-point order and contribution,
@@ -101,7 +101,7 @@ def fitted_albedo(albedo: Floats, views: Sequence[PosedView], wanted: Sequence[N
             gradient += raster_cpu.backward(state, image.astype(np.float32), no_alpha)[3]
         return gradient
 
-    def normal(values: Floats) -> Floats:
+    def apply_normal_equations(values: Floats) -> Floats:
         images = [_splat(gaussians, values, camera)[0].astype(np.float64) for gaussians, camera in views]
         return transposed(images) + ridge * values
 
@@ -111,7 +111,7 @@ def fitted_albedo(albedo: Floats, views: Sequence[PosedView], wanted: Sequence[N
     for _ in range(CG_STEPS):
         if length <= 0:
             break
-        product = normal(direction)
+        product = apply_normal_equations(direction)
         step = length / float((direction * product).sum())
         change += step * direction
         residual -= step * product

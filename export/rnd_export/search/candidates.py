@@ -16,7 +16,7 @@ from rnd_export.export import build, refuse_ablations
 from rnd_export.order import order_gaussians
 from rnd_export.parity import MAX_P99_M
 from rnd_export.reduce.culling import add_advice
-from rnd_export.reduce.merge import contributions, fitted_albedo, merged
+from rnd_export.reduce.merge import contributions, fitted_albedo, merge_gaussians
 from rnd_export.reduce.variant import Variant, reduced, static_where
 from rnd_export.reduce.views import SearchView, SearchViews, resized, views_around
 from rnd_runtime.avatar.avatar import Avatar
@@ -114,7 +114,7 @@ class Workbench:
         if recipe.dynamic_mm and baked.skinning is not None:
             baked = static_where(baked, self._node_moves(baked) < recipe.dynamic_mm)
         if recipe.gaussians is not None:
-            baked = merged(baked, recipe.gaussians, self._shares)
+            baked = merge_gaussians(baked, recipe.gaussians, self._shares)
             fewer = _loaded(build(self._checkpoint, baked, recipe.variant))
             wanted = [_albedo_image(*view) for view in self._posed(self._whole)]
             baked = dataclasses.replace(baked, albedo=fitted_albedo(baked.albedo, self._posed(fewer), wanted))

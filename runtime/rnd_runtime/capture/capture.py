@@ -20,7 +20,7 @@ from rnd_runtime.shading import light as lights
 from rnd_runtime.shading.light import Light
 
 from .body import Body as Body
-from .format import SCHEMA, check_pictures, decode_normals, read_record, read_unit_range
+from .format import SCHEMA, check_images, decode_normals, read_record, read_unit_range
 from .format import CaptureLight as CaptureLight
 from .format import Frame as Frame
 from .format import Split as Split
@@ -185,7 +185,7 @@ def load_capture(path: str | Path, *, motion_file: str | None = None) -> Capture
         if frame.frame >= motion.frame_count:
             expected = f"an index below the {motion.frame_count} frames of {motion.source}"
             raise InputError("frame", expected=expected, got=frame.frame, file=file, frame=frame.frame)
-        check_pictures(frame, cameras[frame.camera], file)
+        check_images(frame, cameras[frame.camera], file)
     return Capture(folder, cameras, record.lights, body, motion, tuple(record.frames), file.name)
 
 

@@ -103,7 +103,7 @@ def read_record(file: Path) -> CaptureRecord:
     return record
 
 
-def check_pictures(frame: Frame, camera: Camera, file: Path) -> None:
+def check_images(frame: Frame, camera: Camera, file: Path) -> None:
     """Check the headers of a frame's images against its camera and the format."""
     for kind, channels in _CHANNELS.items():
         name = getattr(frame, kind)

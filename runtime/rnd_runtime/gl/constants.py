@@ -46,7 +46,7 @@ def shared_constants() -> dict[str, str]:
         "AT_SILHOUETTE": direct.AT_SILHOUETTE,
     }
     values |= {f"SH{name}": getattr(sh, name) for name in _SH}
-    for name in ("CLEARANCE", "CLEARANCE_TEXELS", "DROP", "EDGE_ON", "RIM_TEXELS", "SLOPE_FLOOR", "SOFTNESS"):
+    for name in ("DEPTH_BIAS", "CLEARANCE_TEXELS", "DROP", "EDGE_ON", "RIM_TEXELS", "SLOPE_FLOOR", "SOFTNESS"):
         values[name] = getattr(shadow, name)
     macros = {name: str(value) if isinstance(value, int) else f"({float(value)!r})" for name, value in values.items()}
     cosine = ", ".join(str(float(sh.COSINE_LOBE[degree * degree])) for degree in range(sh.SH_DEGREE + 1))

@@ -1,6 +1,6 @@
 """Blending of tiles, front to back, and its gradient (numba, sixteen lanes).
 
-A tile is 4×4 blocks of 4×4 pixels; a block is one value of sixteen lanes. Threads take tiles one by one, fullest first;
+A tile is 4×4 blocks of 4×4 pixels; a block is one 16-lane SIMD vector. Threads take tiles one by one, fullest first;
 the result does not depend on the thread, to the bit.
 """
 
@@ -99,7 +99,7 @@ def _gather(first, last, splats, tile_x, tile_y, shapes, colours, columns):  # t
 
 
 @njit(inline="always")
-def _fetch(first, last, splats):  # type: ignore[no-untyped-def]
+def _prefetch_batch(first, last, splats):  # type: ignore[no-untyped-def]
     """Prefetch the Gaussians of a later batch."""
     for pair in range(first, last):
         g = splats.pair_gaussians[pair]
@@ -109,7 +109,7 @@ def _fetch(first, last, splats):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _reaching(block, count, shapes):  # type: ignore[no-untyped-def]
+def _overlap_mask(block, count, shapes):  # type: ignore[no-untyped-def]
     """Bit mask of the ``count`` gathered Gaussians that may reach a block."""
     row = np.float32(block // BLOCKS * BLOCK + 0.5 * BLOCK)
     column = np.float32(block % BLOCKS * BLOCK + 0.5 * BLOCK)
@@ -142,7 +142,7 @@ def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped
 
 
 @njit(inline="always")
-def _add_up(at, reaching, weights, colours, first, columns, sums):  # type: ignore[no-untyped-def]
+def _accumulate(at, reaching, weights, colours, first, columns, sums):  # type: ignore[no-untyped-def]
     """Add four attributes, from ``first`` on, to ``sums`` at ``at``."""
     a, b, c, d = (load(sums, at), load(sums, at + WIDTH), load(sums, at + 2 * WIDTH), load(sums, at + 3 * WIDTH))
     while reaching != 0:
@@ -171,12 +171,12 @@ def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[n
     for start in range(first, last, BATCH):
         count = min(BATCH, last - start)
         _gather(start, start + count, splats, tile_x, tile_y, shapes, colours, columns)
-        _fetch(start + count, min(start + count + BATCH, last), splats)
+        _prefetch_batch(start + count, min(start + count + BATCH, last), splats)
         blocks = open_blocks
         while blocks != 0:
             block = lowest_bit(blocks)
             blocks &= blocks - 1
-            reaching = _reaching(block, count, shapes)
+            reaching = _overlap_mask(block, count, shapes)
             if reaching == 0:
                 continue
             left = _weights(block, reaching, shapes, load(transmittance, block * WIDTH), weights)
@@ -184,13 +184,13 @@ def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[n
             if not any_lane(left > ZERO):
                 open_blocks &= ~(1 << block)
             for c in range(0, columns, 4):
-                _add_up((block * columns + c) * WIDTH, reaching, weights, colours, c, columns, sums)
+                _accumulate((block * columns + c) * WIDTH, reaching, weights, colours, c, columns, sums)
         if open_blocks == 0:
             break
 
 
 @njit(inline="always")
-def _fullest_first(starts):  # type: ignore[no-untyped-def]
+def _tiles_by_load(starts):  # type: ignore[no-untyped-def]
     return np.argsort(starts[:-1] - starts[1:], kind="mergesort")
 
 
@@ -202,7 +202,7 @@ def blend(splats, width, height, threads, outlines):  # type: ignore[no-untyped-
     image, coverage = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
     tiles_x = (width + TILE - 1) // TILE
     starts = splats.tile_starts
-    tiles = _fullest_first(starts)
+    tiles = _tiles_by_load(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
         transmittance, sums = aligned_floats(PIXELS), aligned_floats(columns * PIXELS)
@@ -316,7 +316,7 @@ def blend_backward(splats, image, coverage, grad_image, grad_coverage, threads):
     slots = np.empty((splats.pair_slots.size, MOMENTS + channels), np.float32)
     tiles_x = (width + TILE - 1) // TILE
     starts = splats.tile_starts
-    tiles = _fullest_first(starts)
+    tiles = _tiles_by_load(starts)
     counter = np.zeros(1, np.int64)
     for _ in prange(threads):
         transmittance, remaining = aligned_floats(PIXELS), aligned_floats(PIXELS)

@@ -22,7 +22,7 @@ Floats32 = NDArray[np.float32]
 
 # Min rise of a blocker above a point's tangent plane, in disc radii. 0.5 suffices for exact normals; a trained avatar's
 # disagree by 10°, which speckles its limbs (28.9 dB instead of 29.0 on relit images). More loses contact shadows.
-CLEARANCE = np.float32(1.0)
+DEPTH_BIAS = np.float32(1.0)
 CLEARANCE_TEXELS = np.float32(0.35)  # min clearance in texels, for the map's rounding on curved surfaces
 # All transitions are continuous. A plane falls by DROP metres (more than a body's depth) over RIM_TEXELS beyond its
 # disc, and sinks by as much as the cosine of its normal goes from EDGE_ON to 0. Light fades between rises of
@@ -122,7 +122,7 @@ def _one_direction(arrays, frame, resolution, threads, visibility):  # type: ign
                 _draw_disc(depth, across, position, normal, i, radii[i], texel, edges[band], edges[band + 1])
     for i in numba.prange(count):
         if normal[i, 2] > 0 and receivers[i]:
-            visibility[i] = _lit_share(depth, across, position, normal, i, radii[i], texel)
+            visibility[i] = _pcf_visibility(depth, across, position, normal, i, radii[i], texel)
 
 
 @numba.njit(error_model="numpy")
@@ -230,11 +230,11 @@ def _texel_index(row, column, across):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(error_model="numpy")
-def _lit_share(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
+def _pcf_visibility(depth, across, position, normal, i, radius, texel):  # type: ignore[no-untyped-def]
     """Bilinear share of the four texels around a point that are lit: no blocker above its plane."""
     x, y, z = position[i, 0], position[i, 1], position[i, 2]
     slope_x, slope_y = _slopes(normal, i, texel)
-    clearance = max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
+    clearance = max(DEPTH_BIAS * radius, CLEARANCE_TEXELS * texel) / max(normal[i, 2], SLOPE_FLOOR)
     top, span = (_ONE + SOFTNESS) * clearance, _ONE / (_TWO * SOFTNESS * clearance)
     column, row = int(x), int(y)  # positive, one texel from the far edge
     lit = np.float32(0)

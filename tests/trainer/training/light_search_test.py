@@ -10,7 +10,7 @@ import torch
 
 from rnd_runtime.shading.light import texel_directions, texel_solid_angles
 from rnd_trainer.training import light_search
-from rnd_trainer.training.light_search import Observations, start_light
+from rnd_trainer.training.light_search import Observations, initial_light
 
 COUNT, IMAGES = 700, 24
 WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide
@@ -46,7 +46,7 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun /= np.linalg.norm(sun)
     ball = _rotating_ball(sun, strength)
     monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
-    found = start_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
+    found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
     assert found is not None
     light, exposure = found.radiance, found.exposure
     assert light.shape == (32, 64, 3) and (light > 0).all() and (exposure >= 0).all()
@@ -77,7 +77,7 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
     ball.colour *= np.exp(0.3 * rng.normal(size=(len(ball.colour), 1)))
     ball.colour[shade[rng.random(len(shade)) < 1 / 4]] *= 2
     monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
-    found = start_light(None, [], [])  # type: ignore[arg-type]
+    found = initial_light(None, [], [])  # type: ignore[arg-type]
     assert found is not None
     energy = found.radiance.mean(-1) * texel_solid_angles(32, 64)
     near = texel_directions(32, 64) @ sun > math.cos(math.radians(12))
@@ -99,14 +99,14 @@ def test_equal_images_give_none(monkeypatch) -> None:
     once = Observations(ball.point[first], ball.colour[first], ball.image[first], ball.posed[:1], ball.spacing)
     for seen in (alike, once):
         monkeypatch.setattr(light_search, "_observe", lambda *_, seen=seen: seen)
-        assert start_light(None, [], []) is None  # type: ignore[arg-type]
+        assert initial_light(None, [], []) is None  # type: ignore[arg-type]
 
 
 def test_too_few_observations_give_none(monkeypatch) -> None:
     ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 0.0)
     few = Observations(ball.point[:20], ball.colour[:20], ball.image[:20], ball.posed, 0.1)
     monkeypatch.setattr(light_search, "_observe", lambda *_: few)
-    assert start_light(None, [], []) is None  # type: ignore[arg-type]
+    assert initial_light(None, [], []) is None  # type: ignore[arg-type]
 
 
 def test_points_observed_once_or_twice_give_no_sun(monkeypatch) -> None:
@@ -115,4 +115,4 @@ def test_points_observed_once_or_twice_give_no_sun(monkeypatch) -> None:
     few = np.isin(ball.image, (0, 8, 16))
     seen = Observations(ball.point[few], ball.colour[few], ball.image[few] // 8, ball.posed[::8], ball.spacing)
     monkeypatch.setattr(light_search, "_observe", lambda *_: seen)
-    assert start_light(None, [], []) is None  # type: ignore[arg-type]
+    assert initial_light(None, [], []) is None  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ class PoseGaussians(torch.autograd.Function):
     """Means [N, 3], covariances [N, 6] and unit normals [N, 3] of posed Gaussians.
 
     Arguments as ``model.posing.pose_gaussians``, with the axes, levers and shares of ``TwistFrames`` last.
-    No gradient by tangents, axes, levers and shares.
+    Not differentiable w.r.t. tangents, axes, levers and shares.
     """
 
     @staticmethod
@@ -99,7 +99,7 @@ def _rotation(q):
 
 @_inline
 def _rotation_backward(q, length, h):
-    """Gradient by the rotation vector, from the gradient h by the matrix of ``_rotation(_quaternion(v))``."""
+    """Gradient w.r.t. the rotation vector, from the gradient h by the matrix of ``_rotation(_quaternion(v))``."""
     s, x, y, z = q
     two = np.float32(2)
     by_s = two * (-z * h[1] + y * h[2] + z * h[3] - x * h[5] - y * h[6] + x * h[7])
@@ -132,7 +132,7 @@ def _normal_matrix(m):
 
 @_inline
 def _normal_matrix_backward(m, g):
-    """Gradient by M, from the gradient g by ``_normal_matrix(M)``."""
+    """Gradient w.r.t. M, from the gradient g by ``_normal_matrix(M)``."""
     a, b, c = (m[0], m[1], m[2]), (m[3], m[4], m[5]), (m[6], m[7], m[8])
     first, second, third = (g[0], g[1], g[2]), (g[3], g[4], g[5]), (g[6], g[7], g[8])
     a1, a2 = _cross(second, c), _cross(b, third)

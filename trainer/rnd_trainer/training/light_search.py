@@ -75,7 +75,7 @@ REFLECTANCE = 0.22
 
 
 @dataclass
-class FirstLight:
+class InitialLight:
     """Initial light."""
 
     radiance: NDArray[np.float32]  # [32, 64, 3] linear
@@ -93,12 +93,12 @@ class Observations:
     spacing: float  # m
 
 
-def start_light(
+def initial_light(
     model: AvatarModel,
     views: Sequence[TrainingView],
     poses: Sequence[PoseInput],
     on_progress: Callable[[int, int], None] = lambda done, total: None,
-) -> FirstLight | None:
+) -> InitialLight | None:
     """The light that best explains the images; None if the body is hardly visible, or only from one side.
 
     The scale is that of a visible body of mean reflectance ``REFLECTANCE``.
@@ -145,7 +145,7 @@ def start_light(
     exposure = _upsample(coarse.mean(0) / coarse_angles) * solid_angles
     level = (seen.colour @ REC709_LUMINANCE).mean() / REFLECTANCE
     radiance *= level / ((radiance @ REC709_LUMINANCE) @ exposure)
-    return FirstLight(
+    return InitialLight(
         radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(PROBE_SHAPE).astype(np.float32)
     )
 
@@ -194,24 +194,24 @@ def _transport(seen: Observations, directions: Floats, solid_angles: Floats) -> 
 
 @dataclass
 class Quadratic:
-    """Squared error Lᵀ disagreement L of a light L, per channel, over Q columns of the dictionary."""
+    """Squared error Lᵀ residual_gram L of a light L, per channel, over Q columns of the dictionary."""
 
-    disagreement: Floats  # [3, Q, Q]
+    residual_gram: Floats  # [3, Q, Q]
     power: Floats  # [Q, Q]; Lᵀ power L is the squared irradiance
     seen: Floats  # [Q]; seen · L is the total irradiance
 
     def is_undetermined(self) -> bool:
         """Whether the observations do not constrain the light."""
-        unexplained = float(np.trace(self.disagreement.mean(0)))
+        unexplained = float(np.trace(self.residual_gram.mean(0)))
         return unexplained < ROUND_OFF * float(np.trace(self.power))
 
     def fit(self, columns: Sequence[int]) -> tuple[float, Floats]:
         """Least error, and its non-negative intensities [len(columns), 3], under the constraint seen · L = 1."""
         pick = np.asarray(columns)
-        weight = PENALTY * math.sqrt(float(np.trace(self.disagreement.mean(0)))) / np.linalg.norm(self.seen)
+        weight = PENALTY * math.sqrt(float(np.trace(self.residual_gram.mean(0)))) / np.linalg.norm(self.seen)
         intensity, error = np.empty((len(pick), 3)), 0.0
         for channel in range(3):
-            gram = self.disagreement[channel][np.ix_(pick, pick)]
+            gram = self.residual_gram[channel][np.ix_(pick, pick)]
             gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12)
             sky = slice(0, SKY_LOBES)  # always among the columns
             level = SKY_PRIOR * float(np.diag(gram)[sky].mean())
@@ -223,7 +223,7 @@ class Quadratic:
             intensity[:, channel], _ = nnls(rows, target)
             intensity[:, channel] /= self.seen[pick] @ intensity[:, channel]
             error += float(
-                intensity[:, channel] @ self.disagreement[channel][np.ix_(pick, pick)] @ intensity[:, channel]
+                intensity[:, channel] @ self.residual_gram[channel][np.ix_(pick, pick)] @ intensity[:, channel]
             )
         return error, intensity
 
@@ -232,7 +232,7 @@ class Quadratic:
         pick = np.asarray(columns)
         gain = np.zeros(len(self.seen))
         for channel in range(3):
-            matrix = self.disagreement[channel]
+            matrix = self.residual_gram[channel]
             gradient = matrix[:, pick] @ intensity[:, channel]
             level = intensity[:, channel] @ gradient[pick]  # Lagrange multiplier of seen · L = 1
             gain += (level * self.seen - gradient) / np.sqrt(np.diag(matrix) + 1e-12)
@@ -257,14 +257,14 @@ def _quadratic(seen: Observations, transport: NDArray[np.float32], weight: Float
     power = (rows.T @ rows).astype(np.float64)
     order = np.argsort(seen.point, kind="stable")
     starts = np.flatnonzero(np.diff(seen.point[order], prepend=-1))
-    disagreement = np.empty((3, columns, columns))
+    residual_gram = np.empty((3, columns, columns))
     for channel in range(3):
         colour = seen.colour[:, channel] * sqrt_weight
         length = np.sqrt(np.bincount(seen.point, colour**2, count))
         unit = (colour / np.maximum(length[seen.point], 1e-9)).astype(rows.dtype)
         along = np.add.reduceat((rows * unit[:, None])[order], starts, axis=0).astype(np.float64)
-        disagreement[channel] = power - along.T @ along
-    return Quadratic(disagreement, power, rows.sum(0, dtype=np.float64))
+        residual_gram[channel] = power - along.T @ along
+    return Quadratic(residual_gram, power, rows.sum(0, dtype=np.float64))
 
 
 def _intensities(seen: Observations, columns: NDArray[np.float32]) -> Floats:

@@ -223,7 +223,7 @@ class Training:
         if self._searches_light:
             motion = self.motion()
             poses = [self.pose(view, motion) for view in self.views]
-            found = light_search.start_light(self.model, self.views, poses, self.on_light_search)
+            found = light_search.initial_light(self.model, self.views, poses, self.on_light_search)
             self.light_found = found is not None
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))

@@ -1,6 +1,6 @@
 """Overlap the stages of consecutive frames: while one is drawn, the next is encoded and the last is written.
 
-onnxruntime, the compiled kernels and the writers release Python's lock. Results and order are those of one thread.
+onnxruntime, the compiled kernels and the writers release the GIL. Results and order are those of one thread.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TypeVar
 Encoded = TypeVar("Encoded")
 Drawn = TypeVar("Drawn")
 
-_BEHIND = 2  # frames drawn and not yet written: each takes memory
+_MAX_UNWRITTEN = 2  # frames drawn and not yet written: each takes memory
 
 
 def run(
@@ -25,7 +25,7 @@ def run(
     """Take each of ``frames`` through the three stages and yield its number once it is drawn.
 
     Drawing stays in the caller's thread, where its OpenGL context lives; each stage sees the frames in order. When a
-    stage raises, or the caller stops, frames that were drawn before are still written, and the exception goes on.
+    stage raises, or the caller stops, frames that were drawn before are still written, and the exception propagates.
     """
     with ThreadPoolExecutor(1, "encode") as encoder, _writer(write) as submit:
         encodings = ((number, encoder.submit(encode, number)) for number in frames)  # one ahead: more add latency
@@ -46,7 +46,7 @@ def _writer(write: Callable[[int, Drawn], None]) -> Iterator[Callable[[int, Draw
 
         def submit(number: int, frame: Drawn) -> None:
             unwritten.append(executor.submit(write, number, frame))
-            while len(unwritten) > _BEHIND:
+            while len(unwritten) > _MAX_UNWRITTEN:
                 unwritten.pop(0).result()
 
         yield submit

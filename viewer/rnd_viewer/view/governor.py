@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-LADDER = (1.0, 0.75, 0.5)  # scales of width and height
+SCALES = (1.0, 0.75, 0.5)  # scales of width and height
 _WINDOW = 4  # frames whose median decides on a lower scale
 _SMOOTH = 24  # frames that must all be fast before a higher scale
 _HEADROOM = 0.6  # of the budget; the largest time of a fast frame
 
 
-class Governor:
-    """Chooses a ``scale`` of ``LADDER`` from how long frames take.
+class ResolutionController:
+    """Chooses a ``scale`` of ``SCALES`` from how long frames take.
 
     Args:
         fps: the rate to hold.
@@ -24,7 +24,7 @@ class Governor:
 
     @property
     def scale(self) -> float:
-        return LADDER[self._level]
+        return SCALES[self._level]
 
     def observe(self, seconds: float) -> None:
         """Add the time of the last frame."""
@@ -35,5 +35,5 @@ class Governor:
             self._go(-1)
 
     def _go(self, step: int) -> None:
-        self._level = min(max(self._level + step, 0), len(LADDER) - 1)
+        self._level = min(max(self._level + step, 0), len(SCALES) - 1)
         self._seconds = []  # times of other scales do not count

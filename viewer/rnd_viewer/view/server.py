@@ -27,7 +27,7 @@ from rnd_runtime.core.threads import set_threads
 from rnd_viewer.play.video import clip_writer
 
 from .access import HTTP_PORT, Access
-from .governor import Governor
+from .governor import ResolutionController
 from .listener import Listener, connection_limit
 from .options import SIZES
 from .scene import Bytes, Scene
@@ -196,7 +196,7 @@ class _Visitor:
                 self._send(socket, {"kind": "error", "message": str(error)})
                 return
             set_threads(scene.threads)  # per thread, and each visitor has one
-            governor = None if self._fps_floor is None else Governor(self._fps_floor)
+            governor = None if self._fps_floor is None else ResolutionController(self._fps_floor)
             self._send(socket, {"kind": "scene", "scene": scene.description()})
             for message in socket:
                 try:
@@ -208,7 +208,7 @@ class _Visitor:
                         raise
                     self._send(socket, {"kind": "error", "message": reason})
 
-    def _answer(self, socket: Any, scene: Scene, governor: Governor | None, request: Request) -> None:
+    def _answer(self, socket: Any, scene: Scene, governor: ResolutionController | None, request: Request) -> None:
         if isinstance(request, RenderRequest):
             self._render(socket, scene, governor if request.live else None, request)
         elif isinstance(request, ClipRequest):
@@ -217,7 +217,7 @@ class _Visitor:
             data = scene.truth_file(request.index).read_bytes()
             self._send(socket, {"kind": "truth", "index": request.index}, data)
 
-    def _render(self, socket: Any, scene: Scene, governor: Governor | None, request: RenderRequest) -> None:
+    def _render(self, socket: Any, scene: Scene, governor: ResolutionController | None, request: RenderRequest) -> None:
         state, started = request.state, perf_counter()
         if governor:
             width, height = (max(round(governor.scale * side), SIZES[0]) for side in (state.width, state.height))

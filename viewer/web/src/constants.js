@@ -84,7 +84,7 @@ export const SHADOW_RESOLUTION = 384;
 export const DISC_SIGMAS = 1.4;
 export const CASTING_OPACITY = 0.5;
 // rnd_runtime.shading.shadow
-export const CLEARANCE = 1.0;
+export const DEPTH_BIAS = 1.0;
 export const CLEARANCE_TEXELS = 0.3499999940395355;
 export const DROP = 2.0;
 export const RIM_TEXELS = 0.5;

@@ -10,7 +10,7 @@ uniform float light_blurs[LIGHTS];  // mean square angle
 float reached_by(int light) {
     MapPoint here = in_map(light, mean_world, normal_world);
     if (!(here.cosine > 0.0) || !usable(mean_world, normal_world, disc_radius)) return 0.0;
-    float clearance = max(CLEARANCE * disc_radius, CLEARANCE_TEXELS * here.texel) / max(here.cosine, SLOPE_FLOOR);
+    float clearance = max(DEPTH_BIAS * disc_radius, CLEARANCE_TEXELS * here.texel) / max(here.cosine, SLOPE_FLOOR);
     ivec2 cell = ivec2(here.position.xy);
     float lit = 0.0;
     for (int corner = 0; corner < 4; corner++) {

@@ -1,7 +1,7 @@
 // Directional lights: hard shadows from a depth map of the Gaussians (rnd_runtime/shading/shadow.py), and their shading.
 
 import {
-  AT_SILHOUETTE, CASTING_OPACITY, CLEARANCE, CLEARANCE_TEXELS, DISC_SIGMAS, DROP, EDGE_ON, RIM_TEXELS, SHADOW_RESOLUTION, SLOPE_FLOOR,
+  AT_SILHOUETTE, CASTING_OPACITY, DEPTH_BIAS, CLEARANCE_TEXELS, DISC_SIGMAS, DROP, EDGE_ON, RIM_TEXELS, SHADOW_RESOLUTION, SLOPE_FLOOR,
   SOFTNESS, TURNED_AWAY,
 } from "../constants.js";
 import { cross, unit } from "../rotations.js";
@@ -92,7 +92,7 @@ function drawDisc({ depth, width, height, texel }, position, normal, k, radius) 
 /** Bilinear visibility of a point from the four texels around it; texels above its plane occlude it. */
 function lookUp({ depth, width, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
-  const clearance = Math.max(CLEARANCE * radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], SLOPE_FLOOR);
+  const clearance = Math.max(DEPTH_BIAS * radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], SLOPE_FLOOR);
   const top = z + (1 + SOFTNESS) * clearance, span = 1 / (2 * SOFTNESS * clearance);
   const column = Math.floor(x), row = Math.floor(y);
   let lit = 0;
