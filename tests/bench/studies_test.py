@@ -128,7 +128,7 @@ def test_runs_begun_before_are_checked_before_any_is_trained(study, tiny_config)
         model = dataclasses.replace(tiny_config.model, dynamic_skinning=False)
         others = {"light": "none", "weight_consistency": 0.0, "unseen_fraction": 0.0}
         config = to_dict(dataclasses.replace(tiny_config, model=model, **others | changed))
-        header = {"schema": STATE_SCHEMA, "config": config, "perceptual_sha256": None}
+        header = {"schema": STATE_SCHEMA, "config": config, "networks": {}}
         header |= {name: row[name] for name in ("motion", "capture_sha256")}
         write_tensors(folder / STATE_FILE, {"generator": torch.zeros(1)}, header)
 

@@ -24,7 +24,7 @@ SHARED = {
     ),
     "rnd_runtime.motion.smpl": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
     "rnd_runtime.motion.readers.arrays": (
-        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _DEFAULT_FPS FPS_LIMITS"
+        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _DEFAULT_FPS FPS_LIMITS"
     ),
     "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS",
     "rnd_runtime.motion.skeleton": "_TURNS",

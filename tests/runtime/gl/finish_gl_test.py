@@ -97,7 +97,7 @@ def test_one_size_after_another(device):
 def test_a_frame_takes_the_devices_codes(raster, monkeypatch):
     avatar = Avatar.load(ASSETS / "avatar.onnx")
     motion, sky = load_motion(ASSETS / "walk.npz", avatar.skeleton), load_light(ASSETS / "sky.exr")
-    camera = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=94, height=128, fov_y=0.65)
+    camera = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=190, height=256, fov_y=0.65)
     monkeypatch.setattr(finish_gl, "is_software", lambda _: False)  # as on a GPU
     monkeypatch.setattr("rnd_runtime.playback.frame.tone_map", lambda *_: pytest.fail("the CPU tone maps"))
     renderer = FrameRenderer(avatar, sky, camera, raster=raster)

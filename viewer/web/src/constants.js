@@ -19,6 +19,8 @@ export const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_f
 export const MAX_ANGLE = 100.0;
 export const MANY_BEYOND_A_TURN = 0.2;
 export const MAX_DISTANCE = 1000.0;
+export const MAX_HEIGHT = 100.0;
+export const MAX_SPEED = 20.0;
 export const DEFAULT_FPS = 60.0;
 export const FPS_LIMITS = [0.001, 10000.0];
 // rnd_runtime.motion.motion

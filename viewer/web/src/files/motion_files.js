@@ -1,7 +1,7 @@
 // Array layouts of motions, read into one record in the file's axes (rnd_runtime/motion/readers/arrays.py).
 
 import {
-  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT,
+  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT,
 } from "../constants.js";
 import { refusal, short, sizes } from "../errors.js";
 import { Npz } from "./npz.js";
@@ -32,6 +32,8 @@ export function readMotionFile(bytes, name) {
   checkTranslations(translations, name);
   if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
   const fps = readFrameRate(members, notes), zUp = readUpAxis(members, amass || easymocap ? "z" : "y") === "z";
+  if (lookLikeMillimetres(translations, frames, fps, zUp ? 2 : 1))
+    notes.push("trans is higher or faster than a person in metres: these look like millimetres");
   const restRoot = amass || easymocap ? smplRoot : null;
   return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, zUp, notes };
 }
@@ -157,4 +159,19 @@ function readUpAxis(members, otherwise) {
   const up = members.strings("up_axis").join("").toLowerCase();
   if (up !== "y" && up !== "z") throw refusal("up_axis", { expected: "y or z", got: up, file: members.file });
   return up;
+}
+
+function lookLikeMillimetres(translations, frames, fps, up) {
+  const heights = [], speeds = [];
+  for (let f = 0; f < frames; f++) {
+    heights.push(Math.abs(translations[3 * f + up]));
+    if (f > 0) speeds.push(fps * Math.hypot(...[0, 1, 2].map((k) => translations[3 * f + k] - translations[3 * f - 3 + k])));
+  }
+  return median(heights) > MAX_HEIGHT || (frames > 1 && median(speeds) > MAX_SPEED);
+}
+
+function median(values) {
+  values.sort((a, b) => a - b);
+  const half = values.length >> 1;
+  return values.length % 2 ? values[half] : (values[half - 1] + values[half]) / 2;
 }
