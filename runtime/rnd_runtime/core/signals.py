@@ -6,6 +6,7 @@ that ends in its own way, as a training saves first, does so at the first signal
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import signal
@@ -54,6 +55,13 @@ def install_in_command() -> None:
     program = Path(sys.argv[0]).stem if sys.argv else ""
     if program.startswith("rnd-") and threading.current_thread() is threading.main_thread():
         _install(program)
+        atexit.register(_ignore_signals)
+
+
+def _ignore_signals() -> None:
+    """The work is done: while the interpreter goes, which takes our handlers away, a signal changes no exit code."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager

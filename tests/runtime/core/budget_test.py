@@ -31,12 +31,14 @@ READ_LIGHT = "from rnd_runtime.shading.light import load_light as read"
 
 
 def _command(reader: str, path: Path) -> tuple[int, str, int]:
-    """Exit code, stderr and KB of memory of a command that reads ``path``."""
+    """Exit code, stderr and KB of memory that a command takes to read ``path``."""
     program = (
         f"import sys\n{reader}\nfrom rnd_runtime.cli.command import run_command\n"
+        # VmHWM is of this program alone, ru_maxrss of those before it in its process too
+        "def peak(): return int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])\n"
+        "before = peak()\n"
         f"code = run_command('rnd-x', lambda: (read({str(path)!r}), None)[1])\n"
-        "status = open('/proc/self/status').read()  # VmHWM: of this program alone, unlike ru_maxrss\n"
-        "print(status.split('VmHWM:')[1].split()[0])\nsys.exit(code)"
+        "print(peak() - before)\nsys.exit(code)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=300, preexec_fn=_limit, check=False

@@ -197,6 +197,9 @@ def _interrupted(command: list[object], out: Path, after: float, number: int) ->
         after /= 2
     process.send_signal(number)
     code, errors = _outcome(process)
+    if code == 0:  # its work was done, and the interpreter on its way out
+        _interrupted(command, out, after / 2, number)
+        return
     assert code == 128 + number, (after, code, errors)
     assert errors.splitlines()[-1].endswith(": interrupted") and "Traceback" not in errors, (after, errors)
     hidden = [file for file in out.rglob(".*") if not file.name.startswith(".run-")]

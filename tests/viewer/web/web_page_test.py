@@ -52,6 +52,12 @@ pytestmark = [
 ]
 
 
+@pytest.fixture(autouse=True)
+def _small_bodies_as_they_are(monkeypatch):
+    """The page has no finer grid for bodies of few pixels."""
+    monkeypatch.setattr("rnd_runtime.playback.far.MIN_PIXELS_PER_METRE", 1e-9)
+
+
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     """A static host that keeps a list of what it was asked for."""
 
