@@ -38,12 +38,6 @@ BRUTE_DB = 65.0  # the fastest exact path against the reference: float32 against
 SUNS_DB = 50.0  # tables, and suns by their middle and spread; 56.4 measured
 
 
-@pytest.fixture(autouse=True)
-def _small_bodies_as_they_are(monkeypatch):
-    """The reference has no finer grid for bodies of few pixels, as frames of these tests are."""
-    monkeypatch.setattr("rnd_runtime.playback.far.MIN_PIXELS_PER_METRE", 1e-9)
-
-
 def _played(avatar_file, shade) -> Measured:
     """The compared frames as a player renders them, 64 pixels wide."""
     avatar = Avatar.load(avatar_file)

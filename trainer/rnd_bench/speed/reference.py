@@ -20,6 +20,7 @@ from rnd_runtime.avatar.file import NODE_LOGITS, NODE_OUTPUTS, REST_OUTPUTS
 from rnd_runtime.core.files import atomic_path
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.playback.far import fine_view
 from rnd_runtime.posing.forearm import skinning_bones
 from rnd_runtime.posing.reference import pose_reference
 from rnd_runtime.posing.rest import RestPose
@@ -51,9 +52,11 @@ def reference(avatar_file: Path, scene: BenchScene, size: int, folder: Path, *, 
         camera, frames = bench_camera(size, scene.view), []
         for k in range(len(COMPARED)):
             arrays = (lit["means"][k], lit["covariances"][k], lit["opacities"], lit["radiance"][k])
-            raster = raster_oracle.rasterize(*arrays, camera)
+            fine = fine_view(camera, lit["joints"][k])
+            raster = raster_oracle.rasterize(*arrays, camera if fine is None else fine.camera)
             covered = raster.alpha[..., None]
-            frames.append(raster.image * covered * (3 - 2 * covered))  # as rnd_runtime.raster.outline says
+            sharp = replace(raster, image=raster.image * covered * (3 - 2 * covered))
+            frames.append((sharp if fine is None else fine.averaged(sharp)).image)
         return {"radiance": np.array(frames)}
 
     frames = _stored(folder / f"{stem}_{size}.npz", rendered)
@@ -94,11 +97,13 @@ def _lit(avatar_file: Path, scene: BenchScene, with_suns: bool) -> dict[str, Any
     avatar = Avatar.load(avatar_file)
     motion = load_motion(scene.motion, avatar.skeleton)
     light, eye = load_light(scene.hdr), bench_camera(64, scene.view).position
-    values: dict[str, list[Any]] = {"means": [], "covariances": [], "radiance": []}
+    values: dict[str, list[Any]] = {"means": [], "covariances": [], "radiance": [], "joints": []}
     for number in COMPARED:
         posed = posed_reference(avatar, motion, STEP_S * number)
         values["means"].append(posed.means)
         values["covariances"].append(posed.covariances)
+        bones = avatar.encode(motion, STEP_S * number).in_world().bones
+        values["joints"].append(bones[:, :, :3] @ avatar.skeleton.rest_joints[:, :, None] @ np.ones(1) + bones[:, :, 3])
         values["radiance"].append(shade(posed, light.turned(STEP_YAW * number), eye))
     return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
 
