@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.budget import Budget
 from rnd_runtime.core.errors import InputError
-
-if TYPE_CHECKING:
-    from .unpickle import Reader
 
 _TORCH_DTYPES = {
     **{"Double": "f8", "Float": "f4", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1"},
@@ -28,6 +26,18 @@ _CODECS = ("latin1", "latin-1", "iso-8859-1", "utf-8", "utf8", "ascii")
 _LARGEST_KEY = 1 << 60  # larger numbers can be made to share their hash: a dictionary of them is quadratic
 # About the bytes that an opcode fills, whatever it reads: an element of a list, or an object of its own
 ELEMENT, OBJECT = 16, 100
+
+
+class Reader(Protocol):
+    """What the notes need of their reader: its budget, and the meaning of a file within the file."""
+
+    budget: Budget
+
+    def within(self, content: bytes) -> Any:
+        """The meaning of ``content``, a file of its own."""
+
+    def check_size(self, meaning: Any) -> None:
+        """One error line for a meaning whose copies would not fit the budget."""
 
 
 def torch_storage(key: object) -> tuple[np.dtype[Any], object]:
