@@ -1,0 +1,189 @@
+"""What the landmark networks see of one person in a video: 33 points, hands and a mask of every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.npz import Npz, save_npz
+
+Image = NDArray[np.uint8]
+Floats32 = NDArray[np.float32]
+
+BLAZEPOSE = (
+    *("nose", "left_eye_inner", "left_eye", "left_eye_outer", "right_eye_inner", "right_eye", "right_eye_outer"),
+    *("left_ear", "right_ear", "mouth_left", "mouth_right", "left_shoulder", "right_shoulder", "left_elbow"),
+    *("right_elbow", "left_wrist", "right_wrist", "left_pinky", "right_pinky", "left_index", "right_index"),
+    *("left_thumb", "right_thumb", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+    *("left_heel", "right_heel", "left_foot_index", "right_foot_index"),
+)
+"""names of the 33 points in the network's order; left and right are the person's"""
+HAND_POINTS = 21
+"""points of a hand: the wrist, then four of each finger from the thumb on, base to tip"""
+_LEVEL = 3  # zlib's, of a mask's PNG: higher ones cost time and save little
+
+
+class Masks:
+    """Soft masks [T, H, W] uint8, 255 is the person; stored compressed, decoded when indexed.
+
+    ``masks[k]`` is [H, W], a slice or an index array gives [n, H, W]; ``numpy.asarray(masks)`` decodes all of them.
+    """
+
+    def __init__(self, encoded: Iterable[bytes], image_size: tuple[int, int]) -> None:
+        self.encoded = list(encoded)
+        self.image_size = image_size
+
+    @classmethod
+    def of(cls, masks: Iterable[Image], image_size: tuple[int, int]) -> Masks:
+        """Encode ``masks`` [H, W] one by one."""
+        return cls((_encode(mask) for mask in masks), image_size)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        width, height = self.image_size
+        return len(self.encoded), height, width
+
+    def __len__(self) -> int:
+        return len(self.encoded)
+
+    def __iter__(self) -> Iterator[Image]:
+        return (self[k] for k in range(len(self)))
+
+    @overload
+    def __getitem__(self, index: int) -> Image: ...
+    @overload
+    def __getitem__(self, index: slice | NDArray[Any] | list[int]) -> Image: ...
+    def __getitem__(self, index: int | slice | NDArray[Any] | list[int]) -> Image:
+        if isinstance(index, int | np.integer):
+            return self._decode(int(index))
+        chosen = np.arange(len(self))[index]
+        masks = np.empty((len(chosen), *self.shape[1:]), np.uint8)
+        for k, frame in enumerate(chosen):
+            masks[k] = self._decode(int(frame))
+        return masks
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return self[:].astype(dtype or np.uint8, copy=False)
+
+    def select(self, frames: NDArray[Any] | list[int]) -> Masks:
+        """The masks of these frames, not decoded."""
+        return Masks((self.encoded[int(k)] for k in np.arange(len(self))[frames]), self.image_size)
+
+    def _decode(self, frame: int) -> Image:
+        pixels = cv2.imdecode(np.frombuffer(self.encoded[frame], np.uint8), cv2.IMREAD_GRAYSCALE)
+        if pixels is None or pixels.shape != self.shape[1:]:
+            got = "damaged data" if pixels is None else f"{pixels.shape[1]} x {pixels.shape[0]}"
+            raise InputError("mask", expected=f"{self.image_size[0]} x {self.image_size[1]}", got=got, frame=frame)
+        return np.asarray(pixels, np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """One person seen by one camera over T frames.
+
+    Attributes:
+        fps: frames per second of the video.
+        image_size: width and height, pixels, of the image as displayed.
+        frames: [T] numbers of the frames in the video, ascending.
+        keypoints_px: [T, 33, 2] ``BLAZEPOSE`` in pixels; the centre of the first pixel is (0.5, 0.5).
+        confidence: [T, 33] 0…1.
+        spread_px: [T, 33] mean distance of the views of one frame from their median, pixels.
+        keypoints_m: [T, 33, 3] the network's own 3D: metres from the middle of the hips, OpenCV camera axes.
+        hands_px: [T, 2, 21, 2] left and right hand, pixels; NaN where not seen.
+        hands_confidence: [T, 2] 0…1; 0 where not seen.
+        masks: [T, H, W] coverage.
+    """
+
+    fps: float
+    image_size: tuple[int, int]
+    frames: NDArray[np.int64]
+    keypoints_px: Floats32
+    confidence: Floats32
+    spread_px: Floats32
+    keypoints_m: Floats32
+    hands_px: Floats32
+    hands_confidence: Floats32
+    masks: Masks
+
+    def __post_init__(self) -> None:
+        count, points, hands = len(self.frames), len(BLAZEPOSE), HAND_POINTS
+        shapes = {
+            "frames": (count,),
+            "keypoints_px": (count, points, 2),
+            "confidence": (count, points),
+            "spread_px": (count, points),
+            "keypoints_m": (count, points, 3),
+            "hands_px": (count, 2, hands, 2),
+            "hands_confidence": (count, 2),
+            "masks": (count, self.image_size[1], self.image_size[0]),
+        }
+        for name, shape in shapes.items():
+            if (got := getattr(self, name).shape) != shape:
+                raise InputError(name, expected=f"shape {shape}", got=f"{got}")
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def select(self, frames: NDArray[Any] | list[int]) -> Observations:
+        """The observations of some of the T frames, given as a mask or as ascending indices."""
+        arrays = {name: getattr(self, name)[frames] for name in _ARRAYS}
+        return Observations(self.fps, self.image_size, masks=self.masks.select(frames), **arrays)
+
+
+_ARRAYS = tuple(f.name for f in fields(Observations) if f.name not in ("fps", "image_size", "masks"))
+
+
+def save_observations(path: str | Path, observations: Observations) -> None:
+    """Write ``observations`` as one .npz; its masks are PNGs in a row."""
+    encoded = observations.masks.encoded
+    arrays: dict[str, NDArray[Any]] = {name: getattr(observations, name) for name in _ARRAYS}
+    arrays["hands_px"] = np.nan_to_num(observations.hands_px)  # readers refuse NaN; hands_confidence says where it is
+    arrays["fps"] = np.array(observations.fps)
+    arrays["image_size"] = np.array(observations.image_size)
+    arrays["masks_png"] = np.frombuffer(b"".join(encoded), np.uint8)
+    arrays["masks_ends"] = np.cumsum([len(png) for png in encoded], dtype=np.int64)
+    save_npz(path, arrays)
+
+
+def load_observations(path: str | Path) -> Observations:
+    """Read what ``save_observations`` wrote; raises ``InputError`` for anything else."""
+    with Npz(path, what="observations") as archive:
+        width, height = (int(side) for side in archive.numbers("image_size", (2,)))
+        frames = archive.numbers("frames", (None,)).astype(np.int64)
+        count, points = len(frames), len(BLAZEPOSE)
+        pixels, ends = archive.numbers("masks_png", (None,)), archive.numbers("masks_ends", (count,)).astype(np.int64)
+        starts = np.concatenate([[0], ends[:-1]])
+        if (ends <= starts).any() or (count and ends[-1] != len(pixels)):
+            raise InputError("masks_ends", expected="ascending positions in masks_png", got="others", file=path)
+        encoded = pixels.astype(np.uint8).tobytes()
+        numbers = {
+            "keypoints_px": archive.numbers("keypoints_px", (count, points, 2)),
+            "confidence": archive.numbers("confidence", (count, points)),
+            "spread_px": archive.numbers("spread_px", (count, points)),
+            "keypoints_m": archive.numbers("keypoints_m", (count, points, 3)),
+            "hands_confidence": archive.numbers("hands_confidence", (count, 2)),
+        }
+        seen = numbers["hands_confidence"] > 0
+        hands = archive.numbers("hands_px", (count, 2, HAND_POINTS, 2))
+        hands[~seen] = np.nan
+        return Observations(
+            fps=float(archive.numbers("fps", ())),
+            image_size=(width, height),
+            frames=frames,
+            hands_px=hands.astype(np.float32),
+            masks=Masks((encoded[a:b] for a, b in zip(starts, ends)), (width, height)),
+            **{name: array.astype(np.float32) for name, array in numbers.items()},
+        )
+
+
+def _encode(mask: Image) -> bytes:
+    done, png = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, _LEVEL])
+    assert done
+    return bytes(png)
