@@ -15,7 +15,7 @@ from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_trainer.importing.dataset import ImportedDataset, Lens, Sample
 from rnd_trainer.importing.images import Bytes, camera_of, distortion_of, pinhole
 from rnd_trainer.importing.poses import smpl_poses
-from rnd_trainer.importing.video_file import VideoFile
+from rnd_trainer.importing.videos.video_file import VideoFile
 
 
 def detect(source: Path) -> str | None:

@@ -33,7 +33,7 @@ from rnd_trainer.importing.pose_files import PoseFile, pair_with_frames
 from rnd_trainer.importing.poses import Floats
 from rnd_trainer.importing.scene import PlacedScene, place_scene
 from rnd_trainer.importing.select import select_frames, sharpness
-from rnd_trainer.importing.video_file import VideoFile
+from rnd_trainer.importing.videos.video_file import VideoFile
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
 FPS = 30.0
@@ -92,6 +92,7 @@ def read(
     if source.is_file():
         video = VideoFile(source)
         fps = options.fps or video.fps
+        found = replace(found, notes=(*video.notes, *found.notes))
     else:
         video = _FrameFolder(source, found.numbered)
         fps = options.fps or found.fps or FPS

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
-
-from .images import Bytes
+from rnd_trainer.importing.images import Bytes
+from rnd_trainer.importing.videos.video_colour import colour_notes, to_srgb
 
 _CACHED = 3  # latest frames: image and mask of a frame are read in sequence
 
@@ -24,6 +25,7 @@ class VideoFile:
         width, height: pixels, after the file's rotation.
         fps: frames per second, on average.
         numbers: of the frames, from 0; counted by decoding, as an edit list may skip packets.
+        notes: conversions of colour, one sentence each.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -36,7 +38,11 @@ class VideoFile:
             first = next(frames, None)
             if first is None:
                 raise InputError("video", expected="at least one frame", got="none", file=self.path)
-            self.height, self.width = _upright(first).shape[:2]
+            try:
+                self.notes = colour_notes(first)
+                self.height, self.width = _upright(first).shape[:2]
+            except InputError as error:
+                raise error.at(file=self.path) from error
             self.numbers = range(1 + sum(1 for _ in frames))
         self._cache: dict[int, Bytes] = {}
         self._frames: Iterator[Any] | None = None
@@ -84,9 +90,31 @@ class VideoFile:
 
 
 def _upright(frame: Any) -> Bytes:
-    """Rotated pixels, by the stream's colour matrix; by default BT.709 from 720 lines on, else BT.601."""
-    named = {1: "itu709", 5: "itu601", 6: "itu601", 9: "bt2020"}.get(int(frame.colorspace))
-    matrix = named or ("itu709" if frame.height >= 720 else "itu601")
-    pixels: Bytes = frame.reformat(format="rgb24", src_colorspace=matrix).to_ndarray()
-    quarters = round(-getattr(frame, "rotation", 0) / 90) % 4
-    return np.ascontiguousarray(np.rot90(pixels, -quarters)) if quarters else pixels
+    """Pixels in sRGB, rotated and mirrored as the file's display matrix says."""
+    pixels = to_srgb(frame)
+    matrix = _display_matrix(frame)
+    if matrix is None:
+        quarters = round(-getattr(frame, "rotation", 0) / 90) % 4
+        return np.ascontiguousarray(np.rot90(pixels, -quarters)) if quarters else pixels
+    if not matrix[0, 0]:  # x and y change places
+        pixels = pixels.swapaxes(0, 1)
+    right, down = matrix.sum(0)
+    return np.ascontiguousarray(pixels[::down, ::right])
+
+
+def _display_matrix(frame: Any) -> NDArray[np.int64] | None:
+    """[2, 2] of −1, 0 and 1, the columns of which stored x and y make shown x and y; None without one.
+
+    Raises:
+        InputError: it is not made of quarter rotations and mirrors.
+    """
+    found = next((data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"), None)
+    if found is None:
+        return None
+    numbers = np.frombuffer(bytes(found), "<i4")[:9].reshape(3, 3)[:2, :2].astype(np.float64)
+    scale = np.abs(numbers).max()
+    matrix = np.round(numbers / scale if scale else numbers).astype(np.int64)
+    if np.abs(numbers - scale * matrix).max() > 0.01 * scale or abs(round(np.linalg.det(matrix))) != 1:
+        got = np.round(numbers / 65536, 3).tolist()
+        raise InputError("display matrix of the video", expected="quarter rotations and mirrors", got=got)
+    return matrix

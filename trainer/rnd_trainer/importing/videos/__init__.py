@@ -1,0 +1,1 @@
+"""Video files: decoding, orientation and colours."""
