@@ -44,7 +44,9 @@ class Stability:
     fuzz: Count = 0
     """broken inputs for every reader; resumes in WORK"""
     soak: Count = 0
-    """frames of playback, and a tenth as many steps of training and clients of rnd-view; resumes in WORK"""
+    """frames of playback, and a tenth as many steps of training; resumes in WORK"""
+    view: Count = 0
+    """minutes for which clients come and go at one rnd-view"""
     kill: Count = 0
     """times that training, export and play are each killed"""
     determinism: Flag = False
@@ -119,19 +121,21 @@ def measured_on(on: str, subject: Subject) -> dict[str, Any]:
 
 
 def _long_runs(options: Stability, subject: Subject) -> Iterable[tuple[str, str, str, Sequence[Figure]]]:
-    """The runs of --fuzz, --soak, --kill and --determinism: id, failure, subject, figures."""
+    """The runs of --fuzz, --soak, --view, --kill and --determinism: id, failure, subject, figures."""
     from .rows import AVATAR, SHORT
 
     if options.fuzz:
         yield "F", "hostile files", "small files", _fuzz(options, subject)
     if options.soak:
         from .soak import soak_playback, soak_training
-        from .soak_view import soak_view
 
         state = subject.work / "soak.json"
         yield "S1", "soak, playback", AVATAR, soak_playback(subject, options.soak, state)
         yield "S2", "soak, training", SHORT, soak_training(subject, options.soak // 10, state)
-        yield "S3", "soak, rnd-view", AVATAR, soak_view(subject, options.soak // 10)
+    if options.view:
+        from .soak_view import soak_view
+
+        yield "S3", "soak, rnd-view", AVATAR, soak_view(subject, options.view)
     if options.kill:
         from .kill import kill_all
 
