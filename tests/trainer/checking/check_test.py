@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -260,3 +261,24 @@ def test_the_overlay_shows_the_person_and_the_differences(folder) -> None:
     image = read_image(folder / "out" / "check.png").astype(int)
     assert (image[..., 0] > image[..., 2] + 90).sum() > 300
     assert (image[..., 2] > image[..., 0] + 90).sum() > 300
+
+
+INVERTED = Path(__file__).parents[2] / "cases/masks_inverted"
+
+
+def _invert(folder) -> None:
+    for file in (folder / "masks").iterdir():
+        write_image(file, 255 - read_image(file))
+
+
+def test_inverted_masks_are_the_first_explanation(folder) -> None:
+    assert "the masks look inverted: invert them (mean IoU 1.00 then)" in _wrong(INVERTED)["silhouette"]
+    _invert(folder)
+    assert "the masks look inverted" in _wrong(folder)["silhouette"]
+
+
+def test_of_inverted_masks_and_wrong_cameras_no_cause_is_named(folder) -> None:
+    """Nothing that is tried reaches an IoU of 0.4."""
+    _invert(folder)
+    _edit_cameras(folder, "world_to_camera", lambda m: np.linalg.inv(m) @ FLIP)
+    assert "for no usual reason" in _wrong(folder)["silhouette"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ GAIN = 0.04
 """IoU that an explanation must gain; on a correct capture the best one loses 0.06"""
 TIME_GAIN = 0.02
 """IoU that another timing must gain; one frame off costs a walker at 30 fps about 0.03"""
+MIN_IOU = 0.4
+"""IoU that an explanation must reach: what fits less explains nothing"""
 SHIFTS = (-3, -2, -1, 1, 2, 3)
 STRIDES = (0.5, 0.8, 5 / 6, 1.2, 1.25, 2.0)
 
@@ -98,11 +100,25 @@ def _candidates(rest: Floats, world: Floats) -> list[tuple[str, Callable[[MaskVi
 
 
 def explain(rest: Floats, world: Floats, views: list[MaskView]) -> Explanation | None:
-    """Best explanation of a poor fit, or None; arguments as ``_candidates``."""
+    """Best explanation of a poor fit, or None; arguments as ``_candidates``.
+
+    Inverted masks come first: a template that fills the image fits them as well.
+    """
     current = mean_iou(views)
+    inverted = _inverted(views)
+    if inverted is not None and inverted.iou > max(current + GAIN, MIN_IOU):
+        return inverted
     found = [Explanation(s, mean_iou([change(view) for view in views])) for s, change in _candidates(rest, world)]
     best = max(found, key=lambda explanation: explanation.iou)
-    return best if best.iou > current + GAIN else None
+    return best if best.iou > max(current + GAIN, MIN_IOU) else None
+
+
+def _inverted(views: list[MaskView]) -> Explanation | None:
+    """The fit of the masks' complements, where the masks cover most of the images' borders, or None."""
+    borders = [np.concatenate([v.mask[0], v.mask[-1], v.mask[:, 0], v.mask[:, -1]]).mean() for v in views]
+    if np.mean(borders) <= 0.5:
+        return None
+    return Explanation("the masks look inverted: invert them", mean_iou([replace(v, mask=~v.mask) for v in views]))
 
 
 def explain_timing(capture: Capture, views: list[MaskView]) -> Explanation | None:
@@ -122,6 +138,6 @@ def explain_timing(capture: Capture, views: list[MaskView]) -> Explanation | Non
             continue
         here = mean_iou([view for view, _ in pairs])
         there = mean_iou([with_pose(capture, view, k) for view, k in pairs])
-        if there - here > gain:
+        if there - here > gain and there > MIN_IOU:
             best, gain = Explanation(sentence, there), there - here
     return best
