@@ -34,6 +34,7 @@ from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.training.data import pose_input
+from rnd_trainer.training.saving import save_training
 from rnd_trainer.training.training import Training
 from support.tiny import ASSETS
 
@@ -230,7 +231,7 @@ def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp
     for _ in range(2):
         training.step()
     run = tmp_path / "run"
-    training.save(run)
+    save_training(training, run)
     scored: list[Capture] = []
 
     def score(checkpoint, capture, **_):
@@ -329,7 +330,7 @@ def test_the_training_light_is_identified_by_its_map(tiny_capture, tiny_config, 
     shutil.copytree(ASSETS / "capture", tmp_path / "me/capture")
     mine = load_capture(tmp_path / "me/capture")
     training = Training(mine, dataclasses.replace(tiny_config, image_scale=0.1))
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     name = mine.split("train")[0].light
     checkpoint = load_checkpoint(tmp_path / "avatar.ckpt")
     assert checkpoint.learned_under(mine) == {name}

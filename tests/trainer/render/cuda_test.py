@@ -18,6 +18,7 @@ from rnd_trainer.losses.perceptual import load_lpips
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.render import raster
 from rnd_trainer.training.run import run
+from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.training import Training
 from support.raster_scenes import off_centre_camera, random_scene
 from trainer.losses.perceptual_test import write_alexnet
@@ -75,9 +76,9 @@ def test_a_training_on_the_gpu_runs_all_stages(changes, tiny_capture, tiny_confi
     training = Training(tiny_capture, config, device="cuda")
     while training.step_index < 13:
         assert not training.step().skipped
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     resumed = Training(tiny_capture, config, device="cuda")
-    resumed.resume(tmp_path / "training.state")
+    resume_training(resumed, tmp_path / "training.state")
     assert resumed.step_index == 13
 
     def preview() -> None:

@@ -18,6 +18,7 @@ from rnd_trainer.training.pose_refinement import (
     PoseRefinement,
     joint_error_degrees,
 )
+from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.training import Training
 from support.tiny import body, motion
 
@@ -87,9 +88,9 @@ def test_a_refined_training_leaves_its_motion_and_resumes(tiny_capture, tiny_con
     training = Training(tiny_capture, config)
     for _ in range(8):
         training.step()
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     written = load_motion(tmp_path / "refined_motion.npz", tiny_capture.body.skeleton)
     assert np.abs(written.rotations - training.motion().rotations).max() < 1e-6
     resumed = Training(tiny_capture, config)
-    resumed.resume(tmp_path / "training.state")
+    resume_training(resumed, tmp_path / "training.state")
     assert resumed.step().terms == training.step().terms

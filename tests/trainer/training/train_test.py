@@ -33,6 +33,7 @@ from rnd_trainer.model.checkpoint import load_checkpoint, read_tensors, write_te
 from rnd_trainer.render.probe import LightProbe
 from rnd_trainer.training.objective import Objective
 from rnd_trainer.training.run import run
+from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.state import STATE_SCHEMA
 from rnd_trainer.training.training import MAX_BAD_STEPS, Training
 from trainer.losses.perceptual_test import write_alexnet
@@ -98,12 +99,12 @@ def test_the_state_after_the_first_stage_is_lit(tiny_capture, tiny_config, tmp_p
     while training.step_index < 6:
         assert not training.lit
         training.step()
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     saved = load_checkpoint(tmp_path / "avatar.ckpt").model.appearance_residual
     colour, albedo = saved[:, :3], saved[:, 3:6]
     assert colour.any() and torch.equal(albedo, colour)  # the first stage learns colours alone
     resumed = Training(tiny_capture, tiny_config)
-    resumed.resume(tmp_path / "training.state")
+    resume_training(resumed, tmp_path / "training.state")
     assert training.lit and resumed.lit and resumed.step().terms == training.step().terms
 
 
@@ -131,9 +132,9 @@ def test_resuming_continues_the_same_curve(tiny_capture, tiny_config, tmp_path, 
     for stop in (7, 13):  # in the second stage, in the third
         while half.step_index < stop:
             half.step()
-        half.save(tmp_path)
+        save_training(half, tmp_path)
         resumed = Training(tiny_capture, tiny_config)
-        resumed.resume(tmp_path / "training.state")
+        resume_training(resumed, tmp_path / "training.state")
         assert [resumed.step().terms for _ in range(stop, 14)] == expected[stop:]
         for ours, theirs in zip(whole.model.parameters(), resumed.model.parameters()):
             assert torch.equal(ours, theirs)
@@ -145,13 +146,13 @@ def test_the_third_stage_can_be_added_when_resuming(tiny_capture, tiny_config, t
     without = dataclasses.replace(tiny_config, unseen_fraction=0.0)
     run(Training(tiny_capture, without), tmp_path / "without", on_step=_nothing, on_preview=_nothing)
     later = Training(tiny_capture, tiny_config)
-    later.resume(tmp_path / "without/training.state")
+    resume_training(later, tmp_path / "without/training.state")
     assert later.step_index == 12
     later.step(), later.step()
     for ours, theirs in zip(whole.model.parameters(), later.model.parameters()):
         assert torch.equal(ours, theirs)
     with pytest.raises(InputError, match=r"got other \['unseen_fraction'\]"):  # nor back again
-        Training(tiny_capture, without).resume(tmp_path / "whole/training.state")
+        resume_training(Training(tiny_capture, without), tmp_path / "whole/training.state")
 
 
 @pytest.mark.parametrize("light", ["learn", "none"])
@@ -175,7 +176,7 @@ def test_static_skinning_has_no_third_stage(tiny_capture, tiny_config) -> None:
 def test_resuming_with_another_configuration_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
     other = Training(tiny_capture, dataclasses.replace(tiny_config, seed=5))
     with pytest.raises(InputError, match=r"--resume: expected the configuration .* got other \['seed'\]"):
-        other.resume(tiny_run / "training.state")
+        resume_training(other, tiny_run / "training.state")
 
 
 def test_resuming_on_other_images_or_poses_is_refused(tiny_run, tiny_capture, tiny_config) -> None:
@@ -188,28 +189,30 @@ def test_resuming_on_other_images_or_poses_is_refused(tiny_run, tiny_capture, ti
     for other in ({"motion": moved}, {"frames": fewer}, {"frames": swapped}, {"body": wider}):
         training = Training(dataclasses.replace(tiny_capture, **other), tiny_config)
         with pytest.raises(InputError, match="expected the images and poses it was started with, got others"):
-            training.resume(tiny_run / "training.state")
+            resume_training(training, tiny_run / "training.state")
 
 
 def test_resuming_under_another_light_of_the_capture_is_refused(tiny_capture, tiny_config, tmp_path) -> None:
     config = dataclasses.replace(tiny_config, light="capture")
-    Training(tiny_capture, config).save(tmp_path)
-    Training(tiny_capture, config).resume(tmp_path / "training.state")
+    save_training(Training(tiny_capture, config), tmp_path)
+    resume_training(Training(tiny_capture, config), tmp_path / "training.state")
     white = tiny_capture.lights["white"]
     brighter = {"white": replace(white, scale=(2.0, 2.0, 2.0))}
     with pytest.raises(InputError, match="expected the images and poses it was started with, got others"):
-        Training(dataclasses.replace(tiny_capture, lights=brighter), config).resume(tmp_path / "training.state")
+        resume_training(
+            Training(dataclasses.replace(tiny_capture, lights=brighter), config), tmp_path / "training.state"
+        )
 
 
 def test_a_last_bit_of_a_pose_does_not_change_the_digest(tiny_run, tiny_capture, tiny_config) -> None:
     moves = tiny_capture.motion
     near = dataclasses.replace(moves, rotations=np.nextafter(moves.rotations, 2))
-    Training(dataclasses.replace(tiny_capture, motion=near), tiny_config).resume(tiny_run / "training.state")
+    resume_training(Training(dataclasses.replace(tiny_capture, motion=near), tiny_config), tiny_run / "training.state")
 
 
 def test_the_save_interval_may_change_when_resuming(tiny_run, tiny_capture, tiny_config) -> None:
     config = dataclasses.replace(tiny_config, save_every=3, preview_every=5)
-    Training(tiny_capture, config).resume(tiny_run / "training.state")
+    resume_training(Training(tiny_capture, config), tiny_run / "training.state")
 
 
 def test_crops_too_small_for_the_network_skip_its_losses(tiny_capture, tiny_config) -> None:
@@ -236,26 +239,26 @@ def test_the_consistency_loss_has_a_network_of_its_own(tiny_capture, tiny_config
     given = (training.model, training.views[0], training.poses[0], 0, 2)
     assert "consistency" in training.objective(*given) and "lpips" not in training.objective(*given)
     assert "consistency" not in Training(tiny_capture, config).objective(*given)
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     assert load_checkpoint(tmp_path / "avatar.ckpt").info["consistency"] == "vgg16[:2]"
-    Training(tiny_capture, config, consistency=blocks).resume(tmp_path / "training.state")
+    resume_training(Training(tiny_capture, config, consistency=blocks), tmp_path / "training.state")
     with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
-        Training(tiny_capture, config, consistency=others).resume(tmp_path / "training.state")
+        resume_training(Training(tiny_capture, config, consistency=others), tmp_path / "training.state")
 
 
 def test_resuming_tolerates_a_byte_of_difference_in_downscaled_images(tiny_capture, tiny_config, tmp_path) -> None:
     """Rounding differs between CPUs."""
     config = dataclasses.replace(tiny_config, image_scale=0.5)
-    Training(tiny_capture, config).save(tmp_path)
+    save_training(Training(tiny_capture, config), tmp_path)
     other = Training(tiny_capture, config)
     other.views[0].image[0, 0, 0] += 1
-    other.resume(tmp_path / "training.state")
+    resume_training(other, tmp_path / "training.state")
     whole = Training(tiny_capture, tiny_config)
-    whole.save(tmp_path)
+    save_training(whole, tmp_path)
     other = Training(tiny_capture, tiny_config)
     other.views[0].image[0, 0, 0] += 1
     with pytest.raises(InputError, match="expected the images and poses it was started with"):
-        other.resume(tmp_path / "training.state")
+        resume_training(other, tmp_path / "training.state")
 
 
 def test_a_full_disk_is_an_input_error(tmp_path, monkeypatch) -> None:
@@ -272,11 +275,11 @@ def test_a_training_with_lpips_and_its_features_is_resumed(tiny_capture, tiny_co
     """One network in both roles, as --perceptual-weights gives it."""
     write_alexnet(tmp_path / "alexnet.safetensors")
     network = load_lpips(tmp_path / "alexnet.safetensors")
-    Training(tiny_capture, tiny_config, network).save(tmp_path)
-    Training(tiny_capture, tiny_config, network).resume(tmp_path / "training.state")
+    save_training(Training(tiny_capture, tiny_config, network), tmp_path)
+    resume_training(Training(tiny_capture, tiny_config, network), tmp_path / "training.state")
     for other in ({}, {"perceptual": network, "consistency": load_features(_half_of(tmp_path))}):
         with pytest.raises(InputError, match="--resume: expected the perceptual weights"):
-            Training(tiny_capture, tiny_config, **other).resume(tmp_path / "training.state")
+            resume_training(Training(tiny_capture, tiny_config, **other), tmp_path / "training.state")
 
 
 def _half_of(folder: Path) -> Path:
@@ -305,7 +308,7 @@ def test_a_state_with_other_fields_is_refused(tiny_run, tiny_capture, tiny_confi
     for broken in (header["config"] | {"weight_of_tomorrow": 1.0}, less, [], None):
         write_tensors(tmp_path / "broken.state", tensors, header | {"config": broken})
         with pytest.raises(InputError, match=r"broken\.state: not a training state"):
-            training.resume(tmp_path / "broken.state")
+            resume_training(training, tmp_path / "broken.state")
 
 
 def test_ctrl_c_finishes_the_step_and_saves(tiny_capture, tiny_config, tmp_path) -> None:
@@ -421,7 +424,7 @@ def test_a_full_gpu_is_an_input_error_and_keeps_the_last_state(tiny_capture, tmp
 def test_a_training_stopped_in_the_first_stage_has_a_note(tiny_capture, tiny_config, tmp_path, capsys) -> None:
     training = Training(tiny_capture, tiny_config)
     training.step()
-    training.save(tmp_path)
+    save_training(training, tmp_path)
     note = load_checkpoint(tmp_path / "avatar.ckpt").note()
     assert note is not None and "stopped at step 1 of 14, before light and albedo were learned" in note
     evaluate_run(EvalOptions(tmp_path, tiny_capture.folder))

@@ -23,6 +23,7 @@ from rnd_trainer.model.model import AvatarModel
 from rnd_trainer.training.data import check_true_normals, training_light
 from rnd_trainer.training.pose_refinement import joint_error_degrees
 from rnd_trainer.training.run import run
+from rnd_trainer.training.saving import resume_training
 from rnd_trainer.training.state import STATE_FILE, read_state
 from rnd_trainer.training.training import StepResult, Training
 
@@ -182,7 +183,7 @@ def _train(
     folder.mkdir(parents=True, exist_ok=True)
     training = Training(seen, config, perceptual, consistency=consistency)
     if (folder / STATE_FILE).exists():
-        training.resume(folder / STATE_FILE)
+        resume_training(training, folder / STATE_FILE)
     cost = training.schedule.cost
 
     def on_step(step: StepResult) -> None:

@@ -145,7 +145,7 @@ def _checkpoint_file(options: EvalOptions) -> Path:
 def _refined_motion(path: Path, checkpoint: Checkpoint, options: EvalOptions) -> str | None:
     """The motion refined in training on this capture, or None; logs it."""
     from rnd_runtime.capture.capture import capture_file
-    from rnd_trainer.training.training import REFINED_MOTION
+    from rnd_trainer.training.saving import REFINED_MOTION
 
     file = path.with_name(REFINED_MOTION).resolve()
     capture = capture_file(options.capture)

@@ -129,6 +129,7 @@ def _train(options: TrainOptions) -> None:
     from rnd_trainer.config import to_dict
     from rnd_trainer.losses.perceptual import load_features, load_lpips
     from rnd_trainer.training.notes import capture_notes
+    from rnd_trainer.training.saving import resume_training
     from rnd_trainer.training.state import STATE_FILE
     from rnd_trainer.training.training import Training
 
@@ -146,7 +147,7 @@ def _train(options: TrainOptions) -> None:
     with _memory_error_in_one_line():
         training = Training(capture, config, perceptual, device, consistency=features)
     if options.resume:
-        training.resume(state)
+        resume_training(training, state)
     with folder_lock(output_folder(folder), "rnd-train"):
         write_json(folder / "config.json", to_dict(config))
         if perceptual is None:
@@ -275,7 +276,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
     """Score the held-out splits in the training's poses, refined if ``--refine-poses``."""
     from rnd_trainer.evaluation.evaluate import HELD_OUT
-    from rnd_trainer.training.training import REFINED_MOTION
+    from rnd_trainer.training.saving import REFINED_MOTION
 
     learning = options.learning
     if any(training.capture.split(split) for split in HELD_OUT):

@@ -14,6 +14,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path, write_json
 from rnd_runtime.core.signals import at_end, on_signal
 
+from .saving import save_training
 from .training import StepResult, Training
 
 METRICS_FILE, STATUS_FILE = "metrics.jsonl", "status.json"
@@ -86,10 +87,10 @@ def run(
                     on_step(step)
                     if training.step_index % config.save_every == 0:
                         log.flush()
-                        training.save(folder)
+                        save_training(training, folder)
                     if training.step_index % config.preview_every == 0 or training.step_index == total:
                         on_preview()
-                training.save(folder)
+                save_training(training, folder)
     except BaseException:
         stop()
         raise

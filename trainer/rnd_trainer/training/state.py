@@ -28,7 +28,7 @@ _THIRD_STAGE_FIELDS = {"unseen_fraction", "weight_edges", "weight_smooth"}
 
 @dataclass(frozen=True)
 class TrainingState:
-    """State written by ``Training.save``; the first word of a tensor's dotted name is its part."""
+    """State written by ``save_training``; the first word of a tensor's dotted name is its part."""
 
     path: Path
     tensors: dict[str, Tensor]

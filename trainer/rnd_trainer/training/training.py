@@ -9,10 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,13 +17,10 @@ from torch.nn.utils import get_total_norm
 
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import sha256_of
-from rnd_runtime.motion.motion import Motion, save_motion
-from rnd_runtime.playback.doctor import machine
+from rnd_runtime.motion.motion import Motion
 from rnd_runtime.shading.light import texel_directions
-from rnd_trainer.config import TrainConfig, to_dict
-from rnd_trainer.losses.perceptual import Perceptual, networks_by_role, networks_sha256
-from rnd_trainer.model.checkpoint import save_checkpoint, write_tensors
+from rnd_trainer.config import TrainConfig
+from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.render.probe import PROBE_SHAPE, LightProbe, as_probe
@@ -37,11 +31,9 @@ from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
 from .sampled_poses import perturbed_pose
 from .schedule import Schedule
-from .state import STATE_FILE, STATE_SCHEMA, learned_sha256, read_state
+from .state import learned_sha256
 from .unseen import UnseenPoses
 
-REFINED_MOTION = "refined_motion.npz"
-"""in a run's folder: the capture's motion with corrected training frames"""
 MAX_BAD_STEPS = 10
 """consecutive non-finite steps after which training stops"""
 PERTURBED_SHARE = 0.5
@@ -59,7 +51,7 @@ class StepResult:
 
 
 class Training:
-    """The state of a training, with its step, saving and resuming.
+    """The state of a training, with its step; saved and resumed by ``training.saving``.
 
     Args:
         capture: images, poses and body to learn from.
@@ -266,98 +258,8 @@ class Training:
         time_s = view.frame.frame / motion.fps
         return pose_input(motion, self.capture.body.skeleton, time_s, self.config.model).to(self.device)
 
-    # -- saving and resuming -------------------------------------------------------------------------------
-
-    def save(self, folder: Path) -> None:
-        """Write the state, the checkpoint, and the refined motion if there is one."""
-        parts: dict[str, dict[str, Any]] = {"model": self.model.state_dict(), "probe": self.probe.state_dict()}
-        if self.refinement is not None:
-            parts["poses"] = self.refinement.state_dict()
-        if self.unseen is not None:
-            parts["teacher"] = self.unseen.teacher.state_dict()
-        for index, values in self.optimizer.state_dict()["state"].items():
-            parts[f"adam.{index}"] = values
-        tensors = {
-            f"{part}.{name}": torch.as_tensor(value).cpu().contiguous()
-            for part, values in parts.items()
-            for name, value in values.items()
-        }
-        tensors["generator"] = self.generator.get_state()
-        header = {
-            "schema": STATE_SCHEMA,
-            "config": to_dict(self.config),
-            "step": self.step_index,
-            "seconds": self.seconds,
-            "bad_steps": self.bad_steps,
-            "lit": self.lit,
-            "networks": networks_by_role(self.perceptual, self.consistency),
-            "capture_sha256": sha256_of(self.capture.file),
-            "motion": Path(self.capture.motion.source).name,
-            "learned_from_sha256": self._learned_from_sha256,
-        }
-        write_tensors(folder / STATE_FILE, tensors, header)
-        skeleton = self.capture.body.skeleton
-        save_checkpoint(folder / "avatar.ckpt", self.model, self.light(), skeleton, self.config, self.info())
-        if self.refinement is not None:
-            save_motion(folder / REFINED_MOTION, self.motion())
-
-    def resume(self, path: Path) -> None:
-        """Continue from a saved state on the same curve.
-
-        Raises:
-            InputError: another configuration, capture or network, or not a state. Settings of the third stage may
-                differ before it begins.
-        """
-        saved = read_state(path)
-        saved.refuse_other(self.config, networks_by_role(self.perceptual, self.consistency))
-        header, teacher = saved.header, saved.part("teacher")
-        if header.get("learned_from_sha256") != self._learned_from_sha256:
-            raise InputError("--resume", expected="the images and poses it was started with", got="others", file=path)
-        try:
-            self.model.load_state_dict(saved.part("model"))
-            self.probe.load_state_dict(saved.part("probe"))
-            if self.refinement is not None:
-                self.refinement.load_state_dict(saved.part("poses"))
-            if teacher:
-                self.unseen = UnseenPoses(self.model, self.capture.body.skeleton, self.config)
-                self.unseen.teacher.load_state_dict(teacher)
-            moments: dict[int, dict[str, Tensor]] = {}
-            for name, value in saved.part("adam").items():
-                index, key = name.split(".")
-                moments.setdefault(int(index), {})[key] = value
-            self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
-            self.generator.set_state(saved.tensors["generator"])
-            self.step_index, self.seconds = int(header["step"]), float(header["seconds"])
-            self.bad_steps = int(header["bad_steps"])
-            self.lit = bool(header["lit"])
-        except (KeyError, RuntimeError, ValueError, TypeError) as error:
-            raise InputError("not a training state", got=str(error).splitlines()[0], file=path) from error
-
     @cached_property
-    def _learned_from_sha256(self) -> str:
+    def learned_from_sha256(self) -> str:
+        """Digest of the training data, of which a training can only be resumed with the same."""
         light = training_light(self.capture) if self.config.light == "capture" else None
         return learned_sha256(self.views, self.capture, self.config.image_scale, light)
-
-    def info(self) -> dict[str, Any]:
-        """Provenance for the checkpoint."""
-        lights = sorted({view.frame.light for view in self.views if view.frame.light})
-        return {
-            "capture": self.capture.folder.resolve().name,
-            "capture_sha256": sha256_of(self.capture.file),
-            "motion": Path(self.capture.motion.source).name,
-            "lights": {name: self.capture.light_sha256(name) for name in lights},
-            "body_license": self.capture.body.license,
-            "step": self.step_index,
-            "steps_planned": self.schedule.total,
-            "lit": self.lit,
-            "minutes": round(self.seconds / 60, 3),
-            "threads": numba.get_num_threads(),
-            "machine": machine(),
-            "device": "cpu" if self.device.type == "cpu" else torch.cuda.get_device_name(self.device),
-            "images": len(self.views),
-            "spacing_m": float(self.model.spacing),
-            "perceptual": None if self.perceptual is None else self.perceptual.backbone,
-            "perceptual_sha256": networks_sha256(self.perceptual),
-            "consistency": None if self.consistency is None else self.consistency.backbone,
-            "consistency_sha256": networks_sha256(self.consistency),
-        }

@@ -16,6 +16,7 @@ from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
+from rnd_trainer.training.saving import resume_training, save_training
 from rnd_trainer.training.training import MAX_BAD_STEPS, Training
 
 NOISE_DEGREES = 2.0
@@ -115,9 +116,9 @@ def resumed(subject: Subject) -> Result:
         half = _training(subject)
         for _ in range(SHORT // 2):
             half.step()
-        half.save(subject.work / "resumed")
+        save_training(half, subject.work / "resumed")
         again = _training(subject)
-        again.resume(subject.work / "resumed/training.state")
+        resume_training(again, subject.work / "resumed/training.state")
         rest = _to_the_end(again)
     pairs = zip(rest, curve[SHORT // 2 :], strict=True)
     off = max(abs(ours[name] - theirs[name]) for ours, theirs in pairs for name in theirs)
