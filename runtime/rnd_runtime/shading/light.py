@@ -16,18 +16,14 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import ImageHeader, read_header, read_image, read_strips
 from rnd_runtime.core.kinds import explained
+from rnd_runtime.shading.files.channels import colour_channels, colour_notes
+from rnd_runtime.shading.files.radiance import as_stored, read_radiance_header
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Up = Literal["y", "z", "-y"]
 
-REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
-"""x and y of Rec.709's red, green, blue and white (ITU-R BT.709-6, section 1)"""
-_SAME_COLOUR = 2e-3  # by which x and y may miss them: D65 has more digits
-
 _MAX_STOPS = 64  # beyond it radiance leaves float32
-_MAX_EXPOSURE = 1e30  # a .hdr file's EXPOSURE, or one over it
-_LONGEST_LINE = 4096  # bytes of its header
 _MAX_ROWS = 2048  # a map of more is averaged down to as many while it is read
 _ROWS_AT_ONCE = 16  # rows or columns that are averaged by one product
 _LARGEST_HALF = 65504.0
@@ -140,7 +136,8 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     NaN, infinite and negative texels are filled from their neighbours; ``Light.repaired`` counts them. In a HALF map
     +inf is 65 504, the largest HALF number, as a sun that did not fit. A map of more than 2048 rows is averaged to
     2048 × 4096 texels while it is read, weighted by solid angle, so that memory does not grow with it. Pixels of a
-    Radiance file are divided by each EXPOSURE that its header states ("Radiance image format", Ward).
+    Radiance file are divided by each EXPOSURE that its header states ("Radiance image format", Ward); CIE XYZ becomes
+    Rec.709, and rows are ordered as its resolution line says.
 
     Args:
         up: the axis that points up in the world the map was made for: "y"; "z" for a Z-up world; "-y" for
@@ -157,22 +154,43 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         raise explained(InputError("light probe", expected="an .exr or .hdr file", got=got), path, "light")
     if not abs(exposure) <= _MAX_STOPS:
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
-    header = read_header(path)
-    channels = _colour_channels(header.channels, path)
-    if header.width != 2 * header.height:
-        got = f"{header.width} x {header.height}"
-        raise InputError("light probe", expected="a 2:1 lat-long map", got=got, file=path)
-    try:
-        read = _read_reduced if header.height > _MAX_ROWS else _read_whole
-        radiance, repaired, cut = read(path, header, channels)
-    except InputError as error:
-        raise error.at(file=path) from error
-    stated, chromaticities = 1.0, header.chromaticities
-    if suffix == ".hdr":
-        stated, chromaticities = _radiance_header(path)
-    radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure) / stated)
-    notes = _exposure_notes(stated) + _colour_notes(chromaticities) + _cut_notes(cut)
+    if suffix == ".exr" or not _is_radiance(path):
+        radiance, repaired, notes = _read(path, path)
+    else:
+        stored = read_radiance_header(path)
+        with as_stored(path, stored) as copy:
+            radiance, repaired, _ = _read(copy, path, across=stored.axes[1] == "X")
+        notes = stored.notes + (() if stored.xyz else colour_notes(stored.primaries))
+        radiance = stored.upright(radiance if not stored.xyz else stored.rec709(radiance)) / np.float64(stored.exposure)
+    radiance = _finite_float32(radiance * 2.0 ** np.float64(exposure))
     return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=notes)
+
+
+def _is_radiance(path: str | Path) -> bool:
+    """Whether ``path`` begins as a .hdr file does; others fail in OpenImageIO, with its reason."""
+    with Path(path).open("rb") as file:
+        return file.read(2) == b"#?"
+
+
+def _read(path: str | Path, name: str | Path, across: bool = False) -> tuple[Floats32, int, tuple[str, ...]]:
+    """Radiance as stored, how many texels were repaired, and notes; errors are of the file ``name``.
+
+    ``across``: rows and columns have changed places, which is not read of large maps.
+    """
+    try:
+        header = read_header(path)
+        channels, notes = colour_channels(header.channels, name)
+        width, height = (header.height, header.width) if across else (header.width, header.height)
+        if width != 2 * height:
+            raise InputError("light probe", expected="a 2:1 lat-long map", got=f"{width} x {height}", file=name)
+        large = height > _MAX_ROWS
+        if large and across:
+            raise InputError("large light probe", expected="rows from left to right", got="columns", file=name)
+        radiance, repaired, cut = (_read_reduced if large else _read_whole)(path, header, channels)
+    except InputError as error:
+        named = {"expected": error.expected, "got": error.got, "hint": error.hint}
+        raise InputError(error.what, file=name, **named) from error
+    return radiance, repaired, notes + colour_notes(header.chromaticities) + _cut_notes(cut)
 
 
 def _read_whole(path: str | Path, header: ImageHeader, channels: list[int]) -> tuple[Floats32, int, int]:
@@ -258,56 +276,6 @@ def light_notes(light: Light) -> list[str]:
     if light.maximum < _DIM:
         notes.append(f"the light is dark: its largest radiance is {light.maximum:.3g}; try --exposure")
     return notes
-
-
-def _radiance_header(path: str | Path) -> tuple[float, tuple[float, ...] | None]:
-    """The product of a .hdr file's EXPOSUREs, and its PRIMARIES: x and y of red, green, blue and white.
-
-    OpenImageIO reads the last EXPOSURE alone, and no PRIMARIES.
-    """
-    exposure, primaries = 1.0, None
-    with Path(path).open("rb") as file:
-        while (line := file.readline(_LONGEST_LINE)).strip():
-            name, _, text = line.partition(b"=")
-            if name not in (b"EXPOSURE", b"PRIMARIES"):
-                continue
-            try:
-                numbers = tuple(float(word) for word in text.split())
-            except ValueError:
-                numbers = ()
-            if name == b"EXPOSURE":
-                exposure *= numbers[0] if len(numbers) == 1 else np.nan
-            elif len(numbers) == 8 and np.isfinite(numbers).all() and any(numbers):  # zeros state nothing
-                primaries = numbers
-    if not 1 / _MAX_EXPOSURE <= exposure <= _MAX_EXPOSURE:
-        expected = f"numbers whose product is {1 / _MAX_EXPOSURE:g} to {_MAX_EXPOSURE:g}"
-        raise InputError("EXPOSURE of the light probe", expected=expected, got=f"{exposure:g}", file=path)
-    return exposure, primaries
-
-
-def _exposure_notes(stated: float) -> tuple[str, ...]:
-    if stated == 1:
-        return ()
-    return (f"the light's pixels are divided by the exposure that its file states, {stated:.4g}",)
-
-
-def _colour_channels(names: tuple[str, ...], path: str | Path) -> list[int]:
-    """Where R, G and B are: those of no layer, or else of the only layer ("view.R") that has all three."""
-    layers = dict.fromkeys(name.removesuffix("R") for name in names if name.split(".")[-1] == "R")
-    complete = [layer for layer in layers if {f"{layer}{colour}" for colour in "RGB"} <= set(names)]
-    if "" not in complete and len(complete) != 1:
-        expected = "channels R, G and B" + (" of one layer" if complete else "")
-        raise InputError("light probe", expected=expected, got=", ".join(names), file=path)
-    layer = "" if "" in complete else complete[0]
-    return [names.index(f"{layer}{colour}") for colour in "RGB"]
-
-
-def _colour_notes(chromaticities: tuple[float, ...] | None) -> tuple[str, ...]:
-    if chromaticities is None or np.allclose(chromaticities, REC709, rtol=0, atol=_SAME_COLOUR):
-        return ()
-    red, green, blue, white = (f"({x:.4g}, {y:.4g})" for x, y in zip(chromaticities[::2], chromaticities[1::2]))
-    stated = f"red {red}, green {green}, blue {blue} and white {white}"
-    return (f"the light is taken as Rec.709, but its file states {stated}",)
 
 
 def repair(radiance: Floats32) -> tuple[Floats32, int]:

@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
+from rnd_runtime.shading.files.channels import REC709
 from rnd_runtime.shading.light import (
-    REC709,
     Light,
     downsize,
     light_notes,
@@ -345,7 +345,7 @@ def test_radiance_hdr(tmp_path):
     [
         ("a.png", np.zeros((4, 8, 3), np.uint8), ".exr or .hdr"),
         ("a.exr", np.zeros((8, 8, 3), np.float32), "2:1 lat-long map, got 8 x 8"),
-        ("a.exr", np.zeros((4, 8, 1), np.float32), "R, G and B"),
+        ("a.exr", np.zeros((4, 8, 2), np.float32), "R, G and B"),
     ],
 )
 def test_what_is_no_probe_is_refused(tmp_path, name, pixels, words):

@@ -52,11 +52,13 @@ export const C3_3 = 0.5900435899266435;
 export const C3_2 = 2.890611442640554;
 export const C3_1 = 0.4570457994644658;
 export const C3_0 = 0.3731763325901154;
-// rnd_runtime.shading.light
+// rnd_runtime.shading.files.channels
 export const REC709 = [0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329];
-export const REC709_LUMINANCE = [0.2126, 0.7152, 0.0722];
 export const SAME_COLOUR = 0.002;
+// rnd_runtime.shading.files.radiance
 export const MAX_EXPOSURE = 1e+30;
+// rnd_runtime.shading.light
+export const REC709_LUMINANCE = [0.2126, 0.7152, 0.0722];
 export const DIM = 0.001;
 // rnd_runtime.shading.brdf
 export const F0 = 0.04;

@@ -1,0 +1,1 @@
+"""What files of light probes state: channels, colours, exposure and orientation."""
