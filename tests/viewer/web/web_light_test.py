@@ -215,11 +215,10 @@ def test_radiance_files_with_the_line_ends_of_windows(tmp_path):
     _assert_the_same(file)
 
 
-def test_radiance_files_of_another_colour_space_are_refused(tmp_path):
+def test_radiance_files_in_xyz_are_for_python_alone(tmp_path):
     file = tmp_path / "sky.hdr"
     file.write_bytes(_hdr(file).replace(b"rle_rgbe", b"rle_xyze"))
-    with pytest.raises(InputError):
-        load_light(file)
+    assert "CIE XYZ" in load_light(file).notes[0]
     assert "expected FORMAT=32-bit_rle_rgbe, got FORMAT=32-bit_rle_xyze" in _page(file)["refused"]
 
 
