@@ -5,6 +5,7 @@ from __future__ import annotations
 import lzma
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -106,9 +107,13 @@ class Members:
         if array.dtype.kind != "U":
             raise InputError(name, expected="strings", got=f"dtype {array.dtype}", file=self.path)
         try:
+            if array.size and array.dtype.itemsize:  # Python takes numbers that are no characters, and fails later
+                codes = np.dtype(np.uint32).newbyteorder(array.dtype.byteorder)
+                if np.ascontiguousarray(array.reshape(-1)).view(codes).max() > sys.maxunicode:
+                    raise ValueError("no character")
             texts = tuple(str(text) for text in array.reshape(-1))
             "".join(texts).encode()  # what cannot be written cannot be shown either
-        except (SystemError, ValueError) as error:  # numbers that are no characters
+        except (SystemError, ValueError) as error:
             raise InputError(name, expected="strings", got="damaged ones", file=self.path) from error
         return texts
 

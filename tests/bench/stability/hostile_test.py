@@ -10,10 +10,11 @@ import time
 import numpy as np
 import pytest
 
-from rnd_bench.stability import fuzz as module
 from rnd_bench.stability.determinism import backends_agree
-from rnd_bench.stability.fuzz import fuzz
-from rnd_bench.stability.hostile import READERS, prepare
+from rnd_bench.stability.fuzzing import run as module
+from rnd_bench.stability.fuzzing.honest import write_files
+from rnd_bench.stability.fuzzing.readers import READERS
+from rnd_bench.stability.fuzzing.run import fuzz
 from rnd_bench.stability.kill import incomplete_files
 from rnd_bench.stability.processes import environment
 
@@ -24,8 +25,8 @@ INPUTS = 40
 @pytest.fixture(scope="module")
 def honest(subject):
     """One honest file of every kind."""
-    folder = subject.work / "fuzz"
-    prepare(folder, subject.avatar_file, subject.checkpoint, subject.capture.folder)
+    folder = subject.work / "fuzz/files"
+    write_files(folder, subject.avatar_file, subject.checkpoint, subject.capture.folder)
     return folder
 
 

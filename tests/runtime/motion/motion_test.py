@@ -356,6 +356,15 @@ def test_bad_motion_is_one_line_naming_file_field_and_frame(tmp_path, members, w
         assert word in message, message
 
 
+def test_text_of_numbers_that_are_no_characters_is_refused(tmp_path):
+    """numpy and Python take them; printing them fails."""
+    names = np.array(["ab"] * 24)
+    names.view(np.uint32)[::2] = [*range(0x110000, 0x110018)]
+    file = _save(tmp_path / "bad.npz", poses=POSES, joint_names=names)
+    with pytest.raises(InputError, match=r"joint_names: expected strings, got damaged ones"):
+        load_motion(file, _skeleton())
+
+
 def test_files_that_are_no_archives(tmp_path):
     buffer = io.BytesIO()
     np.savez_compressed(buffer, poses=POSES, trans=TRANS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -106,6 +108,17 @@ def test_files_are_numbered_where_each_has_a_number(tmp_path, write) -> None:
         file.rename(folder / f"{name}{file.suffix}")
     found = read_poses(folder)
     assert not found.numbered and found.poses.frames.tolist() == list(range(FRAMES))
+
+
+@pytest.mark.parametrize("number", [2**63, 10**30])
+def test_numbers_of_frames_and_people_may_be_beyond_64_bits(tmp_path, number) -> None:
+    folder = write_easymocap_folder(tmp_path)
+    for file in folder.iterdir():
+        file.write_text(file.read_text().replace('"id": 3', f'"id": {number}'))
+    assert len(read_poses(folder, person=number).poses.frames) == FRAMES
+    shutil.rmtree(folder)
+    with pytest.raises(InputError, match=r"numbers of frames or people: expected below 2\^63"):
+        read_poses(write_easymocap_folder(tmp_path, range(number, number + FRAMES)))
 
 
 def test_romps_files_are_sorted_by_number(tmp_path) -> None:

@@ -43,6 +43,8 @@ class Stability:
     """side of the images in pixels"""
     fuzz: Count = 0
     """broken inputs for every reader; resumes in WORK"""
+    readers: Annotated[str, option("LIST")] = "all"
+    """those of --fuzz, such as pickle,exr"""
     soak: Count = 0
     """frames of playback, and a tenth as many steps of training; resumes in WORK"""
     view: Count = 0
@@ -149,20 +151,24 @@ def _long_runs(options: Stability, subject: Subject) -> Iterable[tuple[str, str,
 def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
     from rnd_runtime.cli.progress import Progress
 
-    from .fuzz import batches, fuzz
-    from .hostile import READERS, prepare
+    from .fuzzing.honest import COMPLETE, write_files
+    from .fuzzing.readers import READERS
+    from .fuzzing.run import batches, fuzz
     from .processes import export, run_commands
     from .small import studio, train_small
 
+    names = list(READERS) if options.readers == "all" else options.readers.split(",")
+    if unknown := set(names) - set(READERS):
+        raise InputError("--readers", expected=f"some of {','.join(READERS)}", got=",".join(sorted(unknown)))
     folder = subject.work / "fuzz"
-    if not (folder / "files/light.hdr").exists():  # written last
+    if not (folder / "files" / COMPLETE).exists():
         capture = studio(subject)
         small = train_small(folder / "run", capture, 12, 200)
         run_commands(folder, [export(small, folder / "small.onnx")])
-        prepare(folder / "files", folder / "small.onnx", small, capture.folder)
+        write_files(folder / "files", folder / "small.onnx", small, capture.folder)
     done = count()
     with Progress() as progress:
-        progress.phase("broken files", len(READERS) * batches(options.fuzz))
-        figures, record = fuzz(folder / "files", options.fuzz, on_batch=lambda: progress.update(next(done) + 1))
+        progress.phase("broken files", len(names) * batches(options.fuzz))
+        figures, record = fuzz(folder / "files", options.fuzz, names, lambda: progress.update(next(done) + 1))
     write_json(options.json.with_name("stability_fuzz.json"), record)
     return figures

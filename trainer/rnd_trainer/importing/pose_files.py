@@ -88,6 +88,8 @@ def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
         return _from_pickle(path, person)
     except InputError as error:
         raise error.at(file=path) from error
+    except OverflowError as error:
+        raise InputError("numbers of frames or people", expected="below 2^63", got="more", file=path) from error
 
 
 def _from_pickle(path: Path, person: int | None) -> PoseFile:

@@ -71,7 +71,7 @@ class VideoFile:
         import av
 
         try:
-            container = av.open(str(self.path))
+            container = av.open(str(self.path), metadata_errors="replace")
         except (av.error.FFmpegError, OSError) as error:
             raise InputError("video cannot be read", got=str(error), file=self.path) from error
         if not container.streams.video:

@@ -1,0 +1,1 @@
+"""Fuzzing of every reader: valid files are damaged by structure and read in processes that may die."""
