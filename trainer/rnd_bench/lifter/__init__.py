@@ -1,0 +1,1 @@
+"""Training and figures of the lifter that rnd_trainer.estimating ships."""
