@@ -1,9 +1,8 @@
 """Fills the tables of README.md and docs from assets/bench/*.json: python scripts/doc_tables.py
 
 A table stands between ``<!-- table: FILE.json | column, column .1f, … -->`` and ``<!-- end -->``; a column is a key of
-the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, A.json+B.json has those of both,
-and ``FILE.json of A; B`` shows those of the methods A and B alone. ``<!-- chart: FILE.svg -->`` …
-``<!-- end -->`` holds an image. Tables and charts without a file stay empty.
+the file's rows, with the format of its numbers; FILE.json#KEY has its rows under KEY, A.json+B.json has those of both.
+``<!-- chart: FILE.svg -->`` … ``<!-- end -->`` holds an image. Tables and charts without a file stay empty.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any
 
 ROOT = Path(__file__).parent.parent
 CHART = re.compile(r"(<!-- chart: (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
-TABLE = re.compile(r"(<!-- table: (\S+)(?: of (.+?))? \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- table: (\S+) \| (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 PAGES = {
     page: os.path.relpath(ROOT / "assets" / "bench", page.parent)
@@ -36,18 +35,16 @@ def filled(text: str, bench: Path, images: str = "../assets/bench") -> str:
     def table(found: re.Match[str]) -> str:
         files, _, key = found[2].partition("#")
         if not all((bench / name).is_file() for name in files.split("+")):
-            return found[1] + found[5]
+            return found[1] + found[4]
         rows = []
         for name in files.split("+"):
             whole = json.loads((bench / name).read_text(encoding="utf-8"))
             some = whole[key] if key else whole
             rows += some if isinstance(some, list) else [some]
-        methods = found[3].split("; ") if found[3] else None
-        rows = [row for row in rows if methods is None or row["method"] in methods]
-        columns = [column.strip().partition(" ")[::2] for column in found[4].split(",")]
+        columns = [column.strip().partition(" ")[::2] for column in found[3].split(",")]
         lines = [[name for name, _ in columns], ["---"] * len(columns)]
         lines += [[_cell(_value(row, name), form) for name, form in columns] for row in rows]
-        return found[1] + "".join(f"| {' | '.join(line)} |\n" for line in lines) + found[5]
+        return found[1] + "".join(f"| {' | '.join(line)} |\n" for line in lines) + found[4]
 
     return CHART.sub(chart, TABLE.sub(table, text))
 
