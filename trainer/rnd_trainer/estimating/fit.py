@@ -1,0 +1,330 @@
+"""The joint fit over a clip: pose, position, shape, focal length and ground from what networks see of one person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.capture.body import Body
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.motion.motion import Motion
+
+from .fitting.figure import Figure, default_figure, known_figure
+from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
+from .fitting.normal_equations import NormalEquations
+from .fitting.prior import pose_prior
+from .fitting.silhouette import Outlines, OutlineTerm, Surface, outlines_of
+from .fitting.start import bones_of_points, joint_rotations, local_rotations, root_positions
+from .fitting.state import TO_CAMERA, Layout, State
+from .fitting.terms import BoneTerm, GroundTerm, Lens, PointTerm, PriorTerm, SharedTerm, SmoothTerm, mark_points
+from .lifted import Lifted
+from .observations import Observations
+
+Floats = NDArray[np.float64]
+OnProgress = Callable[[float, float], None]
+"""called with steps done and steps in all"""
+
+MIN_FRAMES = 12
+"""fewer frames tell too little of the body"""
+FOCAL_OF_SIDE = 1.15
+"""usual focal length over the image's longer side: phones film at 0.8 to 1.6"""
+FOCAL_DEVIATION = 0.20
+KNOWN_FOCAL_DEVIATION = 0.003
+MAX_TURN, MAX_SHIFT = 0.5, 0.4
+"""bounds of one step: rad of a joint, m of the root"""
+_LESS_SURE = {11: 1.5, 12: 1.5, 23: 1.5, 24: 1.5, **dict.fromkeys(range(11), 1.3), **dict.fromkeys(range(17, 23), 1.5)}
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much each term counts, and the deviations it assumes."""
+
+    mark_m: float = 0.022  # deviation of a sure landmark at the person's distance
+    spread: float = 1.0  # of the views of one frame, counted as deviation
+    points: float = 0.6
+    bones: float = 0.6
+    prior: float = 0.03
+    smooth: float = 0.5
+    acceleration: float = 4.0  # m/s² of the trunk along each axis; limbs two to three times that
+    spin: float = 20.0  # rad/s²
+    outline: float = 0.25
+    inner: float = 0.15
+    outline_m: float = 0.012
+    ground: float = 0.4
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Steps of the fit with some terms."""
+
+    steps: int
+    outlines: bool = False
+    points: float = 1.0
+    limit: float = 3.0
+
+
+STAGES = (Stage(8, points=0.3, limit=8.0), Stage(10, limit=5.0), Stage(14, outlines=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What a video says of a person.
+
+    Attributes:
+        motion: one pose for each observed frame; the world has Y up, its ground is y = 0.
+        body: the person's body at rest, with ``motion``'s joints.
+        camera: of all frames, in that world.
+        frames: [T] numbers of the poses' frames in the video.
+        rotation_deviation: [T, J, 3] rad, of each joint's rotation about its own axes; ``translation_deviation``
+            [T, 3] m, of the root.
+        shape: the figure's parameters by name.
+        notes: assumptions, one sentence each.
+        residual_px: [T] median distance of the confident landmarks from the body's.
+    """
+
+    motion: Motion
+    body: Body
+    camera: Camera
+    frames: NDArray[np.int64]
+    rotation_deviation: Floats
+    translation_deviation: Floats
+    shape: dict[str, float]
+    notes: tuple[str, ...]
+    residual_px: Floats
+    state: State = field(repr=False)
+
+
+def estimate(
+    observations: Observations,
+    lifted: Lifted | None = None,
+    *,
+    body: Body | Figure | None = None,
+    height: float | None = None,
+    focal_px: float | None = None,
+    principal_px: tuple[float, float] | None = None,
+    weights: Weights = Weights(),
+    on_progress: OnProgress = lambda done, total: None,
+) -> Estimate:
+    """Fit a body to all frames of ``observations`` at once.
+
+    Args:
+        lifted: directions of bones in the same frames; by default those of ``observations.keypoints_m``.
+        body: a ``Body`` keeps its shape; a ``Figure`` is shaped; by default the figure that ships.
+        height: of the person, m; fixes the scale. By default the mean adult's, as far as nothing else tells.
+        focal_px: focal length in pixels, if known.
+        principal_px: by default the image's middle.
+
+    Raises:
+        InputError: too few frames, or an impossible height or focal length.
+    """
+    count = len(observations)
+    if count < MIN_FRAMES:
+        raise InputError("video", expected=f"at least {MIN_FRAMES} frames of the person", got=count)
+    if height is not None and not 0.5 <= height <= 2.5:
+        raise InputError("--height", expected="0.5 to 2.5 m", got=height)
+    if focal_px is not None and not (np.isfinite(focal_px) and focal_px > 0):
+        raise InputError("focal length", expected="a positive number of pixels", got=focal_px)
+    figure = default_figure() if body is None else known_figure(body) if isinstance(body, Body) else body
+    if lifted is None:
+        lifted = bones_of_points(observations.keypoints_m.astype(np.float64), observations.confidence > 0.3)
+    if len(lifted) != count:
+        raise InputError("lifted bones", expected=f"{count} frames", got=len(lifted))
+    fit = Fit(observations, lifted, figure, _lens(observations, focal_px, principal_px), height, weights)
+    total = sum(stage.steps for stage in STAGES)
+    done = 0
+    for stage in STAGES:
+        for _ in range(stage.steps):
+            fit.advance(stage)
+            done += 1
+            on_progress(done, total)
+    return fit.result()
+
+
+def _lens(observations: Observations, focal_px: float | None, principal_px: tuple[float, float] | None) -> Lens:
+    width, height = observations.image_size
+    centre = np.array(principal_px if principal_px is not None else (width / 2, height / 2), np.float64)
+    if focal_px is not None:
+        return Lens(centre, float(np.log(focal_px)), KNOWN_FOCAL_DEVIATION)
+    return Lens(centre, float(np.log(FOCAL_OF_SIDE * max(width, height))), FOCAL_DEVIATION)
+
+
+class Fit:
+    """A fit in progress."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        lifted: Lifted,
+        figure: Figure,
+        lens: Lens,
+        height: float | None,
+        weights: Weights = Weights(),
+    ) -> None:
+        self.observations, self.lifted, self.figure, self.lens = observations, lifted, figure, lens
+        self.height, self.weights = height, weights
+        self.marks: Marks = marks_of(figure)
+        self.layout = Layout(figure, self.marks)
+        self.times = observations.frames / observations.fps
+        self.surface: Surface | None = None
+        self.outlines: Outlines | None = None
+        self.damping = 1e-3
+        self.cost = np.inf
+        self.state = self._start()
+        self._smooth = self._smoothness()
+
+    def _start(self) -> State:
+        observations, figure = self.observations, self.figure
+        rotations = local_rotations(TO_CAMERA @ joint_rotations(self.lifted), figure.body.skeleton)
+        count = len(observations)
+        shape = np.zeros(len(figure.names))
+        if self.height is not None and figure.names:
+            unit = np.zeros(len(shape))
+            unit[0] = 1
+            shape[0] = (self.height - figure.height(0 * unit)) / (figure.height(unit) - figure.height(0 * unit))
+        focal = float(np.exp(self.lens.log_focal))
+        state = State(
+            rotations, np.zeros((count, 3)), shape, np.zeros_like(self.marks.places), self.lens.log_focal, np.zeros(3)
+        )
+        posed = state.posed(figure)
+        points = mark_points(state, posed, self.marks)[:, :33] @ TO_CAMERA
+        sure = observations.confidence.astype(np.float64) ** 2 / (1 + observations.spread_px.astype(np.float64) ** 2)
+        sure[:, :11] *= 0.1
+        sure[:, 17:23] *= 0.1
+        shift = root_positions(points, observations.keypoints_px.astype(np.float64), sure, focal, self.lens.centre)
+        translations = shift @ TO_CAMERA
+        state = replace(state, translations=translations)
+        posed = state.posed(figure)
+        soles = mark_points(state, posed, self.marks)[:, 29:33, 1].min(1)
+        return replace(state, ground=np.array([np.quantile(soles, 0.3), 0.0, 0.0]))
+
+    def _scale(self) -> Floats:
+        """Pixels a metre [T] at the person's distance."""
+        posed = self.state.posed(self.figure)
+        return np.asarray(self.state.focal / np.maximum(-posed.joints[:, 0, 2], 0.1))
+
+    def _point_term(self, stage: Stage) -> PointTerm:
+        o, w = self.observations, self.weights
+        count, total = len(o), len(self.marks.joints)
+        pixels, deviation = np.zeros((count, total, 2)), np.full((count, total), np.inf)
+        scale = self._scale()[:, None]
+        pixels[:, :33] = o.keypoints_px
+        confidence = np.clip(o.confidence.astype(np.float64), 1e-3, 1)
+        base = w.mark_m * scale * np.ones((1, 33))
+        for mark, factor in _LESS_SURE.items():
+            base[:, mark] *= factor
+        deviation[:, :33] = np.hypot(base / confidence, w.spread * o.spread_px)
+        for side in range(2):
+            sure = o.hands_confidence[:, side].astype(np.float64)
+            seen = (sure > 0.3) & np.isfinite(o.hands_px[:, side]).all((1, 2))
+            here = slice(HAND_MARKS + 4 * side, HAND_MARKS + 4 * side + 4)
+            pixels[seen, here] = o.hands_px[seen, side][:, list(KNUCKLES)]
+            deviation[seen, here] = (0.6 * w.mark_m * scale / np.clip(sure, 0.1, 1)[:, None])[seen]
+        deviation[:, :33][~np.isfinite(o.keypoints_px).all(-1)] = np.inf
+        pixels = np.nan_to_num(pixels)
+        return PointTerm(pixels, deviation, stage.limit, w.points * stage.points)
+
+    def _smoothness(self) -> SmoothTerm:
+        w, names = self.weights, self.figure.body.skeleton.names
+        limb = {"knee": 2.0, "ankle": 2.5, "foot": 3.0, "elbow": 2.0, "wrist": 2.7}
+        factors = np.array([limb.get(n.split("_")[-1], 1.0) for n in names])
+        spins = np.array([2.0 if n.split("_")[-1] in (*limb, "hip", "shoulder") else 0.8 for n in names])
+        return SmoothTerm(self.times, w.acceleration * factors, w.spin * spins, w.smooth)
+
+    def _outline_term(self) -> OutlineTerm:
+        if self.outlines is None or self.surface is None:
+            self.outlines = outlines_of(self.observations.masks, len(self.observations), self.observations.image_size)
+            self.surface = Surface(self.figure)
+        posed = self.state.posed(self.figure)
+        matches = self.surface.matches(self.state, posed, self.lens, self.outlines)
+        deviation = self.weights.outline_m * self._scale()
+        return OutlineTerm(self.surface, self.outlines, matches, deviation, self.weights.outline, self.weights.inner)
+
+    def evaluate(
+        self, state: State, points: PointTerm, outline: OutlineTerm | None, equations: NormalEquations | None = None
+    ) -> float:
+        """Cost of ``state``; adds its derivatives to ``equations``."""
+        figure, marks, layout, lens, w = self.figure, self.marks, self.layout, self.lens, self.weights
+        posed = state.posed(figure)
+        cost = points(state, posed, figure, marks, layout, lens, equations)
+        cost += BoneTerm(self.lifted, weight=w.bones)(state, posed, figure, layout, equations)
+        cost += PriorTerm(pose_prior(), w.prior)(posed, layout, equations)
+        cost += self._smooth(posed, layout, equations)
+        cost += GroundTerm(self.times, w.ground)(state, posed, figure, marks, layout, equations)
+        cost += SharedTerm(lens, self.height)(state, figure, marks, layout, equations)
+        if outline is not None:
+            cost += outline(state, posed, layout, lens, equations)
+        return cost
+
+    def advance(self, stage: Stage) -> float:
+        """One Gauss-Newton step with the terms of ``stage``; its cost."""
+        points = self._point_term(stage)
+        outline = self._outline_term() if stage.outlines else None
+        equations = NormalEquations(len(self.observations), self.layout.unknowns, self.layout.shared)
+        before = self.evaluate(self.state, points, outline, equations)
+        for _ in range(4):
+            local, shared = equations.solve(self.damping)
+            turn = np.clip(local[:, :-3], -MAX_TURN, MAX_TURN)
+            local = np.concatenate([turn, np.clip(local[:, -3:], -MAX_SHIFT, MAX_SHIFT)], 1)
+            state = self.layout.moved(self.state, local, shared)
+            after = self.evaluate(state, points, outline)
+            if after <= before:
+                self.state, self.damping = state, max(self.damping * 0.3, 1e-5)
+                break
+            self.damping = min(self.damping * 8 + 1e-4, 1e3)
+        self.cost = min(before, after)
+        self._equations = equations
+        return self.cost
+
+    def result(self) -> Estimate:
+        """The estimate in a world whose ground is level at y = 0."""
+        state, figure, observations = self.state, self.figure, self.observations
+        body = figure.shaped(state.shape)
+        names = body.skeleton.names
+        level = _level(state.up)
+        posed = state.posed(figure)
+        roots = posed.joints[:, 0] @ level.T
+        middle = np.array([roots[:, 0].mean(), state.ground[0], roots[:, 2].mean()])
+        rotations = state.rotations.copy()
+        rotations[:, 0] = level @ rotations[:, 0]
+        translations = roots - middle - body.skeleton.rest_joints[0]
+        motion = Motion(rotations, translations, observations.fps, names)
+        matrix = np.eye(4)
+        matrix[:3, :3] = TO_CAMERA @ level.T
+        matrix[:3, 3] = matrix[:3, :3] @ middle
+        width, height = observations.image_size
+        K = np.array([[state.focal, 0, self.lens.centre[0]], [0, state.focal, self.lens.centre[1]], [0, 0, 1]])
+        camera = Camera(width, height, K, matrix)
+        deviations = np.sqrt(self._equations.variances())
+        turned = np.zeros((len(observations), len(names), 3))
+        turned[:, self.layout.active] = deviations[:, :-3].reshape(len(observations), -1, 3)
+        return Estimate(
+            motion,
+            body,
+            camera,
+            observations.frames,
+            turned,
+            deviations[:, -3:],
+            dict(zip(figure.names, state.shape.tolist())),
+            (),
+            self._residuals(posed),
+            state,
+        )
+
+    def _residuals(self, posed) -> Floats:  # type: ignore[no-untyped-def]
+        from .fitting.terms import project
+
+        pixels, _ = project(mark_points(self.state, posed, self.marks)[:, :33], self.state, self.lens)
+        gaps = np.linalg.norm(pixels - self.observations.keypoints_px, axis=-1)
+        return np.nanmedian(np.where(self.observations.confidence > 0.5, gaps, np.nan), axis=1)
+
+
+def _level(up: Floats) -> Floats:
+    """The smallest rotation [3, 3] that takes ``up`` to Y."""
+    axis = np.cross(up, [0.0, 1.0, 0.0])
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + up[1])

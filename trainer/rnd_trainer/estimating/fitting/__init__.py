@@ -1,0 +1,1 @@
+"""The joint fit of a parametric body to what networks see of a person over a clip."""

@@ -1,0 +1,266 @@
+"""The outline of a person's mask against the rim of the posed body, in both directions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .figure import Figure, vertex_normals
+from .kinematics import Posed, shape_derivative, skinned_derivative
+from .normal_equations import NormalEquations
+from .state import Layout, State
+from .terms import Lens, project, robust
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+BONES = 3
+"""bones of a vertex that are followed"""
+SAMPLES = 120
+"""points of an outline, and points of the body tested against the mask"""
+BORDER = 3
+"""px: an outline so near the image's edge is not the person's"""
+GRID = 160
+"""px of the longer side of the distance map"""
+RIM = 0.35
+"""cosine to the line of sight below which a vertex is on the rim"""
+NORMAL_M = 0.09
+"""m that two opposite normals count as in the search for the nearest rim vertex, times ½"""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """The outlines of T masks.
+
+    Attributes:
+        points: [T, SAMPLES, 2] px; normals: [T, SAMPLES, 2], outwards; seen: [T, SAMPLES], 0 where there is none.
+        distance: [T, h, w] px from the mask, on a grid of ``scale`` cells a pixel.
+    """
+
+    points: Floats
+    normals: Floats
+    seen: Floats
+    distance: NDArray[np.float32]
+    scale: float
+
+
+def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Outlines:  # type: ignore[no-untyped-def]
+    """Outlines of ``masks`` (T × [H, W] uint8 soft) of images of ``size`` (width, height)."""
+    width, height = size
+    scale = min(1.0, GRID / max(width, height))
+    grid = max(1, round(width * scale)), max(1, round(height * scale))
+    points, normals = np.zeros((frames, SAMPLES, 2)), np.zeros((frames, SAMPLES, 2))
+    seen, distance = np.zeros((frames, SAMPLES)), np.zeros((frames, grid[1], grid[0]), np.float32)
+    rng = np.random.default_rng(seed)
+    for k in range(frames):
+        mask = np.asarray(masks[k])
+        binary = _largest(mask > 127)
+        away = cv2.distanceTransform(1 - binary, cv2.DIST_L2, 5)
+        distance[k] = cv2.resize(away, grid, interpolation=cv2.INTER_AREA)
+        found, _ = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        lines = [line[:, 0] for line in found if len(line) > 30]
+        line = np.concatenate(lines) if lines else np.zeros((0, 2), np.int32)
+        inner = (line >= BORDER).all(1) & (line[:, 0] < width - BORDER) & (line[:, 1] < height - BORDER)
+        line = line[inner]
+        if len(line) < SAMPLES // 4:
+            continue
+        smooth = cv2.GaussianBlur(binary.astype(np.float32), (0, 0), max(1.5, 0.004 * max(size)))
+        slope = np.stack([cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)], -1)
+        chosen = line[rng.choice(len(line), SAMPLES, replace=len(line) < SAMPLES)]
+        outward = -slope[chosen[:, 1], chosen[:, 0]].astype(np.float64)
+        length = np.linalg.norm(outward, axis=1, keepdims=True)
+        points[k], normals[k] = chosen + 0.5, outward / np.maximum(length, 1e-9)
+        seen[k] = length[:, 0] > 1e-6
+    return Outlines(points, normals, seen, distance, scale)
+
+
+def _largest(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    if count <= 2:
+        return mask.astype(np.uint8)
+    return (labels == 1 + stats[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
+
+
+class Surface:
+    """The figure's surface as the silhouette terms use it: fewer vertices, few bones each."""
+
+    def __init__(self, figure: Figure, count: int = 2500, inner: int = SAMPLES) -> None:
+        self.figure = figure
+        body = figure.body
+        rng = np.random.default_rng(1)
+        self.dense = np.sort(rng.choice(len(body.vertices), min(count, len(body.vertices)), replace=False))
+        self.normals = vertex_normals(body.vertices, body.faces)
+        self.bones = np.argsort(-body.skinning_weights, axis=1)[:, :BONES].astype(np.int64)
+        weights = np.take_along_axis(body.skinning_weights.astype(np.float64), self.bones, 1)
+        self.weights = weights / weights.sum(1, keepdims=True)
+        self.inner = _spread(body.vertices, inner)
+
+    def parts(self, posed: Posed, shape: Floats, vertices: Ints) -> Floats:
+        """Positions [T, P, BONES, 3] of ``vertices`` [T, P] as each of their bones moves them."""
+        rest = self.figure.body.vertices[vertices] + np.tensordot(
+            np.moveaxis(self.figure.vertex_basis[:, vertices], 0, -1), shape, 1
+        )
+        bones = self.bones[vertices]
+        frames = np.arange(len(posed))[:, None, None]
+        lever = rest[:, :, None] - posed.rest[bones]
+        return posed.joints[frames, bones] + np.einsum("tpbij,tpbj->tpbi", posed.world[frames, bones], lever)
+
+    def matches(self, state: State, posed: Posed, lens: Lens, outlines: Outlines) -> Ints:
+        """The rim vertex [T, SAMPLES] nearest to each outline point, its normal counted; −1 where there is none."""
+        frames = len(posed)
+        result = np.full((frames, SAMPLES), -1, np.int64)
+        scale = state.focal / np.maximum(-posed.joints[:, 0, 2], 0.05)
+        for k in range(frames):
+            if not outlines.seen[k].any():
+                continue
+            one = _frame(posed, k)
+            parts = self.parts(one, state.shape, self.dense[None])
+            weights = self.weights[self.dense]
+            points = np.einsum("pb,pbi->pi", weights, parts[0])
+            turn = np.einsum("pb,pbij->pij", weights, posed.world[k][self.bones[self.dense]])
+            normals = np.einsum("pij,pj->pi", turn, self.normals[self.dense])
+            view = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
+            rim = np.flatnonzero(np.abs((normals * view).sum(1)) < RIM)
+            if len(rim) < 10:
+                continue
+            pixels, _ = project(points[rim], state, lens)
+            flat = normals[rim, :2] * [1, -1]
+            flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)
+            weight = NORMAL_M * scale[k]
+            tree = cKDTree(np.concatenate([pixels, weight * flat], 1))
+            query = np.concatenate([outlines.points[k], weight * outlines.normals[k]], 1)
+            result[k] = self.dense[rim[tree.query(query)[1]]]
+        result[outlines.seen == 0] = -1
+        return result
+
+
+def _frame(posed: Posed, k: int) -> Posed:
+    part = slice(k, k + 1)
+    return Posed(
+        posed.skeleton,
+        posed.rotations[part],
+        posed.translations[part],
+        posed.rest,
+        posed.world[part],
+        posed.joints[part],
+    )
+
+
+def _spread(points: Floats, count: int) -> Ints:
+    """Indices of ``count`` points far from each other."""
+    nearest, chosen = np.full(len(points), np.inf), [0]
+    for _ in range(count - 1):
+        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(1))
+        chosen.append(int(nearest.argmax()))
+    return np.array(chosen)
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineTerm:
+    """Outline points lie on the rim, across it; points of the body lie inside the mask.
+
+    Attributes:
+        matches: [T, SAMPLES] vertices, −1 for none.
+        deviation: [T] px.
+    """
+
+    surface: Surface
+    outlines: Outlines
+    matches: Ints
+    deviation: Floats
+    weight: float = 0.2
+    inner_weight: float = 0.2
+    limit: float = 4.0
+
+    def __call__(
+        self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
+    ) -> float:
+        found = self.matches >= 0
+        vertices = np.maximum(self.matches, 0)
+        cost = self._across(state, posed, layout, lens, vertices, found, equations)
+        return cost + self._inside(state, posed, layout, lens, equations)
+
+    def _across(
+        self,
+        state: State,
+        posed: Posed,
+        layout: Layout,
+        lens: Lens,
+        vertices: Ints,
+        found: NDArray[np.bool_],
+        equations: NormalEquations | None,
+    ) -> float:
+        pixels, by_unknown, by_shared = self._projected(state, posed, layout, lens, vertices, equations is not None)
+        gap = pixels - self.outlines.points
+        inverse = 1 / self.deviation[:, None]
+        residual = (gap * self.outlines.normals).sum(-1) * inverse
+        far = 1 / (1 + (gap**2).sum(-1) * inverse**2 / (3 * self.limit) ** 2)  # a match that far is a guess
+        squares = residual**2
+        kept = 1 / (1 + squares / self.limit**2)
+        weight = self.weight * far * found
+        cost = float((weight * squares * kept).sum())
+        if equations is not None:
+            across = (self.outlines.normals * inverse[..., None])[..., None, :]
+            equations.add(residual, weight * kept**2, (across @ by_unknown)[..., 0, :], (across @ by_shared)[..., 0, :])
+        return cost
+
+    def _inside(
+        self, state: State, posed: Posed, layout: Layout, lens: Lens, equations: NormalEquations | None
+    ) -> float:
+        vertices = np.broadcast_to(self.surface.inner, (len(posed), len(self.surface.inner)))
+        pixels, by_unknown, by_shared = self._projected(state, posed, layout, lens, vertices, equations is not None)
+        value, slope = self._sample(pixels)
+        inverse = 1 / self.deviation[:, None]
+        residual = value * inverse
+        cost, kept = robust(residual**2, 2 * self.limit)
+        if equations is not None:
+            across = (slope * inverse[..., None])[..., None, :]
+            equations.add(
+                residual,
+                self.inner_weight * kept * (value > 0),
+                (across @ by_unknown)[..., 0, :],
+                (across @ by_shared)[..., 0, :],
+            )
+        return self.inner_weight * cost
+
+    def _projected(
+        self, state: State, posed: Posed, layout: Layout, lens: Lens, vertices: Ints, derive: bool
+    ) -> tuple[Floats, Floats, Floats]:
+        parts = self.surface.parts(posed, state.shape, vertices)
+        bones, weights = self.surface.bones[vertices], self.surface.weights[vertices]
+        points = np.einsum("tpb,tpbi->tpi", weights, parts)
+        pixels, by_point = project(points, state, lens)
+        if not derive:
+            return pixels, np.zeros(0), np.zeros(0)
+        local = by_point @ skinned_derivative(posed, parts, weights, bones, layout.active)
+        figure = self.surface.figure
+        shared = np.zeros((*pixels.shape, layout.shared))
+        if figure.names:
+            frames = np.arange(len(posed))[:, None, None]
+            joints = shape_derivative(posed, figure.joint_basis)[frames, bones]  # [T, P, B, 3, K]
+            lever = figure.vertex_basis[:, vertices][:, :, :, None] - figure.joint_basis[:, bones]
+            lever = np.moveaxis(lever, 0, -1)
+            by_shape = joints + posed.world[frames, bones] @ lever
+            shared[..., layout.shape] = by_point @ np.einsum("tpb,tpbik->tpik", weights, by_shape)
+        shared[..., layout.focal] = pixels - lens.centre
+        return pixels, local, shared
+
+    def _sample(self, pixels: Floats) -> tuple[Floats, Floats]:
+        """Distance [T, P] px from the mask and its slope [T, P, 2]; bilinear, level outside the image."""
+        maps = self.outlines.distance
+        frames, high, wide = maps.shape
+        place = pixels * self.outlines.scale - 0.5
+        limit = np.array([wide - 1.001, high - 1.001])
+        inside = np.clip(place, 0, limit)
+        corner = inside.astype(np.int64)
+        s, t = np.moveaxis(inside - corner, -1, 0)
+        x, y = np.moveaxis(corner, -1, 0)
+        k = np.arange(frames)[:, None]
+        a, b, c, d = maps[k, y, x], maps[k, y, x + 1], maps[k, y + 1, x], maps[k, y + 1, x + 1]
+        value = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
+        slope = np.stack([(1 - t) * (b - a) + t * (d - c), (1 - s) * (c - a) + s * (d - b)], -1)
+        return value, slope * self.outlines.scale * (place == inside)
