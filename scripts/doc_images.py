@@ -19,7 +19,8 @@ from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
 from rnd_runtime.raster.cpu import rasterize
-from rnd_runtime.shading.light import Light, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light
 from rnd_viewer.inputs.background import Backdrop, Background
 
 ROOT = Path(__file__).parent.parent

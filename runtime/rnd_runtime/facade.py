@@ -13,8 +13,8 @@ from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.motion import load_motion as load_motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
+from rnd_runtime.shading.files.load import load_light as load_light
 from rnd_runtime.shading.light import Light
-from rnd_runtime.shading.light import load_light as load_light
 
 
 def load_avatar(path: str | Path, *, threads: int | None = None) -> Avatar:

@@ -26,7 +26,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import matrix_to_axis_angle
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_trainer.model.checkpoint import load_checkpoint
 from support.tiny import ASSETS
 

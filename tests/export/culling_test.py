@@ -62,7 +62,7 @@ def test_the_most_is_left_out_that_does_not_show() -> None:
 
     def coded(cull: float) -> np.ndarray:
         """8-bit images."""
-        views = [*around.seen, *around.held_out]
+        views = [*around.search, *around.held_out]
         frames = (FrameRenderer(avatar, light, s.camera, cull=cull).render(motion, s.time) for s in views)
         return np.array([frame.srgb for frame in frames]) / 255.0
 

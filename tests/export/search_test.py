@@ -58,7 +58,7 @@ def test_a_minimum_psnr_holds_in_held_out_views(bench) -> None:
     assert again.psnr == found.held_out.psnr >= 32.0
     whole = steps[0].measured
     assert found.measured.ms < 0.9 * whole.ms and whole.psnr > 100
-    seen, held_out = ({view.time for view in views} for views in (bench.seen, bench.held_out))
+    seen, held_out = ({view.time for view in views} for views in (bench.search, bench.held_out))
     assert not seen & held_out
 
 
@@ -278,8 +278,8 @@ def test_dynamic_skinning_stays_where_it_moves_something(bench) -> None:
     some = Recipe(dynamic_mm=limit)
     model, share = bench.model(some), bench.still_share(some)
     assert 0.4 < share < 0.6 and _sites(model) == {"skinning": round(len(moves) * (1 - share))}
-    whole, less = (bench.measure(bench.model(r), bench.seen) for r in (Recipe(), some))
-    static = bench.measure(bench.model(Recipe(Variant("static"))), bench.seen)
+    whole, less = (bench.measure(bench.model(r), bench.search) for r in (Recipe(), some))
+    static = bench.measure(bench.model(Recipe(Variant("static"))), bench.search)
     assert static.psnr + 3 < less.psnr < whole.psnr
 
 
@@ -356,8 +356,8 @@ def test_what_contributes_more_is_kept_all_over_the_body(tiny_checkpoint) -> Non
 
 
 def test_sides_that_are_fitted_are_of_the_searchs_moments(bench) -> None:
-    motion = random_motion(bench._whole.skeleton, frames=30, seed=2)
-    seen, fitted, held_out = views_around(motion, (32, 32), lambda time: bench._whole.pose(motion, time))
+    motion = random_motion(bench._full.skeleton, frames=30, seed=2)
+    seen, fitted, held_out = views_around(motion, (32, 32), lambda time: bench._full.pose(motion, time))
     assert (len(seen), len(fitted), len(held_out)) == (COUNT, FIT_COUNT, COUNT)
     assert {view.time for view in fitted} == {view.time for view in seen}
     assert not {view.time for view in fitted} & {view.time for view in held_out}
@@ -381,7 +381,7 @@ def test_merging_conserves_the_moments(tiny_checkpoint) -> None:
 
 
 def test_colours_are_fitted_to_the_images(bench) -> None:
-    views = bench._posed(bench._whole)
+    views = bench._posed(bench._full)
     truth = views[0][0].albedo.astype(np.float64)
     wanted = [rasterize(g.means, g.covariances, g.opacities, g.albedo, c, depth=False).image for g, c in views]
     fitted = fitted_albedo(np.full_like(truth, 0.5), views, wanted)
@@ -397,7 +397,7 @@ def test_colours_are_fitted_to_the_images(bench) -> None:
 
 def test_every_rung_is_a_file(bench) -> None:
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
-    what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.seen)
+    what = bench.measure(bench.model(deepest.recipe(bench.config)), bench.search)
     assert 5 < what.psnr < 60
     assert len(given_up(bench, deepest)) == len(LADDERS) - 1  # no window where nothing is dynamic
 
@@ -450,7 +450,7 @@ def test_a_single_pose_is_compared_from_each_camera_with_itself(tiny_checkpoint)
     still = random_motion(load_checkpoint(tiny_checkpoint).skeleton, frames=2, seed=5).at(0.0)
     light = Light(np.ones((32, 64, 3), np.float32))
     bench = Workbench(load_checkpoint(tiny_checkpoint), SearchScene(still, light, size=(48, 48), shade="table"), _clock)
-    assert bench.measure(bench.model(Recipe()), bench.seen).psnr > 100
+    assert bench.measure(bench.model(Recipe()), bench.search).psnr > 100
 
 
 def test_fewer_gaussians_stand_farther_apart(bench) -> None:

@@ -16,7 +16,8 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angl
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
-from rnd_runtime.shading.light import downsize, load_light, texel_directions, texel_solid_angles
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import downsize, texel_directions, texel_solid_angles
 from support.paths import ASSETS
 
 BUDGET = 8 * 1024 * 1024  # bytes for all of them, avatar.onnx apart

@@ -26,7 +26,7 @@ def find_cull(avatar: Avatar, motion: Motion) -> float | None:
     The views are along ``motion`` and all around, ``SIZE`` pixels wide, under the learned light.
     """
     around = views_around(motion, (SIZE, SIZE), lambda time: avatar.pose(motion, time))
-    views = [*around.seen, *around.held_out]
+    views = [*around.search, *around.held_out]
     renderer = FrameRenderer(avatar, Light(avatar.trained_light), views[0].camera, cull=-1)
 
     def images() -> list[Floats]:

@@ -35,7 +35,7 @@ def contributions(views: Sequence[PosedView]) -> Floats:
     return total
 
 
-def merge_gaussians(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar:
+def merge_gaussians(baked: BakedAvatar, count: int, contributed: Floats) -> BakedAvatar:
     """``baked`` reduced to ``count`` Gaussians, or to its nodes if they are more.
 
     Gaussians at nodes are kept. Others are ranked by the sum of their ranks in farthest-point order and contribution,
@@ -43,31 +43,31 @@ def merge_gaussians(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar
     Gaussian is merged into its nearest neighbour: positions and covariances by moments, materials by contribution.
 
     Args:
-        seen: contributions [N].
+        contributed: result of ``contributions`` [N].
     """
-    unseen = seen < MIN_CONTRIBUTION * seen.mean()
-    contribution = np.argsort(np.argsort(seen, kind="stable"))
-    first = np.lexsort((baked.rows - contribution, unseen))
-    is_node = np.zeros(len(seen), bool)
+    unseen = contributed < MIN_CONTRIBUTION * contributed.mean()
+    contribution_rank = np.argsort(np.argsort(contributed, kind="stable"))
+    by_importance = np.lexsort((baked.rows - contribution_rank, unseen))
+    is_node = np.zeros(len(contributed), bool)
     is_node[baked.node_rows] = True
-    order = np.concatenate([baked.node_rows, first[~is_node[first]]])
+    order = np.concatenate([baked.node_rows, by_importance[~is_node[by_importance]]])
     kept = np.sort(order[: max(count, len(baked.node_rows))])
-    owner = cKDTree(baked.all_codes[kept]).query(baked.all_codes)[1]
-    owner[kept] = np.arange(len(kept))
-    mass = np.where(unseen, 0, seen)
-    mass[kept] = np.maximum(seen[kept], MIN_CONTRIBUTION * seen.mean())
+    target = cKDTree(baked.all_codes[kept]).query(baked.all_codes)[1]
+    target[kept] = np.arange(len(kept))
+    weights = np.where(unseen, 0, contributed)
+    weights[kept] = np.maximum(contributed[kept], MIN_CONTRIBUTION * contributed.mean())
 
     def mean(values: Floats) -> Floats:
         """Mean of each merged group, weighted by contribution."""
-        flat = values.reshape(len(mass), -1)
+        flat = values.reshape(len(weights), -1)
         sums = np.zeros((len(kept), flat.shape[1]))
-        np.add.at(sums, owner, mass[:, None] * flat)
-        weight = np.bincount(owner, mass, len(kept))[:, None]
+        np.add.at(sums, target, weights[:, None] * flat)
+        weight = np.bincount(target, weights, len(kept))[:, None]
         return (sums / weight).reshape(len(kept), *values.shape[1:])
 
     points = mean(baked.points)
-    apart = baked.points - points[owner]
-    full = baked.factors @ baked.factors.transpose(0, 2, 1) + apart[:, :, None] * apart[:, None, :]
+    offsets = baked.points - points[target]
+    covariances = baked.factors @ baked.factors.transpose(0, 2, 1) + offsets[:, :, None] * offsets[:, None, :]
     normals = mean(baked.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     index = {int(row): k for k, row in enumerate(kept)}
@@ -76,7 +76,7 @@ def merge_gaussians(baked: BakedAvatar, count: int, seen: Floats) -> BakedAvatar
         baked,
         node_rows=np.array([index[int(row)] for row in baked.node_rows]),
         points=points,
-        factors=_factors(mean(full)),
+        factors=_factors(mean(covariances)),
         normals=normals,
         opacities=mean(baked.opacities),
         albedo=mean(baked.albedo),

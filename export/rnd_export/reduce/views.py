@@ -29,15 +29,15 @@ class SearchView:
 
 
 class SearchViews(NamedTuple):
-    """``seen``: to search in. ``fitted``: for contributions and colours. ``held_out``: for neither."""
+    """``search``: to search in. ``fitted``: for contributions and colours. ``held_out``: for neither."""
 
-    seen: list[SearchView]
+    search: list[SearchView]
     fitted: list[SearchView]
     held_out: list[SearchView]
 
 
 def views_around(motion: Motion, size: tuple[int, int], pose: Callable[[float], Gaussians]) -> SearchViews:
-    """Views along ``motion``, alternating between seen and held out, each framing the avatar in (width, height)."""
+    """Views along ``motion``, alternating between search and held-out, each framing the avatar in (width, height)."""
     times = (np.arange(2 * COUNT) + 0.5) / (2 * COUNT) * motion.duration
     posed = [(float(t), pose(float(t))) for t in times]
 

@@ -18,7 +18,8 @@ from rnd_runtime.core.files import atomic_path, earlier_rows, write_json
 from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.doctor import machine
-from rnd_runtime.shading.light import Light, Up, light_notes, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, Up, light_notes
 from rnd_trainer.model.checkpoint import Checkpoint
 
 from .budget import Bound, Found, given_up, search
@@ -75,7 +76,7 @@ def export_bounded(
             found = search(bench, what.bound, on_step)
         else:  # only the reported times are measured again
             found = replace(found, held_out=bench.measure(found.model, bench.held_out))
-            steps[0] = replace(steps[0], measured=bench.measure(steps[0].model, bench.seen))
+            steps[0] = replace(steps[0], measured=bench.measure(steps[0].model, bench.search))
     with atomic_path(out) as temporary:
         onnx.save_model(found.model, str(temporary))
     assert found.held_out is not None

@@ -208,7 +208,7 @@ def _next(bench: Workbench, plan: Plan, name: str, direction: Literal[1, -1]) ->
 
 def _make(bench: Workbench, plan: Plan) -> Found:
     model = bench.model(plan.recipe(bench.config))
-    return Found(plan, model, bench.measure(model, bench.seen))
+    return Found(plan, model, bench.measure(model, bench.search))
 
 
 def _squared_error(found: Found) -> float:

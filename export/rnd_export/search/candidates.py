@@ -75,7 +75,7 @@ class Measured(NamedTuple):
 
 
 class Workbench:
-    """Makes and measures files; ``seen`` are the views to search in, ``held_out`` others.
+    """Makes and measures files; ``search`` are the views to search in, ``held_out`` others.
 
     Args:
         clock: an avatar's ms per frame; by default a ``PairedTimer``.
@@ -87,16 +87,16 @@ class Workbench:
         refuse_ablations(checkpoint)
         self.config, self._checkpoint, self._scene = checkpoint.config.model, checkpoint, scene
         self._baked = order_gaussians(bake(checkpoint.model))
-        self._whole = _loaded(self.model(Recipe()))
-        self.seen, fitted, self.held_out = scene.views or views_around(
-            scene.motion, scene.size, lambda time: self._whole.pose(scene.motion, time)
+        self._full = _loaded(self.model(Recipe()))
+        self.search, fitted, self.held_out = scene.views or views_around(
+            scene.motion, scene.size, lambda time: self._full.pose(scene.motion, time)
         )
-        renderer = self._renderer(self._whole)
-        self._reference = {view: self._image(renderer, view) for view in (*self.seen, *self.held_out)}
-        self._timer = None if clock else PairedTimer(self._frames(self._whole))
+        renderer = self._renderer(self._full)
+        self._reference = {view: self._image(renderer, view) for view in (*self.search, *self.held_out)}
+        self._timer = None if clock else PairedTimer(self._frames(self._full))
         self._clock = clock or self._timed
         self._fit = [SearchView(view.time, resized(view.camera, FIT_SIDE)) for view in fitted]
-        self._shares = contributions(self._posed(self._whole))
+        self._contributions = contributions(self._posed(self._full))
         self._moves = self._gaussian_moves()
         self._allowed: dict[Precision, bool] = {}
 
@@ -104,9 +104,9 @@ class Workbench:
         """Whether constants of ``precision`` keep positions within ``MAX_P99_M``."""
         if precision not in self._allowed:
             coarser, motion = _loaded(self.model(Recipe(Variant(precision=precision)))), self._scene.motion
-            both = [(self._whole.pose(motion, view.time), coarser.pose(motion, view.time)) for view in self.seen]
-            apart = [np.linalg.norm(exact.means - rounded.means, axis=1) for exact, rounded in both]
-            self._allowed[precision] = bool(np.percentile(apart, 99) <= MAX_P99_M[precision])
+            both = [(self._full.pose(motion, view.time), coarser.pose(motion, view.time)) for view in self.search]
+            errors = [np.linalg.norm(exact.means - rounded.means, axis=1) for exact, rounded in both]
+            self._allowed[precision] = bool(np.percentile(errors, 99) <= MAX_P99_M[precision])
         return self._allowed[precision]
 
     def model(self, recipe: Recipe) -> onnx.ModelProto:
@@ -114,9 +114,9 @@ class Workbench:
         if recipe.dynamic_mm and baked.skinning is not None:
             baked = static_where(baked, self._node_moves(baked) < recipe.dynamic_mm)
         if recipe.gaussians is not None:
-            baked = merge_gaussians(baked, recipe.gaussians, self._shares)
+            baked = merge_gaussians(baked, recipe.gaussians, self._contributions)
             fewer = _loaded(build(self._checkpoint, baked, recipe.variant))
-            wanted = [_albedo_image(*view) for view in self._posed(self._whole)]
+            wanted = [_albedo_image(*view) for view in self._posed(self._full)]
             baked = dataclasses.replace(baked, albedo=fitted_albedo(baked.albedo, self._posed(fewer), wanted))
         model = build(self._checkpoint, baked, recipe.variant)
         add_advice(model, recipe.cull)
@@ -144,7 +144,7 @@ class Workbench:
         return float((self._node_moves(baked) < recipe.dynamic_mm).mean())
 
     def _renderer(self, avatar: Avatar) -> FrameRenderer:
-        return FrameRenderer(avatar, self._scene.light, self.seen[0].camera, shade=self._scene.shade)
+        return FrameRenderer(avatar, self._scene.light, self.search[0].camera, shade=self._scene.shade)
 
     def _image(self, renderer: FrameRenderer, view: SearchView) -> Floats:
         """sRGB [H, W, 3], not rounded."""
@@ -182,9 +182,9 @@ class Workbench:
         if self._baked.skinning is None:
             return largest
         static, motion = _loaded(self.model(Recipe(Variant("static")))), self._scene.motion
-        for view in self.seen:
-            apart = self._whole.pose(motion, view.time).means - static.pose(motion, view.time).means
-            largest = np.maximum(largest, 1e3 * np.linalg.norm(apart, axis=1))
+        for view in self.search:
+            offsets = self._full.pose(motion, view.time).means - static.pose(motion, view.time).means
+            largest = np.maximum(largest, 1e3 * np.linalg.norm(offsets, axis=1))
         return largest
 
 

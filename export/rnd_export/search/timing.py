@@ -45,7 +45,7 @@ class PairedTimer:
     def ms(self, draw: Callable[[int], object]) -> float:
         """Time of a frame of ``draw`` on the idle machine."""
         both = (draw, self._reference)
-        rounds = [[_timed(drawn, k, self._clock) for drawn in both] for k in range(UNTIMED + TIMED)]
+        rounds = [[_timed(draw, k, self._clock) for draw in both] for k in range(UNTIMED + TIMED)]
         times, reference = np.array(rounds[UNTIMED:]).T
         self._taken.extend(reference)
         return float(np.median(times / reference)) * self._idle_ms

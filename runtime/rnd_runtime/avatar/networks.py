@@ -108,7 +108,7 @@ class Networks:
                 raise InputError(name, expected=f"shape {promised}", got=list(value.shape))
 
     def _constants(self, outputs: Sequence[str]) -> list[Floats32]:
-        session = open_session(self._file.cut(outputs), 1)
+        session = open_session(self._file.extract(outputs), 1)
         if session.get_inputs():
             names = ", ".join(outputs)
             raise InputError("graph outputs", expected=f"{names}: constants", got="some that need a pose")
@@ -119,7 +119,7 @@ class Networks:
         if outputs not in self._sessions:
             at_once = len(self._parts) if outputs in self._parts else 1
             threads = -(-self._threads // at_once)
-            self._sessions[outputs] = open_session(self._file.cut(outputs), threads)
+            self._sessions[outputs] = open_session(self._file.extract(outputs), threads)
         return self._sessions[outputs]
 
     @cached_property

@@ -76,11 +76,11 @@ class OnnxFile:
         self.inputs: dict[str, list[int]] = {}
         self.outputs: dict[str, list[int]] = {}
         self.metadata: dict[str, str] = {}
-        for number, value, whole in _fields(data):
+        for number, value, record in _fields(data):
             if number == _MODEL_GRAPH:
                 self._read_graph(value)
                 continue
-            self._head += whole
+            self._head += record
             if number in (_MODEL_TRAINING, _MODEL_FUNCTIONS):
                 raise InputError("ONNX model", expected="one graph", got="functions or training graphs")
             if number == _MODEL_OPSET:
@@ -90,22 +90,22 @@ class OnnxFile:
                 self.metadata[entry.get(1, "")] = entry.get(2, "")
 
     def _read_graph(self, graph: memoryview) -> None:
-        for number, value, whole in _fields(graph):
+        for number, value, record in _fields(graph):
             if number == _GRAPH_NODE:
-                self._nodes.append(_node(value, whole))
+                self._nodes.append(_node(value, record))
             elif number == _GRAPH_INITIALIZER:
-                name, constant = _tensor(value, whole)
+                name, constant = _tensor(value, record)
                 self._constants[name] = constant
             elif number == _GRAPH_SPARSE:
                 raise InputError("ONNX model", expected="dense constants", got="sparse ones")
             elif number == _GRAPH_INPUT:
                 name, shape = _value_info(value)
-                self.inputs[name], self._input_data[name] = shape, whole
+                self.inputs[name], self._input_data[name] = shape, record
             elif number == _GRAPH_OUTPUT:
                 name, shape = _value_info(value)
                 self.outputs[name] = shape
             elif number != _GRAPH_VALUE_INFO:  # shapes that onnxruntime infers anyway
-                self._graph_head += whole
+                self._graph_head += record
 
     @property
     def nodes(self) -> list[Node]:
@@ -117,12 +117,12 @@ class OnnxFile:
         """The graph's tensors by name."""
         return self._constants
 
-    def _lost(self, names: Iterable[str]) -> list[str]:
+    def _missing(self, names: Iterable[str]) -> list[str]:
         """Those of ``names`` that are no value of the graph."""
-        made = {name for node in self._nodes for name in node.outputs}
-        return [n for n in names if not (n in made or n in self._constants or n in self._input_data)]
+        produced = {name for node in self._nodes for name in node.outputs}
+        return [n for n in names if not (n in produced or n in self._constants or n in self._input_data)]
 
-    def cut(self, outputs: Sequence[str]) -> bytes:
+    def extract(self, outputs: Sequence[str]) -> bytes:
         """A model that makes values ``outputs`` (any of the graph's, inner ones too) and nothing else.
 
         Its inputs are those of the whole that are needed for that; metadata are kept.
@@ -130,8 +130,8 @@ class OnnxFile:
         Raises:
             InputError: nothing in the graph makes one of them.
         """
-        if lost := self._lost(outputs):
-            raise InputError("graph outputs", expected=f"something that makes {', '.join(lost)}", got="nothing")
+        if missing := self._missing(outputs):
+            raise InputError("graph outputs", expected=f"something that makes {', '.join(missing)}", got="nothing")
         wanted = set(outputs)
         kept: list[Node] = []
         for node in reversed(self._nodes):  # ONNX demands topological order
@@ -152,7 +152,7 @@ class OnnxFile:
         return bytes(self._head + bytes_field(_MODEL_GRAPH, graph))
 
 
-def _node(data: memoryview, whole: memoryview) -> Node:
+def _node(data: memoryview, record: memoryview) -> Node:
     names: dict[int, list[str]] = {_NODE_INPUT: [], _NODE_OUTPUT: []}
     operator, attributes = "", {}
     for number, value, _ in _fields(data):
@@ -167,7 +167,7 @@ def _node(data: memoryview, whole: memoryview) -> Node:
             if name in attributes:
                 raise InputError("ONNX model", expected=f"one attribute {name}", got="several")
             attributes[name] = numbers
-    return Node(tuple(names[_NODE_INPUT]), tuple(names[_NODE_OUTPUT]), whole, operator, attributes)
+    return Node(tuple(names[_NODE_INPUT]), tuple(names[_NODE_OUTPUT]), record, operator, attributes)
 
 
 def _check_domain(domain: memoryview) -> None:
@@ -178,19 +178,19 @@ def _check_domain(domain: memoryview) -> None:
 def _attribute(data: memoryview) -> tuple[str, tuple[int, ...]]:
     """Name and whole numbers of an AttributeProto."""
     name, numbers = "", []
-    for number, value, whole in _fields(data):
+    for number, value, record in _fields(data):
         if number not in _ATTRIBUTE_PLAIN:
             raise InputError("ONNX model", expected="numbers as attributes", got="graphs or tensors in operators")
         if number == _ATTRIBUTE_NAME:
             name = _text(value)
         elif number == _ATTRIBUTE_TENSOR:
-            _tensor(value, whole)
+            _tensor(value, record)
         elif number in (_ATTRIBUTE_INT, _ATTRIBUTE_INTS):
             numbers += _signed(value)
     return name, tuple(numbers)
 
 
-def _tensor(data: memoryview, whole: memoryview) -> tuple[str, Constant]:
+def _tensor(data: memoryview, record: memoryview) -> tuple[str, Constant]:
     name, kind, raw = "", 0, data[:0]
     dims: list[int] = []
     integers: list[int] = []
@@ -211,7 +211,7 @@ def _tensor(data: memoryview, whole: memoryview) -> tuple[str, Constant]:
         raise InputError("ONNX model", expected="sizes of a constant", got=min(dims))
     if kind == _INT64 and raw:
         integers = list(struct.unpack(f"<{len(raw) // 8}q", raw[: len(raw) // 8 * 8])) if len(raw) <= _SHORT else []
-    return name, Constant(whole, tuple(dims), tuple(integers) if kind == _INT64 else None)
+    return name, Constant(record, tuple(dims), tuple(integers) if kind == _INT64 else None)
 
 
 _SHORT = 1024  # bytes of a constant that may be a shape

@@ -70,9 +70,9 @@ def _axis(node: Node, default: int = 0) -> int:
 
 def _concat(node: Node, shapes: _Shapes) -> list[Shape]:
     parts = [list(shapes(node, k)) for k in range(len(node.inputs))]
-    axis, whole = _axis(node), parts[0]
-    whole[axis] = sum(part[axis] for part in parts)
-    return [tuple(whole)]
+    axis, shape = _axis(node), parts[0]
+    shape[axis] = sum(part[axis] for part in parts)
+    return [tuple(shape)]
 
 
 def _gather(node: Node, shapes: _Shapes) -> list[Shape]:
@@ -92,12 +92,12 @@ def _reshape(node: Node, shapes: _Shapes) -> list[Shape]:
 
 
 def _split(node: Node, shapes: _Shapes) -> list[Shape]:
-    whole, axis, made = shapes(node), _axis(node), []
+    shape, axis, outputs = shapes(node), _axis(node), []
     for size in shapes.numbers(node, 1):
-        part = list(whole)
+        part = list(shape)
         part[axis] = size
-        made.append(tuple(part))
-    return made
+        outputs.append(tuple(part))
+    return outputs
 
 
 def _transpose(node: Node, shapes: _Shapes) -> list[Shape]:
@@ -148,12 +148,12 @@ def check_operators(file: OnnxFile, file_bytes: int) -> None:
     frame = budget.limit * _FRAME_TIMES
     for node in file.nodes:
         try:
-            made = _SHAPES[node.operator](node, shapes)
-            if any(size < 0 for shape in made for size in shape):
+            outputs = _SHAPES[node.operator](node, shapes)
+            if any(size < 0 for shape in outputs for size in shape):
                 raise ValueError("negative size")
         except (KeyError, IndexError, ValueError, ZeroDivisionError) as error:
             raise InputError(f"operator {node.operator}", expected="inputs of known shapes", got=error) from error
-        size = sum(map(math.prod, made)) * _VALUE_BYTES
+        size = sum(map(math.prod, outputs)) * _VALUE_BYTES
         depends = not varying.isdisjoint(node.inputs)
         (Budget(file_bytes) if depends else constants).take(size, f"value {node.outputs[0] if node.outputs else ''}")
         frame -= size if depends else 0
@@ -162,4 +162,4 @@ def check_operators(file: OnnxFile, file_bytes: int) -> None:
                 "values of a frame", expected=f"at most {budget.limit * _FRAME_TIMES >> 20} MB", got="more"
             )
         varying.update(node.outputs if depends else ())
-        shapes.known.update(zip(node.outputs, made))
+        shapes.known.update(zip(node.outputs, outputs))

@@ -16,7 +16,7 @@ from rnd_runtime.core.files import atomic_path, existing_file, is_folder, sha256
 from rnd_runtime.core.kinds import explained
 from rnd_runtime.motion.motion import Motion, load_motion, save_motion
 from rnd_runtime.motion.skeleton import Skeleton
-from rnd_runtime.shading import light as lights
+from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light
 
 from .body import Body as Body
@@ -140,7 +140,7 @@ class Capture:
             known = " or ".join(self.lights) or "none, as the capture lists none"
             raise InputError("light", expected=known, got=name, file=self.folder)
         entry = self.lights[name]
-        return lights.load_light(self.folder / entry.file, yaw=entry.yaw).scaled(entry.scale)
+        return load_light(self.folder / entry.file, yaw=entry.yaw).scaled(entry.scale)
 
 
 def capture_file(path: str | Path) -> Path:

@@ -64,11 +64,11 @@ class GlFinish:
         alpha = np.empty((camera.height, camera.width), np.float32)
         coverage.read_into(alpha, components=1, dtype="f4", alignment=1)
         rows = (camera.height, PACKED * _texels(camera.width))
-        image, codes = np.empty(rows, np.float32), np.empty(rows, np.uint8)
+        image, srgb = np.empty(rows, np.float32), np.empty(rows, np.uint8)
         packed.read_into(image, components=PACKED, dtype="f4", alignment=1)
         if self._tone:
-            packed.read_into(codes, components=PACKED, attachment=1, dtype="f1", alignment=1)
-        return Finished(_unpacked(image, camera), alpha, _unpacked(codes, camera) if self._tone else None)
+            packed.read_into(srgb, components=PACKED, attachment=1, dtype="f1", alignment=1)
+        return Finished(_unpacked(image, camera), alpha, _unpacked(srgb, camera) if self._tone else None)
 
     def release(self) -> None:
         self._pass.release()

@@ -10,7 +10,7 @@ import numpy as np
 
 from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.simd import WIDTH
+from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.skinning import NEVER
 

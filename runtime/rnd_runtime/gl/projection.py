@@ -62,7 +62,7 @@ class GlProjection:
     def project(self, surfaces: Surfaces, camera: Camera, cull: float | None) -> Projected:
         """Project visible Gaussians, except those with n·v below ``cull``."""
         count = surfaces.gaussians
-        (positions, shapes, drawn), target = self._targets.reserve(count)
+        (positions, shapes, centres), target = self._targets.reserve(count)
         view = pinhole(camera)
         self._pass.bind(
             surfaces.textures(),
@@ -78,7 +78,7 @@ class GlProjection:
         self._context.enable_only(moderngl.NOTHING)
         self._pass.fill()
         if self._sort is not None:
-            return Projected(self._sort.order(drawn, count, view.rotation[2]), positions, shapes, count)
+            return Projected(self._sort.order(centres, count, view.rotation[2]), positions, shapes, count)
         assert self._order is not None
         means = np.empty((*target.viewport[2:][::-1], 4), np.float32)
         target.read_into(means, viewport=target.viewport, components=4, attachment=2, dtype="f4")
@@ -104,12 +104,12 @@ def _device_sort(context: moderngl.Context, sorting: Sorting) -> DepthSort | Non
 
 
 @njit(error_model="numpy", nogil=True, cache=True)
-def _back_to_front(drawn, forward):  # type: ignore[no-untyped-def]
-    """Indices [V] of Gaussians with ``drawn[:, 3]`` > 0 by falling depth along ``forward``, then falling index."""
-    count = len(drawn)
+def _back_to_front(means, forward):  # type: ignore[no-untyped-def]
+    """Indices [V] of Gaussians with ``means[:, 3]`` > 0 by falling depth along ``forward``, then falling index."""
+    count = len(means)
     depths, starts = np.empty(count, np.float64), np.zeros(count + 1, np.int64)
     for i in range(count):
-        depths[i] = forward[0] * drawn[i, 0] + forward[1] * drawn[i, 1] + forward[2] * drawn[i, 2]
-        starts[i + 1] = starts[i] + (1 if drawn[i, 3] > 0 else 0)
+        depths[i] = forward[0] * means[i, 0] + forward[1] * means[i, 1] + forward[2] * means[i, 2]
+        starts[i + 1] = starts[i] + (1 if means[i, 3] > 0 else 0)
     order = front_to_back(depths, starts)
     return order[::-1].copy()

@@ -24,7 +24,7 @@ from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.enlarge import enlarged
-from rnd_runtime.raster.in_view import opacities_of, seen_of
+from rnd_runtime.raster.in_view import opacities_of, visible_to
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
@@ -124,7 +124,7 @@ class FrameRenderer:
     def turn(self, yaw: float) -> None:
         """Turn the light to ``yaw`` radians (as ``shading.light.Light``); builds no table."""
         if yaw != self.light.yaw:
-            self.shader = self.shader.turned(yaw)
+            self.shader = self.shader.with_yaw(yaw)
 
     def relight(self, light: Light) -> None:
         """Use another light; builds its tables."""
@@ -165,17 +165,17 @@ class FrameRenderer:
         seconds = dict(raster.seconds)
         layers = aov_layers(aovs, raster, 3 if lit else 0)
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
-        alpha, codes = raster.alpha, raster.srgb
+        alpha, image_srgb = raster.alpha, raster.srgb
         started = perf_counter()
         if rendered is not camera:
             image = enlarged(np.dstack([radiance, alpha]), camera.height, camera.width)
-            radiance, alpha, codes = image[..., :3], image[..., 3], None
+            radiance, alpha, image_srgb = image[..., :3], image[..., 3], None
             seconds["enlarging"] = perf_counter() - started
             started = perf_counter()
-        if srgb and codes is None:
-            codes = tone_map(radiance, alpha)
+        if srgb and image_srgb is None:
+            image_srgb = tone_map(radiance, alpha)
             seconds["tone map"] = perf_counter() - started
-        return RenderedFrame(radiance, alpha, layers, seconds, srgb_on_black=codes)
+        return RenderedFrame(radiance, alpha, layers, seconds, srgb_on_black=image_srgb)
 
     def close(self) -> None:
         """Release the rasteriser."""
@@ -252,17 +252,17 @@ def draw_gaussians(
     if lit and not aovs and isinstance(rasterizer, ChosenRasterizer) and rasterizer.renderer is not None:
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
-    seen = seen_of(gaussians, camera, cull)
-    features = [shader.shade(gaussians, camera.position, seen)] if lit else []
+    visible = visible_to(gaussians, camera, cull)
+    features = [shader.shade(gaussians, camera.position, visible)] if lit else []
     features += splat_features(aovs, gaussians, camera)
     attributes = features[0] if len(features) == 1 else np.concatenate(features, axis=1)
     shading, depth = perf_counter() - started, "depth" in aovs
     arrays = gaussians.means, gaussians.covariances
     if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
         raster = raster_cpu.rasterize(
-            *arrays, gaussians.opacities, attributes, camera, depth=depth, outlines=True, seen=seen
+            *arrays, gaussians.opacities, attributes, camera, depth=depth, outlines=True, visible=visible
         )
     else:
-        opacities = opacities_of(gaussians, seen)
+        opacities = opacities_of(gaussians, visible)
         raster = sharpened(rasterizer(*arrays, opacities, attributes.astype(np.float32), camera, depth=depth))
     return replace(raster, seconds={"shading": shading, **raster.seconds})

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats
-from rnd_runtime.core.simd import WIDTH
+from rnd_runtime.core.simd.vectors import WIDTH
 
 from .skinning import (
     FACTORS,

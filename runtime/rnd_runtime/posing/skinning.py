@@ -29,20 +29,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from rnd_runtime.core.simd import (
-    WIDTH,
-    aligned_floats,
-    broadcast,
-    exp2,
-    lanes,
-    load,
-    prefetch,
-    prefetch_to_write,
-    select,
-    sqrt,
-    store,
-    transpose,
-)
+from rnd_runtime.core.simd.arithmetic import exp2, lanes, select, sqrt
+from rnd_runtime.core.simd.memory import aligned_floats, broadcast, load, prefetch, prefetch_to_write, store, transpose
+from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import SH_COUNT
 
 Floats32 = NDArray[np.float32]

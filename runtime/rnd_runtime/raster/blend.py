@@ -11,24 +11,20 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from rnd_runtime.core.simd import (
-    WIDTH,
-    aligned_floats,
+from rnd_runtime.core.simd.arithmetic import (
     any_lane,
     bits,
     block_x,
     block_y,
     exp2,
-    fetch_add,
     lanes,
-    load,
     lowest_bit,
     magnitude,
-    prefetch,
     reduce_add,
     select,
-    store,
 )
+from rnd_runtime.core.simd.memory import aligned_floats, fetch_add, load, prefetch, store
+from rnd_runtime.core.simd.vectors import WIDTH
 
 from .outline import sharpening
 from .project import TILE
@@ -123,8 +119,8 @@ def _overlap_mask(block, count, shapes):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped-def]
-    """Fill ``weights`` [BATCH, 16] of Gaussians ``reaching`` a block; takes and returns its transmittance ``left``."""
+def _weights(block, reaching, shapes, transmittance, weights):  # type: ignore[no-untyped-def]
+    """Fill ``weights`` [BATCH, 16] of Gaussians ``reaching`` a block; takes and returns its ``transmittance``."""
     columns, rows = _centers(block)
     while reaching != 0:
         k = lowest_bit(reaching)
@@ -133,12 +129,12 @@ def _weights(block, reaching, shapes, left, weights):  # type: ignore[no-untyped
         d = columns - shapes[k] - shapes[_SHEAR + k] * dy
         power = shapes[_PEAK + k] - shapes[_FALL_Y + k] * dy * dy - shapes[_FALL_X + k] * d * d
         alpha = exp2(select(power < LOG2_ALPHA_MAX, power, LOG2_ALPHA_MAX))
-        weight = left * select(power >= LOG2_ALPHA_MIN, alpha, ZERO)
-        after = left - weight
+        weight = transmittance * select(power >= LOG2_ALPHA_MIN, alpha, ZERO)
+        after = transmittance - weight
         unfinished = after >= TRANSMITTANCE_MIN
         store(weights, k * WIDTH, select(unfinished, weight, ZERO))
-        left = select(unfinished, after, ZERO)
-    return left
+        transmittance = select(unfinished, after, ZERO)
+    return transmittance
 
 
 @njit(inline="always")
@@ -179,9 +175,9 @@ def _blend_tile(tile_x, tile_y, first, last, splats, buffers):  # type: ignore[n
             reaching = _overlap_mask(block, count, shapes)
             if reaching == 0:
                 continue
-            left = _weights(block, reaching, shapes, load(transmittance, block * WIDTH), weights)
-            store(transmittance, block * WIDTH, left)
-            if not any_lane(left > ZERO):
+            after = _weights(block, reaching, shapes, load(transmittance, block * WIDTH), weights)
+            store(transmittance, block * WIDTH, after)
+            if not any_lane(after > ZERO):
                 open_blocks &= ~(1 << block)
             for c in range(0, columns, 4):
                 _accumulate((block * columns + c) * WIDTH, reaching, weights, colours, c, columns, sums)

@@ -48,7 +48,7 @@ def rasterize(
     *,
     depth: bool = True,
     outlines: bool = False,
-    seen: ArrayLike | None = None,
+    visible: ArrayLike | None = None,
 ) -> Raster:
     """Splat N Gaussians.
 
@@ -60,13 +60,13 @@ def rasterize(
         camera: the view.
         depth: False leaves the depth image zero.
         outlines: sharpen them (``.outline``).
-        seen: [N] Gaussians to render, from ``raster.in_view.in_view``; all by default.
+        visible: [N] Gaussians to render, from ``raster.in_view.in_view``; all by default.
 
     Raises:
         InputError: an array has the wrong shape.
     """
     arrays = checked(means, covariances, opacities, features)
-    chosen = _EVERYTHING if seen is None else mask(seen, len(arrays[0]))
+    chosen = _EVERYTHING if visible is None else mask(visible, len(arrays[0]))
     return _splat(arrays, chosen, pinhole(camera), depth, False, outlines)[0]
 
 
@@ -88,7 +88,7 @@ def forward(
 
 def _splat(
     arrays: tuple[Floats32, Floats32, Floats32, Floats32],
-    seen: NDArray[np.bool_],
+    visible: NDArray[np.bool_],
     view: Pinhole,
     depth: bool,
     differentiable: bool,
@@ -97,7 +97,7 @@ def _splat(
     """The raster, the splats, and features and depth in one image [H, W, K]."""
     started = perf_counter()
     threads, channels = get_num_threads(), arrays[3].shape[1]
-    centers, shapes, boxes, attributes, depths, slot_starts = project(*arrays, seen, view, depth)
+    centers, shapes, boxes, attributes, depths, slot_starts = project(*arrays, visible, view, depth)
     projected = perf_counter()
     size = view.width, view.height
     tile_starts, *pairs = sort_into_tiles(boxes, depths, slot_starts, size, threads, differentiable)

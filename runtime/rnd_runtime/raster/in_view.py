@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from rnd_runtime.core.arrays import check_shape, floats
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.simd import WIDTH, load, load_points, sqrt, store_mask
+from rnd_runtime.core.simd.arithmetic import sqrt
+from rnd_runtime.core.simd.memory import load, load_points, store_mask
+from rnd_runtime.core.simd.vectors import WIDTH
 
 from .oracle import ALPHA_MIN, DILATION, NEAR
 from .project import Pinhole, pinhole
@@ -55,21 +57,21 @@ def in_view(
     else:
         facing, min_cosine = floats(normals), np.float32(cull)
     check_shape("normals", facing, (count, 3))
-    seen: NDArray[np.bool_] = find_in_view(
+    visible: NDArray[np.bool_] = find_in_view(
         means, covariances, opacities, facing, floats(camera.position), min_cosine, pinhole(camera)
     )
-    return seen
+    return visible
 
 
-def seen_of(gaussians: Gaussians, camera: Camera, cull: float | None = None) -> NDArray[np.bool_]:
+def visible_to(gaussians: Gaussians, camera: Camera, cull: float | None = None) -> NDArray[np.bool_]:
     """``in_view`` of ``gaussians``."""
     arrays = gaussians.means, gaussians.covariances, gaussians.opacities
     return in_view(*arrays, camera, normals=gaussians.normals, cull=cull)
 
 
-def opacities_of(gaussians: Gaussians, seen: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Opacities [N], 0 where not ``seen``, for rasterisers without a mask."""
-    return np.where(seen, gaussians.opacities, np.float32(0))
+def opacities_of(gaussians: Gaussians, visible: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Opacities [N], 0 where not ``visible``, for rasterisers without a mask."""
+    return np.where(visible, gaussians.opacities, np.float32(0))
 
 
 @njit(inline="always")
@@ -127,7 +129,7 @@ def _along(eye, x, y, z, normal):  # type: ignore[no-untyped-def]
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def find_in_view(means, covariances, opacities, normals, eye, min_cosine, view):  # type: ignore[no-untyped-def]
     """``in_view`` from ``eye`` [3] with n·v ≥ ``min_cosine``; EVERYTHING ignores normals."""
-    seen = np.empty(len(means), np.bool_)
+    visible = np.empty(len(means), np.bool_)
     sides = np.empty((5, 5), np.float64)
     sides[0] = _side(view, 0, view.fx, view.cx, view.low_x, view.high_x)
     sides[1] = _side(view, 0, -view.fx, view.width - view.cx, view.low_x, view.high_x)
@@ -135,15 +137,15 @@ def find_in_view(means, covariances, opacities, normals, eye, min_cosine, view):
     sides[3] = _side(view, 1, -view.fy, view.height - view.cy, view.low_y, view.high_y)
     sides[4] = _ahead(view)
     arrays = (means, covariances, opacities, normals)
-    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
-        last = min((chunk + 1) * CHUNK, len(seen))
-        _find_in_view(chunk * CHUNK, last, arrays, sides, (eye, min_cosine), seen)
-    return seen
+    for chunk in prange((len(visible) + CHUNK - 1) // CHUNK):
+        last = min((chunk + 1) * CHUNK, len(visible))
+        _find_in_view(chunk * CHUNK, last, arrays, sides, (eye, min_cosine), visible)
+    return visible
 
 
 @njit(error_model="numpy")
-def _find_in_view(first, last, arrays, sides, limits, seen):  # type: ignore[no-untyped-def]
-    """Fill ``seen`` from ``first``, a multiple of sixteen, up to ``last``."""
+def _find_in_view(first, last, arrays, sides, limits, visible):  # type: ignore[no-untyped-def]
+    """Fill ``visible`` from ``first``, a multiple of sixteen, up to ``last``."""
     means, covariances, opacities, normals = arrays
     eye, min_cosine = limits
     culling = min_cosine > EVERYTHING
@@ -158,10 +160,10 @@ def _find_in_view(first, last, arrays, sides, limits, seen):  # type: ignore[no-
         if culling:
             along, squared = _along(eye, x, y, z, load_points(normals, 3 * i))
             inside = inside & (along - min_cosine * sqrt(squared) >= ZERO)
-        store_mask(seen, i, inside)
-    seen[sixteens:last] = False
+        store_mask(visible, i, inside)
+    visible[sixteens:last] = False
     for i in range(first, last):
-        if seen[i] or not opacities[i] >= MIN_OPACITY:
+        if visible[i] or not opacities[i] >= MIN_OPACITY:
             continue
         if culling:
             along, squared = _along(eye, means[i, 0], means[i, 1], means[i, 2], normals[i])
@@ -172,4 +174,4 @@ def _find_in_view(first, last, arrays, sides, limits, seen):  # type: ignore[no-
         reached = True
         for side in sides:
             reached = reached and _distance(side, x, y, z, sigma) >= 0.0
-        seen[i] = reached
+        visible[i] = reached

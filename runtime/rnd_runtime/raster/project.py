@@ -113,16 +113,16 @@ def tile_range(boxes, i):  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy")
-def project_range(first, last, means, covariances, opacities, features, seen, view, outputs):  # type: ignore[no-untyped-def]
+def project_range(first, last, means, covariances, opacities, features, visible, view, outputs):  # type: ignore[no-untyped-def]
     """Fill rows first … last − 1; ``tiles`` counts the tiles of each, 0 where it is skipped.
 
-    ``seen`` is a mask, or empty for all. NaN fails every guard.
+    ``visible`` is a mask, or empty for all. NaN fails every guard.
     """
     centers, shapes, boxes, attributes, depths, tiles = outputs
     channels = features.shape[1]
     for i in range(first, last):
         tiles[i] = 0
-        if len(seen) > 0 and not seen[i]:
+        if len(visible) > 0 and not visible[i]:
             continue
         opacity = np.float64(opacities[i])
         x, y, z = _camera_point(view, means, i)
@@ -172,8 +172,8 @@ def project_range(first, last, means, covariances, opacities, features, seen, vi
 
 
 @njit(parallel=True, error_model="numpy", nogil=True, cache=True)
-def project(means, covariances, opacities, features, seen, view, with_depth):  # type: ignore[no-untyped-def]
-    """Project N Gaussians, or those ``seen`` [N] where that is not empty; arrays are float32 and contiguous.
+def project(means, covariances, opacities, features, visible, view, with_depth):  # type: ignore[no-untyped-def]
+    """Project N Gaussians, or those ``visible`` [N] where that is not empty; arrays are float32 and contiguous.
 
     Returns:
         centers: [N, 2] px, float64.
@@ -193,7 +193,7 @@ def project(means, covariances, opacities, features, seen, view, with_depth):  #
     outputs = (centers, shapes, boxes, attributes, depths, slot_starts[1:])
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         last = min((chunk + 1) * CHUNK, count)
-        project_range(chunk * CHUNK, last, means, covariances, opacities, features, seen, view, outputs)
+        project_range(chunk * CHUNK, last, means, covariances, opacities, features, visible, view, outputs)
     for i in range(count):
         slot_starts[i + 1] += slot_starts[i]
     return centers, shapes, boxes, attributes, depths, slot_starts

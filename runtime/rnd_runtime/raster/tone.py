@@ -63,12 +63,12 @@ def _checked(radiance: ArrayLike, alpha: ArrayLike) -> tuple[Floats32, Floats32]
 @cache
 def tone_tables() -> tuple[Floats32, NDArray[np.uint8]]:
     """``code_steps``, and the code at each cell's start."""
-    codes = np.arange(1, 256)
+    levels = np.arange(1, 256)
     low = np.zeros(255, np.int64)  # bits of positive floats are ordered as the floats are
     high = np.full(255, np.float32(1).view(np.int32), np.int64)
     while (high - low > 1).any():
         middle = (low + high) // 2
-        reached = to_bytes(linear_to_srgb(middle.astype(np.int32).view(np.float32))) >= codes
+        reached = to_bytes(linear_to_srgb(middle.astype(np.int32).view(np.float32))) >= levels
         low, high = np.where(reached, low, middle), np.where(reached, middle, high)
     steps = np.concatenate([[0], high.astype(np.int32).view(np.float32), [np.inf]]).astype(np.float32)
     start = int(_LOWEST.view(np.int32)) >> _SHIFT

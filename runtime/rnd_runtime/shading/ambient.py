@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.simd import WIDTH, aligned_floats, at_least, lanes, load, store
+from rnd_runtime.core.simd.arithmetic import at_least, lanes
+from rnd_runtime.core.simd.memory import aligned_floats, load, store
+from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import COSINE_LOBE, compiled_sh_columns, sh_basis, sh_rotation
 
 from .lanes import (
@@ -55,12 +57,12 @@ class AmbientLight:
         return cls(np.einsum("hwj,hwc->jc", sh_basis(texel_directions(*texels)), flux))
 
     def shade(
-        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
+        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, visible: ArrayLike | None = None
     ) -> Floats32:
         """Linear radiance [N, 3] towards the camera: (albedo · E(n)/π + unoccluded specular) · occlusion.
 
         Occlusion is the cosine-weighted mean visibility over the upper hemisphere. Occlusion and E(n) are exact up to
-        degree 2 and independent of each other. 0 where not ``seen``.
+        degree 2 and independent of each other. 0 where not ``visible``.
         """
         root = np.asarray(gaussians.root_rotation, np.float64)
         in_root = sh_rotation(root.T @ light_to_world) @ self.coefficients
@@ -71,21 +73,21 @@ class AmbientLight:
             np.array(camera_position, np.float32),
             np.array(root, np.float32, order="C"),
             (np.array(in_root, np.float32, order="C"), lobe_rows()),
-            mask(seen, len(radiance)),
+            mask(visible, len(radiance)),
             radiance,
         )
         return radiance
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _ambient(surfaces, camera, root_rotation, tables, seen, radiance):  # type: ignore[no-untyped-def]
+def _ambient(surfaces, camera, root_rotation, tables, visible, radiance):  # type: ignore[no-untyped-def]
     """``.lookup.shade_from_tables`` with ``tables``: the light [16, 3] in the root's frame, and the lobes."""
-    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+    for chunk in prange((len(visible) + CHUNK - 1) // CHUNK):
         indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(FREE)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
-        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(visible))
         while i < last:
-            i, count = gather(i, last, seen, surfaces, camera, indices, scratch)
+            i, count = gather(i, last, visible, surfaces, camera, indices, scratch)
             if count > 0:
                 _shade_sixteen(indices, surfaces[4], root_rotation, tables, scratch, rows, columns)
                 scatter(count, indices, scratch, radiance)

@@ -25,7 +25,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from rnd_runtime.core import simd
+from rnd_runtime.core.simd.arithmetic import at_least, sqrt
 
 F0 = 0.04
 ROUGHNESS_RANGE = (0.09, 0.99)  # GGX's D overflows half floats below 0.089
@@ -73,4 +73,4 @@ def _ggx(sqrt: Callable[[Any], Any], at_least: Callable[[Any, Any], Any], number
 
 ggx = _ggx(lambda x: x**0.5, lambda x, low: x.clip(min=low), float)  # numpy or torch
 ggx_scalar = numba.njit(_ggx(np.sqrt, max, np.float32), fastmath=True, error_model="numpy")
-ggx_lanes = numba.njit(_ggx(simd.sqrt, simd.at_least, np.float32), error_model="numpy")
+ggx_lanes = numba.njit(_ggx(sqrt, at_least, np.float32), error_model="numpy")

@@ -13,7 +13,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from rnd_runtime.core.simd import WIDTH, aligned_floats, at_least, lanes, load, select, sqrt, store
+from rnd_runtime.core.simd.arithmetic import at_least, lanes, select, sqrt
+from rnd_runtime.core.simd.memory import aligned_floats, load, store
+from rnd_runtime.core.simd.vectors import WIDTH
 
 from .brdf import ROUGHNESS_RANGE, ggx_lanes
 from .lanes import (
@@ -55,19 +57,19 @@ class DirectionalArrays(NamedTuple):
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def add_directional(surfaces, visibility, camera, lights, seen, radiance):  # type: ignore[no-untyped-def]
-    """Add direct light on the Gaussians ``seen`` [N] to ``radiance`` [N, 3], where ``visibility`` [N, S] is not 0.
+def add_directional(surfaces, visibility, camera, lights, visible, radiance):  # type: ignore[no-untyped-def]
+    """Add direct light on the Gaussians ``visible`` [N] to ``radiance`` [N, 3], where ``visibility`` [N, S] is not 0.
 
     ``surfaces`` as for ``.lanes.gather``; ``camera`` [3] m.
     """
-    lit = np.empty(len(seen), np.bool_)
-    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+    lit = np.empty(len(visible), np.bool_)
+    for chunk in prange((len(visible) + CHUNK - 1) // CHUNK):
         indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(_SCRATCH)
-        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(visible))
         for k in range(i, last):
             lit[k] = False
             for light in range(visibility.shape[1]):
-                lit[k] |= seen[k] and visibility[k, light] > ZERO
+                lit[k] |= visible[k] and visibility[k, light] > ZERO
         while i < last:
             i, count = gather(i, last, lit, surfaces, camera, indices, scratch)
             if count > 0:
@@ -92,7 +94,7 @@ def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-unt
             scratch[_OPEN + k] = visibility[indices[k], light]
         lx, ly, lz = lights.directions[light, 0], lights.directions[light, 1], lights.directions[light, 2]
         n_dot_l = normal[0] * lx + normal[1] * ly + normal[2] * lz
-        arriving = at_least(facing * load(scratch, _OPEN) * n_dot_l, ZERO)
+        visible_cosine = at_least(facing * load(scratch, _OPEN) * n_dot_l, ZERO)
         hx, hy, hz = view[0] + lx, view[1] + ly, view[2] + lz
         half_squared = at_least(hx * hx + hy * hy + hz * hz, TINY)
         cx, cy = normal[1] * hz - normal[2] * hy, normal[2] * hx - normal[0] * hz
@@ -101,9 +103,9 @@ def _light_sixteen(indices, visibility, lights, scratch):  # type: ignore[no-unt
         alpha_squared = alpha * alpha + lights.spread_squared[light] / sqrt(half_squared)
         alpha_squared = select(alpha_squared < ONE, alpha_squared, ONE)
         specular = ggx_lanes(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
-        red += arriving * (albedo[0] * ONE_OVER_PI + specular) * lights.irradiance[light, 0]
-        green += arriving * (albedo[1] * ONE_OVER_PI + specular) * lights.irradiance[light, 1]
-        blue += arriving * (albedo[2] * ONE_OVER_PI + specular) * lights.irradiance[light, 2]
+        red += visible_cosine * (albedo[0] * ONE_OVER_PI + specular) * lights.irradiance[light, 0]
+        green += visible_cosine * (albedo[1] * ONE_OVER_PI + specular) * lights.irradiance[light, 1]
+        blue += visible_cosine * (albedo[2] * ONE_OVER_PI + specular) * lights.irradiance[light, 2]
     store(scratch, RADIANCE, red)
     store(scratch, RADIANCE + WIDTH, green)
     store(scratch, RADIANCE + 2 * WIDTH, blue)

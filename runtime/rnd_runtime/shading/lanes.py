@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from rnd_runtime.core.simd import WIDTH, at_least, broadcast, floor, load, magnitude, select, sqrt, store, transpose
+from rnd_runtime.core.simd.arithmetic import at_least, floor, magnitude, select, sqrt
+from rnd_runtime.core.simd.memory import broadcast, load, store, transpose
+from rnd_runtime.core.simd.vectors import WIDTH
 
 from .brdf import ROUGHNESS_RANGE
 from .specular_lobe import COSINE_COUNT, ROUGHNESS_COUNT
@@ -31,15 +33,15 @@ FREE = 18 * WIDTH
 
 
 @njit(error_model="numpy")
-def gather(first, last, seen, surfaces, camera, indices, scratch):  # type: ignore[no-untyped-def]
-    """Gather the next sixteen of the Gaussians ``seen`` [N] from ``first`` on; return the next position and the count.
+def gather(first, last, visible, surfaces, camera, indices, scratch):  # type: ignore[no-untyped-def]
+    """Gather the next sixteen ``visible`` [N] Gaussians from ``first`` on; return the next position and the count.
 
     ``surfaces``: means, normals, albedo, roughness, visibility. Fewer than sixteen are padded with the first.
     """
     means, normals, albedo, roughness, _ = surfaces
     i, k = first, 0
     while i < last and k < WIDTH:
-        if seen[i]:
+        if visible[i]:
             for axis in range(3):
                 scratch[NORMAL + axis * WIDTH + k] = normals[i, axis]
                 scratch[VIEW + axis * WIDTH + k] = camera[axis] - means[i, axis]

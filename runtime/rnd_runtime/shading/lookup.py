@@ -5,20 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from rnd_runtime.core.simd import (
-    WIDTH,
-    aligned_floats,
-    at_least,
-    broadcast,
-    floor,
-    lanes,
-    load,
-    magnitude,
-    reduce_add,
-    select,
-    store,
-    transpose,
-)
+from rnd_runtime.core.simd.arithmetic import at_least, floor, lanes, magnitude, reduce_add, select
+from rnd_runtime.core.simd.memory import aligned_floats, broadcast, load, store, transpose
+from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import compiled_sh_columns
 
 from .lanes import (
@@ -66,8 +55,8 @@ _SCRATCH = FREE + 5 * WIDTH
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def shade_from_tables(surfaces, camera, rotations, tables, seen, radiance):  # type: ignore[no-untyped-def]
-    """Fill ``radiance`` [N, 3] of the Gaussians ``seen`` [N].
+def shade_from_tables(surfaces, camera, rotations, tables, visible, radiance):  # type: ignore[no-untyped-def]
+    """Fill ``radiance`` [N, 3] of the Gaussians ``visible`` [N].
 
     Args:
         surfaces: means [N, 3] m, normals [N, 3], albedo [N, 3], roughness [N] and visibility [N, 16].
@@ -76,12 +65,12 @@ def shade_from_tables(surfaces, camera, rotations, tables, seen, radiance):  # t
         tables: diffuse [33·33, 3·16] for visibility in the root's frame; specular [49·49, 7, 16] of cells; lobes
             [16, 49, 16].
     """
-    for chunk in prange((len(seen) + CHUNK - 1) // CHUNK):
+    for chunk in prange((len(visible) + CHUNK - 1) // CHUNK):
         indices, scratch = np.empty(WIDTH, np.int64), aligned_floats(_SCRATCH)
         rows, columns = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
-        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(seen))
+        i, last = chunk * CHUNK, min((chunk + 1) * CHUNK, len(visible))
         while i < last:
-            i, count = gather(i, last, seen, surfaces, camera, indices, scratch)
+            i, count = gather(i, last, visible, surfaces, camera, indices, scratch)
             if count > 0:
                 _shade_sixteen(indices, surfaces[4], rotations, tables, scratch, rows, columns)
                 scatter(count, indices, scratch, radiance)

@@ -110,8 +110,8 @@ def _sum_over_texels(
         n_dot_l, l_dot_v = normals @ directions.T, to_camera[part] @ directions.T  # [chunk, K]
         n_dot_v = np.sum(normals * to_camera[part], axis=-1, keepdims=True)
         roughness = np.asarray(gaussians.roughness[part], np.float64)[:, None]
-        arriving = visibility(part) * np.maximum(n_dot_l, 0)
+        visible_cosine = visibility(part) * np.maximum(n_dot_l, 0)
         # f = albedo/π + specular, which all channels share
-        specular_sum = arriving * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
-        radiance[part] = gaussians.albedo[part] / np.pi * (arriving @ flux) + specular_sum @ flux
+        specular_sum = visible_cosine * specular(roughness, n_dot_l, n_dot_v, l_dot_v)
+        radiance[part] = gaussians.albedo[part] / np.pi * (visible_cosine @ flux) + specular_sum @ flux
     return radiance

@@ -47,7 +47,7 @@ class Shader:
     """Shades Gaussians under one light; built once per light, called for every frame.
 
     Args:
-        light: the probe. ``turned`` changes its yaw at no cost.
+        light: the probe. ``with_yaw`` changes its yaw at no cost.
         mode: one of SHADE_MODES, with a number for K.
         texels: (height, width) the probe is downsized to. Visibility has degree 3 and is trained on 32 × 64; more
             changes highlights below roughness 0.4 only.
@@ -83,9 +83,9 @@ class Shader:
             np.array([light_.spread**2 for light_ in self.directional], np.float32),
         )
 
-    def turned(self, yaw: float) -> Shader:
+    def with_yaw(self, yaw: float) -> Shader:
         """The same light at another ``yaw`` (radians, as ``Light``); shares all tables."""
-        light = self.light.turned(yaw)
+        light = self.light.with_yaw(yaw)
         return shallow_copy(self, light=light, light_to_world=light.rotation)
 
     def in_frame(self, frame_to_world: ArrayLike) -> Shader:
@@ -93,16 +93,21 @@ class Shader:
         return shallow_copy(self, light_to_world=np.asarray(frame_to_world, np.float64).T @ self.light.rotation)
 
     def shade(
-        self, gaussians: Gaussians, camera_position: ArrayLike, seen: ArrayLike | None = None, *, shadows: bool = True
+        self,
+        gaussians: Gaussians,
+        camera_position: ArrayLike,
+        visible: ArrayLike | None = None,
+        *,
+        shadows: bool = True,
     ) -> Floats32:
         """Linear radiance [N, 3], not negative, of each Gaussian towards the camera at [3] m.
 
-        Gaussians that are not ``seen`` [N] keep radiance 0 and still cast shadows; all are seen by default. Without
-        ``shadows`` directional lights are unoccluded.
+        Gaussians that are not ``visible`` [N] keep radiance 0 and still cast shadows; all are visible by default.
+        Without ``shadows`` directional lights are unoccluded.
         """
         light_to_world = self.light_to_world
-        seen = mask(seen, len(gaussians.means))
-        radiance = self.sky.shade(gaussians, camera_position, light_to_world, seen)
+        visible = mask(visible, len(gaussians.means))
+        radiance = self.sky.shade(gaussians, camera_position, light_to_world, visible)
         if self.directional and len(radiance):
             lights = self.directional_arrays()
             visibility = np.ones((len(radiance), len(lights.directions)), np.float32)
@@ -113,11 +118,11 @@ class Shader:
                     lights.directions,
                     radii=shadow_radii(gaussians),
                     resolution=SHADOW_RESOLUTION,
-                    receivers=seen,
+                    receivers=visible,
                 )
             surfaces = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
             eye = np.array(camera_position, np.float32)
-            add_directional(tuple(floats(a) for a in surfaces), floats(visibility), eye, lights, seen, radiance)
+            add_directional(tuple(floats(a) for a in surfaces), floats(visibility), eye, lights, visible, radiance)
         return radiance
 
     def directional_arrays(self) -> DirectionalArrays:
@@ -125,8 +130,8 @@ class Shader:
         directions, irradiance, spreads = self._in_probe
         if not self.directional:
             return DirectionalArrays(irradiance, irradiance, spreads)
-        turned = directions @ self.light_to_world.T
-        return DirectionalArrays(np.array(turned, np.float32, order="C"), irradiance, spreads)
+        in_frame = directions @ self.light_to_world.T
+        return DirectionalArrays(np.array(in_frame, np.float32, order="C"), irradiance, spreads)
 
 
 def check_mode(mode: str) -> None:

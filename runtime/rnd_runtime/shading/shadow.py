@@ -16,7 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.simd import WIDTH, aligned_floats, block_x, block_y, lanes, load, maximum, store
+from rnd_runtime.core.simd.arithmetic import block_x, block_y, lanes, maximum
+from rnd_runtime.core.simd.memory import aligned_floats, load, store
+from rnd_runtime.core.simd.vectors import WIDTH
 
 Floats32 = NDArray[np.float32]
 

@@ -77,14 +77,14 @@ class DistantLights:
         return cls(np.reshape(directions, (-1, 3)), np.reshape(flux, (-1, 3)))
 
     def shade(
-        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
+        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, visible: ArrayLike | None = None
     ) -> Floats32:
-        """Linear radiance [N, 3] towards the camera, as ``shade_reference`` over these lights; 0 where not ``seen``."""
+        """Linear radiance [N, 3] towards the camera, as ``shade_reference``; 0 where not ``visible``."""
         directions = self.directions @ light_to_world.T
         basis = sh_basis(directions @ np.asarray(gaussians.root_rotation, np.float64))  # rows times R: root's frame
         radiance = np.zeros((len(gaussians.means), 3), np.float32)
         means, normals, albedo = (floats(a) for a in (gaussians.means, gaussians.normals, gaussians.albedo))
-        visibility, seen = floats(gaussians.visibility), mask(seen, len(radiance))
+        visibility, visible = floats(gaussians.visibility), mask(visible, len(radiance))
         surfaces = (means, normals, albedo, floats(gaussians.roughness), visibility)
         _sum_lights(
             means,
@@ -95,7 +95,7 @@ class DistantLights:
             tuple(array.view(np.int32) for array in surfaces),
             np.array(camera_position, np.float32),
             *(np.array(a.T, np.float32, order="C") for a in (directions, basis, self.flux)),
-            seen,
+            visible,
             radiance,
         )
         return radiance
@@ -147,14 +147,14 @@ def _is_finite(bits, i):  # type: ignore[no-untyped-def]
 
 @numba.njit(parallel=True, nogil=True, cache=True, fastmath=True, error_model="numpy")
 def _sum_lights(  # type: ignore[no-untyped-def]
-    means, normals, albedo, alpha, visibility, bits, camera, directions, basis, flux, seen, radiance
+    means, normals, albedo, alpha, visibility, bits, camera, directions, basis, flux, visible, radiance
 ):
     """Fill ``radiance`` [N, 3]; arrays of lights are transposed, [3, K] and [16, K], for vectorisation.
 
     ``bits``: see ``_is_finite``.
     """
     for i in numba.prange(len(means)):
-        if not seen[i]:
+        if not visible[i]:
             continue
         if not _is_finite(bits, i):
             radiance[i, 0] = radiance[i, 1] = radiance[i, 2] = _NAN
@@ -183,11 +183,11 @@ def _sum_lights(  # type: ignore[no-untyped-def]
             cx, cy, cz = ny * hz - nz * hy, nz * hx - nx * hz, nx * hy - ny * hx
             sine_squared = (cx * cx + cy * cy + cz * cz) / half_squared
             n_dot_l = nx * lx + ny * ly + nz * lz
-            arriving = v * max(n_dot_l, _ZERO)
-            reflected = arriving * ggx_scalar(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
-            diffuse_r += arriving * flux[0, k]
-            diffuse_g += arriving * flux[1, k]
-            diffuse_b += arriving * flux[2, k]
+            visible_cosine = v * max(n_dot_l, _ZERO)
+            reflected = visible_cosine * ggx_scalar(alpha_squared, n_dot_l, n_dot_v, sine_squared, half_squared)
+            diffuse_r += visible_cosine * flux[0, k]
+            diffuse_g += visible_cosine * flux[1, k]
+            diffuse_b += visible_cosine * flux[2, k]
             specular_r += reflected * flux[0, k]
             specular_g += reflected * flux[1, k]
             specular_b += reflected * flux[2, k]

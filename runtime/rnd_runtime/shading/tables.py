@@ -21,7 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats, mask
 from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.simd import WIDTH, lanes, load, reduce_add, store
+from rnd_runtime.core.simd.arithmetic import lanes, reduce_add
+from rnd_runtime.core.simd.memory import load, store
+from rnd_runtime.core.simd.vectors import WIDTH
 from rnd_runtime.shading.sh import SH_COUNT, rotation_matrix, sh_basis, sh_quadrature
 
 from .light import Light, texel_directions, texel_solid_angles
@@ -77,9 +79,9 @@ class SkyTables:
         return cls(diffuse, specular)
 
     def shade(
-        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, seen: ArrayLike | None = None
+        self, gaussians: Gaussians, camera_position: ArrayLike, light_to_world: Floats, visible: ArrayLike | None = None
     ) -> Floats32:
-        """Linear radiance [N, 3] towards the camera, close to ``shade_reference``; 0 where not ``seen``."""
+        """Linear radiance [N, 3] towards the camera, close to ``shade_reference``; 0 where not ``visible``."""
         arrays = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
         radiance: Floats32 = shade_by_tables(
             tuple(floats(array) for array in arrays),
@@ -87,7 +89,7 @@ class SkyTables:
             np.array(light_to_world, np.float64, order="C"),
             np.array(gaussians.root_rotation, np.float64, order="C"),
             self.arrays,
-            mask(seen, len(gaussians.means)),
+            mask(visible, len(gaussians.means)),
         )
         return radiance
 
@@ -109,7 +111,7 @@ class SkyTables:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, seen):  # type: ignore[no-untyped-def]
+def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, visible):  # type: ignore[no-untyped-def]
     """``SkyTables.shade`` of ``surfaces``: means, normals, albedo, roughness and visibility."""
     root_to_light = np.zeros((3, 3))
     for row in range(3):
@@ -118,9 +120,9 @@ def shade_by_tables(surfaces, camera, light_to_world, root_rotation, tables, see
                 root_to_light[row, column] += light_to_world[k, row] * root_rotation[k, column]
     rotation = rotation_matrix(tables.directions, tables.weighted, root_to_light).astype(np.float32)
     rotations = light_to_world.astype(np.float32), root_to_light.astype(np.float32)
-    radiance = np.zeros((len(seen), 3), np.float32)
+    radiance = np.zeros((len(visible), 3), np.float32)
     diffuse = rotated(tables.diffuse, rotation)
-    shade_from_tables(surfaces, camera, rotations, (diffuse, tables.specular, tables.lobes), seen, radiance)
+    shade_from_tables(surfaces, camera, rotations, (diffuse, tables.specular, tables.lobes), visible, radiance)
     return radiance
 
 

@@ -54,11 +54,11 @@ def test_a_file_says_what_it_holds():
 
 def test_a_part_computes_its_outputs_and_nothing_else():
     file = OnnxFile(_model().SerializeToString())
-    np.testing.assert_array_equal(_run(file.cut(["e"]), ["e"], a=A, b=B)[0], 2 * (A + 1) * B)
-    inner, constant = _run(file.cut(["d", "f"]), ["d", "f"], a=A)  # an inner value; b is not asked for
+    np.testing.assert_array_equal(_run(file.extract(["e"]), ["e"], a=A, b=B)[0], 2 * (A + 1) * B)
+    inner, constant = _run(file.extract(["d", "f"]), ["d", "f"], a=A)  # an inner value; b is not asked for
     np.testing.assert_array_equal(inner, 2 * (A + 1))
     np.testing.assert_array_equal(constant, np.full((2, 3), 2))
-    part = onnx.load_from_string(file.cut(["f"]))
+    part = onnx.load_from_string(file.extract(["f"]))
     assert [node.output[0] for node in part.graph.node] == ["f"]
     assert [tensor.name for tensor in part.graph.initializer] == ["two"] and not part.graph.input
     assert {prop.key: prop.value for prop in part.metadata_props} == file.metadata
@@ -70,7 +70,7 @@ def test_an_output_that_nothing_makes_is_refused():
     file = OnnxFile(model.SerializeToString())
     assert file.outputs.keys() == {"e", "f"}
     with pytest.raises(InputError, match="graph outputs: expected something that makes f, got nothing"):
-        file.cut(["e", "f"])
+        file.extract(["e", "f"])
 
 
 @pytest.mark.parametrize("length", [0, 1, 20, 150, -1])

@@ -27,7 +27,7 @@ MAX_MEMORY_KB = 1 << 20
 SECONDS = 30  # of the processor; of a machine that is busy more
 
 READ_PICKLE = "from rnd_runtime.motion.readers.unpickle import read_pickle as read"
-READ_LIGHT = "from rnd_runtime.shading.light import load_light as read"
+READ_LIGHT = "from rnd_runtime.shading.files.load import load_light as read"
 
 
 def _command(reader: str, path: Path) -> tuple[int, str, int]:

@@ -11,7 +11,7 @@ from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.kinds import kind_of
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from support.tiny import ASSETS, body
 
 

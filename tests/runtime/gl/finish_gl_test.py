@@ -16,7 +16,7 @@ from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import code_steps, tone_map
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from support import gl_devices
 from support.gl_devices import BACKENDS
 from support.tiny import ASSETS

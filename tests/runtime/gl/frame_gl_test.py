@@ -14,7 +14,7 @@ from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.tone import tone_map
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.shader import Shader
 from support.paths import ASSETS
 from support.shading_scenes import ball
@@ -109,7 +109,7 @@ def test_the_cpu_neither_poses_nor_shades(avatar, motion, sky, monkeypatch):
 
 def test_other_views_lights_and_sizes_leave_nothing_behind(avatar, motion, sky, rasterizer):
     gaussians = avatar.pose(motion, 0.3)
-    shaders = [Shader(sky), Shader(sky).turned(2.0), Shader(sky, "brute")]
+    shaders = [Shader(sky), Shader(sky).with_yaw(2.0), Shader(sky, "brute")]
     away = Camera.look_at([0, 1, 5], [0, 1, 10], width=96, height=128, fov_y=0.6)
     close = Camera.look_at([0.2, 1.6, 1.2], [0, 1.5, 0], width=40, height=30, fov_y=0.4)
     calls = [(shader, camera) for shader in shaders for camera in (CAMERA, away, close)]

@@ -16,7 +16,8 @@ from rnd_runtime.gl.passes import GaussianTexture
 from rnd_runtime.gl.shading import GlShading
 from rnd_runtime.gl.surfaces import SurfaceUpload
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.shading.light import Light, load_light, texel_directions
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, texel_directions
 from rnd_runtime.shading.shader import Shader
 from support import gl_devices
 from support.gl_devices import BACKENDS
@@ -104,7 +105,7 @@ def test_shadows_of_a_body_are_the_kernels(device, walker, yaw):
 def test_turning_and_relighting_leave_nothing_behind(devices):
     device, gaussians = devices["egl"], ball(300)
     shaders = [Shader(probe(height=64, sun=4000), mode) for mode in MODES]
-    turned = [shader.turned(1.1) for shader in shaders]
+    turned = [shader.with_yaw(1.1) for shader in shaders]
     first = [_shade(device, shader, gaussians) for shader in (*shaders, *turned)]
     for k in (0, 5, 7, 2, 1, 6, 9, 4, 3, 8, 0):
         np.testing.assert_array_equal(_shade(device, [*shaders, *turned][k], gaussians), first[k])

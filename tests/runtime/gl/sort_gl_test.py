@@ -21,7 +21,7 @@ from rnd_runtime.gl.projection import GlProjection
 from rnd_runtime.gl.raster import GlRasterizer
 from rnd_runtime.gl.sort import DepthSort
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.shader import Shader
 from support.paths import ASSETS
 

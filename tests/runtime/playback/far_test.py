@@ -8,7 +8,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.far import fine_view
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from support.gl_devices import BACKENDS
 from support.paths import ASSETS
 

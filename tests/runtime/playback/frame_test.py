@@ -17,7 +17,8 @@ from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.in_view import in_view
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import tone_map
-from rnd_runtime.shading.light import Light, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 from support.paths import ASSETS
 

@@ -9,7 +9,7 @@ from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.in_view import in_view
 from support.raster_scenes import off_centre_camera, random_scene
 
-MORE = 0.1  # of those drawn, that may be held for seen besides: 0.02 to 0.05 measured; of one avatar's head 0.09
+MORE = 0.1  # of those drawn, that may be held for visible besides: 0.02 to 0.05 measured; of one avatar's head 0.09
 
 
 def drawn(scene, camera):
@@ -26,22 +26,22 @@ def test_all_that_is_drawn_is_seen(seed):
     scene[2][::7] *= 0.004
     eye = rng.uniform(-1, 1, 3)
     camera = off_centre_camera(*rng.integers(8, 200, 2), eye=tuple(eye))
-    shown, seen = drawn(scene, camera), in_view(*scene[:3], camera)
-    assert shown.sum() > 20 and not (shown & ~seen).any()
-    assert not seen[scene[2] < 1 / 255].any()
+    shown, visible = drawn(scene, camera), in_view(*scene[:3], camera)
+    assert shown.sum() > 20 and not (shown & ~visible).any()
+    assert not visible[scene[2] < 1 / 255].any()
 
 
 @pytest.mark.parametrize("fov", [0.2, 0.6, 2.0])
 def test_little_else_is_seen(fov):
     scene = random_scene(3, 20_000, spread=2.0, size=0.003)
     camera = Camera.look_at([0.3, 0.2, -1.0], [0, 0, 0], width=160, height=90, fov_y=fov)
-    shown, seen = drawn(scene, camera), in_view(*scene[:3], camera)
+    shown, visible = drawn(scene, camera), in_view(*scene[:3], camera)
     assert 0.001 < shown.mean() < 0.9
-    assert (seen & ~shown).sum() < MORE * shown.sum()
+    assert (visible & ~shown).sum() < MORE * shown.sum()
 
 
 def test_a_gaussian_on_the_border_is_seen_by_its_reach():
-    """One after the other moved out of the picture until it is not drawn; it is seen as long as it is."""
+    """One after the other moved out of the picture until it is not drawn; it is visible as long as it is."""
     camera = Camera.look_at([0, 0, -2], [0, 0, 0], width=64, height=64, fov_y=0.6)
     aside = np.linspace(0, 2, 400)
     for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
@@ -49,8 +49,8 @@ def test_a_gaussian_on_the_border_is_seen_by_its_reach():
         means[:, axis] = sign * aside
         scene = (means, *(np.repeat(a[:1], 400, 0) for a in random_scene(0, 1, size=0.1)[1:]))
         scene[2][:] = 0.99
-        shown, seen = drawn(scene, camera), in_view(*scene[:3], camera)
-        assert 0.1 < shown.mean() < 0.9 and not (shown & ~seen).any() and not seen[-1]
+        shown, visible = drawn(scene, camera), in_view(*scene[:3], camera)
+        assert 0.1 < shown.mean() < 0.9 and not (shown & ~visible).any() and not visible[-1]
 
 
 def test_what_is_broken_is_seen_where_it_is_drawn():
@@ -61,8 +61,8 @@ def test_what_is_broken_is_seen_where_it_is_drawn():
         means[500 + k, k % 3] = covariances[510 + k, k] = opacities[520 + k] = junk
     scene, camera = (means, covariances, opacities, features), off_centre_camera(80, 60)
     with np.errstate(all="ignore"):
-        shown, seen = drawn(scene, camera), in_view(*scene[:3], camera)
-    assert shown[:500].sum() > 20 and not (shown & ~seen).any()
+        shown, visible = drawn(scene, camera), in_view(*scene[:3], camera)
+    assert shown[:500].sum() > 20 and not (shown & ~visible).any()
 
 
 def test_what_faces_away_is_left_out_wherever_it_stands():

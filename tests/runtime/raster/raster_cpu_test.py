@@ -179,13 +179,13 @@ def test_outlines_are_sharp_where_asked_for():
     assert ((ours.alpha > 0.1) & (ours.alpha < 0.9)).any()
 
 
-def test_only_those_seen_are_drawn():
+def test_only_visible_gaussians_are_rendered():
     scene, camera = random_scene(2), off_centre_camera(40, 30)
-    seen = np.arange(len(scene[0])) % 3 > 0
-    expected = raster_cpu.rasterize(*(array[seen] for array in scene), camera)
-    np.testing.assert_array_equal(raster_cpu.rasterize(*scene, camera, seen=seen).image, expected.image)
+    visible = np.arange(len(scene[0])) % 3 > 0
+    expected = raster_cpu.rasterize(*(array[visible] for array in scene), camera)
+    np.testing.assert_array_equal(raster_cpu.rasterize(*scene, camera, visible=visible).image, expected.image)
     with pytest.raises(InputError, match="chosen Gaussians: expected shape"):
-        raster_cpu.rasterize(*scene, camera, seen=seen[1:])
+        raster_cpu.rasterize(*scene, camera, visible=visible[1:])
 
 
 def test_other_layouts_and_types_are_taken():

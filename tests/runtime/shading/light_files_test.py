@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 
 CASES = Path(__file__).parents[2] / "cases/formats"
 RGBE = 1 / 64  # readers may add half a step to the mantissa
@@ -51,7 +51,7 @@ def test_every_orientation_of_a_radiance_file_is_upright(tmp_path, x, y, across)
 
 
 def test_large_maps_are_flipped_too(tmp_path, monkeypatch):
-    monkeypatch.setattr("rnd_runtime.shading.light._MAX_ROWS", 2)
+    monkeypatch.setattr("rnd_runtime.shading.files.load._MAX_ROWS", 2)
     path = _write_rgbe(tmp_path / "a.hdr", UPRIGHT[::-1], "+Y 4 +X 8")
     upright = _write_rgbe(tmp_path / "b.hdr", UPRIGHT, "-Y 4 +X 8")
     assert_allclose(load_light(path).radiance, load_light(upright).radiance, rtol=1e-6)

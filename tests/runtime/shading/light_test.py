@@ -11,15 +11,8 @@ from numpy.testing import assert_allclose
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_runtime.shading.files.channels import REC709
-from rnd_runtime.shading.light import (
-    Light,
-    downsize,
-    light_notes,
-    load_light,
-    repair,
-    texel_directions,
-    texel_solid_angles,
-)
+from rnd_runtime.shading.files.load import load_light, repair
+from rnd_runtime.shading.light import Light, downsize, light_notes, texel_directions, texel_solid_angles
 from support.paths import SHARED
 
 SHARED_DATA = SHARED / "data"
@@ -93,11 +86,11 @@ def test_positive_yaw_moves_the_light_from_x_towards_z():
 
 def test_turning_shares_the_texels_and_refuses_what_is_no_angle():
     light = Light(np.ones((4, 8, 3), np.float32), yaw=0.2, up="z")
-    turned = light.turned(1.0)
+    turned = light.with_yaw(1.0)
     assert turned.radiance is light.radiance and (turned.yaw, turned.up, light.yaw) == (1.0, "z", 0.2)
     assert_allclose(turned.rotation, Light(light.radiance, yaw=1.0, up="z").rotation, atol=0)
     with pytest.raises(InputError, match="finite radians"):
-        light.turned(float("nan"))
+        light.with_yaw(float("nan"))
 
 
 def test_sampling_texel_centres_gives_the_texels():
@@ -249,7 +242,7 @@ def test_a_sun_that_half_floats_cut_is_their_largest_number():
 
 @pytest.mark.parametrize("rows", [128, 99, 33])
 def test_large_maps_are_averaged_while_they_are_read(tmp_path, monkeypatch, rows):
-    monkeypatch.setattr("rnd_runtime.shading.light._MAX_ROWS", 32)
+    monkeypatch.setattr("rnd_runtime.shading.files.load._MAX_ROWS", 32)
     monkeypatch.setattr("rnd_runtime.core.images._STRIP", 24)
     pixels = np.random.default_rng(0).gamma(0.5, 2, (rows, 2 * rows, 3)).astype(np.float32)
     pixels[5, 7] = 1e6
@@ -298,7 +291,7 @@ def test_other_primaries_than_rec709s_are_noted(tmp_path):
         file = oiio.ImageOutput.create(str(tmp_path / f"{name}.exr"))
         assert file.open(str(tmp_path / f"{name}.exr"), spec) and file.write_image(pixels) and file.close()
     assert load_light(tmp_path / "same.exr").notes == ()
-    (note,) = load_light(tmp_path / "ap0.exr").turned(1.0).notes
+    (note,) = load_light(tmp_path / "ap0.exr").with_yaw(1.0).notes
     assert "red (0.7347, 0.2653)" in note and note.startswith("the light is taken as Rec.709")
 
 

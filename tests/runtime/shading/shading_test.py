@@ -148,7 +148,7 @@ def test_turning_everything_changes_nothing(mode):
         root_rotation=(turn @ gaussians.root_rotation).astype(np.float32),
     )
     shader = Shader(light, mode)
-    here, there = shader.shade(gaussians, CAMERA), shader.turned(0.8).shade(turned, turn @ CAMERA)
+    here, there = shader.shade(gaussians, CAMERA), shader.with_yaw(0.8).shade(turned, turn @ CAMERA)
     assert psnr(there, here) > (50 if mode == "table+sun" else 90)  # a depth map's texels fall elsewhere
     assert shader.light.yaw == 0.0
 

@@ -31,7 +31,7 @@ from rnd_runtime.playback.frame import FrameRenderer, in_root_frame
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.convert.cli import main
 from rnd_viewer.convert.splat_files import TRANSFORM

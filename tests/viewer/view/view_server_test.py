@@ -37,7 +37,7 @@ from rnd_runtime.motion.edit import MotionEdits, edit_motion
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.options import MotionOptions
 from rnd_viewer.view.access import Access, is_loopback

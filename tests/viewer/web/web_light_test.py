@@ -16,7 +16,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.files.channels import REC709
-from rnd_runtime.shading.light import light_notes, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import light_notes
 from support.paths import ROOT
 from support.sun_scenes import beside_a_lamp
 

@@ -28,7 +28,7 @@ from rnd_runtime.avatar.file import CONSTANT_OUTPUTS, POSED_OUTPUTS
 from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import load_motion, save_motion
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_viewer.play.cli import main as play
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene

@@ -31,21 +31,21 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.shading.light import load_light
+from rnd_runtime import load_light
 avatar, motion, hdr, shade, size, threads, frames, warm_up = sys.argv[1:]
 avatar = Avatar.load(avatar, threads=int(threads))
 motion, light = load_motion(motion, avatar.skeleton), load_light(hdr)
 camera = Camera.look_at([1.163, 0.9, 3.195], [0, 0.875, 0], width=int(size), height=int(size), fov_y=0.704)
 renderer = FrameRenderer(avatar, light, camera, shade=shade)
 for line in sys.stdin:
-    first, taken = int(line), []
+    first, times = int(line), []
     for number in range(first - int(warm_up), first + int(frames)):
         started = perf_counter()
         renderer.turn(0.02 * number)
         frame = renderer.render(motion, number / 30)
         total = perf_counter() - started
-        taken.append({name: 1e3 * s for name, s in {"frame": total, **frame.stage_seconds}.items()})
-    print(json.dumps(taken[int(warm_up):]), flush=True)
+        times.append({name: 1e3 * s for name, s in {"frame": total, **frame.stage_seconds}.items()})
+    print(json.dumps(times[int(warm_up):]), flush=True)
 """
 
 
@@ -58,9 +58,9 @@ class Checkout:
         paths = os.pathsep.join(str(self.folder / package) for package in PACKAGES)
         environment = os.environ | {"PYTHONPATH": paths, "NUMBA_NUM_THREADS": str(threads)}
         environment.pop("NUMBA_CACHE_DIR", None)  # each checkout has its own kernels
-        words = [*(str(file.resolve()) for file in files), shade, *map(str, (size, threads, FRAMES, WARM_UP))]
+        arguments = [*(str(file.resolve()) for file in files), shade, *map(str, (size, threads, FRAMES, WARM_UP))]
         self._process = subprocess.Popen(
-            [sys.executable, "-c", RENDER, *words],
+            [sys.executable, "-c", RENDER, *arguments],
             cwd=self.folder,
             env=environment,
             stdin=subprocess.PIPE,
@@ -91,14 +91,14 @@ def compare(checkouts: Sequence[Checkout], pairs: int, on_pair: Callable[[int], 
     """A row for each stage: median and p95 in ms of both checkouts, and the ratio with its standard error."""
     for checkout in checkouts:
         checkout.render(WARM_UP)
-    taken: tuple[list[Any], list[Any]] = ([], [])
+    rounds: tuple[list[Any], list[Any]] = ([], [])
     for pair in range(pairs):
         for k in (0, 1) if pair % 2 == 0 else (1, 0):
-            taken[k].append(checkouts[k].render(WARM_UP + pair * FRAMES % 200))
+            rounds[k].append(checkouts[k].render(WARM_UP + pair * FRAMES % 200))
         on_pair(pair + 1)
     rows = []
-    for stage in taken[0][0][0]:
-        old, new = (np.array([[frame[stage] for frame in frames] for frames in own]) for own in taken)
+    for stage in rounds[0][0][0]:
+        old, new = (np.array([[frame[stage] for frame in frames] for frames in one]) for one in rounds)
         ratios = np.median(new, 1) / np.median(old, 1)
         row = {
             "stage": stage,

@@ -106,7 +106,7 @@ def _render(point: Point, out: Path, spawned: float, ahead: Any) -> None:
     from rnd_runtime.avatar.avatar import Avatar
     from rnd_runtime.motion.motion import load_motion
     from rnd_runtime.playback.frame import FrameRenderer
-    from rnd_runtime.shading.light import load_light
+    from rnd_runtime.shading.files.load import load_light
 
     avatar = Avatar.load(point.avatar, threads=point.threads, ahead=ahead)
     motion = load_motion(Path(point.motion), avatar.skeleton)

@@ -26,7 +26,7 @@ from rnd_runtime.posing.reference import pose_reference
 from rnd_runtime.posing.rest import RestPose
 from rnd_runtime.posing.window import motion_window
 from rnd_runtime.raster import oracle as raster_oracle
-from rnd_runtime.shading.light import load_light
+from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.reference import shade_reference, shade_reference_with_directional
 
 from .frame import COMPARED, STEP_S, STEP_YAW, Measured
@@ -104,7 +104,7 @@ def _lit(avatar_file: Path, scene: BenchScene, with_suns: bool) -> dict[str, Any
         values["covariances"].append(posed.covariances)
         bones = avatar.encode(motion, STEP_S * number).in_world().bones
         values["joints"].append(bones[:, :, :3] @ avatar.skeleton.rest_joints[:, :, None] @ np.ones(1) + bones[:, :, 3])
-        values["radiance"].append(shade(posed, light.turned(STEP_YAW * number), eye))
+        values["radiance"].append(shade(posed, light.with_yaw(STEP_YAW * number), eye))
     return {name: np.array(value) for name, value in values.items()} | {"opacities": posed.opacities}
 
 

@@ -42,7 +42,7 @@ def soak_playback(subject: Subject, frames: int, state: Path) -> list[Figure]:
 
     def frame(number: int) -> str:
         posed = subject.avatar.pose(walk, (number % count) / walk.fps)
-        radiance = subject.shader.turned(2 * np.pi * (number % count) / count).shade(posed, camera.position)
+        radiance = subject.shader.with_yaw(2 * np.pi * (number % count) / count).shade(posed, camera.position)
         raster = rasterize(posed.means, posed.covariances, posed.opacities, radiance, camera)
         return hashlib.sha256(raster.image.tobytes()).hexdigest()
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.shading.light import Light, downsize, load_light, texel_directions
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, downsize, texel_directions
 
 Floats = NDArray[np.float64]
 

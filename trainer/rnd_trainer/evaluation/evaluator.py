@@ -76,8 +76,8 @@ def render_runtime(
     normals = gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32)
     features = np.ascontiguousarray(np.concatenate([radiance, normals, gaussians.albedo], axis=1), np.float32)
     splats = gaussians.means, gaussians.covariances, gaussians.opacities
-    seen = None if cull is None else in_view(*splats, camera, normals=gaussians.normals, cull=cull)
-    raster = sharpened(rasterize(*splats, features, camera, seen=seen))
+    visible = None if cull is None else in_view(*splats, camera, normals=gaussians.normals, cull=cull)
+    raster = sharpened(rasterize(*splats, features, camera, visible=visible))
     image, normals_image, albedo = (torch.from_numpy(x) for x in np.split(raster.image, [3, 6], axis=2))
     return Rendered(image, normals_image, albedo, torch.from_numpy(raster.alpha))
 

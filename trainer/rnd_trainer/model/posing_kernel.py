@@ -1,7 +1,4 @@
-"""Compiled posing of all Gaussians in one pass, forward and backward; see ``model.skinning``.
-
-3×3 matrices are row-major tuples of nine scalars, which stay in registers.
-"""
+"""Compiled posing of all Gaussians in one pass, forward and backward; see ``model.skinning``."""
 
 from __future__ import annotations
 
@@ -12,11 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .matrix_kernels import (
+    FAST,
+    apply,
+    cross,
+    inline,
+    load,
+    multiply,
+    quaternion,
+    rotation_backward,
+    rotation_matrix,
+    scale_columns,
+    transpose,
+)
 from .skinning import NORMAL_FALLBACK, THICKNESS_FLOOR
 from .twist import SMALLEST_SQUARE, STEPS
-
-_FAST = {"reassoc", "contract", "arcp", "nsz"}  # not nnan, ninf: a NaN must stay one
-_inline = numba.njit(fastmath=_FAST, error_model="numpy")  # inlined by LLVM; numba's inlining fails on tuples
 
 
 class PoseGaussians(torch.autograd.Function):
@@ -42,80 +49,11 @@ class PoseGaussians(torch.autograd.Function):
         return weights, bones, points, delta_rotation, None, rotation, scales, normals, None, None, None
 
 
-@_inline
-def _row(x, y, z, b):
-    """(x, y, z) B."""
-    return (x * b[0] + y * b[3] + z * b[6], x * b[1] + y * b[4] + z * b[7], x * b[2] + y * b[5] + z * b[8])
-
-
-@_inline
-def _multiply(a, b):
-    """A B."""
-    p, q, r = _row(a[0], a[1], a[2], b), _row(a[3], a[4], a[5], b), _row(a[6], a[7], a[8], b)
-    return (p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2])
-
-
-@_inline
-def _transpose(a):
-    return (a[0], a[3], a[6], a[1], a[4], a[7], a[2], a[5], a[8])
-
-
-@_inline
-def _apply(a, x, y, z):
-    """A (x, y, z)."""
-    return (a[0] * x + a[1] * y + a[2] * z, a[3] * x + a[4] * y + a[5] * z, a[6] * x + a[7] * y + a[8] * z)
-
-
-@_inline
-def _cross(a, b):
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
-@_inline
-def _quaternion(x, y, z):
-    """normalize(1, v/2) and its length before normalisation."""
-    half = np.float32(0.5)
-    x, y, z = half * x, half * y, half * z
-    length = np.sqrt(np.float32(1) + x * x + y * y + z * z)
-    return (np.float32(1) / length, x / length, y / length, z / length), length
-
-
-@_inline
-def _rotation(q):
-    s, x, y, z = q
-    one, two = np.float32(1), np.float32(2)
-    return (
-        one - two * (y * y + z * z),
-        two * (x * y - s * z),
-        two * (x * z + s * y),
-        two * (x * y + s * z),
-        one - two * (x * x + z * z),
-        two * (y * z - s * x),
-        two * (x * z - s * y),
-        two * (y * z + s * x),
-        one - two * (x * x + y * y),
-    )
-
-
-@_inline
-def _rotation_backward(q, length, h):
-    """Gradient w.r.t. the rotation vector, from the gradient h by the matrix of ``_rotation(_quaternion(v))``."""
-    s, x, y, z = q
-    two = np.float32(2)
-    by_s = two * (-z * h[1] + y * h[2] + z * h[3] - x * h[5] - y * h[6] + x * h[7])
-    by_x = two * (y * (h[1] + h[3]) + z * (h[2] + h[6]) - two * x * (h[4] + h[8]) + s * (h[7] - h[5]))
-    by_y = two * (x * (h[1] + h[3]) + z * (h[5] + h[7]) - two * y * (h[0] + h[8]) + s * (h[2] - h[6]))
-    by_z = two * (x * (h[2] + h[6]) + y * (h[5] + h[7]) - two * z * (h[0] + h[4]) + s * (h[3] - h[1]))
-    along = s * by_s + x * by_x + y * by_y + z * by_z
-    factor = np.float32(0.5) / length
-    return (factor * (by_x - x * along), factor * (by_y - y * along), factor * (by_z - z * along))
-
-
-@_inline
+@inline
 def _normal_matrix(m):
     """cofactor(M) + ε M."""
     a, b, c = (m[0], m[1], m[2]), (m[3], m[4], m[5]), (m[6], m[7], m[8])
-    first, second, third = _cross(b, c), _cross(c, a), _cross(a, b)
+    first, second, third = cross(b, c), cross(c, a), cross(a, b)
     e = np.float32(NORMAL_FALLBACK)
     return (
         first[0] + e * m[0],
@@ -130,14 +68,14 @@ def _normal_matrix(m):
     )
 
 
-@_inline
+@inline
 def _normal_matrix_backward(m, g):
     """Gradient w.r.t. M, from the gradient g by ``_normal_matrix(M)``."""
     a, b, c = (m[0], m[1], m[2]), (m[3], m[4], m[5]), (m[6], m[7], m[8])
     first, second, third = (g[0], g[1], g[2]), (g[3], g[4], g[5]), (g[6], g[7], g[8])
-    a1, a2 = _cross(second, c), _cross(b, third)
-    b1, b2 = _cross(c, first), _cross(third, a)
-    c1, c2 = _cross(first, b), _cross(a, second)
+    a1, a2 = cross(second, c), cross(b, third)
+    b1, b2 = cross(c, first), cross(third, a)
+    c1, c2 = cross(first, b), cross(a, second)
     e = np.float32(NORMAL_FALLBACK)
     return (
         a1[0] + a2[0] + e * g[0],
@@ -152,7 +90,7 @@ def _normal_matrix_backward(m, g):
     )
 
 
-@_inline
+@inline
 def _blend(weights, bones, n):
     """A = Σ_j W_j B_j: the 3×3 part and the translation."""
     zero = np.float32(0)
@@ -175,14 +113,14 @@ def _blend(weights, bones, n):
     return a, (x, y, z)
 
 
-@_inline
+@inline
 def _excess(linear, axes, shares, n):
     """``model.twist.excess``."""
     x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
-    a, b, c = _apply(linear, x, y, z)
+    a, b, c = apply(linear, x, y, z)
     length_squared = max(a * a + b * b + c * c, np.float32(SMALLEST_SQUARE))
     first, second, third = (linear[0], linear[1], linear[2]), (linear[3], linear[4], linear[5]), linear[6:]
-    p, q, r = _cross(second, third), _cross(third, first), _cross(first, second)
+    p, q, r = cross(second, third), cross(third, first), cross(first, second)
     a, b, c = p[0] * x + p[1] * y + p[2] * z, q[0] * x + q[1] * y + q[2] * z, r[0] * x + r[1] * y + r[2] * z
     ratio = min(np.sqrt(a * a + b * b + c * c) / length_squared, np.float32(1))
     factor = np.float32(1)
@@ -192,7 +130,7 @@ def _excess(linear, axes, shares, n):
     return shares[n] * (factor - np.float32(1))
 
 
-@_inline
+@inline
 def _widen(m, axes, kappa, n):
     """C M with C = (1 + κ) I − κ u uᵀ."""
     x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
@@ -213,27 +151,14 @@ def _widen(m, axes, kappa, n):
     )
 
 
-@_inline
+@inline
 def _widen_normal(x, y, z, axes, kappa, n):
     """n + κ u (u·n)."""
     along = kappa * (axes[n, 0] * x + axes[n, 1] * y + axes[n, 2] * z)
     return (x + axes[n, 0] * along, y + axes[n, 1] * along, z + axes[n, 2] * along)
 
 
-@_inline
-def _load(matrices, n):
-    m = matrices[n]
-    return (m[0, 0], m[0, 1], m[0, 2], m[1, 0], m[1, 1], m[1, 2], m[2, 0], m[2, 1], m[2, 2])
-
-
-@_inline
-def _scale_columns(m, scales, n):
-    """M diag(s)."""
-    s, t, u = scales[n, 0], scales[n, 1], scales[n, 2]
-    return (m[0] * s, m[1] * t, m[2] * u, m[3] * s, m[4] * t, m[5] * u, m[6] * s, m[7] * t, m[8] * u)
-
-
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(parallel=True, cache=True, fastmath=FAST, error_model="numpy")
 def _pose(weights, bones, points, delta_rotation, tangents, rotation, scales, normals, axes, levers, shares):
     count = len(points)
     means = np.empty((count, 3), np.float32)
@@ -243,7 +168,7 @@ def _pose(weights, bones, points, delta_rotation, tangents, rotation, scales, no
     for n in numba.prange(count):
         linear, shift = _blend(weights, bones, n)
         kappa = _excess(linear, axes, shares, n)
-        x, y, z = _apply(
+        x, y, z = apply(
             linear,
             points[n, 0] + kappa * levers[n, 0],
             points[n, 1] + kappa * levers[n, 1],
@@ -251,10 +176,10 @@ def _pose(weights, bones, points, delta_rotation, tangents, rotation, scales, no
         )
         means[n, 0], means[n, 1], means[n, 2] = x + shift[0], y + shift[1], z + shift[2]
 
-        own, _ = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
-        added, _ = _quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
-        frame = _scale_columns(_multiply(_load(tangents, n), _rotation(own)), scales, n)
-        g = _multiply(linear, _widen(_multiply(_rotation(added), frame), axes, kappa, n))
+        own, _ = quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
+        added, _ = quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
+        frame = scale_columns(multiply(load(tangents, n), rotation_matrix(own)), scales, n)
+        g = multiply(linear, _widen(multiply(rotation_matrix(added), frame), axes, kappa, n))
         covariances[n, 0] = g[0] * g[0] + g[1] * g[1] + g[2] * g[2] + floor
         covariances[n, 1] = g[0] * g[3] + g[1] * g[4] + g[2] * g[5]
         covariances[n, 2] = g[0] * g[6] + g[1] * g[7] + g[2] * g[8]
@@ -263,13 +188,13 @@ def _pose(weights, bones, points, delta_rotation, tangents, rotation, scales, no
         covariances[n, 5] = g[6] * g[6] + g[7] * g[7] + g[8] * g[8] + floor
 
         x, y, z = _widen_normal(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
-        x, y, z = _apply(_normal_matrix(linear), x, y, z)
+        x, y, z = apply(_normal_matrix(linear), x, y, z)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         posed_normals[n, 0], posed_normals[n, 1], posed_normals[n, 2] = x / length, y / length, z / length
     return means, covariances, posed_normals
 
 
-@numba.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@numba.njit(parallel=True, cache=True, fastmath=FAST, error_model="numpy")
 def _pose_backward(
     weights,
     bones,
@@ -294,7 +219,7 @@ def _pose_backward(
     two = np.float32(2)
     for n in numba.prange(count):
         linear, _ = _blend(weights, bones, n)
-        transposed = _transpose(linear)
+        transposed = transpose(linear)
         mx, my, mz = by_mean[n, 0], by_mean[n, 1], by_mean[n, 2]
         kappa = _excess(linear, axes, shares, n)
         px, py, pz = (
@@ -302,15 +227,15 @@ def _pose_backward(
             points[n, 1] + kappa * levers[n, 1],
             points[n, 2] + kappa * levers[n, 2],
         )
-        by_points[n, 0], by_points[n, 1], by_points[n, 2] = _apply(transposed, mx, my, mz)
+        by_points[n, 0], by_points[n, 1], by_points[n, 2] = apply(transposed, mx, my, mz)
 
-        own, own_length = _quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
-        added, added_length = _quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
-        added_matrix = _rotation(added)
-        frame = _multiply(_load(tangents, n), _rotation(own))
-        scaled = _scale_columns(frame, scales, n)
-        rotated = _widen(_multiply(added_matrix, scaled), axes, kappa, n)
-        g = _multiply(linear, rotated)
+        own, own_length = quaternion(rotation[n, 0], rotation[n, 1], rotation[n, 2])
+        added, added_length = quaternion(delta_rotation[n, 0], delta_rotation[n, 1], delta_rotation[n, 2])
+        added_matrix = rotation_matrix(added)
+        frame = multiply(load(tangents, n), rotation_matrix(own))
+        scaled = scale_columns(frame, scales, n)
+        rotated = _widen(multiply(added_matrix, scaled), axes, kappa, n)
+        g = multiply(linear, rotated)
         c = by_covariance[n]
         symmetric = (
             two * c[0],
@@ -323,30 +248,30 @@ def _pose_backward(
             c[4],
             two * c[5],
         )  # twice the gradient by the symmetric matrix
-        by_g = _multiply(symmetric, g)
-        by_linear = _multiply(by_g, _transpose(rotated))
-        by_rotated = _widen(_multiply(transposed, by_g), axes, kappa, n)
-        by_added = _multiply(by_rotated, _transpose(scaled))
-        u = _rotation_backward(added, added_length, by_added)
+        by_g = multiply(symmetric, g)
+        by_linear = multiply(by_g, transpose(rotated))
+        by_rotated = _widen(multiply(transposed, by_g), axes, kappa, n)
+        by_added = multiply(by_rotated, transpose(scaled))
+        u = rotation_backward(added, added_length, by_added)
         by_delta_rotation[n, 0], by_delta_rotation[n, 1], by_delta_rotation[n, 2] = u
-        by_scaled = _multiply(_transpose(added_matrix), by_rotated)
+        by_scaled = multiply(transpose(added_matrix), by_rotated)
         by_scales[n, 0] = frame[0] * by_scaled[0] + frame[3] * by_scaled[3] + frame[6] * by_scaled[6]
         by_scales[n, 1] = frame[1] * by_scaled[1] + frame[4] * by_scaled[4] + frame[7] * by_scaled[7]
         by_scales[n, 2] = frame[2] * by_scaled[2] + frame[5] * by_scaled[5] + frame[8] * by_scaled[8]
-        by_frame = _scale_columns(by_scaled, scales, n)
-        by_own = _multiply(_transpose(_load(tangents, n)), by_frame)
-        r = _rotation_backward(own, own_length, by_own)
+        by_frame = scale_columns(by_scaled, scales, n)
+        by_own = multiply(transpose(load(tangents, n)), by_frame)
+        r = rotation_backward(own, own_length, by_own)
         by_rotation[n, 0], by_rotation[n, 1], by_rotation[n, 2] = r
 
         matrix = _normal_matrix(linear)
         nx, ny, nz = _widen_normal(normals[n, 0], normals[n, 1], normals[n, 2], axes, kappa, n)
-        x, y, z = _apply(matrix, nx, ny, nz)
+        x, y, z = apply(matrix, nx, ny, nz)
         length = max(np.sqrt(x * x + y * y + z * z), np.float32(1e-9))
         x, y, z = x / length, y / length, z / length
         gx, gy, gz = by_normal[n, 0], by_normal[n, 1], by_normal[n, 2]
         along = x * gx + y * gy + z * gz
         gx, gy, gz = (gx - x * along) / length, (gy - y * along) / length, (gz - z * along) / length
-        x, y, z = _apply(_transpose(matrix), gx, gy, gz)
+        x, y, z = apply(transpose(matrix), gx, gy, gz)
         x, y, z = _widen_normal(x, y, z, axes, kappa, n)
         by_rest_normals[n, 0], by_rest_normals[n, 1], by_rest_normals[n, 2] = x, y, z
         outer = (gx * nx, gx * ny, gx * nz, gy * nx, gy * ny, gy * nz, gz * nx, gz * ny, gz * nz)

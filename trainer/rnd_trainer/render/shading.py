@@ -62,10 +62,10 @@ def shade(
     if not normals.is_cuda and normals.dtype == torch.float32:
         return FusedShade.apply(normals, view, albedo, roughness, visibility, texels.directions, texels.power)
     n_dot_l = normals @ texels.directions.T  # [n, K]
-    arriving = visibility * n_dot_l.clamp(min=0)
+    visible_cosine = visibility * n_dot_l.clamp(min=0)
     n_dot_v = (normals * view).sum(-1, keepdim=True)
     glossy = specular(roughness[:, None], n_dot_l, n_dot_v, view @ texels.directions.T)
-    radiance = albedo * (arriving @ texels.power) / math.pi + (arriving * glossy) @ texels.power
+    radiance = albedo * (visible_cosine @ texels.power) / math.pi + (visible_cosine * glossy) @ texels.power
     return radiance.clamp(min=0)
 
 

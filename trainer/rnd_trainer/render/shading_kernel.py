@@ -113,14 +113,14 @@ def _sum(normals, view, roughness, visibility, directions, power, half_squared):
         d0 = d1 = d2 = s0 = s1 = s2 = zero
         for k in range(texels):
             n_dot_l = nx * directions[0, k] + ny * directions[1, k] + nz * directions[2, k]
-            arriving = visibility[i, k] * max(n_dot_l, zero)
+            visible_cosine = visibility[i, k] * max(n_dot_l, zero)
             value, _, _, _ = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
-            d0 += arriving * power[0, k]
-            d1 += arriving * power[1, k]
-            d2 += arriving * power[2, k]
-            s0 += arriving * value * power[0, k]
-            s1 += arriving * value * power[1, k]
-            s2 += arriving * value * power[2, k]
+            d0 += visible_cosine * power[0, k]
+            d1 += visible_cosine * power[1, k]
+            d2 += visible_cosine * power[2, k]
+            s0 += visible_cosine * value * power[0, k]
+            s1 += visible_cosine * value * power[1, k]
+            s2 += visible_cosine * value * power[2, k]
         diffuse[i, 0], diffuse[i, 1], diffuse[i, 2] = d0, d1, d2
         specular[i, 0], specular[i, 1], specular[i, 2] = s0, s1, s2
     return diffuse, specular
@@ -147,12 +147,12 @@ def _sum_backward(normals, view, roughness, visibility, directions, power, half_
                 lx, ly, lz = directions[0, k], directions[1, k], directions[2, k]
                 n_dot_l = nx * lx + ny * ly + nz * lz
                 cosine = max(n_dot_l, zero)
-                arriving = visibility[i, k] * cosine
+                visible_cosine = visibility[i, k] * cosine
                 value, by_alpha, by_light, by_view = _specular(alpha_squared, n_dot_l, n_dot_v, half_squared[i, k])
                 p0, p1, p2 = power[0, k], power[1, k], power[2, k]
                 specular = g0 * p0 + g1 * p1 + g2 * p2
                 diffuse = a0 * p0 + a1 * p1 + a2 * p2
-                by_value = arriving * specular * value
+                by_value = visible_cosine * specular * value
                 by_alpha_sum += by_value * by_alpha
                 by_view_sum += by_value * by_view
                 facing = visibility[i, k] if n_dot_l > zero else zero
@@ -160,9 +160,9 @@ def _sum_backward(normals, view, roughness, visibility, directions, power, half_
                 gx += by_cosine * lx
                 gy += by_cosine * ly
                 gz += by_cosine * lz
-                partial[0, k] += arriving * (a0 + g0 * value)
-                partial[1, k] += arriving * (a1 + g1 * value)
-                partial[2, k] += arriving * (a2 + g2 * value)
+                partial[0, k] += visible_cosine * (a0 + g0 * value)
+                partial[1, k] += visible_cosine * (a1 + g1 * value)
+                partial[2, k] += visible_cosine * (a2 + g2 * value)
             by_normal[i, 0] = gx + by_view_sum * view[i, 0]
             by_normal[i, 1] = gy + by_view_sum * view[i, 1]
             by_normal[i, 2] = gz + by_view_sum * view[i, 2]

@@ -108,42 +108,42 @@ def initial_light(
         views, poses: of the training images.
         on_progress: called with done and total.
     """
-    parts = iter(range(1, 6))
+    steps = iter(range(1, 6))
 
     def advance() -> None:
-        on_progress(next(parts), 5)
+        on_progress(next(steps), 5)
 
     on_progress(0, 5)
-    seen = _observe(model, views, poses)
+    observations = _observe(model, views, poses)
     advance()
-    if len(seen.point) == 0:
+    if len(observations.point) == 0:
         return None
-    reliable = np.bincount(seen.point)[seen.point] >= MIN_OBSERVATIONS
+    reliable = np.bincount(observations.point)[observations.point] >= MIN_OBSERVATIONS
     if np.count_nonzero(reliable) < 10 * SKY_LOBES:
         return None
-    weight = _point_luminance(seen) * reliable
+    weight = _point_luminance(observations) * reliable
     directions, solid_angles = _grid(PROBE_SHAPE)
     coarse_directions, coarse_angles = _grid(SEARCH_SHAPE)
-    coarse = _transport(seen, coarse_directions, coarse_angles)
+    coarse = _transport(observations, coarse_directions, coarse_angles)
     sky = coarse @ _lobes(coarse_directions).astype(np.float32)
-    form = _quadratic(seen, np.concatenate([sky, coarse], axis=1), weight)
+    quadratic = _quadratic(observations, np.concatenate([sky, coarse], axis=1), weight)
     advance()
-    if form.is_undetermined():
+    if quadratic.is_undetermined():
         return None
-    found = _search(form)
+    coarse_lights = _search(quadratic)
     advance()
-    near = _texels_near(directions, coarse_directions[np.array(found, int) - SKY_LOBES])
-    fine = _transport(seen, directions[near], solid_angles[near])
+    near_texels = _texels_near(directions, coarse_directions[np.array(coarse_lights, int) - SKY_LOBES])
+    fine = _transport(observations, directions[near_texels], solid_angles[near_texels])
     columns = np.concatenate([sky, fine], axis=1)
-    lights = _search(_quadratic(seen, columns, weight))
+    lights = _search(_quadratic(observations, columns, weight))
     advance()
-    intensity = _intensities(seen, columns[:, [*range(SKY_LOBES), *lights]])
+    intensity = _intensities(observations, columns[:, [*range(SKY_LOBES), *lights]])
     advance()
     radiance = _lobes(directions) @ intensity[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
-    radiance[near[np.array(lights, int) - SKY_LOBES]] += intensity[SKY_LOBES:]
+    radiance[near_texels[np.array(lights, int) - SKY_LOBES]] += intensity[SKY_LOBES:]
     exposure = _upsample(coarse.mean(0) / coarse_angles) * solid_angles
-    level = (seen.colour @ REC709_LUMINANCE).mean() / REFLECTANCE
+    level = (observations.colour @ REC709_LUMINANCE).mean() / REFLECTANCE
     radiance *= level / ((radiance @ REC709_LUMINANCE) @ exposure)
     return InitialLight(
         radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(PROBE_SHAPE).astype(np.float32)
@@ -155,8 +155,8 @@ def warm_up() -> None:
     rng = np.random.default_rng(0)
     transport = rng.random((8 * POINTS, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
     colour, point = 0.1 + rng.random((len(transport), 3)), np.arange(len(transport)) % POINTS
-    seen = Observations(point, colour, np.zeros(len(point), np.int64), [], 0.0)
-    _quadratic(seen, transport, _point_luminance(seen)).fit(range(SKY_LOBES))
+    observations = Observations(point, colour, np.zeros(len(point), np.int64), [], 0.0)
+    _quadratic(observations, transport, _point_luminance(observations)).fit(range(SKY_LOBES))
 
 
 def _observe(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Observations:
@@ -173,21 +173,21 @@ def _observe(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[
         column, row = pixel.astype(int).T
         pixels = view.image[row, column]
         unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        good = np.nonzero(visible & unclipped)[0]
-        point.append(good)
-        colour.append(srgb_to_linear(pixels[good] / 255))
-        image.append(np.full(len(good), k))
+        usable = np.nonzero(visible & unclipped)[0]
+        point.append(usable)
+        colour.append(srgb_to_linear(pixels[usable] / 255))
+        image.append(np.full(len(usable), k))
         posed_nodes.append((posed.means[:nodes].cpu(), posed.normals[:nodes].cpu()))
     return Observations(np.concatenate(point), np.concatenate(colour), np.concatenate(image), posed_nodes, spacing)
 
 
-def _transport(seen: Observations, directions: Floats, solid_angles: Floats) -> NDArray[np.float32]:
+def _transport(observations: Observations, directions: Floats, solid_angles: Floats) -> NDArray[np.float32]:
     """[n, K] radiance of white observations per unit radiance from each direction, shadows traced."""
     towards = torch.as_tensor(directions, dtype=torch.float32)
     rows = []
-    for k, (means, normals) in enumerate(seen.posed):
-        point = seen.point[seen.image == k]
-        visible = traced_visibility(means, normals, towards, seen.spacing)[point]
+    for k, (means, normals) in enumerate(observations.posed):
+        point = observations.point[observations.image == k]
+        visible = traced_visibility(means, normals, towards, observations.spacing)[point]
         rows.append((visible * (normals[point] @ towards.T).clamp(min=0)).numpy())
     return np.concatenate(rows) * (solid_angles / np.pi).astype(np.float32)
 
@@ -197,112 +197,112 @@ class Quadratic:
     """Squared error Lᵀ residual_gram L of a light L, per channel, over Q columns of the dictionary."""
 
     residual_gram: Floats  # [3, Q, Q]
-    power: Floats  # [Q, Q]; Lᵀ power L is the squared irradiance
-    seen: Floats  # [Q]; seen · L is the total irradiance
+    irradiance_gram: Floats  # [Q, Q]; Lᵀ irradiance_gram L is the squared irradiance
+    irradiance: Floats  # [Q]; irradiance · L is the total irradiance
 
     def is_undetermined(self) -> bool:
         """Whether the observations do not constrain the light."""
         unexplained = float(np.trace(self.residual_gram.mean(0)))
-        return unexplained < ROUND_OFF * float(np.trace(self.power))
+        return unexplained < ROUND_OFF * float(np.trace(self.irradiance_gram))
 
     def fit(self, columns: Sequence[int]) -> tuple[float, Floats]:
-        """Least error, and its non-negative intensities [len(columns), 3], under the constraint seen · L = 1."""
-        pick = np.asarray(columns)
-        weight = PENALTY * math.sqrt(float(np.trace(self.residual_gram.mean(0)))) / np.linalg.norm(self.seen)
-        intensity, error = np.empty((len(pick), 3)), 0.0
+        """Least error, and its non-negative intensities [len(columns), 3], under the constraint irradiance · L = 1."""
+        selected = np.asarray(columns)
+        weight = PENALTY * math.sqrt(float(np.trace(self.residual_gram.mean(0)))) / np.linalg.norm(self.irradiance)
+        intensity, error = np.empty((len(selected), 3)), 0.0
         for channel in range(3):
-            gram = self.residual_gram[channel][np.ix_(pick, pick)]
+            gram = self.residual_gram[channel][np.ix_(selected, selected)]
             gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12)
             sky = slice(0, SKY_LOBES)  # always among the columns
             level = SKY_PRIOR * float(np.diag(gram)[sky].mean())
             expected = natural_sky(_lobe_centres()[:, 1])
             gram[sky, sky] += level * (np.eye(SKY_LOBES) - np.outer(expected, expected) / (expected @ expected))
             factor = np.linalg.cholesky(gram).T  # ‖factor L‖² is the error
-            rows = np.concatenate([factor, weight * self.seen[None, pick]])
-            target = np.append(np.zeros(len(pick)), weight)
-            intensity[:, channel], _ = nnls(rows, target)
-            intensity[:, channel] /= self.seen[pick] @ intensity[:, channel]
+            equations = np.concatenate([factor, weight * self.irradiance[None, selected]])
+            target = np.append(np.zeros(len(selected)), weight)
+            intensity[:, channel], _ = nnls(equations, target)
+            intensity[:, channel] /= self.irradiance[selected] @ intensity[:, channel]
             error += float(
-                intensity[:, channel] @ self.residual_gram[channel][np.ix_(pick, pick)] @ intensity[:, channel]
+                intensity[:, channel] @ self.residual_gram[channel][np.ix_(selected, selected)] @ intensity[:, channel]
             )
         return error, intensity
 
     def gains(self, columns: Sequence[int], intensity: Floats) -> Floats:
         """Decrease of the error [Q] per light moved into each column, normalised by the column."""
-        pick = np.asarray(columns)
-        gain = np.zeros(len(self.seen))
+        selected = np.asarray(columns)
+        gain = np.zeros(len(self.irradiance))
         for channel in range(3):
             matrix = self.residual_gram[channel]
-            gradient = matrix[:, pick] @ intensity[:, channel]
-            level = intensity[:, channel] @ gradient[pick]  # Lagrange multiplier of seen · L = 1
-            gain += (level * self.seen - gradient) / np.sqrt(np.diag(matrix) + 1e-12)
+            gradient = matrix[:, selected] @ intensity[:, channel]
+            level = intensity[:, channel] @ gradient[selected]  # Lagrange multiplier of irradiance · L = 1
+            gain += (level * self.irradiance - gradient) / np.sqrt(np.diag(matrix) + 1e-12)
         return gain
 
 
-def _point_luminance(seen: Observations) -> Floats:
+def _point_luminance(observations: Observations) -> Floats:
     """Mean luminance of each observation's point [n], the weight of its error."""
-    count = np.maximum(np.bincount(seen.point), 1)
-    return (np.bincount(seen.point, seen.colour @ REC709_LUMINANCE) / count)[seen.point]
+    count = np.maximum(np.bincount(observations.point), 1)
+    return (np.bincount(observations.point, observations.colour @ REC709_LUMINANCE) / count)[observations.point]
 
 
-def _quadratic(seen: Observations, transport: NDArray[np.float32], weight: Floats) -> Quadratic:
+def _quadratic(observations: Observations, transport: NDArray[np.float32], weight: Floats) -> Quadratic:
     """Quadratic form of ``transport`` [n, Q] with ``weight`` [n], the albedo eliminated.
 
     With I_p the colours and T_p L the irradiance of point p in its images, the best albedo leaves
     ‖(1 − Î_p Î_pᵀ) T_p L‖.
     """
-    count, columns = int(seen.point.max()) + 1, transport.shape[1]
+    count, columns = int(observations.point.max()) + 1, transport.shape[1]
     sqrt_weight = np.sqrt(weight)
     rows = transport * sqrt_weight[:, None].astype(transport.dtype)
-    power = (rows.T @ rows).astype(np.float64)
-    order = np.argsort(seen.point, kind="stable")
-    starts = np.flatnonzero(np.diff(seen.point[order], prepend=-1))
+    irradiance_gram = (rows.T @ rows).astype(np.float64)
+    order = np.argsort(observations.point, kind="stable")
+    starts = np.flatnonzero(np.diff(observations.point[order], prepend=-1))
     residual_gram = np.empty((3, columns, columns))
     for channel in range(3):
-        colour = seen.colour[:, channel] * sqrt_weight
-        length = np.sqrt(np.bincount(seen.point, colour**2, count))
-        unit = (colour / np.maximum(length[seen.point], 1e-9)).astype(rows.dtype)
+        colour = observations.colour[:, channel] * sqrt_weight
+        length = np.sqrt(np.bincount(observations.point, colour**2, count))
+        unit = (colour / np.maximum(length[observations.point], 1e-9)).astype(rows.dtype)
         along = np.add.reduceat((rows * unit[:, None])[order], starts, axis=0).astype(np.float64)
-        residual_gram[channel] = power - along.T @ along
-    return Quadratic(residual_gram, power, rows.sum(0, dtype=np.float64))
+        residual_gram[channel] = irradiance_gram - along.T @ along
+    return Quadratic(residual_gram, irradiance_gram, rows.sum(0, dtype=np.float64))
 
 
-def _intensities(seen: Observations, columns: NDArray[np.float32]) -> Floats:
+def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Floats:
     """Intensities [Q, 3] of all columns that minimise the absolute error of log colours."""
-    every = list(range(columns.shape[1]))
-    _, intensity = _quadratic(seen, columns, _point_luminance(seen)).fit(every)
-    colour = np.log(np.maximum(seen.colour @ REC709_LUMINANCE, 1e-4))
-    count, weight = int(seen.point.max()) + 1, np.ones(len(colour))
+    all_columns = list(range(columns.shape[1]))
+    _, intensity = _quadratic(observations, columns, _point_luminance(observations)).fit(all_columns)
+    colour = np.log(np.maximum(observations.colour @ REC709_LUMINANCE, 1e-4))
+    count, weight = int(observations.point.max()) + 1, np.ones(len(colour))
     for _ in range(REWEIGHTINGS):
         light = columns @ (intensity @ REC709_LUMINANCE)
         light = np.maximum(light / light.mean(), 1e-3)
-        weighted = np.bincount(seen.point, weight * (colour - np.log(light)), count)
-        albedo = weighted / np.maximum(np.bincount(seen.point, weight, count), 1e-12)
-        error = np.abs(colour - np.log(light) - albedo[seen.point])
+        weighted = np.bincount(observations.point, weight * (colour - np.log(light)), count)
+        albedo = weighted / np.maximum(np.bincount(observations.point, weight, count), 1e-12)
+        error = np.abs(colour - np.log(light) - albedo[observations.point])
         weight = 1 / np.maximum(error, ERROR_FLOOR)
-        _, intensity = _quadratic(seen, columns, weight / light**2).fit(every)
+        _, intensity = _quadratic(observations, columns, weight / light**2).fit(all_columns)
     return intensity
 
 
-def _search(form: Quadratic) -> list[int]:
+def _search(quadratic: Quadratic) -> list[int]:
     """Columns of the directional lights, in the order in which they are added.
 
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
     lobe are even only (Ramamoorthi & Hanrahan 2001). ``CANDIDATES`` are therefore fitted.
     """
     columns = list(range(SKY_LOBES))
-    before, intensity = form.fit(columns)
+    before, intensity = quadratic.fit(columns)
     sky = slice(0, SKY_LOBES)
-    noise = NOISE_FLOOR * float(np.einsum("qc,qr,rc", intensity, form.power[sky, sky], intensity))
-    while len(columns) < min(SKY_LOBES + MAX_LIGHTS, len(form.seen)) and before > noise:
-        gain = form.gains(columns, intensity)
+    noise = NOISE_FLOOR * float(np.einsum("qc,qr,rc", intensity, quadratic.irradiance_gram[sky, sky], intensity))
+    while len(columns) < min(SKY_LOBES + MAX_LIGHTS, len(quadratic.irradiance)) and before > noise:
+        gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
-        tried = [(form.fit([*columns, int(k)])[0], int(k)) for k in np.argsort(-gain)[:CANDIDATES]]
+        tried = [(quadratic.fit([*columns, int(k)])[0], int(k)) for k in np.argsort(-gain)[:CANDIDATES]]
         after, best = min(tried)
         if before - after < MIN_GAIN * before:
             break
         columns.append(best)
-        before, intensity = form.fit(columns)
+        before, intensity = quadratic.fit(columns)
     return columns[SKY_LOBES:]
 
 

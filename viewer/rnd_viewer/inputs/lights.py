@@ -6,7 +6,8 @@ import math
 from pathlib import Path
 
 from rnd_runtime.avatar.avatar import Avatar
-from rnd_runtime.shading.light import Light, Up, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, Up
 
 
 def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, exposure: float) -> Light:
@@ -19,5 +20,5 @@ def chosen_light(avatar: Avatar, probe: Path | None, *, up: Up, yaw: float, expo
     """
     turn = math.radians(yaw)
     if probe is None:
-        return Light(avatar.trained_light).scaled(2.0**exposure).turned(turn)
+        return Light(avatar.trained_light).scaled(2.0**exposure).with_yaw(turn)
     return load_light(probe, up=up, yaw=turn, exposure=exposure)

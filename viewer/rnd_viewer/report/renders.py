@@ -16,7 +16,8 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
-from rnd_runtime.shading.light import Light, Up, light_notes, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, Up, light_notes
 from rnd_viewer.play.video import clip_writer
 
 Bytes = NDArray[np.uint8]
@@ -63,7 +64,7 @@ class AvatarRenders:
 
         ``up``: the axis that points up in their files.
         """
-        lights = [(f"learned light, {yaw}°", self._learned.turned(math.radians(yaw))) for yaw in YAWS]
+        lights = [(f"learned light, {yaw}°", self._learned.with_yaw(math.radians(yaw))) for yaw in YAWS]
         lights += [(hdr.stem, self._read_light(hdr, up)) for hdr in hdrs]
         time_s = self.motion.duration / 2
         camera = self._front(0, time_s)

@@ -26,7 +26,8 @@ from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.tone import tone_map
-from rnd_runtime.shading.light import Light, downsize, light_notes, load_light
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, downsize, light_notes
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 
@@ -200,7 +201,7 @@ class Scene:
 
     def _rotated_shader(self, state: ViewState) -> Shader:
         shader = self._shader(self._light_name(state), state.shade)
-        return shader.turned(shader.light.yaw + state.yaw)
+        return shader.with_yaw(shader.light.yaw + state.yaw)
 
     def _light_name(self, state: ViewState) -> str | Path | None:
         """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""
@@ -248,8 +249,8 @@ class Scene:
         key = (name, state.yaw, size, camera.K.tobytes(), camera.world_to_camera.tobytes())
         if self._background is None or self._background[0] != key:
             light = self._sky(name)
-            turned = light.turned(light.yaw + state.yaw)
-            self._background = key, background.radiance(camera, turned)
+            rotated = light.with_yaw(light.yaw + state.yaw)
+            self._background = key, background.radiance(camera, rotated)
         return self._background[1] * np.float32(2.0**state.exposure)
 
     def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:

@@ -13,10 +13,10 @@ void main() {
     if (place >= count) return;
     int gaussian = count - 1 - place;
     double depth;
-    bool seen = depth_of(gaussian, depth);
+    bool visible = depth_of(gaussian, depth);
     double span = farthest - nearest;
     double scale = span > 0.0lf ? 4294967295.0lf / span : 0.0lf;
     // the nearest's own key would be LAST: it shares that of what lies 0.2 nm in 1 m behind it
-    keys[place] = seen ? min(LAST - uint((depth - nearest) * scale), LAST - 1u) : LAST;
-    gaussians[place] = seen ? gaussian : -1;
+    keys[place] = visible ? min(LAST - uint((depth - nearest) * scale), LAST - 1u) : LAST;
+    gaussians[place] = visible ? gaussian : -1;
 }

@@ -31,14 +31,14 @@ vec3 direct() {
     for (int light = 0; light < LIGHTS; light++) {
         vec3 l = light_directions[light];
         float n_dot_l = dot(normal, l);
-        float arriving = facing * reached_by(light) * n_dot_l;
-        if (!(arriving > 0.0)) continue;
+        float visible_cosine = facing * reached_by(light) * n_dot_l;
+        if (!(visible_cosine > 0.0)) continue;
         vec3 h = l + view;
         float half_squared = max(dot(h, h), TINY);
         vec3 across = cross(normal, h);
         float widened = min(alpha_squared() + light_blurs[light] / sqrt(half_squared), 1.0);
         float specular_term = ggx(widened, n_dot_l, n_dot_v, dot(across, across) / half_squared, half_squared);
-        sum += arriving * (ONE_OVER_PI * albedo + specular_term) * light_irradiances[light];
+        sum += visible_cosine * (ONE_OVER_PI * albedo + specular_term) * light_irradiances[light];
     }
     return sum;
 }

@@ -1,1 +1,1 @@
-"""What files of light probes state: channels, colours, exposure and orientation."""
+"""Files of light probes: reading, and their channels, colours, exposure and orientation."""

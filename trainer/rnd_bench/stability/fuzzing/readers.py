@@ -114,7 +114,7 @@ def _colmap(folder: Path) -> Read:
 
 
 def _light(folder: Path) -> Read:
-    from rnd_runtime.shading.light import load_light
+    from rnd_runtime.shading.files.load import load_light
 
     return load_light
 

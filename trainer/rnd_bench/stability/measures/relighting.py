@@ -16,15 +16,8 @@ from rnd_bench.stability.processes import play, run_commands
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import to_bytes, write_image
 from rnd_runtime.shading.brdf import F0, LARGEST_ALBEDO, ROUGHNESS_RANGE, specular
-from rnd_runtime.shading.light import (
-    REC709_LUMINANCE,
-    Light,
-    Up,
-    downsize,
-    load_light,
-    texel_directions,
-    texel_solid_angles,
-)
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import REC709_LUMINANCE, Light, Up, downsize, texel_directions, texel_solid_angles
 from rnd_runtime.shading.reference import shade_reference
 from rnd_runtime.shading.sh import SH_COUNT
 from rnd_runtime.shading.shader import Shader
@@ -180,7 +173,7 @@ def turning_light(subject: Subject) -> Result:
     posed = subject.avatar.pose(subject.walk(0.3), 0.2)
     camera = subject.camera()
     angles = np.radians(0.5 * np.arange(subject.few(180, 720)))
-    frames = (subject.image(posed, camera, subject.shader.turned(angle)) for angle in angles)
+    frames = (subject.image(posed, camera, subject.shader.with_yaw(angle)) for angle in angles)
     changes = [float(np.abs(now - before).mean()) for before, now in pairwise(frames)]
     ratio = max(changes) / float(np.median(changes))
     return result(below("frame difference, largest over median", ratio, 3, "×"))

@@ -10,10 +10,10 @@ const DIGITS = 1 << RADIX_BITS;
 
 /**
  * Inputs of the shader in complete rows: `records` [rows·ROW_GAUSSIANS·TEXELS·4], `pairs` (Gaussians by tile, front to
- * back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `grown` scales covariances.
+ * back), `tiles` [columns·rows·2] (first and last + 1 of its pairs). `features` [N·3]; `covarianceScale` scales covariances.
  * Gaussians with numbers that are not finite, without extent, or with n·v below `cull` are skipped: NaN fails every guard.
  */
-export function project({ means, covariances, opacities, normals }, count, features, camera, grown, cull) {
+export function project({ means, covariances, opacities, normals }, count, features, camera, covarianceScale, cull) {
   const { rotation: r, translation: t, position: eye, focal, width, height } = camera;
   const limitX = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * width / focal, limitY = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * height / focal;
   const records = new Float32Array(wholeRows(count, ROW_GAUSSIANS) * TEXELS * 4);
@@ -32,8 +32,8 @@ export function project({ means, covariances, opacities, normals }, count, featu
     const scale = focal / z;
     const a0 = scale * (r[0] - slopeX * r[6]), a1 = scale * (r[1] - slopeX * r[7]), a2 = scale * (r[2] - slopeX * r[8]);
     const b0 = scale * (r[3] - slopeY * r[6]), b1 = scale * (r[4] - slopeY * r[7]), b2 = scale * (r[5] - slopeY * r[8]);
-    const k = 6 * i, xx = grown * covariances[k], xy = grown * covariances[k + 1], xz = grown * covariances[k + 2];
-    const yy = grown * covariances[k + 3], yz = grown * covariances[k + 4], zz = grown * covariances[k + 5];
+    const k = 6 * i, xx = covarianceScale * covariances[k], xy = covarianceScale * covariances[k + 1], xz = covarianceScale * covariances[k + 2];
+    const yy = covarianceScale * covariances[k + 3], yz = covarianceScale * covariances[k + 4], zz = covarianceScale * covariances[k + 5];
     const sa0 = xx * a0 + xy * a1 + xz * a2, sa1 = xy * a0 + yy * a1 + yz * a2, sa2 = xz * a0 + yz * a1 + zz * a2;
     const sb0 = xx * b0 + xy * b1 + xz * b2, sb1 = xy * b0 + yy * b1 + yz * b2, sb2 = xz * b0 + yz * b1 + zz * b2;
     const pxx = a0 * sa0 + a1 * sa1 + a2 * sa2 + DILATION, pxy = b0 * sa0 + b1 * sa1 + b2 * sa2;

@@ -8,17 +8,17 @@ import { buildSky, shadeSky } from "./tables.js";
 import { extractSuns } from "./sun.js";
 
 /**
- * The shader of a light and the mode `shade`: a function (gaussians, count, eye, lightToRoot, grown) → radiance [count·3];
- * `grown` scales covariances.
+ * The shader of a light and the mode `shade`: a function (gaussians, count, eye, lightToRoot, covarianceScale) → radiance [count·3];
+ * `covarianceScale` scales covariances.
  */
 export function makeShader(light, shade) {
   const { sky, suns } = shade === "table+sun" ? extractSuns(light) : { sky: light, suns: [] };
   const [prepared, shadeUnder] = prepare(sky, shade);
-  return (gaussians, count, eye, lightToRoot, grown) => {
+  return (gaussians, count, eye, lightToRoot, covarianceScale) => {
     const radiance = new Float32Array(3 * count);
     shadeUnder(prepared, gaussians, count, eye, lightToRoot, radiance);
-    const turned = suns.map((sun) => ({ ...sun, direction: rotate(lightToRoot, sun.direction) }));
-    addSuns(turned, gaussians, count, eye, grown, radiance);
+    const rotated = suns.map((sun) => ({ ...sun, direction: rotate(lightToRoot, sun.direction) }));
+    addSuns(rotated, gaussians, count, eye, covarianceScale, radiance);
     return radiance;
   };
 }

@@ -8,16 +8,16 @@ import { cross, unit } from "../rotations.js";
 import { clampRoughness, ggx } from "./brdf.js";
 
 /** Add to `radiance` [count·3] that of `suns` ({direction in the root's frame, irradiance, spread}). */
-export function addSuns(suns, gaussians, count, eye, grown, radiance) {
-  const radii = suns.length ? discRadii(gaussians, count, grown) : null;
+export function addSuns(suns, gaussians, count, eye, covarianceScale, radiance) {
+  const radii = suns.length ? discRadii(gaussians, count, covarianceScale) : null;
   for (const sun of suns) shadeSun(sun, gaussians, count, eye, sunVisibility(sun.direction, gaussians, count, radii), radiance);
 }
 
-/** Disc radius [count] m of each Gaussian in a depth map; `grown` scales covariances. */
-function discRadii({ covariances, opacities }, count, grown) {
+/** Disc radius [count] m of each Gaussian in a depth map; `covarianceScale` scales covariances. */
+function discRadii({ covariances, opacities }, count, covarianceScale) {
   const radii = new Float32Array(count);
   for (let i = 0; i < count; i++) {
-    const trace = grown * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5]);
+    const trace = covarianceScale * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5]);
     if (opacities[i] > CASTING_OPACITY) radii[i] = DISC_SIGMAS * Math.sqrt(trace / 2);
   }
   return radii;
@@ -52,9 +52,9 @@ function sunVisibility(direction, { means, normals }, count, radii) {
     if (!(normal[3 * i + 2] > 0)) continue;
     position[3 * i] = (position[3 * i] - left) / texel + 1;
     position[3 * i + 1] = (position[3 * i + 1] - low) / texel + 1;
-    if (radii[i] > 0) drawDisc(map, position, normal, 3 * i, radii[i]);
+    if (radii[i] > 0) rasterizeDisc(map, position, normal, 3 * i, radii[i]);
   }
-  for (let i = 0; i < count; i++) if (normal[3 * i + 2] > 0) visibility[i] = lookUp(map, position, normal, 3 * i, radii[i]);
+  for (let i = 0; i < count; i++) if (normal[3 * i + 2] > 0) visibility[i] = visibilityAt(map, position, normal, 3 * i, radii[i]);
   return visibility;
 }
 
@@ -72,14 +72,14 @@ function slopes(normal, k, texel) {
   return [normal[k] * scale, normal[k + 1] * scale];
 }
 
-function drawDisc({ depth, width, height, texel }, position, normal, k, radius) {
+function rasterizeDisc({ depth, width, height, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2] - DROP * Math.max(1 - normal[k + 2] / EDGE_ON, 0);
-  const cosine = Math.max(normal[k + 2], SLOPE_FLOOR), box = radius / texel + RIM_TEXELS;
+  const cosine = Math.max(normal[k + 2], SLOPE_FLOOR), halfSize = radius / texel + RIM_TEXELS;
   const area = texel * texel, square = radius * radius;
-  const fall = DROP / (box * box * area - square), [slopeX, slopeY] = slopes(normal, k, texel);
-  const left = Math.max(Math.ceil(x - box), 0), right = Math.min(Math.floor(x + box) + 1, width);
-  const bottom = Math.min(Math.floor(y + box) + 1, height);
-  for (let row = Math.max(Math.ceil(y - box), 0); row < bottom; row++) {
+  const fall = DROP / (halfSize * halfSize * area - square), [slopeX, slopeY] = slopes(normal, k, texel);
+  const left = Math.max(Math.ceil(x - halfSize), 0), right = Math.min(Math.floor(x + halfSize) + 1, width);
+  const bottom = Math.min(Math.floor(y + halfSize) + 1, height);
+  for (let row = Math.max(Math.ceil(y - halfSize), 0); row < bottom; row++) {
     const dy = row - y, along = slopeY * dy, above = dy * dy * area - square;
     for (let column = left, at = row * width + left; column < right; column++, at++) {
       const dx = column - x, rise = slopeX * dx + along, beyond = dx * dx * area + above, outside = beyond + rise * rise;
@@ -90,7 +90,7 @@ function drawDisc({ depth, width, height, texel }, position, normal, k, radius) 
 }
 
 /** Bilinear visibility of a point from the four texels around it; texels above its plane occlude it. */
-function lookUp({ depth, width, texel }, position, normal, k, radius) {
+function visibilityAt({ depth, width, texel }, position, normal, k, radius) {
   const x = position[k], y = position[k + 1], z = position[k + 2], [slopeX, slopeY] = slopes(normal, k, texel);
   const clearance = Math.max(DEPTH_BIAS * radius, CLEARANCE_TEXELS * texel) / Math.max(normal[k + 2], SLOPE_FLOOR);
   const top = z + (1 + SOFTNESS) * clearance, span = 1 / (2 * SOFTNESS * clearance);
@@ -109,8 +109,8 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
   const [lx, ly, lz] = sun.direction, spread = sun.spread ** 2;
   for (let i = 0; i < count; i++) {
     const nx = normals[3 * i], ny = normals[3 * i + 1], nz = normals[3 * i + 2];
-    const nDotL = nx * lx + ny * ly + nz * lz, arriving = visibility[i] * nDotL;
-    if (!(arriving > 0)) continue;
+    const nDotL = nx * lx + ny * ly + nz * lz, visibleCosine = visibility[i] * nDotL;
+    if (!(visibleCosine > 0)) continue;
     let vx = eye[0] - means[3 * i], vy = eye[1] - means[3 * i + 1], vz = eye[2] - means[3 * i + 2];
     const distance = Math.max(Math.hypot(vx, vy, vz), 1e-12);
     vx /= distance;
@@ -124,6 +124,6 @@ function shadeSun(sun, { means, normals, albedo, roughness }, count, eye, visibi
     const sineSquared = (cx * cx + cy * cy + cz * cz) / halfSquared;
     const alpha = clampRoughness(roughness[i]) ** 2;
     const specular = ggx(Math.min(alpha * alpha + spread / Math.sqrt(halfSquared), 1), nDotL, nDotV, sineSquared, halfSquared);
-    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * arriving * (albedo[3 * i + c] / Math.PI + specular) * sun.irradiance[c];
+    for (let c = 0; c < 3; c++) radiance[3 * i + c] += facing * visibleCosine * (albedo[3 * i + c] / Math.PI + specular) * sun.irradiance[c];
   }
 }

@@ -94,14 +94,14 @@ export function shadeLights(lights, { means, normals, albedo, roughness, visibil
     for (let k = 0; k < K; k++) {
       const lx = toward[3 * k], ly = toward[3 * k + 1], lz = toward[3 * k + 2], nDotL = nx * lx + ny * ly + nz * lz;
       if (!(nDotL > 0)) continue;
-      let arriving = 0;
-      for (let j = 0; j < 16; j++) arriving += visibility[16 * i + j] * basis[16 * k + j];
-      arriving *= nDotL;
+      let visibleCosine = 0;
+      for (let j = 0; j < 16; j++) visibleCosine += visibility[16 * i + j] * basis[16 * k + j];
+      visibleCosine *= nDotL;
       const hx = lx + vx, hy = ly + vy, hz = lz + vz, halfSquared = Math.max(hx * hx + hy * hy + hz * hz, HALF_FLOOR);
       const cx = ny * hz - nz * hy, cy = nz * hx - nx * hz, cz = nx * hy - ny * hx;
-      const reflected = arriving * ggx(alphaSquared, nDotL, nDotV, (cx * cx + cy * cy + cz * cz) / halfSquared, halfSquared);
+      const reflected = visibleCosine * ggx(alphaSquared, nDotL, nDotV, (cx * cx + cy * cy + cz * cz) / halfSquared, halfSquared);
       for (let c = 0; c < 3; c++) {
-        diffuse[c] += arriving * flux[3 * k + c];
+        diffuse[c] += visibleCosine * flux[3 * k + c];
         specular[c] += reflected * flux[3 * k + c];
       }
     }
