@@ -1,0 +1,1 @@
+"""Motions on skeletons of their own or as bare positions, and the choice of a reader."""
