@@ -102,7 +102,7 @@ def _forearm(avatar: Avatar, rest: Motion, sky: Light) -> None:
     alone = shared._replace(bones=bone_transforms(avatar.skeleton, turned[0], np.zeros(3)))
     tiles = []
     for encoded in (avatar.encode(rest, 0.0), alone, shared):
-        posed = PosedAvatar(avatar.posed(encoded), np.eye(4))
+        posed = PosedAvatar(avatar.posed(encoded), np.eye(4), avatar.joints(encoded))
         tiles.append(FrameRenderer(avatar, sky, camera, cull=-1).draw(posed).srgb)
     _write("forearm.png", tiles)
 

@@ -111,6 +111,11 @@ class Avatar:
             np.ascontiguousarray(bones[0, :, :3], np.float32),
         )
 
+    def joints(self, encoded: Encoded) -> NDArray[np.float64]:
+        """Joint positions [J, 3] m in the frame of ``encoded``."""
+        rest = self.skeleton.rest_joints
+        return np.asarray(np.einsum("jab,jb->ja", encoded.bones[:, :, :3], rest) + encoded.bones[:, :, 3], np.float64)
+
     def unposed(self, encoded: Encoded) -> Unposed | None:
         """What ``posed`` is made of, for those who pose elsewhere; None where the graph has posed already."""
         if self._rest is None:

@@ -108,6 +108,8 @@ def read_strips(path: str | Path, channels: Sequence[int]) -> Iterator[tuple[int
         spec = source.spec()
         _checked_header(spec, path)
         _read_type(spec, path)
+        # numpy converts halves in a third of OpenImageIO's time
+        kind = "half" if {str(of) for of in (spec.format, *spec.channelformats)} == {"half"} else "float"
         tile: int = spec.tile_height or 1
         rows = -(-_STRIP // tile) * tile
         budget.take(rows * spec.width * spec.nchannels * _PIXEL_BYTES["float"], "strip of the image")
@@ -116,9 +118,9 @@ def read_strips(path: str | Path, channels: Sequence[int]) -> Iterator[tuple[int
         for top in range(0, spec.height, rows):
             bottom = min(top + rows, spec.height)
             if spec.tile_width:
-                pixels = source.read_tiles(0, 0, 0, spec.width, top, bottom, 0, 1, low, high, "float")
+                pixels = source.read_tiles(0, 0, 0, spec.width, top, bottom, 0, 1, low, high, kind)
             else:
-                pixels = source.read_scanlines(0, 0, top, bottom, 0, low, high, "float")
+                pixels = source.read_scanlines(0, 0, top, bottom, 0, low, high, kind)
             if pixels is None:
                 raise InputError("image cannot be read", got=_reason(source.geterror()), file=path)
             budget.check_time("image")

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,10 +76,11 @@ class RenderedFrame:
 
 
 class PosedAvatar(NamedTuple):
-    """Gaussians in the root's frame, and root frame → world [4, 4] (rigid, m)."""
+    """Gaussians and joints [J, 3] m in the root's frame, and root frame → world [4, 4] (rigid, m)."""
 
     gaussians: Gaussians
     root: Floats
+    joints: Floats
 
 
 class FrameRenderer:
@@ -193,18 +194,11 @@ class FrameRenderer:
     ) -> Raster:
         """In the root's frame; with ``antialias`` a body of few pixels is rendered on a finer grid and averaged."""
         shader, camera = in_root_frame(body.root, self.shader, camera)
-        fine = fine_view(camera, self._extent(body)) if antialias else None
+        joints = body.joints if isinstance(body, PosedAvatar) else self.avatar.joints(body)
+        fine = fine_view(camera, joints) if antialias else None
         if fine is None:
             return self._splat(body, shader, camera, aovs, lit)
         return fine.averaged(self._splat(body, shader, fine.camera, aovs, lit))
-
-    def _extent(self, body: Encoded | PosedAvatar) -> NDArray[np.floating[Any]]:
-        """Points [N, 3] m in the root's frame, from which no part of the body is far."""
-        if isinstance(body, PosedAvatar):
-            return body.gaussians.means
-        rest = self.avatar.skeleton.rest_joints
-        joints: NDArray[np.floating[Any]] = np.einsum("jab,jb->ja", body.bones[:, :, :3], rest) + body.bones[:, :, 3]
-        return joints
 
     def _splat(
         self, body: Encoded | PosedAvatar, shader: Shader, camera: Camera, aovs: Sequence[str], lit: bool

@@ -83,7 +83,7 @@ def test_encoded_and_posed_bodies_give_one_frame(avatar, motion, sky, mode, cull
     renderer = FrameRenderer(avatar, sky, camera, shade=mode, cull=-1 if cull is None else cull)
     renderer.turn(0.7)
     frame, encoded = renderer.render(motion, 0.3), avatar.encode(motion, 0.3)
-    parts = renderer.draw(PosedAvatar(avatar.posed(encoded), encoded.root))
+    parts = renderer.draw(PosedAvatar(avatar.posed(encoded), encoded.root, avatar.joints(encoded)))
     np.testing.assert_array_equal(frame.radiance, parts.radiance)
     np.testing.assert_array_equal(frame.srgb, tone_map(parts.radiance, parts.alpha))
     stages = ["motion", "encoders", "posing", "shading", "projection", "sort", "raster", "tone map"]

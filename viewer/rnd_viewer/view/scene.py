@@ -118,14 +118,14 @@ class Scene:
         if state.truth is not None:
             state = structs.replace(state, yaw=0.0, exposure=0.0)
         camera, motion, time_s = self._view(state)
-        gaussians, root = self._pose(motion, time_s, seconds)
-        gaussians = _fewer(gaussians, state.gaussians)
+        body = self._pose(motion, time_s, seconds)
+        gaussians = _fewer(body.gaussians, state.gaussians)
         if state.output == "light":
             gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
         lit = state.output in ("lit", "light")
         aovs = () if lit else (state.output,)
         self.renderer.shader = self._rotated_shader(state)
-        frame = self.renderer.draw(PosedAvatar(gaussians, root), camera, aovs=aovs, lit=lit, srgb=False)
+        frame = self.renderer.draw(body._replace(gaussians=gaussians), camera, aovs=aovs, lit=lit, srgb=False)
         started = perf_counter()
         if lit or state.output == "albedo":
             radiance = frame.radiance * np.float32(2.0**state.exposure) if lit else frame.aovs["albedo"]
@@ -195,7 +195,8 @@ class Scene:
             started = perf_counter()
             encoded = self.avatar.encode(motion, time_s)
             known = perf_counter()
-            self._posed = motion, time_s, PosedAvatar(self.avatar.posed(encoded), encoded.root)
+            body = PosedAvatar(self.avatar.posed(encoded), encoded.root, self.avatar.joints(encoded))
+            self._posed = motion, time_s, body
             seconds |= {"encoders": known - started, "posing": perf_counter() - known}
         return self._posed[2]
 
