@@ -18,7 +18,7 @@ from rnd_trainer.losses.losses import (
     skinning_divergence,
     sky_prior,
 )
-from rnd_trainer.losses.metrics import mask_box, normal_degrees, psnr, ssim, ssim_map
+from rnd_trainer.losses.metrics import mask_box, mean_ssim, normal_degrees, psnr, ssim, ssim_map
 from rnd_trainer.render.probe import LightProbe, natural_sky
 
 SSIM_AGREEMENT = 1e-6  # float64 on both sides; the border is cut on both sides
@@ -63,6 +63,19 @@ def test_ssim_is_scikit_images() -> None:
     assert np.abs(ssim_map(image, noisy).numpy() - expected).max() < SSIM_AGREEMENT
     assert ssim(image, noisy) == pytest.approx(expected.mean(), abs=SSIM_AGREEMENT)
     assert ssim(image, image) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("size", [(11, 11), (24, 31), (12, 90)])
+def test_compiled_ssim_equals_the_map_forward_and_by_gradient(size) -> None:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(*size, 3, generator=generator)
+    target = (image + 0.2 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
+    fast, slow = image.clone().requires_grad_(), image.double().requires_grad_()
+    ours, expected = mean_ssim(fast, target), ssim_map(slow, target.double()).mean()
+    (1 - 3 * ours).backward()
+    (1 - 3 * expected).backward()
+    assert float(ours.detach()) == pytest.approx(float(expected.detach()), abs=SSIM_AGREEMENT)
+    assert float((fast.grad - slow.grad).norm() / slow.grad.norm()) < 1e-5
 
 
 def test_normal_angle_is_exact_where_arccos_is_not() -> None:

@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from rnd_trainer.losses.blur import SeparableFilter
 from rnd_trainer.render.probe import Texels
 from rnd_trainer.render.shading import shade
 
@@ -76,18 +75,3 @@ def test_a_nan_is_propagated() -> None:
     scene[0][2] = math.nan
     radiance = shade(*scene[:5], Texels(scene[5], scene[6]))
     assert radiance[2].isnan().all() and radiance[[0, 1, 3]].isfinite().all()
-
-
-def test_filter_equals_convolution_forward_and_by_gradient() -> None:
-    generator = torch.Generator().manual_seed(0)
-    images = torch.randn(3, 24, 31, generator=generator)
-    taps = torch.tensor([0.1, 0.2, 0.4, 0.2, 0.1])
-    fast, slow = images.clone().requires_grad_(), images.double().requires_grad_()
-    ours = SeparableFilter.apply(fast, taps)
-    window = taps.double()
-    expected = torch.nn.functional.conv2d(slow[:, None], (window[:, None] * window)[None, None])[:, 0]
-    incoming = torch.randn(expected.shape, generator=generator)
-    ours.backward(incoming)
-    expected.backward(incoming.double())
-    assert _relative(ours.detach(), expected.detach()) < 1e-6
-    assert _relative(fast.grad, slow.grad) < 1e-6

@@ -22,7 +22,7 @@ KINDS = {
     "our posing": "PoseGaussians|_Interpolate",
     "our shading": "FusedShade",
     "our splatting": "_CpuRasterizer",
-    "our SSIM": "SeparableFilter",
+    "our SSIM": "MeanSsim",
     "perceptual network": "convolution|max_pool|grid_sampler",
     "matrix products": r"aten::(mm|addmm|bmm|baddbmm|matmul)$",
 }

@@ -8,7 +8,7 @@ from torch import Tensor
 from rnd_trainer.model.model import PosedGaussians
 from rnd_trainer.render.probe import luminance, natural_sky
 
-from .metrics import SSIM_WINDOW, ssim_map
+from .metrics import SSIM_WINDOW, mean_ssim
 
 ALLOWED_STRETCH = 1.7
 """stretch (ratio of lengths) without a penalty"""
@@ -30,7 +30,7 @@ def multiscale_dssim(image_srgb: Tensor, target_srgb: Tensor, scales: int) -> Te
             image_srgb, target_srgb = _halved(image_srgb), _halved(target_srgb)
             if min(image_srgb.shape[:2]) < SSIM_WINDOW:
                 break
-        terms.append(1 - ssim_map(image_srgb, target_srgb).mean())
+        terms.append(1 - mean_ssim(image_srgb, target_srgb))
     return torch.stack(terms).mean()
 
 

@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from .blur import SeparableFilter
+from .ssim_kernel import MeanSsim
 
-SSIM_SIGMA, SSIM_WINDOW = 1.5, 11
+SSIM_SIGMA, SSIM_WINDOW, SSIM_C1, SSIM_C2 = 1.5, 11, 0.01**2, 0.03**2
 """of Wang et al. 2004, as scikit-image with gaussian_weights=True, use_sample_covariance=False"""
 
 
@@ -22,30 +22,38 @@ def psnr(image: Tensor, target: Tensor, where: Tensor | None = None) -> float:
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity [H', W', C] of [H, W, C] images in 0…1, valid region (Wang et al. 2004, eq. 13)."""
-    assert min(image.shape[:2]) >= SSIM_WINDOW, "SSIM needs at least 11 × 11 pixels"
+    _check_size(image)
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)  # [C, H, W]
-    stack = torch.cat([x, y, x * x, y * y, x * y])
-    ramp = torch.arange(SSIM_WINDOW, dtype=x.dtype, device=x.device) - SSIM_WINDOW // 2
-    window = torch.exp(-0.5 * (ramp / SSIM_SIGMA) ** 2)
-    window = window / window.sum()
-    mean_x, mean_y, xx, yy, xy = _blur(stack, window).chunk(5)
-    c1, c2 = 0.01**2, 0.03**2
-    similarity = (2 * mean_x * mean_y + c1) * (2 * (xy - mean_x * mean_y) + c2)
-    similarity = similarity / ((mean_x**2 + mean_y**2 + c1) * ((xx - mean_x**2) + (yy - mean_y**2) + c2))
+    window = _window(x)
+    stack = torch.cat([x, y, x * x, y * y, x * y])[:, None]
+    filtered = torch.nn.functional.conv2d(stack, (window[:, None] * window)[None, None])[:, 0]
+    mean_x, mean_y, xx, yy, xy = filtered.chunk(5)
+    similarity = (2 * mean_x * mean_y + SSIM_C1) * (2 * (xy - mean_x * mean_y) + SSIM_C2)
+    similarity = similarity / ((mean_x**2 + mean_y**2 + SSIM_C1) * ((xx - mean_x**2) + (yy - mean_y**2) + SSIM_C2))
     return similarity.permute(1, 2, 0)
 
 
-def _blur(images: Tensor, taps: Tensor) -> Tensor:
-    """[C, H, W] filtered along both axes by ``taps``, valid region."""
-    if not images.is_cuda and images.dtype == torch.float32:
-        return SeparableFilter.apply(images, taps)
-    blurred = torch.nn.functional.conv2d(images[:, None], taps[None, None, :, None])
-    return torch.nn.functional.conv2d(blurred, taps[None, None, None, :])[:, 0]
+def mean_ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean of ``ssim_map``. Float32 on the CPU uses the compiled kernel, without gradient by ``target``."""
+    if image.is_cuda or image.dtype != torch.float32:
+        return ssim_map(image, target).mean()
+    _check_size(image)
+    return MeanSsim.apply(image, target, _window(image), SSIM_C1, SSIM_C2)
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
     """Mean of ``ssim_map``."""
-    return float(ssim_map(image, target).mean())
+    return float(mean_ssim(image, target))
+
+
+def _check_size(image: Tensor) -> None:
+    assert min(image.shape[:2]) >= SSIM_WINDOW, "SSIM needs at least 11 × 11 pixels"
+
+
+def _window(like: Tensor) -> Tensor:
+    ramp = torch.arange(SSIM_WINDOW, dtype=like.dtype, device=like.device) - SSIM_WINDOW // 2
+    window = torch.exp(-0.5 * (ramp / SSIM_SIGMA) ** 2)
+    return window / window.sum()
 
 
 def normal_degrees(normals: Tensor, target: Tensor, where: Tensor) -> float:
