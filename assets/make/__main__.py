@@ -1,4 +1,4 @@
-"""``python -m assets.make [body] [walk] [sky] [capture] [contact]``: remakes the named assets, or all of them."""
+"""``python -m assets.make [body] [figure] [walk] [sky] [capture] [contact]``: remakes the named assets, or all."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from rnd_runtime.capture.body import Body
 from rnd_runtime.motion.motion import save_motion
 from rnd_stage.film.dances import walk
 from rnd_stage.people.template import template_body
+from rnd_trainer.estimating.fitting.figure import TEMPLATE
 
 from . import sky
 
 ASSETS = Path(__file__).parents[1]
-STEPS = ("body", "walk", "sky", "capture", "contact")
+STEPS = ("body", "figure", "walk", "sky", "capture", "contact")
 
 
 def main(steps: list[str]) -> None:
@@ -25,6 +26,10 @@ def main(steps: list[str]) -> None:
     if "body" in steps:
         template_body().save(ASSETS / "body.npz")
     body = Body.load(ASSETS / "body.npz")
+    if "figure" in steps:
+        from . import figure  # needs anny
+
+        figure.make_figure(TEMPLATE)
     if "walk" in steps:
         save_motion(ASSETS / "walk.npz", walk(body.skeleton))
     if "sky" in steps:

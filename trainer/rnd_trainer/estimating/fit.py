@@ -55,6 +55,7 @@ class Weights:
     inner: float = 0.15
     outline_m: float = 0.012
     ground: float = 0.4
+    shared: float = 0.1  # part of the frames that count as independent
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class Stage:
     limit: float = 3.0
 
 
+CONVERGED = 1e-3
+"""relative fall of the cost below which a stage ends"""
 STAGES = (Stage(8, points=0.3, limit=8.0), Stage(10, limit=5.0), Stage(14, outlines=True))
 
 
@@ -137,10 +140,14 @@ def estimate(
     total = sum(stage.steps for stage in STAGES)
     done = 0
     for stage in STAGES:
-        for _ in range(stage.steps):
-            fit.advance(stage)
-            done += 1
-            on_progress(done, total)
+        cost = np.inf
+        for number in range(stage.steps):
+            before, cost = cost, fit.advance(stage)
+            on_progress(done + number + 1, total)
+            if number >= 2 and cost > before * (1 - CONVERGED):
+                break
+        done += stage.steps
+        on_progress(done, total)
     return fit.result()
 
 
@@ -181,7 +188,7 @@ class Fit:
         rotations = local_rotations(TO_CAMERA @ joint_rotations(self.lifted), figure.body.skeleton)
         count = len(observations)
         shape = np.zeros(len(figure.names))
-        if self.height is not None and figure.names:
+        if self.height is not None and "height" in figure.names:
             unit = np.zeros(len(shape))
             unit[0] = 1
             shape[0] = (self.height - figure.height(0 * unit)) / (figure.height(unit) - figure.height(0 * unit))
@@ -254,7 +261,9 @@ class Fit:
         cost += PriorTerm(pose_prior(), w.prior)(posed, layout, equations)
         cost += self._smooth(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground)(state, posed, figure, marks, layout, equations)
-        cost += SharedTerm(lens, self.height)(state, figure, marks, layout, equations)
+        cost += SharedTerm(lens, 1 + w.shared * len(state.translations), self.height)(
+            state, figure, marks, layout, equations
+        )
         if outline is not None:
             cost += outline(state, posed, layout, lens, equations)
         return cost
@@ -319,7 +328,8 @@ class Fit:
 
         pixels, _ = project(mark_points(self.state, posed, self.marks)[:, :33], self.state, self.lens)
         gaps = np.linalg.norm(pixels - self.observations.keypoints_px, axis=-1)
-        return np.nanmedian(np.where(self.observations.confidence > 0.5, gaps, np.nan), axis=1)
+        sure = self.observations.confidence > 0.5
+        return np.array([np.median(gap[here]) if here.any() else np.inf for gap, here in zip(gaps, sure)])
 
 
 def _level(up: Floats) -> Floats:

@@ -29,7 +29,48 @@ _SIDED = {
     "Hand": "wrist",
 }
 _SIDED |= {f"Hand{f}{k}": f"{f.lower()}{k}" for f in ("Index", "Middle", "Pinky", "Ring", "Thumb") for k in "123"}
+PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
+ADULT = 2 / 3
+"""``age`` of a young adult"""
 _ARM = ("shoulder", "elbow", "wrist", "middle1")
+
+
+class AnnyModel:
+    """Anny, loaded once: some minutes the first time, when it fills its cache.
+
+    Raises:
+        InputError: the package ``anny`` is not installed.
+    """
+
+    def __init__(self) -> None:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                import anny
+        except ImportError as error:
+            raise InputError("Anny is not installed", hint="pip install anny") from error
+        self.model = anny.Anny(rig="mixamo", skinning_method="lbs")
+
+    def body(self, **phenotype: float) -> Body:
+        """The adult of a phenotype with SMPL-H's joint names, in a T-pose, Y up, facing +Z; 0.5 is the mean."""
+        import torch
+
+        model = self.model
+        usual = {name: ADULT if name == "age" else 0.5 for name in PHENOTYPE}
+        values = {name: torch.tensor([value]) for name, value in (usual | phenotype).items()}
+        posed = model(phenotype_kwargs=values) if phenotype else model()
+        vertices, joints = (
+            posed[name][0].detach().numpy() @ Z_UP_TO_Y_UP.T for name in ("rest_vertices", "rest_bone_heads")
+        )
+        names = tuple(_smpl_name(label.removeprefix("mixamorig:")) for label in model.bone_labels)
+        weights = np.zeros((len(vertices), len(names)))
+        rows = np.arange(len(vertices))[:, None]
+        np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
+        faces = model.faces.numpy()
+        if faces.shape[1] == 4:
+            faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
+        skeleton = Skeleton(names, np.array(model.bone_parents, np.int32), joints)
+        return _with_level_arms(Body(vertices, faces, weights.astype(np.float32), skeleton, LICENSE))
 
 
 def anny_body() -> Body:
@@ -38,26 +79,7 @@ def anny_body() -> Body:
     Raises:
         InputError: the package ``anny`` is not installed.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import anny
-    except ImportError as error:
-        raise InputError("Anny is not installed", hint="pip install anny") from error
-    model = anny.Anny(rig="mixamo", skinning_method="lbs")
-    posed = model()
-    vertices, joints = (
-        posed[name][0].detach().numpy() @ Z_UP_TO_Y_UP.T for name in ("rest_vertices", "rest_bone_heads")
-    )
-    names = tuple(_smpl_name(label.removeprefix("mixamorig:")) for label in model.bone_labels)
-    weights = np.zeros((len(vertices), len(names)))
-    rows = np.arange(len(vertices))[:, None]
-    np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
-    faces = model.faces.numpy()
-    if faces.shape[1] == 4:
-        faces = np.concatenate([faces[:, :3], faces[:, [0, 2, 3]]])
-    skeleton = Skeleton(names, np.array(model.bone_parents, np.int32), joints)
-    return _with_level_arms(Body(vertices, faces, weights.astype(np.float32), skeleton, LICENSE))
+    return AnnyModel().body()
 
 
 def _smpl_name(name: str) -> str:

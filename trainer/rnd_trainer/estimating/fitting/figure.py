@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.npz import Npz
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES
 
@@ -119,9 +120,11 @@ class Figure:
 
 
 def known_figure(body: Body) -> Figure:
-    """``body`` with no parameter."""
+    """``body`` as it is, in clothes of unknown thickness."""
     check_joints(body)
-    return Figure(body, (), np.zeros((0, *body.vertices.shape)), np.zeros((0, len(body.skeleton), 3)))
+    clothes = _clothes(body)
+    dressed = replace(body, vertices=body.vertices + clothes)
+    return Figure(dressed, ("clothes",), clothes[None], np.zeros((1, len(body.skeleton), 3)))
 
 
 def check_joints(body: Body) -> None:
@@ -151,8 +154,18 @@ def figure_of(body: Body) -> Figure:
 
 @cache
 def default_figure() -> Figure:
-    """The figure that every fit without a body of its own takes."""
-    return figure_of(Body.load(TEMPLATE))
+    """The figure that ships: MakeHuman's mean adult, phenotypes and all ``PARAMETERS`` but the sex, a phenotype too."""
+    with Npz(TEMPLATE, what="figure") as archive:
+        names = archive.strings("shape_names")
+        flesh, bones = (archive.numbers(f"shape_{what}", (len(names), None, 3)) for what in ("vertices", "joints"))
+    figure = figure_of(Body.load(TEMPLATE))
+    kept = [k for k, name in enumerate(figure.names) if name != "sex"]
+    return Figure(
+        figure.body,
+        (*(figure.names[k] for k in kept), *names),
+        np.concatenate([figure.vertex_basis[kept], flesh.astype(np.float64)]),
+        np.concatenate([figure.joint_basis[kept], bones.astype(np.float64)]),
+    )
 
 
 def _stretched(body: Body, stretch: _Stretch) -> tuple[Floats, Floats]:

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.motion.skeleton import Skeleton
-
-from ..lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
+from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.rotations import matrix_to_axis_angle
+from rnd_trainer.estimating.lifted import PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 
-from ..lifted import PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 from .figure import JOINTS, Figure
 from .kinematics import Posed, attached, direction_derivative, point_derivative, shape_derivative
 from .marks import Marks
@@ -343,33 +343,43 @@ def _part(marks: Marks, chosen: NDArray[np.int64]) -> Marks:
 
 @dataclass(frozen=True, eq=False)
 class SharedTerm:
-    """Priors of what all frames share; ``height`` m fixes the body's."""
+    """Priors of what all frames share.
+
+    Attributes:
+        weight: of the priors; errors of one video's landmarks are alike in all its frames, so it grows with them.
+        height: of the body, m; by default the template's, as one camera does not tell the scale.
+        tilt: rad, deviation of the ground from the camera's level.
+    """
 
     lens: Lens
+    weight: float = 1.0
     height: float | None = None
-    tilt: float = 0.15  # rad, deviation of the ground from the camera's level
+    tilt: float = 0.15
     height_deviation: float = 0.003
 
     def __call__(
         self, state: State, figure: Figure, marks: Marks, layout: Layout, equations: NormalEquations | None
     ) -> float:
         freedom = np.repeat(marks.freedom_m[layout.free], 3)
-        offsets = state.offsets[layout.free].ravel() / freedom
-        focal = (state.log_focal - self.lens.log_focal) / self.lens.deviation
-        residual = np.concatenate([state.shape, offsets, [focal], [0.0], state.ground[1:] / self.tilt])
-        derivative = np.concatenate(
-            [np.ones(len(state.shape)), 1 / freedom, [1 / self.lens.deviation], [0.0], [1 / self.tilt] * 2]
+        inverse = np.concatenate(
+            [np.ones(len(state.shape)), 1 / freedom, [1 / self.lens.deviation, 0.0], [1 / self.tilt] * 2]
         )
-        matrix = np.diag(derivative)
-        if self.height is not None and figure.names:
-            vertices = figure.body.vertices[:, 1]
+        values = np.concatenate(
+            [state.shape, state.offsets[layout.free].ravel(), [state.log_focal - self.lens.log_focal], state.ground]
+        )
+        matrix = np.diag(inverse)
+        residual = inverse * values
+        weight = np.full(len(residual), self.weight)
+        if "height" in figure.names:
+            vertices, basis = figure.body.vertices[:, 1], figure.vertex_basis[..., 1]
             high, low = vertices.argmax(), vertices.argmin()
             row = np.zeros(layout.shared)
-            row[layout.shape] = (
-                figure.vertex_basis[:, high, 1] - figure.vertex_basis[:, low, 1]
-            ) / self.height_deviation
+            row[layout.shape] = (basis[:, high] - basis[:, low]) / self.height_deviation
             matrix = np.concatenate([matrix, row[None]])
-            residual = np.append(residual, (figure.height(state.shape) - self.height) / self.height_deviation)
+            wanted = figure.height(0 * state.shape) if self.height is None else self.height
+            residual = np.append(residual, (figure.height(state.shape) - wanted) / self.height_deviation)
+            weight = np.append(weight, self.weight)
+            weight[figure.names.index("height")] = 1e-3
         if equations is not None:
-            equations.add_shared(residual, np.ones_like(residual), matrix)
-        return float((residual**2).sum())
+            equations.add_shared(residual, weight, matrix)
+        return float((weight * residual**2).sum())
