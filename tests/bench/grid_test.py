@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 
 import pytest
 
 from rnd_bench.cli import main
 from rnd_bench.scenes.scenes import SQUAT
-from rnd_bench.speed import chart, point
-from rnd_bench.speed import cli as speed_cli
 from rnd_bench.speed import grid as grids
+from rnd_bench.speed import point
 from rnd_bench.speed.chart import draw_chart
 from rnd_bench.speed.grid import grid, pareto, settings
 from rnd_bench.speed.point import Inputs, Setting
@@ -41,43 +39,6 @@ def test_factors_that_are_crossed_come_in_all_combinations() -> None:
         settings(cross=("n", "colour"))
     with pytest.raises(InputError, match="--cross: expected each factor once, got n,n"):
         settings(cross=("n", "n"))
-
-
-@pytest.fixture
-def pretended(monkeypatch):
-    """Points that take no time and have no chart."""
-    monkeypatch.setattr(grids, "measured", lambda setting, inputs, **_: dataclasses.asdict(setting) | HERE)
-    monkeypatch.setattr(grids, "machine", lambda: HERE["machine"])
-    monkeypatch.setattr(chart, "draw_chart", lambda rows, files: None)
-    monkeypatch.setattr(speed_cli, "_line", lambda row: "")
-
-
-def test_a_crossed_grid_logs_its_progress(tmp_path, monkeypatch, capsys, pretended) -> None:
-    moments = itertools.count(0.0, 60.0)  # a minute between two looks at the clock
-    monkeypatch.setattr(speed_cli, "perf_counter", lambda: next(moments))
-    out, image = tmp_path / "grid[a].json", tmp_path / "grid[/a].svg"
-    line = ["grid", str(ASSETS), "--cross", "threads, shade", "--work", str(tmp_path / "work")]
-    line += ["--json", str(out), "--chart", str(image)]
-
-    def states() -> list[str]:
-        assert main(line) == 0
-        lines = capsys.readouterr().out.splitlines()
-        assert lines[-1] == f"{out}, {image}"
-        return [text.strip() for text in lines[:10]]
-
-    assert states()[::4] == ["(9 left)", "(5 left, about 5 min)", "(1 left, about 1 min)"]
-    out.write_text(json.dumps(json.loads(out.read_text())[:7]))
-    assert states()[5:] == ["(stored)", "(stored)", "(2 left)", "(1 left, about 1 min)", "(0 left, about 0 min)"]
-
-
-def test_points_of_earlier_grids_stay_in_the_file_and_are_counted(tmp_path, capsys, pretended) -> None:
-    out = tmp_path / "grid.json"
-    out.write_text(json.dumps([dataclasses.asdict(Setting(n=n)) | HERE for n in (1, 2)]))
-    line = ["grid", str(ASSETS), "--quick", "--json", str(out), "--work", str(tmp_path / "work")]
-    for more, others in (([], 2), (["--fresh"], 0)):
-        assert main([*line, *more]) == 0
-        assert len(json.loads(out.read_text())) == len(settings(True)) + others
-        assert (f"{others} points of earlier grids" in capsys.readouterr().out) == bool(others)
 
 
 def test_an_interrupted_grid_resumes(tmp_path, monkeypatch) -> None:

@@ -16,24 +16,13 @@ from rnd_bench.stability import soak
 from rnd_bench.stability.cli import measured_on
 from rnd_bench.stability.figures import Figure, above, below, holds, not_measured, reported
 from rnd_bench.stability.measures import captures, materials, poses, stress
-from rnd_bench.stability.rows import AVATAR, ROWS
+from rnd_bench.stability.rows import AVATAR
 from rnd_bench.stability.table import line_of, rows_of, store
-from rnd_runtime.capture.capture import Capture, load_capture
+from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 
 pytestmark = pytest.mark.slow
-
-
-def test_every_row_of_the_list_is_there_once():
-    ids = [row.id for row in ROWS]
-    expected = {
-        "P": (1, 2, 3, 4, 7, 8, 9, 10, 11, 13, 14, 15, 16, 17),
-        "G": (1, 2, 3, 5, 6, 7, 9, 10),
-        "L": (1, 2, 3, 4, 5, 7, 8, 9, 10, 11, 12, 13, 15),
-        "R": (1, 2, 3, 4, 5, 6, 9, 10, 11, 12),
-    }
-    assert ids == [f"{letter}{number}" for letter, numbers in expected.items() for number in numbers]
 
 
 def _about(name: str, failure: str) -> dict:
@@ -154,17 +143,6 @@ def test_flipped_normals_need_normals(bare, tiny_capture, tmp_path):
     plain = dataclasses.replace(tiny_capture, folder=folder)
     subject = _with(bare.avatar_file, bare.checkpoint, plain, tmp_path, plain.frames)
     assert len(_missing((captures.flipped_normals(subject),))) == 1
-
-
-def test_a_copy_is_of_the_loaded_file(bare, tiny_capture, tmp_path):
-    record = captures._record(tiny_capture.folder)
-    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"][1:4]]
-    night = _linked(tiny_capture, tmp_path / "plain") / "night.json"
-    night.write_text(json.dumps(record))
-    capture = load_capture(night)
-    assert capture.file == night
-    subject = _with(bare.avatar_file, bare.checkpoint, capture, tmp_path, capture.frames)
-    assert captures._record(captures._copy(subject, "night"))["frames"] == record["frames"]
 
 
 def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture, tmp_path):

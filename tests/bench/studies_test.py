@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import pytest
 import torch
@@ -181,18 +180,6 @@ def test_every_variant_builds_and_the_encoders_cost_grows_with_its_window(tiny_c
 
 def _person_row(method: str, subject: int, seed: int, psnr: float, **more: float) -> dict[str, object]:
     return {"method": method, "split": "novel_view", "subject": subject, "seed": seed, "psnr": psnr, **more}
-
-
-def test_people_that_rnd_stage_rendered_have_no_cost(tmp_path) -> None:
-    sizes, row = PeopleSizes(subjects=2), _person_row("ours", 0, 0, 30.0, minutes=6)
-    nothing = people._cost(tmp_path, sizes, [row], 60)
-    assert nothing["images"] == 0 and nothing["seconds_per_image"] is None and nothing["variant"] is None
-    (tmp_path / "subject1").mkdir()
-    spent = {"images": 4, "seconds": 8.0, "cpu_seconds": 12.0, "variant": "llvm_ad_rgb"}
-    (tmp_path / "subject1" / people.COST_FILE).write_text(json.dumps(spent))
-    one = people._cost(tmp_path, sizes, [row], 60)
-    assert (one["images"], one["seconds_per_image"], one["cpu_seconds_per_image"]) == (4, 2, 3)
-    assert one["variant"] == "llvm_ad_rgb" and one["hours_training"] == pytest.approx(0.1)
 
 
 def test_every_person_counts_once() -> None:

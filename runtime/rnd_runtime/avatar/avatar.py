@@ -69,7 +69,7 @@ class Avatar:
                 ``playback.start.load_ahead``.
 
         Raises:
-            InputError: for anything that is not a whole avatar of the schema we know.
+            InputError: for anything that is not a complete avatar of a known schema.
         """
         networks = Networks.load(path, threads) if ahead is None else ahead.result()
         try:
@@ -117,7 +117,7 @@ class Avatar:
         return np.asarray(np.einsum("jab,jb->ja", encoded.bones[:, :, :3], rest) + encoded.bones[:, :, 3], np.float64)
 
     def unposed(self, encoded: Encoded) -> Unposed | None:
-        """What ``posed`` is made of, for those who pose elsewhere; None where the graph has posed already."""
+        """Inputs of posing on another device; None where the graph poses."""
         if self._rest is None:
             return None
         *logits, offsets, visibility = encoded.values

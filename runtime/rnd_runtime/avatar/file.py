@@ -17,7 +17,7 @@ Outputs are ``means`` [N, 3], ``covariances`` [N, 6], ``normals`` [N, 3], ``visi
 model's ``metadata_props``: ``AvatarMetadata``. What a player may do to be faster, JSON under ``rnd_player``, is
 advice: ``PlayerAdvice``.
 
-That is the whole avatar for any ONNX runtime. For our faster posing kernel a file also names the values between its
+That is the complete avatar for any ONNX runtime. For our faster posing kernel a file also names the values between its
 networks and the Gaussians: ``node_offsets`` [M, 6], ``node_visibility`` [M, S] and, where skinning
 is dynamic, ``node_logits`` [M, J], and the constants ``neighbours`` [N, K] (int32), ``neighbour_weights`` [N, K],
 ``log_template`` [N, J], ``rest_points`` [N, 3], ``rest_factors`` [N, 9], ``rest_normals`` [N, 3], ``rest_limbs`` [N, 7]
@@ -64,7 +64,7 @@ REST_OUTPUTS = (
 )
 
 _SIZES: dict[int | str, range] = {"M": range(1, 2**31), "K": range(1, 2**31), "1 to 16": range(1, 17)}
-"""what a size may be that no other one tells"""
+"""bounds of sizes that no other one determines"""
 
 
 _Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -80,7 +80,7 @@ class SkeletonMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class VariantMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a file has left out for speed or size. The defaults are the whole avatar.
+    """What a file leaves out for speed or size. The defaults are the complete avatar.
 
     ``encoder``: networks at every node, at fewer (``coarse``), or the template's skinning (``static``).
     ``precision``: how constants are stored. ``nodes``: M, the most at which networks are evaluated, 0 if unknown.

@@ -62,7 +62,7 @@ class Networks:
     def load(cls, path: str | Path, threads: int | None = None) -> Networks:
         """Read ``path``. ``threads``: of onnxruntime; by default one per core.
 
-        Raises ``InputError`` for anything that is not a whole avatar of the schema we know.
+        Raises ``InputError`` for anything that is not a complete avatar of a known schema.
         """
         try:
             path = existing_file(path, what="avatar")
@@ -85,7 +85,7 @@ class Networks:
     def run(self, inputs: tuple[ArrayLike, ArrayLike, ArrayLike], outputs: Sequence[str]) -> list[Floats32]:
         """Named outputs of the graph for (pose_window, joint_velocity, bone_transforms); nothing else is computed.
 
-        Raises ``InputError`` where the file's graph cannot be evaluated: its indices are looked at only then.
+        Raises ``InputError`` where the file's graph cannot be evaluated: its indices are checked only then.
         """
         session = self._session(tuple(outputs))
         given = dict(zip(("pose_window", "joint_velocity", "bone_transforms"), inputs))

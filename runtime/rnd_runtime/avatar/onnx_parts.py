@@ -30,7 +30,7 @@ _LONGEST_VARINT = 10  # bytes: 64 bits, seven in each
 
 
 class Node(NamedTuple):
-    """An operation: names of what it reads and makes, its bytes, its name and its whole-number attributes."""
+    """An operation: names of its inputs and outputs, its bytes, its name and its integer attributes."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -125,7 +125,7 @@ class OnnxFile:
     def extract(self, outputs: Sequence[str]) -> bytes:
         """A model that makes values ``outputs`` (any of the graph's, inner ones too) and nothing else.
 
-        Its inputs are those of the whole that are needed for that; metadata are kept.
+        Its inputs are those of the full graph that it needs; metadata are kept.
 
         Raises:
             InputError: nothing in the graph makes one of them.
@@ -176,7 +176,7 @@ def _check_domain(domain: memoryview) -> None:
 
 
 def _attribute(data: memoryview) -> tuple[str, tuple[int, ...]]:
-    """Name and whole numbers of an AttributeProto."""
+    """Name and integers of an AttributeProto."""
     name, numbers = "", []
     for number, value, record in _fields(data):
         if number not in _ATTRIBUTE_PLAIN:

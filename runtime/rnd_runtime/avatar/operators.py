@@ -136,7 +136,7 @@ OPERATORS = frozenset(_SHAPES)
 
 
 def check_operators(file: OnnxFile, file_bytes: int) -> None:
-    """Raise ``InputError`` unless ``file``, of so many bytes, is made of ``OPERATORS`` and its values fit their budget.
+    """Raise ``InputError`` unless ``file`` is made of ``OPERATORS`` and its values fit the budget of ``file_bytes``.
 
     Values that depend on no input are counted together, as onnxruntime keeps them; each other one fits alone, and all
     of a frame in several budgets.

@@ -1,4 +1,4 @@
-"""The unclothed template body a capture stands on."""
+"""The unclothed template body of a capture."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Body:
         faces: [F, 3] vertex indices, counter-clockwise seen from outside.
         skinning_weights: [V, J], not negative, rows sum to 1.
         skeleton: J joints.
-        license: of the template's shape, for whoever gets an avatar made from it.
+        license: of the template's shape, which holds for avatars made from it.
 
     Raises:
         InputError: when the arrays do not fit together. Weights within 1 % of summing to 1 are normalised.
@@ -82,7 +82,7 @@ class Body:
                 skeleton = Skeleton(names, parents, archive.numbers("rest_joints", (joints, 3)))  # type: ignore[arg-type]
                 return cls(
                     archive.numbers("vertices", (None, 3)),
-                    archive.numbers("faces", (None, 3)),  # type: ignore[arg-type]  # checked to be whole
+                    archive.numbers("faces", (None, 3)),  # type: ignore[arg-type]  # checked to be integers
                     archive.numbers("skinning_weights", (None, joints)),  # type: ignore[arg-type]
                     skeleton,
                     next(iter(archive.strings("license")), "unknown") if "license" in archive.names else "unknown",

@@ -111,16 +111,16 @@ class Capture:
             raise error.at(frame=frame.frame) from error
 
     def _read_normals(self, name: str | None, mask: Floats32) -> Floats32 | None:
-        """Unit normals [H, W, 3], refused when they point away from the camera as a whole."""
+        """Unit normals [H, W, 3], refused where their mean points away from the camera."""
         if name is None:
             return None
         normals = decode_normals(read_unit_range(self.folder / name))
-        seen = normals[mask > 0.5][:, 2]
-        if seen.size and seen.mean() > 0:
+        depths = normals[mask > 0.5][:, 2]
+        if depths.size and depths.mean() > 0:
             raise InputError(
                 "normals point away from the camera",
-                expected="z < 0 in the camera's OpenCV axes where a surface is seen",
-                got=f"a mean of {seen.mean():.2f}",
+                expected="z < 0 in the camera's OpenCV axes where a surface is visible",
+                got=f"a mean of {depths.mean():.2f}",
                 file=self.folder / name,
                 hint="OpenGL's have y and z the other way round",
             )

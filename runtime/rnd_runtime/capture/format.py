@@ -65,7 +65,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CaptureRecord(msgspec.Struct, frozen=True):  # further keys at the top inform people, not us
-    """The whole of ``capture.json``."""
+    """``capture.json``."""
 
     schema: str
     fps: Annotated[float, msgspec.Meta(gt=0)]

@@ -1,4 +1,4 @@
-"""Errors, files, arrays, cameras and kernels that everything else stands on."""
+"""Errors, files, arrays, cameras and kernels that everything else uses."""
 
 from .signals import install_in_command
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from .errors import InputError
 
-_SMALLEST = 256 << 20
-_EXPANSION = 16
+_MIN_BYTES = 256 << 20
+_EXPANSION = 16  # times the file's size
 _SECONDS = 60.0
 _limit: int | None = None  # bytes, of this process; None: by the file's size
 
@@ -25,7 +25,7 @@ def set_max_expanded(megabytes: int | None) -> None:
 
 
 class Budget:
-    """What is left of a file's bytes and seconds; both are counted before they are spent.
+    """Remaining bytes and seconds of a file; both are counted before they are spent.
 
     Args:
         file_bytes: the file's size.
@@ -34,7 +34,7 @@ class Budget:
     """
 
     def __init__(self, file_bytes: int, *, file: str | Path | None = None, seconds: float = _SECONDS) -> None:
-        self.limit = _limit or max(_SMALLEST, _EXPANSION * file_bytes)
+        self.limit = _limit or max(_MIN_BYTES, _EXPANSION * file_bytes)
         self.left = self.limit
         self._file, self._seconds, self._end = file, seconds, time.monotonic() + seconds
 

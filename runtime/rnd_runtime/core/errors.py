@@ -117,7 +117,7 @@ def withheld(error: OSError) -> str | None:
 def first_line(error: Exception) -> str:
     """Of the message of an error, at most 300 letters; the name of its class if it has none.
 
-    For what a library raised over a user's file. Memory that runs out says nothing of the file.
+    For exceptions of libraries on a user's file. A lack of memory is not the file's fault.
 
     Raises:
         MemoryError: ``error`` is one, or says that memory could not be allocated.

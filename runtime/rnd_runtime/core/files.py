@@ -1,4 +1,4 @@
-"""Writing files so that a final name never holds half a file."""
+"""Atomic writing of files, and checks of paths."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any, TypeGuard
 from .errors import InputError
 from .signals import at_end
 
-_NAMED = 40  # letters of the final name in a temporary's: all of them may be too long
+_NAME_LETTERS = 40  # of the final name in a temporary's, which may not be too long
 
 
 @contextmanager
@@ -24,8 +24,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path``; rename it to ``path`` when the block succeeds.
 
     The temporary keeps the suffix (writers choose a format by it) and starts with a dot. When the block
-    raises or a signal ends the process, the temporary is removed and what stood under ``path`` before stays. The
-    mode is the umask's.
+    raises or a signal ends the process, the temporary is removed and an earlier file at ``path`` stays. The mode is
+    the umask's.
     """
     path = output_file(path)
     temporary = path.with_name(f"{temporary_stem(path)}{secrets.token_hex(4)}{path.suffix}")
@@ -41,12 +41,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def temporary_stem(path: Path) -> str:
-    """What the names of ``path``'s temporaries begin with; eight letters and its suffix follow."""
-    return f".{path.stem[:_NAMED]}."
+    """Prefix of the names of ``path``'s temporaries; eight letters and its suffix follow."""
+    return f".{path.stem[:_NAME_LETTERS]}."
 
 
 def _sync(path: Path) -> None:
-    """Wait until the content is on the disk: after a crash of the machine the name holds the old file or the new."""
+    """Flush to the disk: after a crash of the machine the name holds the old file or the new."""
     with suppress(OSError):  # a file system without it
         handle = os.open(path, os.O_RDWR)
         try:
@@ -56,14 +56,14 @@ def _sync(path: Path) -> None:
 
 
 def sha256_of(path: str | Path) -> str:
-    """Of a file's content, 64 hexadecimal digits."""
+    """SHA-256 of a file's content, 64 hexadecimal digits."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write ``value`` under ``path``, indented, UTF-8; what is no number in JSON (NaN, infinity) as null.
+    """Write ``value`` under ``path``, indented, UTF-8; NaN and infinity as null.
 
-    Names of files that are not UTF-8 stand with escapes.
+    Names of files that are not UTF-8 are escaped.
     """
     text = json.dumps(_finite(value), indent=1, ensure_ascii=False, allow_nan=False)
     with atomic_path(path) as temporary:
@@ -79,7 +79,7 @@ def _finite(value: object) -> object:
 
 
 def earlier_rows(path: str | Path, *, what: str, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Rows that an earlier run wrote by ``write_json``, to add more; none where there is no file yet.
+    """Rows that an earlier run wrote by ``write_json``; none where there is no file.
 
     Raises ``InputError`` where the file is not ``what``: a list of objects that have all of ``names``.
     """
@@ -112,7 +112,7 @@ def output_folder(path: str | Path) -> Path:
 
 
 def output_file(path: str | Path) -> Path:
-    """``path``, its folder made, if a file can be put there; else ``InputError``. Ask before what takes long."""
+    """``path`` with its folder created; ``InputError`` where no file can be written. For checks before long work."""
     path = Path(path)
     output_folder(path.parent)
     if path.is_dir():
@@ -128,7 +128,7 @@ def npz_output(path: Path) -> Path:
 
 
 def refuse_input(out: str | Path, *inputs: str | Path | None) -> None:
-    """Raise ``InputError`` where ``out`` is one of ``inputs``, those that there are: it would be lost."""
+    """Raise ``InputError`` where ``out`` would overwrite one of ``inputs``."""
     if any(_is_same(Path(path), Path(out)) for path in inputs if path is not None):
         raise InputError("output", expected="another file than what is read", got=out)
 
@@ -136,12 +136,12 @@ def refuse_input(out: str | Path, *inputs: str | Path | None) -> None:
 def _is_same(one: Path, other: Path) -> bool:
     try:
         return one.samefile(other)
-    except OSError:  # one is not there
+    except OSError:  # one does not exist
         return one.resolve() == other.resolve()
 
 
 def is_folder(path: str | Path) -> bool:
-    """Whether ``path`` is a folder; where ``Path.is_dir`` raises (a name that is too long), it is none."""
+    """Whether ``path`` is a folder; False where ``Path.is_dir`` raises, as for a name that is too long."""
     return os.path.isdir(path)  # noqa: PTH112
 
 

@@ -95,7 +95,7 @@ def read_image(path: str | Path) -> Image:
 
 
 def read_strips(path: str | Path, channels: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """The first row and the pixels [rows, W, C] of strips of an EXR or a .hdr, from the top; never the whole image.
+    """First row and pixels [rows, W, C] of each strip of an EXR or a .hdr, from the top; never the full image.
 
     Args:
         channels: indices of the C channels.

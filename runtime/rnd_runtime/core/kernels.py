@@ -54,10 +54,10 @@ def prepare_process() -> str | None:
 def kernels_are_cold() -> bool:
     """Whether no kernel of the rasteriser is cached yet: a cheap hint, false from the first one on."""
     raster = _PACKAGE / "raster"
-    if kept := os.environ.get("NUMBA_CACHE_DIR"):
-        folders = list(Path(kept).glob(f"{raster.name}_*"))
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        folders = list(Path(chosen).glob(f"{raster.name}_*"))
     else:
-        from numba.misc.appdirs import AppDirs  # numba's place for installations that cannot be written
+        from numba.misc.appdirs import AppDirs  # numba's folder for read-only installations
 
         users = Path(AppDirs(appname="numba", appauthor=False).user_cache_dir)
         folders = [raster / "__pycache__", *users.glob(f"{raster.name}_*")]
@@ -85,7 +85,7 @@ def _cache_of_sources() -> Path | None:
 
 
 def _numba_can_write() -> bool:
-    """Whether one of numba's own places can be written: beside the sources, or the user's cache folder."""
+    """Whether numba can write beside the sources or in the user's cache folder."""
     if os.name == "nt":
         return True
     mac = sys.platform == "darwin"
@@ -99,11 +99,11 @@ def _numba_can_write() -> bool:
 
 
 def _temporary_cache() -> Path:
-    """A folder that is this user's alone, and the same one next time; else one that goes with the process."""
+    """A private folder of the user, the same at every call; else one that is removed with the process."""
     folder = Path(tempfile.gettempdir()) / f"rnd-kernels-{os.getuid()}"
     with suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()  # whoever made it before us could put code into it
+        found = folder.lstat()  # its owner could have put code into it
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
             return folder
     folder = Path(tempfile.mkdtemp(prefix="rnd-kernels-"))

@@ -55,7 +55,7 @@ _BODY_MODEL = ("v_template", "kintree_table")
 def kind_of(path: str | Path) -> str:
     """A ``Kind``, or "body model", "image", "ONNX model", "run", "video", "folder", or "unknown".
 
-    Looks at names and a few hundred kilobytes; nothing is decoded, executed or raised. "unknown" also of what is
+    Reads names and a few hundred kilobytes; nothing is decoded, executed or raised. "unknown" also of what is
     missing or cannot be read.
     """
     try:

@@ -141,7 +141,7 @@ class Members:
 class Npz(Members):
     """The members of an .npz, read one at a time when asked for; use it in a ``with`` statement.
 
-    Members nobody asks for are never touched, so an archive may hold Python objects beside the arrays we
+    Members that are not requested are never read, so an archive may hold Python objects beside the arrays we
     need. Nothing is ever unpickled.
     """
 
@@ -151,7 +151,7 @@ class Npz(Members):
         try:
             begins = self._stream.read(len(np.lib.format.MAGIC_PREFIX))
             self._stream.seek(0)
-            if begins == np.lib.format.MAGIC_PREFIX:  # numpy would read it whole
+            if begins == np.lib.format.MAGIC_PREFIX:  # numpy would read all of it
                 raise InputError(f"{what} cannot be read", expected="an .npz archive", got="an array", file=path)
             self._archive: np.lib.npyio.NpzFile = np.load(self._stream, allow_pickle=False)
         except _UNREADABLE as error:
@@ -201,6 +201,6 @@ class Npz(Members):
 
 
 def save_npz(path: str | Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write ``arrays`` as a compressed .npz, whole or not at all; equal arrays give equal bytes."""
+    """Write ``arrays`` as a compressed .npz, atomically; equal arrays give equal bytes."""
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, **dict(arrays))  # type: ignore[arg-type]  # its keyword allow_pickle

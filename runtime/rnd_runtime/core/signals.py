@@ -1,6 +1,6 @@
 """End a command by a signal at any moment: one line on stderr, exit code 128 + number, no temporary left.
 
-The handlers do not raise: an exception between two bytecodes of a library turns into another error there. A command
+The handlers do not raise: between two bytecodes of a library an exception would become another error. A command
 that ends in its own way, as a training saves first, does so at the first signal (``on_signal``).
 """
 
@@ -33,7 +33,7 @@ class _State:
     def __init__(self) -> None:
         self.name = "rnd-avatar"
         self.first = 0  # number of the first signal
-        self.handled = 0  # signals that the main thread has seen
+        self.handled = 0  # signals handled by the main thread
         self.callbacks: list[Callable[[], None]] = []
         self.cleanups: dict[object, Callable[[], object]] = {}
         self.lock = threading.RLock()  # who ends keeps it, so that no temporary is added
@@ -59,7 +59,7 @@ def install_in_command() -> None:
 
 
 def _ignore_signals() -> None:
-    """The work is done: while the interpreter goes, which takes our handlers away, a signal changes no exit code."""
+    """Ignore signals while the interpreter shuts down, so that they change no exit code."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
@@ -103,7 +103,7 @@ def _install(name: str) -> Callable[[], None]:
 
 @contextmanager
 def on_signal(callback: Callable[[], None]) -> Iterator[None]:
-    """Call ``callback`` in the main thread at the first signal, in place of the process's end; the second ends it.
+    """Call ``callback`` in the main thread at the first signal instead of ending the process; the second ends it.
 
     Outside of a command the first Ctrl-C is taken so, and the second raises ``KeyboardInterrupt``.
     """
@@ -134,7 +134,7 @@ def at_end(cleanup: Callable[[], object]) -> Iterator[None]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A new folder that goes with the block, also where a signal ends the process."""
+    """A new folder, removed after the block, also where a signal ends the process."""
     with _state.lock:
         folder = tempfile.mkdtemp(prefix="rnd-")
         remove = at_end(lambda: shutil.rmtree(folder, ignore_errors=True))
@@ -160,16 +160,16 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 def _watch(reading: socket.socket) -> None:
     """End the process where the main thread does not: a call of C that takes long lets handlers wait."""
-    seen = 0
+    received = 0
     with reading:
         while number := reading.recv(1):
             if number[0] not in ENDING:
                 continue
-            seen += 1
-            if seen == 1 and _state.callbacks:  # it is asked to end and may take its time
+            received += 1
+            if received == 1 and _state.callbacks:  # it is asked to end and may take its time
                 continue
             time.sleep(PATIENCE_S)
-            if _state.installed and _state.handled < seen:
+            if _state.installed and _state.handled < received:
                 _end(number[0])
 
 

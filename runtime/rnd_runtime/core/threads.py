@@ -20,10 +20,10 @@ def max_threads() -> int:
 
 
 def check_threads(threads: int) -> None:
-    """Raise ``InputError`` unless the compiled kernels can run on so many."""
-    most = max_threads()
-    if not 1 <= threads <= most:
-        raise InputError("--threads", expected=f"1 to {most}", got=threads)
+    """Raise ``InputError`` unless the compiled kernels can run on ``threads``."""
+    maximum = max_threads()
+    if not 1 <= threads <= maximum:
+        raise InputError("--threads", expected=f"1 to {maximum}", got=threads)
 
 
 def set_threads(threads: int | None) -> None:

@@ -73,7 +73,7 @@ def report() -> list[Finding]:
 def machine() -> str:
     """CPU model, its microarchitecture as named by LLVM, and cores.
 
-    The model's name alone does not tell whether it has AVX-512 on cloud machines.
+    On cloud machines the model's name does not determine whether it has AVX-512.
     """
     return f"{_cpu_model()} ({_microarchitecture()}), {cores()} cores"
 

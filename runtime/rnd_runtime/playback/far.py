@@ -64,10 +64,10 @@ def fine_view(camera: Camera, points: NDArray[np.floating[Any]]) -> FineView | N
         return None
     low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
-    seen = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    if not seen[:, 2].min() >= NEAR:
+    corners = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    if not corners[:, 2].min() >= NEAR:
         return None
-    pixels = seen[:, :2] / seen[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    pixels = corners[:, :2] / corners[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
     size = np.array([camera.width, camera.height])
     (left, top), (right, bottom) = (
         np.clip(edge, 0, size) for edge in (np.floor(pixels.min(0)), np.ceil(pixels.max(0)))

@@ -1,4 +1,4 @@
-"""Cameras that show a whole motion, from the front or from an orbit.
+"""Cameras that show a motion completely, from the front or from an orbit.
 
 A camera path ``(frame, time_s) -> Camera`` depends on its arguments alone, so any part of a run gives the same pixels.
 """
@@ -58,7 +58,7 @@ class CameraOptions:
         width, height: pixels.
         fov_y: vertical field of view, rad.
         elevation: rad above the horizon.
-        distance: m from the framing's centre; by default the smallest that shows the whole motion.
+        distance: m from the framing's centre; by default the smallest that shows all of the motion.
     """
 
     width: int

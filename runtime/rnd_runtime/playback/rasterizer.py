@@ -23,7 +23,7 @@ class ChosenRasterizer:
 
     Attributes:
         name: such as ``gl (egl, llvmpipe (LLVM 15.0.6, 256 bits))`` or ``cpu``.
-        renderer: renders whole frames on the device; None for the CPU.
+        renderer: renders complete frames on the device; None for the CPU.
     """
 
     def __init__(self, name: str, gl: GlRasterizer | None = None) -> None:

@@ -22,27 +22,27 @@ def pose_reference(
     logarithms = np.asarray(rest.log_template, np.float64)
     if logits is not None:
         logarithms = logarithms + (np.asarray(logits, np.float64)[rest.neighbours] * weights).sum(1)
-    shares = np.exp(logarithms - logarithms.max(1, keepdims=True))
-    blend = np.einsum("nj,jrc->nrc", shares / shares.sum(1, keepdims=True), bones)
+    joint_weights = np.exp(logarithms - logarithms.max(1, keepdims=True))
+    blend = np.einsum("nj,jrc->nrc", joint_weights / joint_weights.sum(1, keepdims=True), bones)
     linear = blend[:, :, :3]
-    moved = np.tanh((offsets[rest.neighbours] * weights).sum(1))
+    offset = np.tanh((offsets[rest.neighbours] * weights).sum(1))
     a, b, c = linear.transpose(1, 0, 2)
     cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], 1)
     limbs = np.asarray(rest.limbs, np.float64)
     axes, levers = limbs[:, :3], limbs[:, 3:6]
     length = np.linalg.norm((linear @ axes[..., None])[..., 0], axis=1)
     area = np.linalg.norm((cofactors @ axes[..., None])[..., 0], axis=1)
-    twist_left = np.minimum(area / np.maximum(length**2, SMALLEST_SQUARE), 1)
-    factor = np.ones(len(twist_left))
+    twist_ratio = np.minimum(area / np.maximum(length**2, SMALLEST_SQUARE), 1)
+    factor = np.ones(len(twist_ratio))
     for _ in range(TWIST_STEPS):
-        step = 0.5 * (3 - twist_left)
-        factor, twist_left = factor * step, twist_left * step**2
+        step = 0.5 * (3 - twist_ratio)
+        factor, twist_ratio = factor * step, twist_ratio * step**2
     kappa = (limbs[:, 6] * (factor - 1))[:, None]
-    points = rest.points + rest.max_offset * moved[:, :3] + kappa * levers
+    points = rest.points + rest.max_offset * offset[:, :3] + kappa * levers
     means = (linear @ points[..., None])[..., 0] + blend[:, :, 3]
 
-    s = 1 / np.sqrt(1 + (moved[:, 3:] ** 2).sum(1) / 4)
-    x, y, z = (0.5 * moved[:, 3:] * s[:, None]).T
+    s = 1 / np.sqrt(1 + (offset[:, 3:] ** 2).sum(1) / 4)
+    x, y, z = (0.5 * offset[:, 3:] * s[:, None]).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - s * z), 2 * (x * z + s * y)],
         [2 * (x * y + s * z), 1 - 2 * (x * x + z * z), 2 * (y * z - s * x)],

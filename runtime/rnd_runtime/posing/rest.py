@@ -13,12 +13,12 @@ from rnd_runtime.core.arrays import floats
 from rnd_runtime.core.simd.vectors import WIDTH
 
 from .skinning import (
+    COMPONENTS,
     FACTORS,
     FLOOR,
     LIMBS,
     NEVER,
     NORMALS,
-    OWN,
     POINTS,
     PosedArrays,
     bone_rows,
@@ -110,14 +110,14 @@ class RestPose:
     @cached_property
     def template(self) -> Template:
         """The template as it is summed."""
-        given = np.asarray(self.log_template, np.float32)
-        lowest = np.where(given > -np.inf, given, np.float32(np.inf)).min(1)
-        gaussians, joints = np.nonzero(~(given <= lowest[:, None]))  # NaN stays NaN
-        heights = given[gaussians, joints].astype(np.float64) - lowest[gaussians]
-        top = np.zeros(len(given))
+        template_logs = np.asarray(self.log_template, np.float32)
+        lowest = np.where(template_logs > -np.inf, template_logs, np.float32(np.inf)).min(1)
+        gaussians, joints = np.nonzero(~(template_logs <= lowest[:, None]))  # NaN stays NaN
+        log_ratios = template_logs[gaussians, joints].astype(np.float64) - lowest[gaussians]
+        top = np.zeros(len(template_logs))
         with np.errstate(invalid="ignore"):
-            np.maximum.at(top, gaussians, heights)
-            logs = heights + np.log(-np.expm1(-heights)) - top[gaussians]
+            np.maximum.at(top, gaussians, log_ratios)
+            logs = log_ratios + np.log(-np.expm1(-log_ratios)) - top[gaussians]
         floors = np.exp(-np.minimum(top, _DEEPEST))
         return Template(floors.astype(np.float32), gaussians, joints, logs.astype(np.float32))
 
@@ -126,7 +126,7 @@ class RestPose:
         """Kernel arrays."""
         count = len(self.points)
         padded = -(-count // WIDTH) * WIDTH
-        own = np.zeros((padded, OWN), np.float32)
+        components = np.zeros((padded, COMPONENTS), np.float32)
         floors = self.template.floors
         for first, values in (
             (POINTS, self.points),
@@ -135,11 +135,11 @@ class RestPose:
             (LIMBS, self.limbs),
             (FLOOR, floors[:, None]),
         ):
-            own[:count, first : first + values.shape[1]] = values
+            components[:count, first : first + values.shape[1]] = values
         neighbours = np.zeros((padded, self.neighbours.shape[1]), np.int32)
         weights = np.zeros(neighbours.shape, np.float32)
         neighbours[:count], weights[:count] = self.neighbours, self.neighbour_weights
-        blocks = own.reshape(-1, WIDTH, OWN).transpose(0, 2, 1)
+        blocks = components.reshape(-1, WIDTH, COMPONENTS).transpose(0, 2, 1)
         return RestArrays(neighbours, weights, *_slots(self.template, padded), blocks.ravel())
 
 
@@ -167,7 +167,7 @@ class RestArrays(NamedTuple):
     starts: NDArray[np.int32]  # [N/16 + 1]: slots of block i are starts[i] : starts[i + 1]
     joints: NDArray[np.int32]  # [S · 16], a joint of each of sixteen Gaussians per slot
     logs: Floats32  # [S · 16] ``Template.logs``
-    own: Floats32  # [N/16 · 23 · 16] points, factors, normals, limbs, floors; blocks of sixteen by component
+    components: Floats32  # [N/16 · 23 · 16] points, factors, normals, limbs, floors; blocks of sixteen by component
 
 
 class Unposed(NamedTuple):

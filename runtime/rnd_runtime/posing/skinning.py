@@ -45,8 +45,8 @@ SHORTEST = np.float32(1e-9)  # min length of a normal in its normalisation
 TWIST_STEPS = 3  # of Newton–Schulz, s → s (3 − s²)/2 on s = √t: two leave 0.54 of a limb at 150°, three 0.73
 SMALLEST_SQUARE = np.float32(1e-6)  # min |A_R u|²
 NEVER = np.float32(-1e30)  # log of weight 0
-# First component of each part of a Gaussian's rest pose; OWN: their number
-POINTS, FACTORS, NORMALS, LIMBS, FLOOR, OWN = (0, 3, 12, 15, 22, 23)
+# First component of each part of a Gaussian's rest pose; COMPONENTS: their number
+POINTS, FACTORS, NORMALS, LIMBS, FLOOR, COMPONENTS = (0, 3, 12, 15, 22, 23)
 # A node's fields: Σ_j e^(Δ_j − c) B_j [12], Σ_j e^(Δ_j − c), c; offsets [16]; visibility [16]; Δ_j
 _SUM, _MAX_LOGIT, _OFFSETS, _VISIBILITY, _LOGITS = (12, 13, WIDTH, 2 * WIDTH, 3 * WIDTH)
 
@@ -149,23 +149,23 @@ def _interpolate_sixteen(first, fields, rest, blends, offsets, visibility, logit
 
 
 @njit(error_model="numpy")
-def _blend_sixteen(first, rest, bones, rows, logits_16, shares, blend):  # type: ignore[no-untyped-def]
+def _blend_sixteen(first, rest, bones, rows, logits_16, joint_weights, blend):  # type: ignore[no-untyped-def]
     """A [3, 4] by component of sixteen Gaussians from interpolated ``rows`` and ``logits_16``.
 
-    NaN where a logit is NaN or +∞, as in a softmax. ``shares`` [slots, 16] is scratch.
+    NaN where a logit is NaN or +∞, as in a softmax. ``joint_weights`` [slots, 16] is scratch.
     """
     width = len(logits_16) // WIDTH
     start, end = WIDTH * rest.starts[first // WIDTH], WIDTH * rest.starts[first // WIDTH + 1]
     for at in range(start, end, WIDTH):
         for lane in range(WIDTH):
-            shares[at - start + lane] = logits_16[lane * width + rest.joints[at + lane]]
+            joint_weights[at - start + lane] = logits_16[lane * width + rest.joints[at + lane]]
         logs = load(rest.logs, at)
-        weights = _exp(load(shares, at - start) + logs)
-        store(shares, at - start, select(logs < _HALF * NEVER, _ZERO, weights))
+        weights = _exp(load(joint_weights, at - start) + logs)
+        store(joint_weights, at - start, select(logs < _HALF * NEVER, _ZERO, weights))
     for lane in range(WIDTH):
-        row = rest.own[first * OWN + FLOOR * WIDTH + lane] * load(rows, lane * WIDTH)
+        row = rest.components[first * COMPONENTS + FLOOR * WIDTH + lane] * load(rows, lane * WIDTH)
         for at in range(start + lane, end, WIDTH):
-            row += shares[at - start] * load(bones, rest.joints[at] * WIDTH)
+            row += joint_weights[at - start] * load(bones, rest.joints[at] * WIDTH)
         store(rows, lane * WIDTH, row)
     transpose(rows, blend)
     scale = _ONE / load(blend, _SUM * WIDTH)
@@ -219,12 +219,12 @@ def _widening(a, cofactors, axis, share):  # type: ignore[no-untyped-def]
     length_squared = x * x + y * y + z * z
     length_squared = select(length_squared > SMALLEST_SQUARE, length_squared, SMALLEST_SQUARE)
     x, y, z = _apply(cofactors, axis[0], axis[1], axis[2])
-    twist_left = sqrt(x * x + y * y + z * z) / length_squared
-    twist_left = select(twist_left > _ONE, _ONE, twist_left)
+    twist_ratio = sqrt(x * x + y * y + z * z) / length_squared
+    twist_ratio = select(twist_ratio > _ONE, _ONE, twist_ratio)
     factor = lanes(_ONE)
     for _ in range(TWIST_STEPS):
-        step = _HALF * (_THREE - twist_left)
-        factor, twist_left = factor * step, twist_left * step * step
+        step = _HALF * (_THREE - twist_ratio)
+        factor, twist_ratio = factor * step, twist_ratio * step * step
     return share * (factor - _ONE)
 
 
@@ -242,34 +242,34 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     ``blend`` holds A and ``offset`` the bounded offsets and rotations, both by component.
     """
     max_offset, floor, fallback = limits
-    at, stride = i * OWN, WIDTH
+    at, stride = i * COMPONENTS, WIDTH
     first, second, third = (_load3(blend, 0, 0, WIDTH), _load3(blend, 4, 0, WIDTH), _load3(blend, 8, 0, WIDTH))
     a = first + second + third
     cofactors = _cofactors(a)
-    axis, lever = _load3(rest.own, LIMBS, at, stride), _load3(rest.own, LIMBS + 3, at, stride)
-    kappa = _widening(a, cofactors, axis, load(rest.own, (LIMBS + 6) * stride + at))
+    axis, lever = _load3(rest.components, LIMBS, at, stride), _load3(rest.components, LIMBS + 3, at, stride)
+    kappa = _widening(a, cofactors, axis, load(rest.components, (LIMBS + 6) * stride + at))
 
-    point, moved = _load3(rest.own, POINTS, at, stride), _load3(offset, 0, 0, WIDTH)
-    x = point[0] + max_offset * moved[0] + kappa * lever[0]
-    y = point[1] + max_offset * moved[1] + kappa * lever[1]
-    z = point[2] + max_offset * moved[2] + kappa * lever[2]
+    point, shift = _load3(rest.components, POINTS, at, stride), _load3(offset, 0, 0, WIDTH)
+    x = point[0] + max_offset * shift[0] + kappa * lever[0]
+    y = point[1] + max_offset * shift[1] + kappa * lever[1]
+    z = point[2] + max_offset * shift[2] + kappa * lever[2]
     x, y, z = _apply(a, x, y, z)
     store(out, 0, x + load(blend, 3 * WIDTH))
     store(out, WIDTH, y + load(blend, 7 * WIDTH))
     store(out, 2 * WIDTH, z + load(blend, 11 * WIDTH))
 
     f = (
-        _load3(rest.own, FACTORS, at, stride)
-        + _load3(rest.own, FACTORS + 3, at, stride)
-        + _load3(rest.own, FACTORS + 6, at, stride)
+        _load3(rest.components, FACTORS, at, stride)
+        + _load3(rest.components, FACTORS + 3, at, stride)
+        + _load3(rest.components, FACTORS + 6, at, stride)
     )
     rotation = _load3(offset, 3, 0, WIDTH)
     f = _rotated_rows(rotation[0], rotation[1], rotation[2], f)
-    wide = _ONE + kappa
+    widened = _ONE + kappa
     x, y, z = _row(kappa * axis[0], kappa * axis[1], kappa * axis[2], f)
-    row0 = wide * f[0] - axis[0] * x, wide * f[1] - axis[0] * y, wide * f[2] - axis[0] * z
-    row1 = wide * f[3] - axis[1] * x, wide * f[4] - axis[1] * y, wide * f[5] - axis[1] * z
-    row2 = wide * f[6] - axis[2] * x, wide * f[7] - axis[2] * y, wide * f[8] - axis[2] * z
+    row0 = widened * f[0] - axis[0] * x, widened * f[1] - axis[0] * y, widened * f[2] - axis[0] * z
+    row1 = widened * f[3] - axis[1] * x, widened * f[4] - axis[1] * y, widened * f[5] - axis[1] * z
+    row2 = widened * f[6] - axis[2] * x, widened * f[7] - axis[2] * y, widened * f[8] - axis[2] * z
     f = row0 + row1 + row2
     f0, f1, f2 = _row(a[0], a[1], a[2], f)
     f3, f4, f5 = _row(a[3], a[4], a[5], f)
@@ -281,7 +281,7 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
     store(out, 7 * WIDTH, f3 * f6 + f4 * f7 + f5 * f8)
     store(out, 8 * WIDTH, f6 * f6 + f7 * f7 + f8 * f8 + floor)
 
-    normal = _load3(rest.own, NORMALS, at, stride)
+    normal = _load3(rest.components, NORMALS, at, stride)
     along = kappa * (axis[0] * normal[0] + axis[1] * normal[1] + axis[2] * normal[2])
     nx, ny, nz = normal[0] + axis[0] * along, normal[1] + axis[1] * along, normal[2] + axis[2] * along
     x, y, z = _apply(cofactors, nx, ny, nz)
@@ -298,8 +298,8 @@ def _pose_sixteen(i, blend, offset, rest, limits, out):  # type: ignore[no-untyp
 def _prefetch_sixteen(first, rest, posed):  # type: ignore[no-untyped-def]
     """Prefetch what a later sixteen reads and writes; saves 1/7 of the time."""
     neighbours = rest.neighbours.shape[1]
-    for line in range(0, OWN * WIDTH, WIDTH):
-        prefetch(rest.own, first * OWN + line)
+    for line in range(0, COMPONENTS * WIDTH, WIDTH):
+        prefetch(rest.components, first * COMPONENTS + line)
     for line in range(0, neighbours * WIDTH, WIDTH):
         prefetch(rest.neighbours, first * neighbours + line)
         prefetch(rest.weights, first * neighbours + line)
@@ -314,7 +314,7 @@ def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
     count = len(rest.neighbours)
     means, covariances, normals = posed.means, posed.covariances, posed.normals
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        shares, rows = aligned_floats(len(bones) * WIDTH), aligned_floats(WIDTH * WIDTH)
+        joint_weights, rows = aligned_floats(len(bones) * WIDTH), aligned_floats(WIDTH * WIDTH)
         logits_16 = aligned_floats((fields.shape[1] - _LOGITS) * WIDTH)
         blend, offset = aligned_floats(WIDTH * WIDTH), aligned_floats(WIDTH * WIDTH)
         out = aligned_floats(WIDTH * WIDTH)
@@ -322,7 +322,7 @@ def _pose(fields, rest, bones, limits, posed):  # type: ignore[no-untyped-def]
             _prefetch_sixteen(first + WIDTH, rest, posed)
             _interpolate_sixteen(first, fields, rest, rows, out, posed.visibility, logits_16)
             transpose(out, offset)
-            _blend_sixteen(first, rest, bones, rows, logits_16, shares, blend)
+            _blend_sixteen(first, rest, bones, rows, logits_16, joint_weights, blend)
             for c in range(6):
                 store(offset, c * WIDTH, _tanh(load(offset, c * WIDTH)))
             _pose_sixteen(first, blend, offset, rest, limits, out)

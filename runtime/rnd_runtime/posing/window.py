@@ -83,10 +83,10 @@ def _tree(skeleton: Skeleton) -> _Tree:
 def _moment(path, spacing, poses, tree):  # type: ignore[no-untyped-def]
     """``moment`` compiled: numpy takes 0.4 ms per frame."""
     rotations, translations, position = path
-    recent, moved = interpolate_rotations(rotations, position), interpolate_points(translations, position)
+    recent, positions = interpolate_rotations(rotations, position), interpolate_points(translations, position)
     window, velocity = _window(recent, spacing, poses)
     root = np.zeros((4, 4))
-    bones = _bones(recent[-1], moved[-1], tree, root)
+    bones = _bones(recent[-1], positions[-1], tree, root)
     return window, velocity, bones, root
 
 

@@ -1,7 +1,7 @@
 """Shared kernels that shade sixteen Gaussians at a time: gathering, table look-ups, specular lobes.
 
-Cells of tables are found in lanes, one Gaussian each. Table rows have sixteen numbers: a look-up loads whole rows for
-one Gaussian, and a transpose turns them into lanes of Gaussians again.
+Cells of tables are found in lanes, one Gaussian each. Table rows have sixteen numbers: a look-up loads rows for one
+Gaussian, and a transpose makes them lanes of Gaussians again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ROUGHNESS_LOW = np.float32(ROUGHNESS_RANGE[0])
 ROUGHNESS_SPAN = np.float32(ROUGHNESS_RANGE[1] - ROUGHNESS_RANGE[0])
 ONE_OVER_PI = np.float32(1 / np.pi)
 
-# Rows of sixteen in a thread's scratch: inputs, radiance in place of the albedo, table cells
+# Rows of sixteen in a thread's scratch: inputs, radiance over the albedo, table cells
 (NORMAL, VIEW, ALBEDO) = (0, 3 * WIDTH, 6 * WIDTH)  # three each, one after the other
 RADIANCE = ALBEDO
 ROUGHNESS = 9 * WIDTH

@@ -31,8 +31,8 @@ class Light:
     """Distant light all around, as a lat-long map.
 
     Column and row of a direction (x, y, z) **in the light's frame**: ``u = 0.5 + atan2(z, x) / 2π``,
-    ``v = acos(y) / π``; texel centres at (i + 0.5) / N. Only ``rotation`` knows how that frame lies in
-    the world, so rotating a light never changes its texels.
+    ``v = acos(y) / π``; texel centres at (i + 0.5) / N. Only ``rotation`` relates that frame to the
+    world, so rotating a light never changes its texels.
 
     Attributes:
         radiance: [H, W, 3] linear Rec.709, finite and not negative, W = 2 H.
@@ -153,7 +153,7 @@ REC709_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 def downsize(radiance: ArrayLike, height: int, width: int) -> Floats32:
     """``radiance`` [H, W, C] as the mean over each of ``height`` × ``width`` texels, weighted by solid angle.
 
-    Exact for any two sizes, whole ratio or not, so Σ radiance · solid angle stays; bilinear resizing would lose a
+    Exact for any two sizes, so Σ radiance · solid angle stays; bilinear resizing would lose a
     small sun. Larger grids repeat texels.
     """
     source = np.asarray(radiance, np.float64)

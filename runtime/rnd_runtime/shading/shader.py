@@ -2,9 +2,9 @@
 
 ============  =====================================================================================
 ao            sixteen SH coefficients of light times ambient occlusion
-table         the whole map through tables over the normal; soft shadows from the visibility
+table         the full map through tables over the normal; soft shadows from the visibility
 table+sun     the same without the sun, which gets its own highlight and a shadow from a depth map
-lights:K      K lights of equal luminance (median cut), each with the whole BRDF
+lights:K      K lights of equal luminance (median cut), each with the full BRDF
 brute         every texel of the downsized map: the light of training
 ============  =====================================================================================
 

@@ -1,4 +1,4 @@
-"""The sum over distant lights, each with the whole BRDF and the SH visibility.
+"""The sum over distant lights, each with the full BRDF and the SH visibility.
 
 With every texel of a 64 × 32 map this is ``shade_reference`` in float32 (145 dB), in 84 ms for 30 000 Gaussians on two
 cores. With K lights of a median cut it is an approximation.

@@ -140,10 +140,6 @@ _BROKEN = (
 
 @pytest.mark.parametrize("mode", MODES)
 def test_broken_gaussians_leave_no_trace(sky, rasterizer, mode):
-    _assert_no_trace_of_broken_ones(sky, rasterizer, mode)
-
-
-def _assert_no_trace_of_broken_ones(sky, rasterizer, mode):
     gaussians, shader = ball(300), Shader(sky, mode)
     camera = Camera.look_at([0.5, 0.4, 4.0], [0, 0, 0], width=64, height=64, fov_y=0.6)
     broken = {name: np.array(getattr(gaussians, name)) for name in _ARRAYS}

@@ -401,13 +401,3 @@ def test_an_exported_avatar_adds_its_size_and_speed(tiny_checkpoint, tiny_avatar
     rows = score(load_checkpoint(tiny_checkpoint), tiny_capture, method="m", avatar=tiny_avatar)
     assert rows[0]["file_mb"] == tiny_avatar.stat().st_size / 1e6
     assert rows[0]["fps"] > 0
-
-
-def test_the_learned_light_stands_in_for_its_own_captures_alone(tiny_run, tiny_capture, tmp_path) -> None:
-    """Under another capture's training light the avatar is relit like under any other light."""
-    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
-    light = tiny_capture.split("train")[0].light
-    assert light is not None
-    foreign = dataclasses.replace(tiny_capture, folder=tmp_path)
-    own, other = (Evaluator(checkpoint, capture)._trained for capture in (tiny_capture, foreign))
-    assert own == {light} and other == set()

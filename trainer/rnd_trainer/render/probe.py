@@ -30,13 +30,13 @@ class Texels:
 class LightProbe(nn.Module):
     """L(ω): 32×64 texels of linear RGB, stored as logarithms.
 
-    The factor that albedo and light share is fixed by Σ expoalways · luminance = level, initially a mean of 1 over the
+    The factor that albedo and light share is fixed by Σ exposure · luminance = level, initially a mean of 1 over the
     sphere.
     """
 
     directions: Tensor
     solid_angles: Tensor
-    expoalways: Tensor
+    exposure: Tensor
     level: Tensor
 
     def __init__(self, channels: int = 3) -> None:
@@ -44,21 +44,21 @@ class LightProbe(nn.Module):
         self.raw = nn.Parameter(torch.zeros(*PROBE_SHAPE, channels))
         self.register_buffer("directions", torch.as_tensor(texel_directions(*PROBE_SHAPE), dtype=torch.float32))
         self.register_buffer("solid_angles", torch.as_tensor(texel_solid_angles(*PROBE_SHAPE), dtype=torch.float32))
-        self.register_buffer("expoalways", self.solid_angles / (4 * math.pi))
+        self.register_buffer("exposure", self.solid_angles / (4 * math.pi))
         self.register_buffer("level", torch.ones(()))
 
     def radiance(self) -> Tensor:
         """[32, 64, 3] linear."""
         light = torch.exp(self.raw).expand(*PROBE_SHAPE, 3)
-        return light / (luminance(light) * self.expoalways).sum() * self.level
+        return light / (luminance(light) * self.exposure).sum() * self.level
 
     @torch.no_grad()
-    def start_from(self, radiance: Tensor, expoalways: Tensor) -> None:
-        """Start from ``radiance`` [32, 64, 3] > 0, and fix its luminance under ``expoalways`` [32, 64]."""
+    def start_from(self, radiance: Tensor, exposure: Tensor) -> None:
+        """Start from ``radiance`` [32, 64, 3] > 0, and fix its luminance under ``exposure`` [32, 64]."""
         grey = self.raw.shape[-1] == 1
         self.raw.copy_(torch.log(luminance(radiance)[..., None] if grey else radiance))
-        self.expoalways.copy_(expoalways)
-        self.level.copy_((luminance(radiance) * expoalways).sum())
+        self.exposure.copy_(exposure)
+        self.level.copy_((luminance(radiance) * exposure).sum())
 
 
 def natural_sky(height: Tensor | NDArray[np.float64]) -> Any:

@@ -18,7 +18,7 @@ from .channels import colour_channels, colour_notes
 from .radiance import as_stored, read_radiance_header
 
 _MAX_STOPS = 64  # beyond it radiance leaves float32
-_MAX_ROWS = 2048  # a map of more is averaged down to as many while it is read
+_MAX_ROWS = 2048  # larger maps are averaged to this while they are read
 _ROWS_AT_ONCE = 16  # rows or columns that are averaged by one product
 _LARGEST_HALF = 65504.0
 _MIN_WEIGHT = 1e-3  # of a texel's area, from which its radiance is known
@@ -31,7 +31,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
     +inf is 65 504, the largest HALF number, as a sun that did not fit. A map of more than 2048 rows is averaged to
     2048 × 4096 texels while it is read, weighted by solid angle, so that memory does not grow with it. Pixels of a
     Radiance file are divided by each EXPOSURE that its header states ("Radiance image format", Ward); CIE XYZ becomes
-    Rec.709, and rows are ordered as its resolution line says.
+    Rec.709, and rows are ordered by its resolution line.
 
     Args:
         up: the axis that points up in the world the map was made for: "y"; "z" for a Z-up world; "-y" for
@@ -69,7 +69,7 @@ def _is_radiance(path: str | Path) -> bool:
 def _read(path: str | Path, name: str | Path, across: bool = False) -> tuple[Floats32, int, tuple[str, ...]]:
     """Radiance as stored, how many texels were repaired, and notes; errors are of the file ``name``.
 
-    ``across``: rows and columns have changed places, which is not read of large maps.
+    ``across``: the file stores the transposed map, which is refused for large maps.
     """
     try:
         header = read_header(path)

@@ -26,7 +26,7 @@ export function readMotionFile(bytes, name) {
   const amass = whole || (split && !named && members.firstOf(...AMASS_MEMBERS) !== undefined);
   const smplRoot = joints === 55 || (split && amass) ? SMPLX_REST_ROOT : SMPL_REST_ROOT;
   let translations = new Float64Array(3 * frames);
-  if (easymocap) translations = turnAboutOrigin(members, rotations, frames, joints, smplRoot);
+  if (easymocap) translations = rotateAboutOrigin(members, rotations, frames, joints, smplRoot);
   else if (members.firstOf("trans", "transl")) translations = perFrame(members, frames, "trans", "transl");
   else notes.push("no trans in the file: the root stays in place");
   checkTranslations(translations, name);
@@ -103,21 +103,21 @@ function perFrame(members, frames, ...names) {
   const { file } = members, key = members.firstOf(...names);
   if (!key) throw refusal(`${names[0]} is missing`, { got: members.names.join(", "), file });
   const { shape, numbers } = members.numbers(key);
-  const kept = shape.length === 3 && shape[1] === 1 ? [shape[0], shape[2]] : shape;
-  if (kept.length !== 2 || kept[0] !== frames || kept[1] !== 3)
-    throw refusal(`shape of ${key}`, { expected: `${frames}×3, as many frames as poses`, got: sizes(kept), file });
+  const flat = shape.length === 3 && shape[1] === 1 ? [shape[0], shape[2]] : shape;
+  if (flat.length !== 2 || flat[0] !== frames || flat[1] !== 3)
+    throw refusal(`shape of ${key}`, { expected: `${frames}×3, as many frames as poses`, got: sizes(flat), file });
   return numbers;
 }
 
 /** EasyMocap's Rh rotates about the origin: rotates the roots of `rotations` [F·J·9], returns transl = Th + Rh·J0 − J0. */
-function turnAboutOrigin(members, rotations, frames, joints, restRoot) {
-  const angles = perFrame(members, frames, "Rh", "Rh_all"), turn = new Float64Array(9), turned = new Float64Array(9);
+function rotateAboutOrigin(members, rotations, frames, joints, restRoot) {
+  const angles = perFrame(members, frames, "Rh", "Rh_all"), rotation = new Float64Array(9), product = new Float64Array(9);
   const translations = perFrame(members, frames, "Th", "Th_all");
   for (let f = 0; f < frames; f++) {
-    axisAngleToMatrix(angles[3 * f], angles[3 * f + 1], angles[3 * f + 2], turn, 0);
-    multiply(turn, 0, rotations, 9 * f * joints, turned, 0);
-    rotations.set(turned, 9 * f * joints);
-    rotate(turn, restRoot).forEach((value, k) => { translations[3 * f + k] += value - restRoot[k]; });
+    axisAngleToMatrix(angles[3 * f], angles[3 * f + 1], angles[3 * f + 2], rotation, 0);
+    multiply(rotation, 0, rotations, 9 * f * joints, product, 0);
+    rotations.set(product, 9 * f * joints);
+    rotate(rotation, restRoot).forEach((value, k) => { translations[3 * f + k] += value - restRoot[k]; });
   }
   return translations;
 }

@@ -4,7 +4,7 @@ import { unzipSync } from "fflate";
 import { crc32, crcs } from "./crc.js";
 import { refusal, short } from "../errors.js";
 
-const READERS = {  // bytes, and the number at a place of a view
+const READERS = {  // bytes, and the number at an index of a view
   f8: [8, (view, at, little) => view.getFloat64(at, little)], f4: [4, (view, at, little) => view.getFloat32(at, little)],
   f2: [2, (view, at, little) => half(view.getUint16(at, little))],
   i8: [8, (view, at, little) => Number(view.getBigInt64(at, little))], i4: [4, (view, at, little) => view.getInt32(at, little)],
@@ -109,13 +109,13 @@ function dtypeName(descr, order, kind, digits) {
 function inRows(values, { shape, count, fortran }) {
   if (!fortran) return values;
   return values.map((_, k) => {
-    let rest = k, place = 0, stride = count;
+    let rest = k, index = 0, stride = count;
     for (let axis = shape.length - 1; axis >= 0; axis--) {
       stride /= shape[axis];
-      place += (rest % shape[axis]) * stride;
+      index += (rest % shape[axis]) * stride;
       rest = Math.floor(rest / shape[axis]);
     }
-    return values[place];
+    return values[index];
   });
 }
 

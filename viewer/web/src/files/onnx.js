@@ -12,9 +12,9 @@ export class OnnxFile {
   /** `metadata`: of metadata_props; `outputs`: names. Throws for other or truncated files. */
   constructor(bytes) {
     Object.assign(this, { head: [], graphHead: [], nodes: [], constants: new Map(), inputs: new Map(), outputs: new Set(), metadata: new Map() });
-    for (const [field, value, whole] of fields(bytes)) {
+    for (const [field, value, record] of fields(bytes)) {
       if (field === MODEL_GRAPH && value) this.readGraph(value);
-      else this.head.push(whole);
+      else this.head.push(record);
       if (field === MODEL_METADATA && value) {
         const entry = new Map(fields(value));
         if (entry.get(1)) this.metadata.set(text(entry.get(1)), text(entry.get(2) ?? new Uint8Array()));
@@ -23,27 +23,27 @@ export class OnnxFile {
   }
 
   readGraph(graph) {
-    for (const [field, value, whole] of fields(graph)) {
+    for (const [field, value, record] of fields(graph)) {
       const named = (number) => [...fields(value)].filter(([part]) => part === number).map(([, bytes]) => text(bytes));
-      if (field === GRAPH_NODE) this.nodes.push({ inputs: named(NODE_INPUT), outputs: named(NODE_OUTPUT), whole });
-      else if (field === GRAPH_INITIALIZER) this.constants.set(named(TENSOR_NAME)[0], whole);
-      else if (field === GRAPH_INPUT) this.inputs.set(named(NAME)[0], whole);
+      if (field === GRAPH_NODE) this.nodes.push({ inputs: named(NODE_INPUT), outputs: named(NODE_OUTPUT), record });
+      else if (field === GRAPH_INITIALIZER) this.constants.set(named(TENSOR_NAME)[0], record);
+      else if (field === GRAPH_INPUT) this.inputs.set(named(NAME)[0], record);
       else if (field === GRAPH_OUTPUT) this.outputs.add(named(NAME)[0]);
-      else if (field !== GRAPH_VALUE_INFO) this.graphHead.push(whole);  // onnxruntime infers shapes
+      else if (field !== GRAPH_VALUE_INFO) this.graphHead.push(record);  // onnxruntime infers shapes
     }
   }
 
   /** A model that computes only `outputs`, any values of the graph; `inputs`: the names it needs. */
   cut(outputs) {
-    const wanted = new Set(outputs), kept = [];
+    const wanted = new Set(outputs), nodes = [];
     for (const node of this.nodes.toReversed()) {  // ONNX demands topological order
       if (!node.outputs.some((name) => wanted.has(name))) continue;
-      kept.unshift(node.whole);
+      nodes.unshift(node.record);
       for (const name of node.inputs) wanted.add(name);
     }
-    const taken = (values) => [...values].filter(([name]) => wanted.has(name)).map(([, whole]) => whole);
+    const needed = (values) => [...values].filter(([name]) => wanted.has(name)).map(([, record]) => record);
     const given = outputs.map((name) => field(GRAPH_OUTPUT, field(NAME, new TextEncoder().encode(name))));
-    const graph = joined([...this.graphHead, ...kept, ...taken(this.constants), ...taken(this.inputs), ...given]);
+    const graph = joined([...this.graphHead, ...nodes, ...needed(this.constants), ...needed(this.inputs), ...given]);
     const inputs = [...this.inputs.keys()].filter((name) => wanted.has(name));
     return { model: joined([...this.head, field(MODEL_GRAPH, graph)]), inputs };
   }

@@ -25,14 +25,14 @@ export function restMotion(skeleton) {
 
 /** Translations relative to the avatar's rest position, from those relative to `restRoot`. */
 function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, skeleton) {
-  const turned = new Float64Array(9);
+  const product = new Float64Array(9);
   for (let f = 0; f < frames; f++) {
     const p = [0, 1, 2].map((k) => restRoot[k] + translations[3 * f + k]);
     const placed = zUp ? [p[0], p[2], -p[1]] : p;
     for (let k = 0; k < 3; k++) translations[3 * f + k] = placed[k] - skeleton.rest[k];
     if (!zUp) continue;
-    multiply(Z_UP_TO_Y_UP.flat(), 0, rotations, 9 * f * joints, turned, 0);
-    rotations.set(turned, 9 * f * joints);
+    multiply(Z_UP_TO_Y_UP.flat(), 0, rotations, 9 * f * joints, product, 0);
+    rotations.set(product, 9 * f * joints);
   }
 }
 
@@ -75,8 +75,8 @@ function firstTurns(rotations, frames, joints) {
 
 /** Local rotations [J·9] and the root's translation [3] at `time` seconds, clamped to the motion. */
 export function poseAt(motion, time) {
-  const place = Math.min(Math.max(time * motion.fps, 0), motion.frames - 1);
-  return { rotations: rotationsAt(motion, place), translation: pointAt(motion.translations, motion.frames, place) };
+  const position = Math.min(Math.max(time * motion.fps, 0), motion.frames - 1);
+  return { rotations: rotationsAt(motion, position), translation: pointAt(motion.translations, motion.frames, position) };
 }
 
 /** The last `poses` poses up to `time` over `seconds`, without the root: 6D rotations and joint velocities (window.py). */
@@ -90,10 +90,10 @@ export function motionWindow(motion, time, poses, seconds) {
       for (let k = 0; k < 6; k++)  // the first two columns, one after the other
         window[(row * others + joint) * 6 + k] = rotations[9 * (joint + 1) + 3 * (k % 3) + (k < 3 ? 0 : 1)];
   });
-  const turn = new Float64Array(9), [last, now] = steps.slice(-2);
+  const difference = new Float64Array(9), [last, now] = steps.slice(-2);
   for (let joint = 0; joint < others; joint++) {
-    transposedTimes(last, 9 * (joint + 1), now, 9 * (joint + 1), turn, 0);
-    matrixToAxisAngle(turn, 0).forEach((value, k) => { velocity[3 * joint + k] = value / spacing; });
+    transposedTimes(last, 9 * (joint + 1), now, 9 * (joint + 1), difference, 0);
+    matrixToAxisAngle(difference, 0).forEach((value, k) => { velocity[3 * joint + k] = value / spacing; });
   }
   return { window, velocity };
 }

@@ -13,19 +13,19 @@ export function shareTwists({ names, parents, rest }, rotations) {
     const bone = [0, 1, 2].map((k) => rest[3 * wrist + k] - rest[3 * elbow + k]);
     if (!(Math.hypot(...bone) > 0)) continue;
     const axis = unit(bone);
-    const angle = handedOn(rotations, 9 * elbow, axis) - handedOn(rotations, 9 * wrist, axis);
+    const angle = sharedTwist(rotations, 9 * elbow, axis) - sharedTwist(rotations, 9 * wrist, axis);
     if (angle === 0) continue;
-    const turn = new Float64Array(9), turned = new Float64Array(9);
-    axisAngleToMatrix(...axis.map((value) => value * angle), turn, 0);
-    multiply(rotations, 9 * elbow, transposed(turn), 0, turned, 0);
-    rotations.set(turned, 9 * elbow);
-    multiply(turn, 0, rotations, 9 * wrist, turned, 0);
-    rotations.set(turned, 9 * wrist);
+    const twist = new Float64Array(9), product = new Float64Array(9);
+    axisAngleToMatrix(...axis.map((value) => value * angle), twist, 0);
+    multiply(rotations, 9 * elbow, transposed(twist), 0, product, 0);
+    rotations.set(product, 9 * elbow);
+    multiply(twist, 0, rotations, 9 * wrist, product, 0);
+    rotations.set(product, 9 * wrist);
   }
 }
 
 /** The share of the twist about `axis` that the rotation at `at` passes to the forearm, radians. */
-function handedOn(m, at, axis) {
+function sharedTwist(m, at, axis) {
   let along = 0;
   for (let row = 0; row < 3; row++) for (let k = 0; k < 3; k++) along += axis[row] * m[at + 3 * row + k] * axis[k];
   const sine = axis[0] * (m[at + 7] - m[at + 5]) + axis[1] * (m[at + 2] - m[at + 6]) + axis[2] * (m[at + 3] - m[at + 1]);

@@ -165,8 +165,8 @@ export function downsize(light, height, width) {
   return { ...light, height, width, radiance: result };
 }
 
-function edges(from, to, place) {
-  return [from, to].map((count) => Float64Array.from({ length: count + 1 }, (_, k) => place(k / count)));
+function edges(from, to, edgeAt) {
+  return [from, to].map((count) => Float64Array.from({ length: count + 1 }, (_, k) => edgeAt(k / count)));
 }
 
 /** For each target interval, the covered source intervals and their shares. */
