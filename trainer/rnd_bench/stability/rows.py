@@ -11,8 +11,10 @@ from .figures import Result
 from .measures import (
     captures,
     files,
+    hostile,
     materials,
     motions,
+    operating,
     parity,
     playback,
     poses,
@@ -26,6 +28,7 @@ from .measures import (
 AVATAR = "the avatar"
 SHORT = "a training of at most 4 000 Gaussians, 96²"
 MADE = "Gaussians or a light made for it"
+FILES = "files made for it"
 
 
 class Row(NamedTuple):
@@ -83,5 +86,16 @@ ROWS: tuple[Row, ...] = (
     Row("R10", "NaN while training", trainings.not_finite, SHORT),
     Row("R11", "resume", trainings.resumed, SHORT),
     Row("R12", "no display", files.no_display),
+    Row("H1", "heap corruption by a calibration", hostile.calibration_text, FILES),
+    Row("H2", "read-only containers", operating.no_home, FILES),
+    Row("H3", "signals", operating.signals),
+    Row("H4", "bombs", hostile.bombs, FILES),
+    Row("H5", "fatter and brighter far away", operating.far_away),
+    Row("H6", "graphs that are no exporter's", hostile.foreign_graphs),
+    Row("H7", "two writers at once", operating.two_writers),
+    Row("H8", "idle connections", operating.idle_clients),
+    Row("H9", "a sun cut by HALF", hostile.cut_sun, MADE),
+    Row("H10", "millimetres and times out of order", hostile.odd_motions, FILES),
+    Row("H11", "numbers, names and modes of files", hostile.small_print, FILES),
 )
 TIMES = Row("T", "time in the worst cases", stress.worst_cases)

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from http.client import HTTPException
 from pathlib import Path
 from time import monotonic, perf_counter, sleep
 from typing import Any
@@ -20,6 +21,7 @@ from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 import numpy as np
+from websockets.exceptions import WebSocketException
 
 from rnd_bench.scenes.subject import Subject
 from rnd_runtime.core.errors import InputError
@@ -39,6 +41,7 @@ EVERY = 20
 """clients between two readings of memory"""
 PAUSE_S = 0.05
 """between two clients"""
+TRIES = 20
 ANSWER_S = 2.0
 SLOPE_BYTES = 1000.0
 PATIENCE_S = 30.0
@@ -51,11 +54,11 @@ def soak_view(subject: Subject, minutes: float) -> list[Figure]:
     with _viewer(subject.avatar_file) as (url, process), ExitStack() as stack:
         stack.callback(_close_all, idle)
         kinds: list[Callable[[str], None]] = [_page, _file, _leave, _stranger, _garbage, lambda url: _idle(url, idle)]
-        clients, end = 0, monotonic() + 60 * minutes
+        clients, refused, end = 0, 0, monotonic() + 60 * minutes
         while monotonic() < end:
-            kinds[clients % len(kinds)](url)
+            refused += _visit(kinds[clients % len(kinds)], url)
             started = perf_counter()
-            _file(url)
+            refused += _visit(_file, url)
             seconds.append(perf_counter() - started)
             if clients >= WARM and clients % EVERY == 0:
                 memory.append(_memory(process.pid))
@@ -69,8 +72,20 @@ def soak_view(subject: Subject, minutes: float) -> list[Figure]:
         not_measured(growth, TOO_SHORT) if slope is None else below(growth, float(slope), SLOPE_BYTES, "bytes"),
         reported(f"{name}: answer to a page, p99", float(np.quantile(seconds, 0.99)), "s"),
         replace(below(f"{name}: longest answer to a page", max(seconds), ANSWER_S, "s"), timing=True),
+        reported(f"{name}: connections refused, then taken", refused),
         at_most(f"{name}: ended early", int(ended), 0),
     ]
+
+
+def visit_idle(subject: Subject, count: int) -> tuple[float, bool]:
+    """Seconds of a page's image beside ``count`` idle connections, and whether the server ended."""
+    with _viewer(subject.avatar_file) as (url, process), ExitStack() as stack:
+        for _ in range(count):
+            with suppress(OSError):
+                stack.callback(_connect(url).close)
+        started = perf_counter()
+        _visit(_page, url)
+        return perf_counter() - started, process.poll() is not None
 
 
 @contextmanager
@@ -100,6 +115,18 @@ def _websocket(url: str) -> Iterator[tuple[Any, dict[str, Any]]]:
         view = json.loads(page.recv(PATIENCE_S))["scene"]["view"]
         state = {"time": 0.0, "width": SIDE, "height": SIDE} | view
         yield page, {"ask": "render", "number": 1, "state": state}
+
+
+def _visit(visit: Callable[[str], None], url: str) -> int:
+    """Come again, as a browser does, where the server has no space within its patience; how often."""
+    for refused in range(TRIES):
+        try:
+            visit(url)
+            return refused
+        except (OSError, HTTPException, WebSocketException):
+            sleep(PAUSE_S)
+    visit(url)
+    return TRIES
 
 
 def _page(url: str) -> None:

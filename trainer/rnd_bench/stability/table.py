@@ -33,7 +33,7 @@ def store(
         row |= {name: getattr(figure, name) for name in ("what", "measured", "unit", "line")}
         row |= {"verdict": verdict(figure), "baseline": figure.baseline, "baseline_name": figure.baseline_name}
         rows.append(row | about)
-    rows.sort(key=lambda row: ("PGLRTFSKD".find(row["id"][0]), int(row["id"][1:] or 0)))
+    rows.sort(key=lambda row: ("PGLRHTFSKD".find(row["id"][0]), int(row["id"][1:] or 0)))
     write_json(file, rows)
     with atomic_path(file.with_suffix(".md")) as temporary:
         temporary.write_text(markdown(rows), encoding="utf-8")

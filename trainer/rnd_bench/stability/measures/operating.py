@@ -1,0 +1,158 @@
+"""Rows H2, H3, H5, H7 and H8: read-only machines, signals, small images, two writers, idle clients."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from rnd_bench.scenes.subject import Subject
+from rnd_bench.stability.figures import Result, at_most, below, holds, reported, result
+from rnd_bench.stability.processes import PLAY, Command, environment, play
+from rnd_bench.stability.soak_view import visit_idle
+from rnd_runtime.cli.lock import LOCK_FILE
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.motion.motion import Motion, save_motion
+from rnd_runtime.playback import far
+from rnd_runtime.playback.frame import FrameRenderer
+
+MOMENTS_S = 4.0
+FOCAL, HEIGHT_M = 4000.0, 1.75
+NEAR_PX, FAR_PX = 384, (100, 40, 16)
+SMALLEST_PX = 8
+IDLE = 300
+"""connections that ask for nothing: more than the 262 that once ended the server"""
+_NOWHERE = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent", "NUMBA_CACHE_DIR": ""}
+
+
+def _started(command: Command, folder: Path, **more: str) -> subprocess.Popen[str]:
+    """A command that heeds all signals, also those that its parent ignores."""
+    module, arguments = command
+    name = f"rnd-{module.split('.')[1]}"
+    code = (
+        "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+        "signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"sys.argv[0] = {name!r}; from {module} import main; sys.exit(main())"
+    )
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        cwd=folder,
+        env=environment(**more),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def _motion_file(subject: Subject, folder: Path, seconds: float) -> Path:
+    save_motion(folder / "walk.npz", subject.walk(seconds))
+    return folder / "walk.npz"
+
+
+def no_home(subject: Subject) -> Result:
+    """H2: no home and no cache folder: the kernels go to a temporary one, with one line."""
+    folder = subject.work / "no_home"
+    folder.mkdir(parents=True, exist_ok=True)
+    wrong = []
+    for words in (["--help"], ["--doctor"]):
+        process = _started((PLAY, words), folder, **_NOWHERE)
+        errors = process.communicate()[1]
+        if process.returncode != 0 or "Traceback" in errors:
+            wrong.append(f"{words[0]}: exit {process.returncode}, {errors[-80:]!r}")
+    return result(holds("commands that fail without a home", wrong))
+
+
+def signals(subject: Subject) -> Result:
+    """H3: SIGINT, SIGTERM and SIGHUP at random moments of rnd-play."""
+    folder, rng, wrong, sent = subject.work / "signals", np.random.default_rng(4), list[str](), 0
+    folder.mkdir(parents=True, exist_ok=True)
+    motion = _motion_file(subject, folder, 4.0)
+    command = play(subject.avatar_file, motion, folder / "out", "--size", 64, "--format", "png,exr,mp4")
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    for k in range(subject.few(3, 50)):
+        number, after = numbers[k % 3], float(rng.uniform(0.5, MOMENTS_S))
+        process = _started(command, folder)
+        time.sleep(after)
+        process.send_signal(number)
+        errors = process.communicate(timeout=60)[1]
+        if process.returncode == 0:  # it had ended
+            continue
+        sent += 1
+        if process.returncode == -number and not errors:  # Python itself was being loaded
+            continue
+        if process.returncode != 128 + number or "Traceback" in errors or "interrupted" not in errors:
+            wrong.append(f"{number.name} after {after:.2f} s: exit {process.returncode}, {errors[-60:]!r}")
+        wrong += [f"left {file.name}" for file in (folder / "out").rglob(".*") if not file.name.startswith(".run-")]
+    return result(holds(f"{sent} signals that did not end rnd-play in one line with its code", wrong))
+
+
+def far_away(subject: Subject) -> Result:
+    """H5: coverage and energy per (pixel of height)² of a body that recedes, over those of a near one."""
+    middle = np.array([0.0, float(np.mean(subject.rest.means[:, 1])), 0.0])
+    motion, measured = subject.walk(1.0), {}
+    with FrameRenderer(subject.avatar, subject.light, shade="table") as renderer:
+        for limit in (far.MIN_PIXELS_PER_METRE, 0.0):
+            kept, far.MIN_PIXELS_PER_METRE = far.MIN_PIXELS_PER_METRE, limit
+            try:
+                sizes = (NEAR_PX, *FAR_PX, SMALLEST_PX)
+                measured[limit] = [_amounts(renderer, motion, middle, pixels) for pixels in sizes]
+            finally:
+                far.MIN_PIXELS_PER_METRE = kept
+    figures = []
+    changes, plain = (np.abs(np.array(rows[1:]) / rows[0] - 1) * 100 for rows in measured.values())
+    for k, what in enumerate(("coverage", "energy")):
+        worst, plain_worst = float(changes[:-1, k].max()), float(plain[:-1, k].max())
+        figures.append(
+            below(f"{what} from 100 to 16 px, change", worst, 5, "%", baseline=("no finer grid", plain_worst))
+        )
+        smallest, plain_smallest = float(changes[-1, k]), float(plain[-1, k])
+        figures.append(below(f"{what} at 8 px, change", smallest, 10, "%", baseline=("no finer grid", plain_smallest)))
+    return result(*figures)
+
+
+def _amounts(renderer: FrameRenderer, motion: Motion, middle: np.ndarray, pixels: int) -> list[float]:
+    """Coverage and energy, averaged over two positions in the pixel grid."""
+    amounts = []
+    for offset in (0.0, 0.37):
+        side = int(1.5 * pixels) + 8
+        K = np.array([[FOCAL, 0, side / 2 + offset], [0, FOCAL, side / 2 - offset], [0, 0, 1]])
+        world_to_camera = np.diag([1.0, -1.0, -1.0, 1.0])
+        world_to_camera[:3, 3] = [-middle[0], middle[1], FOCAL * HEIGHT_M / pixels]
+        frame = renderer.render(motion, 0.5, Camera(side, side, K, world_to_camera))
+        amounts.append([float(frame.alpha.sum()), float(frame.radiance.sum())])
+    return [total / pixels**2 for total in np.mean(amounts, axis=0)]
+
+
+def two_writers(subject: Subject) -> Result:
+    """H7: of two plays into one folder the second is told who holds it."""
+    folder, wrong = subject.work / "two", list[str]()
+    folder.mkdir(parents=True, exist_ok=True)
+    command = play(subject.avatar_file, _motion_file(subject, folder, 60.0), folder / "out", "--size", 256)
+    first = _started(command, folder)
+    try:
+        while first.poll() is None and not (folder / "out" / LOCK_FILE).exists():
+            time.sleep(0.02)
+        second = _started(command, folder)
+        errors = second.communicate()[1]
+        held = first.poll() is None
+        if held and (second.returncode != 2 or f"process {first.pid}" not in errors):
+            wrong.append(f"exit {second.returncode}, {errors[-120:]!r}")
+    finally:
+        first.kill()
+        ended = first.communicate()[1]
+    if not held:
+        wrong.append(f"the first ended before the second began: {ended[-80:]!r}")
+    return result(holds("second writers not told who holds the folder", wrong))
+
+
+def idle_clients(subject: Subject) -> Result:
+    """H8: connections that ask for nothing end neither rnd-view nor its answers."""
+    seconds, ended = visit_idle(subject, subject.few(100, IDLE))
+    return result(
+        at_most("rnd-view ended by idle connections", int(ended), 0),
+        reported("answer to a page beside them", seconds, "s"),
+    )
