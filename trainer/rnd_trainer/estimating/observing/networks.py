@@ -79,7 +79,9 @@ def network_file(name: str) -> Path:
         raise InputError(f"network {name} is missing", file=folder, hint=f"{COMMAND} fetches it")
     known = noted.get("source_sha256") == wanted.sha256 and noted.get("conversion") == _CONVERSION
     if not known or noted.get("sha256") != sha256_of(path):
-        raise InputError(f"network {name}", expected="the one this version reads", got="another", file=path, hint=COMMAND)
+        raise InputError(
+            f"network {name}", expected="the one this version reads", got="another", file=path, hint=COMMAND
+        )
     return path
 
 

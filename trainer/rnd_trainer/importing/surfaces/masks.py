@@ -103,7 +103,7 @@ def _learn_background(images: Sequence[Image], silhouettes: Sequence[Mask] | Non
     stack = np.stack([images[frame] for frame in chosen])
     hidden = np.zeros(stack.shape[:3], bool)
     if silhouettes is not None:
-        hidden = np.stack([_dilated(silhouettes[frame], _CLEARANCE) for frame in chosen])
+        hidden = np.stack([dilated(silhouettes[frame], _CLEARANCE) for frame in chosen])
     seen = (~hidden).sum(0) >= min(3, len(chosen))
     colour = np.zeros(stack.shape[1:], np.float32)
     differences = np.zeros(255 * _BINS + 1, np.int64)  # how often each difference occurs
@@ -132,7 +132,7 @@ def _seeds(person: Mask, silhouette: Mask | None, image: Image, background: _Bac
     template = person if silhouette is None else silhouette
     if not template.any():
         return seeds
-    near = _dilated(template, reach)
+    near = dilated(template, reach)
     seeds[near] = cv2.GC_PR_BGD
     seeds[near & person] = cv2.GC_PR_FGD
     if background is not None:
@@ -141,7 +141,7 @@ def _seeds(person: Mask, silhouette: Mask | None, image: Image, background: _Bac
         seeds[near & background.seen & ~differs] = cv2.GC_PR_BGD
         seeds[near & ~template & background.seen & ~differs] = cv2.GC_BGD
     inside = cv2.distanceTransform((template & person).astype(np.uint8), cv2.DIST_L2, 3)
-    seeds[inside > _SURE_INSIDE * _height(template)] = cv2.GC_FGD
+    seeds[inside > _SURE_INSIDE * mask_height(template)] = cv2.GC_FGD
     return seeds
 
 
@@ -151,7 +151,7 @@ def _moving_mask(image: Image, background: _Background) -> Mask:
     side = max(3, 2 * (min(differs.shape) // 120) + 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     opened = cv2.morphologyEx(differs, cv2.MORPH_OPEN, kernel)
-    return _large_parts(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel, iterations=2))
+    return large_parts(cv2.morphologyEx(opened, cv2.MORPH_CLOSE, kernel, iterations=2))
 
 
 def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) -> Mask:
@@ -159,7 +159,7 @@ def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) 
     height, width = image.shape[:2]
     rows, columns = slice(0, height), slice(0, width)
     if silhouette is not None and silhouette.any():
-        rows, columns = _box(silhouette, 1.5 * _REACH)
+        rows, columns = bounding_box(silhouette, 1.5 * _REACH)
     output = network(image[rows, columns])
     if output.shape[2] == 2:  # scores of background and person
         likely = output[..., 1] > output[..., 0]
@@ -168,7 +168,7 @@ def _network_mask(network: ImageNetwork, image: Image, silhouette: Mask | None) 
         likely = output[..., 0] > (0 if logits else 0.5)
     person = np.zeros((height, width), bool)
     person[rows, columns] = likely
-    return _large_parts(person)
+    return large_parts(person)
 
 
 def _refine(image: Image, seeds: Image) -> Image:
@@ -177,7 +177,7 @@ def _refine(image: Image, seeds: Image) -> Image:
     possible = seeds != cv2.GC_BGD
     if not possible.any():
         return coverage
-    rows, columns = _box(possible, 0.05)
+    rows, columns = bounding_box(possible, 0.05)
     crop, labels = np.ascontiguousarray(image[rows, columns]), seeds[rows, columns]
     scale = min(1.0, _WORK_SIDE / max(labels.shape))
     small = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -196,14 +196,14 @@ def _grabcut(image: Image, labels: Image) -> Mask:
     """Foreground after GrabCut, or of ``labels`` if they have one class only."""
     person = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
     if not person.any() or person.all():
-        return _large_parts(person)
+        return large_parts(person)
     cv2.setRNGSeed(0)  # random initial clusters: equal images give equal masks
     models = np.zeros((1, 65)), np.zeros((1, 65))
     refined, *_ = cv2.grabCut(image, labels.copy(), None, *models, _GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return _large_parts(np.isin(refined, (cv2.GC_FGD, cv2.GC_PR_FGD)))
+    return large_parts(np.isin(refined, (cv2.GC_FGD, cv2.GC_PR_FGD)))
 
 
-def _large_parts(mask: NDArray[np.generic]) -> Mask:
+def large_parts(mask: NDArray[np.generic]) -> Mask:
     """``mask`` without components below a twentieth of the largest one."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = statistics[1:, cv2.CC_STAT_AREA]
@@ -211,23 +211,23 @@ def _large_parts(mask: NDArray[np.generic]) -> Mask:
     return large
 
 
-def _height(mask: Mask) -> int:
+def mask_height(mask: Mask) -> int:
     rows = np.flatnonzero(mask.any(1))
     return int(rows[-1] - rows[0] + 1)
 
 
-def _dilated(mask: Mask, share: float) -> Mask:
+def dilated(mask: Mask, share: float) -> Mask:
     """``mask`` dilated by ``share`` of its height."""
     if not mask.any():
         return mask
     outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 3)
-    grown: Mask = outside <= share * _height(mask)
+    grown: Mask = outside <= share * mask_height(mask)
     return grown
 
 
-def _box(mask: Mask, share: float) -> tuple[slice, slice]:
+def bounding_box(mask: Mask, share: float) -> tuple[slice, slice]:
     """Bounding box of ``mask``, grown by ``share`` of its height."""
-    margin = int(np.ceil(share * _height(mask))) + 2
+    margin = int(np.ceil(share * mask_height(mask))) + 2
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     return (
         slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + 1 + margin),

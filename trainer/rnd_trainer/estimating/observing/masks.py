@@ -1,0 +1,178 @@
+"""Soft masks of the person: the network's, sharpened by the background of a static camera and by the image's edges.
+
+Source: He et al. 2013, Guided image filtering; Qian and Sezan 1992, Video background replacement (known background).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_trainer.importing.surfaces.masks import bounding_box, dilated, large_parts, mask_height
+
+from .regions import Image
+
+Floats32 = NDArray[np.float32]
+
+MAX_SIDE = 800
+"""pixels of the person's height at which masks are made; larger ones are enlarged from it"""
+_ROUNDS = 2  # of the background: the second one knows the person's outline
+_CLEARANCES = (0.04, 0.006)  # of the person's height around the mask, hidden in each round
+_FRAMES, _MAX_BYTES = 40, 600 << 20
+_MIN_SEEN = 3  # frames that show a pixel of the background
+_MIN_NOISE, _MAX_NOISE = 1.5, 12.0  # 8-bit steps of a static camera
+_EDGE_NOISE = 0.35  # of a step to the neighbour: codecs and sway move edges
+_DIFFERENCE = 5.0  # half squared deviations from which a pixel is rather the person's
+_EVIDENCE = (-4.0, 8.0)  # log odds that a pixel's difference from the background can give
+_SHADOW = 0.15  # what remains of the evidence where the difference is a shadow's
+_TRUST = 0.5  # of the network's log odds beside the background's
+_FAR = (0.02, 0.05)  # of the height: distances from the network's mask at which the person becomes unlikely
+_RADIUS, _REGULARITY = 1, 1e-3  # of the guided filter, pixels and variance
+_BLIND_RADIUS, _BLIND_REGULARITY = 3, 1e-4  # without a background
+_COLOUR_REACH = 2.5  # pixels over which the person's colour is taken to the outline
+_MIN_CONTRAST = 8.0  # deviations between person and background from which their mixture is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """Background of a static camera: colour [H, W, 3], where it was seen [H, W], its deviation [H, W] in 8-bit steps."""
+
+    colour: Floats32
+    seen: NDArray[np.bool_]
+    noise: Floats32
+
+
+def refine_masks(
+    frame: Callable[[int], Image],
+    soft: Sequence[Image],
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Iterator[Image]:
+    """Yield a mask [H, W] uint8 for each of ``soft``, the network's masks of the images that ``frame`` gives by index.
+
+    Frames whose mask is empty stay empty.
+    """
+    heights = [mask_height(mask > 127) for mask in soft if (mask > 127).any()]
+    scale = min(1.0, MAX_SIDE / max(heights, default=1))
+    background = _learn_background(frame, soft, scale)
+    for k, mask in enumerate(soft):
+        image = frame(k)
+        small = _matte(_resized(image, scale), _resized(mask, scale), background)
+        yield small if scale == 1 else _resized(small, (mask.shape[1], mask.shape[0]))
+        on_progress(k + 1, len(soft))
+
+
+def _learn_background(frame: Callable[[int], Image], soft: Sequence[Image], scale: float) -> Background | None:
+    """The background, or None of a moving camera; in rounds, the later ones with the person's own outline."""
+    if len(soft) < _MIN_SEEN:
+        return None
+    first = _resized(frame(0), scale)
+    count = int(np.clip(_MAX_BYTES // (first.size + 1), _MIN_SEEN, min(_FRAMES, len(soft))))
+    chosen = np.unique(np.linspace(0, len(soft) - 1, count).astype(int))
+    images = np.stack([_resized(frame(int(k)), scale) for k in chosen])
+    network = [_resized(soft[int(k)], scale) for k in chosen]
+    masks, background = [mask > 76 for mask in network], None
+    for clearance in _CLEARANCES[:_ROUNDS]:
+        background = _median(images, np.stack([dilated(mask, clearance) for mask in masks]))
+        if background is None:
+            return None
+        masks = [_matte(image, mask, background) > 127 for image, mask in zip(images, network)]
+    return background
+
+
+def _median(images: NDArray[np.uint8], hidden: NDArray[np.bool_]) -> Background | None:
+    """Median and deviation over the frames in which a pixel is not hidden, row by row."""
+    seen = (~hidden).sum(0) >= _MIN_SEEN
+    colour = np.zeros(images.shape[1:], np.float32)
+    noise = np.zeros(images.shape[1:3], np.float32)
+    for row in range(len(seen)):
+        columns = seen[row]
+        if columns.any():
+            shown = np.where(hidden[:, row, columns, None], np.float32(np.nan), images[:, row, columns])
+            colour[row, columns] = np.nanmedian(shown, axis=0)
+            noise[row, columns] = 1.48 * np.nanmedian(np.abs(shown - colour[row, columns]), axis=0).max(-1)
+    if not seen.any():
+        return None
+    usual = float(np.median(noise[seen]))
+    if usual > _MAX_NOISE:
+        return None
+    noise[~seen] = usual
+    smooth = cv2.blur(noise, (5, 5))
+    return Background(colour, seen, np.maximum(smooth, max(usual, _MIN_NOISE)).astype(np.float32))
+
+
+def _matte(image: Image, soft: Image, background: Background | None) -> Image:
+    """The mask [H, W] of one image; ``soft`` is the network's."""
+    result = np.zeros_like(soft)
+    inside = soft > 127
+    if not inside.any():
+        return result
+    window = bounding_box(inside, 2 * _FAR[1])
+    pixels, likely = image[window].astype(np.float32), soft[window].astype(np.float32) / 255
+    near = None
+    if background is not None:
+        near = Background(background.colour[window], background.seen[window], background.noise[window])
+    odds = _network_odds(likely, mask_height(inside), 1.0 if near is None else _TRUST)
+    radius, regularity = _BLIND_RADIUS, _BLIND_REGULARITY
+    if near is not None:
+        odds += _difference_odds(pixels, near)
+        radius, regularity = _RADIUS, _REGULARITY
+    person = (1 / (1 + np.exp(-odds))).astype(np.float32)
+    filtered = cv2.ximgproc.guidedFilter(pixels / 255, person, radius, regularity)
+    alpha = np.clip((filtered - 0.15) / 0.7, 0, 1).astype(np.float32)  # the filter blurs both sides of the edge
+    if near is not None:
+        alpha = _mixed(alpha, pixels, near)
+    parts = large_parts(alpha > 0.5)
+    alpha = np.where(dilated(parts, 0.005), alpha, 0)
+    result[window] = np.round(255 * alpha)
+    return result
+
+
+def _network_odds(likely: Floats32, height: int, trust: float) -> Floats32:
+    odds = trust * np.clip(np.log((likely + 0.01) / (1.01 - likely)), -4, 4)
+    outside = cv2.distanceTransform((likely < 0.5).astype(np.uint8), cv2.DIST_L2, 5) / height
+    near, far = _FAR
+    return np.asarray(odds - 8 * np.clip((outside - near) / (far - near), 0, 1), np.float32)
+
+
+def _deviation(background: Background) -> Floats32:
+    grey = background.colour.mean(-1)
+    across, down = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)
+    return np.sqrt(background.noise**2 + _EDGE_NOISE**2 * (across**2 + down**2))
+
+
+def _difference_odds(pixels: Floats32, background: Background) -> Floats32:
+    """Log odds of the person by the difference from the background; little where it is a shadow's."""
+    blurred = cv2.GaussianBlur(pixels - background.colour, (0, 0), 0.6)
+    squared = ((blurred / _deviation(background)[..., None]) ** 2).sum(-1)
+    odds = np.clip(0.5 * squared - _DIFFERENCE, *_EVIDENCE)
+    ratio = (pixels + 1) / (background.colour + 1)
+    shadow = (ratio.max(-1) < 1.05) & (ratio.min(-1) > 0.5) & (np.ptp(ratio, axis=-1) < 0.1)
+    odds[shadow & (odds > 0)] *= _SHADOW
+    odds[~background.seen] = 0
+    return odds
+
+
+def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats32:
+    """``alpha`` with the outline's pixels measured as mixtures of the person's colour nearby and the background's."""
+    sure = cv2.erode((alpha > 0.95).astype(np.float32), np.ones((3, 3), np.uint8))
+    weight = cv2.GaussianBlur(sure, (0, 0), _COLOUR_REACH)
+    person = cv2.GaussianBlur(pixels * sure[..., None], (0, 0), _COLOUR_REACH) / np.maximum(weight, 1e-4)[..., None]
+    across = person - background.colour
+    contrast = (across**2).sum(-1)
+    share = ((pixels - background.colour) * across).sum(-1) / np.maximum(contrast, 1)
+    trust = contrast / (contrast + (_MIN_CONTRAST * _deviation(background)) ** 2)
+    edge = cv2.dilate((np.abs(alpha - 0.5) < 0.45).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    trust = np.where(edge & background.seen & (weight > 0.02), trust, 0)
+    return np.asarray((1 - trust) * alpha + trust * np.clip(share, 0, 1), np.float32)
+
+
+def _resized(pixels: Image, to: float | tuple[int, int]) -> Image:
+    if isinstance(to, tuple):
+        return cv2.resize(pixels, to, interpolation=cv2.INTER_LINEAR)  # type: ignore[return-value]
+    if to == 1:
+        return pixels
+    return cv2.resize(pixels, None, fx=to, fy=to, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]

@@ -1,0 +1,145 @@
+"""One person through a video: found, followed from frame to frame, found again where lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from rnd_runtime.core.errors import InputError
+
+from .detection import Detection, Detector
+from .landmarks import SIDE, LandmarkNetwork, View, Views
+from .regions import Image, Region, Shrunk
+
+MIN_SCORE = 0.5
+"""of the landmark network, that there is a person"""
+_SAMPLES = 9  # frames in which people are counted
+_ALIKE = 0.6  # size of a second person, relative to the first, from which one has to be chosen
+_OFTEN = 0.25  # share of the sampled frames
+_STEADY = 0.9  # overlap of regions below which a frame is looked at again in the newer one
+_NEAR = 0.05  # overlap with the last region from which a detection is the same person
+_DARK = 16.0  # mean 8-bit value of a dark image
+
+
+class Frames(Protocol):
+    """Frames of a video by number."""
+
+    @property
+    def numbers(self) -> range | list[int]: ...
+    def frame(self, number: int) -> Image: ...
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the person is first seen."""
+
+    frame: int
+    region: Region
+
+
+def find_person(
+    video: Frames,
+    numbers: list[int],
+    detector: Detector,
+    network: LandmarkNetwork,
+    person: int | None = None,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Start:
+    """The person to follow: the only one, the largest one by far, or number ``person`` from the left.
+
+    Raises:
+        InputError: nobody, nobody upright, several people of one size, or no such person.
+    """
+    sampled = [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, _SAMPLES).astype(int))]
+    seen: dict[int, list[Detection]] = {}
+    for done, number in enumerate(sampled):
+        image = video.frame(number)
+        people = [one for one in detector(image) if _confirmed(image, one.region, network)]
+        if people:
+            seen[number] = sorted(people, key=lambda one: -one.region.size)
+        on_progress(done + 1, len(sampled))
+    if not seen:
+        raise _nobody(video, sampled, detector, network)
+    several = {number: _alike(people) for number, people in seen.items() if len(_alike(people)) > 1}
+    if person is not None:
+        rows = {number: sorted(people, key=lambda one: one.region.x) for number, people in seen.items()}
+        number, row = next(((n, row) for n, row in rows.items() if len(row) > person), (None, []))
+        if number is None:
+            most = max(len(row) for row in rows.values())
+            raise InputError("--person", expected=f"0 to {most - 1}, counted from the left", got=person)
+        return Start(number, row[person].region)
+    if len(several) > _OFTEN * len(seen):
+        number, people = next(iter(several.items()))
+        places = ", ".join(f"{k} at x = {x:.0f}" for k, x in enumerate(sorted(one.region.x for one in people)))
+        raise InputError(
+            "people", expected="one", got=f"{len(people)}", frame=number, hint=f"choose by --person: {places}"
+        )
+    number = next(iter(seen))
+    return Start(number, seen[number][0].region)
+
+
+def follow(
+    video: Frames, numbers: list[int], start: Start, detector: Detector, network: LandmarkNetwork
+) -> Iterator[tuple[int, Views | None]]:
+    """Yield each frame's number and all views of the person in it, None where the person is not seen."""
+    region: Region | None = None
+    last = start.region
+    for number in numbers:
+        image = video.frame(number)
+        if number == start.frame:
+            region = start.region
+        if region is None:
+            region = _found_again(detector(image), last)
+        first = None if region is None else _settled(image, region, network)
+        if first is None or region is None:
+            region = None
+            yield number, None
+            continue
+        used, view = first
+        yield number, network.look_often(image, used, view)
+        last = region = view.next_region
+
+
+def _settled(image: Image, region: Region, network: LandmarkNetwork) -> tuple[Region, View] | None:
+    """The view of ``region``, or of the better one that it shows; None where there is nobody."""
+    for _ in range(3):
+        view = network.look(Shrunk(image, region.size, SIDE), region)
+        if view.score < MIN_SCORE or not view.next_region.size > 1:
+            return None
+        if region.overlap(view.next_region) >= _STEADY:
+            break
+        region = view.next_region
+    return region, view
+
+
+def _found_again(people: list[Detection], last: Region) -> Region | None:
+    near = [(one.region.overlap(last.scaled(1.5)), one.region) for one in people]
+    near = [(overlap, region) for overlap, region in near if overlap > _NEAR]
+    return max(near, key=lambda pair: pair[0])[1] if near else None
+
+
+def _confirmed(image: Image, region: Region, network: LandmarkNetwork) -> bool:
+    return _settled(image, region, network) is not None
+
+
+def _alike(people: list[Detection]) -> list[Detection]:
+    return [one for one in people if one.region.size >= _ALIKE * people[0].region.size]
+
+
+def _nobody(video: Frames, sampled: list[int], detector: Detector, network: LandmarkNetwork) -> InputError:
+    """Why nobody was found: darkness, a rotated video, or nobody."""
+    images = [video.frame(number) for number in sampled[:: max(1, len(sampled) // 3)]]
+    brightness = float(np.mean([image.mean() for image in images]))
+    if brightness < _DARK:
+        return InputError("images", expected="light enough to see a person", got=f"a mean of {brightness:.0f} of 255")
+    for quarters, name in ((1, "left"), (3, "right"), (2, "upside down")):
+        for image in images:
+            rotated = np.ascontiguousarray(np.rot90(image, -quarters))
+            if any(_confirmed(rotated, one.region, network) for one in detector(rotated)):
+                return InputError(
+                    "person", expected="upright", got=f"lying, head to the {name}" if quarters != 2 else name
+                )
+    return InputError("person", expected="one in the video", got="none")
