@@ -1,4 +1,4 @@
-// Lat-long, linear light probes: read, repair, downsize (rnd_runtime/shading/light.py).
+// Lat-long, linear light probes: read, repair, downsize (rnd_runtime/shading/light.py, shading/files/load.py).
 
 import { DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
 import { refusal, short } from "../errors.js";
