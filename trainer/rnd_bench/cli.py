@@ -12,6 +12,7 @@ from typing import Any
 from rnd_runtime.cli.command import parse_subcommand, run_command
 from rnd_runtime.core.errors import InputError
 
+from .lifter.options import Lifter
 from .options import Compare, Frame, Grid, Raster, Step
 from .stability.cli import Stability
 from .studies.options import Ablations, Agreement, Causes, Lengths, People
@@ -39,6 +40,7 @@ STUDIES: dict[str, tuple[Any, str, str]] = {
     "lengths": (Lengths, STUDY, "run_trainings"),
     "people": (People, STUDY, "run_people"),
     "agreement": (Agreement, STUDY, "run_agreement"),
+    "lifter": (Lifter, "rnd_bench.lifter.cli", "run"),
 }
 
 

@@ -2,7 +2,7 @@
 
 The errors of a frame are jointly Gaussian given the pose: a mean that is linear in the true points and in the direction
 that the person faces, a covariance over all points, part of it constant in a window and the rest correlated in time.
-Points of low confidence err more. All is fitted to rendered people (``filmed``).
+Points of low confidence err more. All is fitted to a rendered person (``captured``).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import save_npz
 from rnd_trainer.estimating.lifted import JOINTS
 from rnd_trainer.estimating.lifter import looking_at
@@ -150,8 +149,8 @@ def viewed(points: Floats32) -> tuple[Floats32, Floats32]:
     return points @ np.swapaxes(view, -1, -2), view
 
 
-def fit_errors(windows: list[Window], ridge: float = 0.003) -> ErrorModel:
-    """Fit the model to windows of ``filmed.observed``, each also mirrored."""
+def fit_errors(windows: list[Window], ridge: float = 0.1) -> ErrorModel:
+    """Fit the model to windows of rendered people (``captured``), each also mirrored."""
     offsets = fit_offsets(windows)
     predictors, values = [], []
     for window in windows:
@@ -302,16 +301,3 @@ def _swap(flat: Floats, hint: Floats, chance: Floats, rng: Generator) -> None:
         part, members = slice(start, start + rng.integers(2, 10)), np.array(kinds[kind])
         for array in (flat, hint, chance):
             array[b, part, members] = array[b, part, SWAPPED[members]]
-
-
-def load_windows(folder: Path) -> list[Window]:
-    """The windows that ``filmed.film_windows`` wrote, without those in which the person was lost."""
-    windows = []
-    for file in sorted(folder.glob("[0-9]*.npz")):
-        with np.load(file, allow_pickle=False) as archive:
-            window = {name: archive[name].astype(np.float32) for name in archive.files}
-        if len(window["rays"]):
-            windows.append(window)
-    if not windows:
-        raise InputError("filmed windows", expected="at least one .npz", got="none", file=folder)
-    return windows

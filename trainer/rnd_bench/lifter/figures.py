@@ -15,7 +15,6 @@ from rnd_trainer.estimating.lifter import Features, features, run
 from rnd_trainer.estimating.observations import BLAZEPOSE
 
 from .errors import ErrorModel, Window
-from .filmed import STEP
 from .motions import FPS, Clips, Floats32
 from .synthesis import batch, strided, vectors_of
 
@@ -64,25 +63,25 @@ def synthetic(clips: Clips, errors: ErrorModel, network: Path, batches: int = 20
     return Lifts(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def of_windows(windows: list[Window], network: Path) -> Lifts:
-    """Lifts of filmed windows: what the landmark network saw of rendered people."""
+def of_windows(windows: list[Window], network: Path, step: int) -> Lifts:
+    """Lifts of what the landmark network saw of rendered people, in every ``step``-th frame of 30 a second."""
     parts = []
     for window in windows:
-        unit, kappa, seen = _window(window, network)
-        target = vectors_of(seen.views[0, ::STEP, None] @ window["rotations"])
+        unit, kappa, seen = _window(window, network, step)
+        target = vectors_of(seen.views[0, ::step, None] @ window["rotations"])
         bones = window["joints"][:, 1:] - window["joints"][:, PARENTS[1:]]
         parts.append([unit, kappa, target, window["hint_m"], np.linalg.norm(bones, axis=-1)])
     return Lifts(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def _window(window: Window, network: Path) -> tuple[Floats32, Floats32, Features]:
-    """Unit vectors and concentrations of the frames of a window filmed at every ``STEP``-th frame."""
+def _window(window: Window, network: Path, step: int) -> tuple[Floats32, Floats32, Features]:
+    """Unit vectors and concentrations of the frames of a window."""
     names = ("rays", "confidence", "hint_m")
-    rays, confidence, hint = (strided(np.repeat(window[name], STEP, 0), STEP)[None] for name in names)
-    gap = np.minimum(np.arange(rays.shape[1]) % STEP, -np.arange(rays.shape[1]) % STEP)[None] / FPS
+    rays, confidence, hint = (strided(np.repeat(window[name], step, 0), step)[None] for name in names)
+    gap = np.minimum(np.arange(rays.shape[1]) % step, -np.arange(rays.shape[1]) % step)[None] / FPS
     seen = features(rays, confidence, hint, gap.astype(np.float32))
     unit, kappa = run(seen.inputs, network)
-    return unit[0, ::STEP], kappa[0, ::STEP], seen
+    return unit[0, ::step], kappa[0, ::step], seen
 
 
 def figures(lifts: Lifts) -> dict[str, Any]:

@@ -1,48 +1,80 @@
-"""The lifter's network: dilated convolutions over time, trained by the likelihood of unit vectors."""
+"""The lifter's network: two wide hidden layers over some frames each, and the likelihood of unit vectors."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
+import numpy as np
+import onnx
 import torch
 from torch import Tensor, nn
 
 from rnd_runtime.core.files import atomic_path
-from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_OFFSETS
+from rnd_trainer.estimating.lifted import JOINTS
 from rnd_trainer.estimating.lifter import CHANNELS, REACH
 
 VECTORS = 2 * (len(JOINTS) - 1)
+HALF = REACH // 2
+"""frames that each stage looks ahead and back"""
+SIZES = (4 * CHANNELS, 5 * 3 * VECTORS + 2 * CHANNELS)
+"""inputs of the stages"""
+HIDDEN = 1536
+OUTPUTS = ("directions", "concentrations")
 _LIMITS = (0.5, 4000.0)  # of κ, rad⁻²
 
 
-class LifterNetwork(nn.Module):
-    """Inputs [B, T + 2·REACH, CHANNELS] to unit vectors [B, T, 42, 3] and concentrations [B, T, 42], rad⁻²."""
+class Stage(nn.Module):
+    """A hidden layer beside a linear map: [..., size] to [..., 42, outputs]."""
 
-    def __init__(self, width: int = 256) -> None:
+    def __init__(self, size: int, hidden: int, outputs: int) -> None:
         super().__init__()
-        self.first = nn.Conv1d(CHANNELS, width, 3)
-        self.wide = nn.ModuleList(nn.Conv1d(width, width, 3, dilation=d) for d in (3, 9))
-        self.narrow = nn.ModuleList(nn.Conv1d(width, width, 1) for _ in self.wide)
-        self.frame = nn.Conv1d(CHANNELS, width, 1)
-        self.last = nn.Conv1d(width, width, 1)
-        self.head = nn.Conv1d(width, 4 * VECTORS, 1)
-        self.norms = nn.ModuleList(nn.BatchNorm1d(width) for _ in range(2 * len(self.wide) + 2))
-        nn.init.normal_(self.head.weight, std=0.02)
+        self.first = nn.Linear(size, hidden)
+        self.skip = nn.Linear(size, outputs * VECTORS)
+        self.head = nn.Linear(hidden, outputs * VECTORS, bias=False)
+        self.outputs = outputs
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        out = self.head(torch.relu(self.first(inputs))) + self.skip(inputs)
+        return out.unflatten(-1, (VECTORS, self.outputs))
+
+
+class LifterNetwork(nn.Module):
+    """Inputs [B, T + 2·REACH, CHANNELS] to unit vectors [B, T, 42, 3] and concentrations [B, T, 42], rad⁻².
+
+    The first stage guesses vectors from landmarks, the second from landmarks and the first's vectors over time.
+    """
+
+    def __init__(self, hidden: int = HIDDEN) -> None:
+        super().__init__()
+        self.stages = nn.ModuleList(Stage(size, hidden, outputs) for size, outputs in zip(SIZES, (3, 4)))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        x = features.transpose(1, 2)
-        centre = x[:, :, REACH : x.shape[2] - REACH]
-        norms = iter(self.norms)
-        h = torch.relu(next(norms)(self.first(x)))
-        for wide, narrow in zip(self.wide, self.narrow):
-            reach = wide.dilation[0]
-            g = torch.relu(next(norms)(wide(h)))
-            h = h[:, :, reach : h.shape[2] - reach] + torch.relu(next(norms)(narrow(g)))
-        h = torch.relu(next(norms)(self.last(h + self.frame(centre))))
-        out = self.head(h).transpose(1, 2).unflatten(-1, (VECTORS, 4))
-        unit = out[..., :3] / (out[..., :3].square().sum(-1, keepdim=True) + 1e-6).sqrt()
+        out = self.stages[1](self.inputs_of(1, features))
         low, high = _LIMITS
-        return unit, (low + (3 + out[..., 3]).exp()).clamp(max=high)
+        return unit_of(out[..., :3]), (low + out[..., 3].exp()).clamp(max=high)
+
+    def inputs_of(self, stage: int, features: Tensor) -> Tensor:
+        """What ``stage`` sees [B, T - 2·HALF·(stage + 1), SIZES[stage]] of inputs [B, T, CHANNELS]."""
+        if stage == 0:
+            near = sum(_at(features, k) for k in (-2, 0, 2)) / 3
+            wide = sum(_at(features, k) for k in range(-HALF, HALF + 1, 3)) / (2 * HALF // 3 + 1)
+            motion = 2 * (_at(features, 5) - _at(features, -5))
+            return torch.cat([_at(features, 0), near, wide, motion], -1)
+        guess = unit_of(self.stages[0](self.inputs_of(0, features))).flatten(-2)
+        inner = features[:, HALF:-HALF]
+        near = (_at(inner, -2) + _at(inner, 2)) / 2
+        return torch.cat([*(_at(guess, k) for k in (-HALF, -2, 0, 2, HALF)), _at(inner, 0), near], -1)
+
+
+def _at(values: Tensor, offset: int) -> Tensor:
+    """``values`` [B, T, n] without HALF frames at each end, moved by ``offset`` frames."""
+    return values[:, HALF + offset : (offset - HALF) or None]
+
+
+def unit_of(vectors: Tensor) -> Tensor:
+    """Vectors [..., 3] made unit."""
+    return vectors / (vectors.square().sum(-1, keepdim=True) + 1e-6).sqrt()
 
 
 def negative_log_likelihood(unit: Tensor, kappa: Tensor, target: Tensor) -> Tensor:
@@ -51,30 +83,32 @@ def negative_log_likelihood(unit: Tensor, kappa: Tensor, target: Tensor) -> Tens
     return kappa * versine - kappa.log() + torch.log1p(-torch.exp(-2 * kappa))
 
 
-def rest_joints(vectors: Tensor) -> Tensor:
-    """Joints [..., 22, 3] of the mean body's bones with the first 21 of ``vectors`` [..., 42, 3], from the pelvis."""
-    lengths = torch.tensor(REST_OFFSETS[1:]).norm(dim=-1).to(vectors)
-    joints = [torch.zeros_like(vectors[..., 0, :])]
-    for bone, parent in enumerate(PARENTS[1:]):
-        joints.append(joints[parent] + lengths[bone] * vectors[..., bone, :])
-    return torch.stack(joints, -2)
-
-
 def export(network: LifterNetwork, path: Path) -> None:
     """Write the network as ONNX: ``features`` [B, F, CHANNELS] to ``directions`` and ``concentrations``."""
-    was = network.training
-    network.eval()
-    example = torch.zeros(1, 2 * REACH + 4, CHANNELS)
-    axes = {"features": {0: "batch", 1: "frames"}}
-    with atomic_path(path) as temporary:
+    example = torch.zeros(2, 2 * REACH + 4, CHANNELS)
+    with atomic_path(path) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # torch's newer exporter takes a hundred times as long
         torch.onnx.export(
             network,
             (example,),
             str(temporary),
             input_names=["features"],
-            output_names=["directions", "concentrations"],
-            dynamic_axes=axes,
-            opset_version=17,
+            output_names=list(OUTPUTS),
+            dynamic_axes={name: {0: "batch", 1: f"{name}_frames"} for name in ("features", *OUTPUTS)},
             dynamo=False,
         )
-    network.train(was)
+        onnx.save(_halved(onnx.load(str(temporary))), str(temporary))
+
+
+def _halved(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model with its matrices stored in half precision, computed in single precision."""
+    casts = []
+    for tensor in model.graph.initializer:
+        if tensor.data_type == onnx.TensorProto.FLOAT and len(tensor.dims) == 2:
+            name, half = tensor.name, onnx.numpy_helper.to_array(tensor).astype(np.float16)
+            tensor.CopyFrom(onnx.numpy_helper.from_array(half, f"{name}_half"))
+            casts.append(onnx.helper.make_node("Cast", [f"{name}_half"], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    return model

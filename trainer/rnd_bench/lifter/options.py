@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.cli.command import Count, OptionalFile, option
+from rnd_runtime.cli.command import Count, File, OptionalFile, option
 from rnd_runtime.core.errors import check_option
 
 Folder = Annotated[Path, option("FOLDER")]
@@ -17,24 +17,22 @@ OptionalFolder = Annotated[Path | None, option("FOLDER")]
 
 @dataclass(frozen=True)
 class Lifter:
-    """Film people in captured motions, fit the landmark network's errors, train the lifter on them, score it; resumes.
+    """Fit the landmark network's errors to a rendered person, solve the lifter's weights on captured motions, score it.
 
-    rnd-bench study lifter out/lifter --motions ../shared/data/mocap --characters ../shared/data/characters
-    --probes ../shared/data/hdri --json out/lifter.json
+    rnd-bench study lifter out/lifter --motions ../shared/data/mocap --capture ../shared/data/capture
+    --video dancer.mp4 --json out/lifter.json
     """
 
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]
-    """folder for filmed windows, errors, states and lifter.onnx"""
+    """folder for observations, errors.npz and lifter.onnx"""
     motions: Folder
     """folder with .npz of motions at 30 frames a second, 22 joints"""
-    characters: Folder
-    """folder with .npz of rigged characters, filmed beside the stage's people"""
-    probes: Folder
-    """folder with .hdr light probes, backgrounds of the filmed people"""
-    windows: Count = 60
-    """filmed windows of twelve images from which the errors are fitted; 20 of held-out motions are filmed besides"""
-    steps: Count = 3_000
-    """of the training"""
+    capture: Folder
+    """capture of a rendered person, whose training frames the landmark network's errors are fitted to"""
+    video: File
+    """video of these frames, 15 a second"""
+    batches: Count = 100
+    """of 900 samples each, to each of the network's two stages"""
     real: OptionalFolder = None
     """Pose2Sim's folder Demo_SinglePerson: adds the rows of its cameras 01 and 03"""
     json: OptionalFile = None
@@ -42,5 +40,4 @@ class Lifter:
 
     def check(self) -> None:
         """Refuse sizes that cannot be fitted or trained."""
-        check_option(self.windows >= 2, "--windows", "at least 2", self.windows)
-        check_option(self.steps >= 1, "--steps", "at least 1", self.steps)
+        check_option(self.batches >= 1, "--batches", "at least 1", self.batches)

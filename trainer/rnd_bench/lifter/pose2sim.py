@@ -13,24 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.core.errors import InputError
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_OFFSETS, Lifted
 from rnd_trainer.estimating.lifter import lift
-from rnd_trainer.estimating.observations import (
-    BLAZEPOSE,
-    HAND_POINTS,
-    Masks,
-    Observations,
-    load_observations,
-    save_observations,
-)
-from rnd_trainer.estimating.observing.detection import Detector
-from rnd_trainer.estimating.observing.landmarks import LandmarkNetwork, Views
-from rnd_trainer.estimating.observing.networks import open_network
-from rnd_trainer.estimating.observing.sides import merge_views
-from rnd_trainer.estimating.observing.tracking import find_person, follow
-from rnd_trainer.importing.videos.video_file import VideoFile
+from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
 
+from .captured import observed
 from .figures import BODY, LIMBS, angles, placed, procrustes, root_relative
 
 Floats = NDArray[np.float64]
@@ -96,57 +83,18 @@ def triangulated(cameras: list[Calibrated], rays: Floats, confidence: Floats) ->
     return found
 
 
-def observed_cameras(folder: Path, out: Path) -> dict[str, Observations]:
-    """What the landmark network sees of every second frame of the four videos; kept in ``out``."""
-    detector = Detector(open_network("person_detector", 1))
-    network = LandmarkNetwork(open_network("pose_landmarks", 1))
-    seen = {}
-    for file in sorted((folder / "videos").glob("cam*.mp4")):
-        kept = out / f"{file.stem}.npz"
-        if not kept.exists():
-            video = VideoFile(file)
-            numbers = list(video.numbers)[::2]
-            start = find_person(video, numbers, detector, network)
-            views = list(follow(video, numbers, start, detector, network))
-            if any(view is None for _, view in views):
-                raise InputError("person", expected="in every frame", got="lost in some", file=file)
-            save_observations(kept, _merged([v for _, v in views if v is not None], numbers, video))
-        seen[file.stem] = load_observations(kept)
-    return seen
-
-
-def _merged(views: list[Views], numbers: list[int], video: VideoFile) -> Observations:
-    merged = merge_views(
-        np.stack([view.points for view in views]),
-        np.stack([view.metres for view in views]),
-        np.stack([view.confidence for view in views]),
-        np.array([view.region.size for view in views]),
-        np.array(numbers) / video.fps,
-    )
-    size = video.width, video.height
-    return Observations(
-        video.fps,
-        size,
-        np.array(numbers),
-        merged.points.astype(np.float32),
-        merged.confidence.astype(np.float32),
-        merged.spread.astype(np.float32),
-        merged.metres.astype(np.float32),
-        np.full((len(views), 2, HAND_POINTS, 2), np.nan, np.float32),
-        np.zeros((len(views), 2), np.float32),
-        Masks.of((np.uint8(255 * view.mask + 0.5) for view in views), size),
-    )
-
-
-def figures_of_cameras(folder: Path, seen: dict[str, Observations], network: Path) -> list[dict[str, object]]:
+def figures_of_cameras(folder: Path, network: Path, out: Path) -> list[dict[str, object]]:
     """Rows of the scored cameras: the lifter and the landmark network against the triangulated points.
 
     Args:
         folder: Pose2Sim's Demo_SinglePerson.
-        seen: observations of the same frames by each camera.
+        out: folder in which observations of every second frame are kept.
     """
     cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
     names = sorted(cameras)
+    seen: dict[str, Observations] = {
+        name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", every=2) for name in names
+    }
     rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px.astype(np.float64)) for n in names])
     points = triangulated([cameras[n] for n in names], rays, np.stack([seen[n].confidence for n in names]))
     errors = []

@@ -20,13 +20,17 @@ Floats32 = NDArray[np.float32]
 NETWORK = Path(__file__).with_name("lifter.onnx")
 FPS = 30.0
 """rate of the network's frames"""
-REACH = 13
+REACH = 12
 """frames before and after one frame that its result depends on, beside the smoothing of centre and size"""
-CHANNELS = 33 * 6 + 2
-"""inputs a frame: 2D, confidence and 3D of 33 landmarks, apparent size, time to the nearest frame of the video"""
+POINTS = np.array([0, 7, 8, *range(11, 33)])
+"""landmarks that the network sees: nose, ears, and all below"""
+_LIMBS = [(11, 13), (13, 15), (23, 25), (25, 27), (27, 31), (15, 19)]
+LIMBS = np.array([(a + side, b + side) for a, b in _LIMBS for side in (0, 1)])
+"""pairs of landmarks whose direction is guessed from the length in the image"""
+CHANNELS = len(POINTS) * 6 + len(LIMBS) * 6 + 2
+"""inputs a frame: 2D, confidence and 3D of the points, directions of the limbs, distance, time to the nearest frame"""
 _SMOOTH = 4  # frames on each side over which centre and size are averaged
 _TORSO = [11, 12, 23, 24]
-_LEAST = 1e-3
 _GAP = 0.5  # s; frames of the video farther apart than this are not interpolated as one motion
 
 
@@ -58,20 +62,38 @@ def features(rays: Floats32, confidence: Floats32, hint_m: Floats32, gap_s: Floa
     views = looking_at(middle)
     rotated = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ np.swapaxes(views, -1, -2)
     flat = rotated[..., :2] / np.maximum(rotated[..., 2:], 0.05)
-    square = (flat * flat).sum(-1, keepdims=True)
-    size = np.sqrt(_smoothed((square * seen).sum(2) / seen.sum(2)) + _LEAST**2)
+    metric, distance = _in_metres(flat, seen, hint_m)
+    bones = metric[:, :, LIMBS[:, 1]] - metric[:, :, LIMBS[:, 0]]
+    hinted = hint_m[:, :, LIMBS[:, 1]] - hint_m[:, :, LIMBS[:, 0]]
+    length = np.linalg.norm(hinted, axis=-1)
+    depth = np.sqrt(np.maximum(_smoothed(length) ** 2 - (bones * bones).sum(-1), 0)) * np.sign(hinted[..., 2])
+    guessed = np.concatenate([bones, depth[..., None]], -1)
+    guessed /= np.maximum(np.linalg.norm(guessed, axis=-1, keepdims=True), 0.02)
     shape = flat.shape[:2]
     inputs = np.concatenate(
         [
-            np.clip(flat / size[..., None], -6, 6).reshape(*shape, -1),
-            confidence,
-            np.clip(2 * hint_m, -4, 4).reshape(*shape, -1),
-            np.log(size) + 2,
+            np.clip(2 * metric[:, :, POINTS], -4, 4).reshape(*shape, -1),
+            confidence[:, :, POINTS],
+            np.clip(2 * hint_m[:, :, POINTS], -4, 4).reshape(*shape, -1),
+            (hinted / np.maximum(length[..., None], 0.02)).reshape(*shape, -1),
+            guessed.reshape(*shape, -1),
+            np.log(distance) - 1,
             np.minimum(10 * gap_s, 5)[..., None],
         ],
         -1,
     )
     return Features(inputs.astype(np.float32), views.astype(np.float32))
+
+
+def _in_metres(flat: Floats32, seen: Floats32, hint_m: Floats32) -> tuple[Floats32, Floats32]:
+    """2D positions [B, T, 33, 2] m from their mean, and the distance [B, T, 1] m, by the scale of ``hint_m``."""
+    weight = seen / seen.sum(2, keepdims=True)
+    flat = flat - (flat * weight).sum(2, keepdims=True)
+    known = hint_m[..., :2] - (hint_m[..., :2] * weight).sum(2, keepdims=True)
+    own = (weight * flat * flat).sum((2, 3))[..., None]
+    both = (weight * flat * known).sum((2, 3))[..., None]
+    distance = np.clip(_smoothed(both) / np.maximum(_smoothed(own), 1e-6), 0.3, 60).astype(np.float32)
+    return flat * distance[..., None], distance
 
 
 def _smoothed(values: Floats32) -> Floats32:
