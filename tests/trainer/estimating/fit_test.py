@@ -1,0 +1,212 @@
+"""The joint fit on synthetic landmarks of a known motion; no network is needed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rnd_runtime.capture.body import posed_vertices
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_trainer.estimating.fit import Fit, Stage, Weights, _lens, estimate
+from rnd_trainer.estimating.fitting.figure import default_figure
+from rnd_trainer.estimating.fitting.kinematics import attached, pose
+from rnd_trainer.estimating.fitting.marks import marks_of
+from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
+from rnd_trainer.estimating.fitting.start import bones_of_points
+from rnd_trainer.estimating.fitting.state import TO_CAMERA
+from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
+from rnd_trainer.estimating.observations import Masks, Observations
+
+FRAMES, SIZE, FOCAL, FPS = 16, 200, 260.0, 15.0
+SHAPE = {"height": 0.6, "legs": 0.8, "arms": -0.7, "gender": 0.5}
+
+
+def known_person(noise_px: float = 0.7, seed: int = 0):
+    """Observations and bones of a person who turns; true joints [T, 24, 3] m in camera axes; the body."""
+    figure = default_figure()
+    shape = np.array([SHAPE.get(name, 0.0) for name in figure.names])
+    body = figure.shaped(shape)
+    names = body.skeleton.names
+    phase = np.linspace(0, 1, FRAMES)
+    vectors = np.zeros((FRAMES, len(names), 3))
+    vectors[:, 0, 1] = -0.8 + 1.6 * phase
+    for side, sign in (("left", 1), ("right", -1)):
+        vectors[:, names.index(f"{side}_shoulder"), 2] = sign * (-1.2 + 0.9 * phase)
+        vectors[:, names.index(f"{side}_elbow"), 1] = -sign * (0.3 + 0.8 * phase)
+        vectors[:, names.index(f"{side}_hip"), 0] = -0.15 - 0.1 * sign * np.sin(3 * phase)
+        vectors[:, names.index(f"{side}_knee"), 0] = 0.3
+    rotations = axis_angle_to_matrix(vectors)
+    translations = np.stack([0.1 * phase, np.full(FRAMES, -1.0), np.full(FRAMES, -3.2)], 1)
+    posed = pose(body.skeleton, rotations, translations, body.skeleton.rest_joints)
+    marks = marks_of(figure)
+    places = marks.places + np.tensordot(shape, marks.basis, 1)
+    points = attached(posed, marks.joints, places)[:, :33] @ TO_CAMERA
+    pixels = FOCAL * points[..., :2] / points[..., 2:] + SIZE / 2
+    rng = np.random.default_rng(seed)
+    masks = []
+    for frame in range(FRAMES):
+        vertices = posed_vertices(body, rotations[frame], translations[frame]) @ TO_CAMERA
+        flat = FOCAL * vertices[:, :2] / vertices[:, 2:] + SIZE / 2
+        mask = np.zeros((SIZE, SIZE), np.uint8)
+        for triangle in (flat[body.faces] * 16).astype(np.int32):
+            cv2.fillConvexPoly(mask, triangle, 255, shift=4)
+        masks.append(mask)
+    hint = points - points[:, 23:25].mean(1, keepdims=True)
+    index = [names.index(name) for name in JOINTS]
+    world = TO_CAMERA @ posed.world[:, index]
+    directions = np.stack([world[:, PARENTS[j]] @ REST_DIRECTIONS[j - 1] for j in range(1, 22)], 1)
+    bones = (posed.joints[:, index[1:]] - posed.joints[:, [index[p] for p in PARENTS[1:]]]) @ TO_CAMERA
+    limbs = [name.endswith(("knee", "ankle", "elbow", "wrist")) for name in JOINTS[1:]]
+    directions[:, limbs] = (bones / np.linalg.norm(bones, axis=-1, keepdims=True))[:, limbs]
+    rolls = np.stack([world[:, j] @ ROLL_AXES[j - 1] for j in range(1, 22)], 1)
+    lifted = Lifted(*(part for v in (directions, rolls) for part in perturbed(v, np.radians(5), rng)))
+    observations = Observations(
+        FPS,
+        (SIZE, SIZE),
+        np.arange(FRAMES),
+        (pixels + rng.normal(scale=noise_px, size=pixels.shape)).astype(np.float32),
+        np.full((FRAMES, 33), 0.95, np.float32),
+        np.zeros((FRAMES, 33), np.float32),
+        (hint + rng.normal(scale=0.02, size=hint.shape)).astype(np.float32),
+        np.full((FRAMES, 2, 21, 2), np.nan, np.float32),
+        np.zeros((FRAMES, 2), np.float32),
+        Masks.of(masks, (SIZE, SIZE)),
+    )
+    return observations, lifted, posed.joints @ TO_CAMERA, body
+
+
+def perturbed(vectors: np.ndarray, angle: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Unit ``vectors`` [T, 21, 3] that err by ``angle`` rad along each axis, and their concentration."""
+    moved = vectors + rng.normal(scale=angle, size=vectors.shape)
+    moved /= np.linalg.norm(moved, axis=-1, keepdims=True)
+    return moved.astype(np.float32), np.full(vectors.shape[:2], 1 / angle**2, np.float32)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return known_person()
+
+
+def camera_joints(result) -> np.ndarray:
+    skeleton = result.body.skeleton
+    posed = pose(skeleton, result.motion.rotations, result.motion.translations, skeleton.rest_joints)
+    matrix = result.camera.world_to_camera
+    return posed.joints @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.mark.slow
+def test_it_recovers_a_known_motion(person):
+    observations, lifted, truth, body = person
+    height = float(np.ptp(body.vertices[:, 1]))
+    result = estimate(observations, lifted, focal_px=FOCAL, height=height)
+    found = camera_joints(result)
+    limbs = [
+        body.skeleton.names.index(f"{s}_{n}") for s in ("left", "right") for n in ("knee", "ankle", "elbow", "wrist")
+    ]
+    relative = np.linalg.norm((found - found[:, :1]) - (truth - truth[:, :1]), axis=-1)
+    assert relative[:, limbs].mean() < 0.030 and relative.mean() < 0.022
+    assert np.linalg.norm(found - truth, axis=-1).mean() < 0.08
+    assert abs(np.ptp(result.body.vertices[:, 1]) - height) < 0.03  # clothes' thickness is not known
+    assert result.residual_px.max() < 4
+    # the uncertainty is of the errors' size: sideways less than in depth
+    assert 0.001 < np.median(result.translation_deviation[:, 0]) < np.median(result.translation_deviation[:, 2]) < 0.2
+    soles = [
+        posed_vertices(result.body, r, t)[:, 1].min()
+        for r, t in zip(result.motion.rotations, result.motion.translations)
+    ]
+    assert abs(np.median(soles)) < 0.10
+
+
+@pytest.mark.parametrize("part", ["pose", "root", "shape", "offsets", "focal"])
+@pytest.mark.parametrize("outlines", [False, True])
+def test_derivatives_agree_with_differences(person, part, outlines):
+    few, lifted = person[0].select(np.arange(4)), parts_of(person[1], 4)
+    weights = replace(Weights(), smooth=0.0) if part == "shape" else Weights()  # smoothness counts a pose's part alone
+    if outlines:
+        weights = replace(Weights(), points=0, bones=0, prior=0, smooth=0, shared=0)
+    fit = Fit(few, lifted, default_figure(), _lens(few, 240.0, None), 1.7, replace(weights, ground=0.0))
+    points, outline = fit._point_term(Stage(1)), None
+    if outlines:  # wide limits: the weights of far matches are constants of a step
+        outline = replace(fit._outline_term(), inner_weight=0.0, limit=1e4)
+    equations = NormalEquations(4, fit.layout.unknowns, fit.layout.shared)
+    fit.evaluate(fit.state, points, outline, equations)
+    rng = np.random.default_rng(0)
+    local, shared = np.zeros((4, fit.layout.unknowns)), np.zeros(fit.layout.shared)
+    if part == "pose":
+        local[:, :-3] = rng.normal(size=local[:, :-3].shape)
+    elif part == "root":
+        local[:, -3:] = rng.normal(size=(4, 3))
+    else:
+        here = getattr(fit.layout, part)
+        shared[here] = rng.normal(size=shared[here].shape)
+    small = 1e-5
+    ahead, behind = (
+        fit.evaluate(fit.layout.moved(fit.state, s * local, s * shared), points, outline) for s in (small, -small)
+    )
+    slope = 2 * ((equations.gradient * local).sum() + equations.shared_gradient @ shared)
+    assert (ahead - behind) / (2 * small) == pytest.approx(slope, rel=1e-3, abs=0.05)
+
+
+def parts_of(lifted: Lifted, count: int) -> Lifted:
+    names = ("directions", "concentration", "roll", "roll_concentration")
+    return Lifted(*(getattr(lifted, name)[:count] for name in names))
+
+
+def test_equations_are_solved_as_dense_ones():
+    rng = np.random.default_rng(1)
+    frames, unknowns, shared = 5, 3, 2
+    equations = NormalEquations(frames, unknowns, shared)
+    rows: list[np.ndarray] = []
+    right: list[float] = []
+
+    def note(parts: dict[int, np.ndarray], common: np.ndarray, value: float, weight: float) -> None:
+        row = np.zeros(frames * unknowns + shared)
+        for frame, part in parts.items():
+            row[frame * unknowns : (frame + 1) * unknowns] = part
+        row[frames * unknowns :] = common
+        rows.append(row * np.sqrt(weight))
+        right.append(value * np.sqrt(weight))
+
+    residual, weight = rng.normal(size=(frames, 8)), rng.uniform(0.5, 2, (frames, 8))
+    local, common = rng.normal(size=(frames, 8, unknowns)), rng.normal(size=(frames, 8, shared))
+    equations.add(residual, weight, local, common)
+    for t in range(frames):
+        for m in range(8):
+            note({t: local[t, m]}, common[t, m], residual[t, m], weight[t, m])
+    chained, kept = rng.normal(size=(frames - 2, 4)), rng.uniform(0.5, 2, (frames - 2, 4))
+    parts = [rng.normal(size=(frames - 2, 4, unknowns)) for _ in range(3)]
+    equations.add_chain(chained, kept, parts)
+    for t in range(frames - 2):
+        for m in range(4):
+            note({t + k: parts[k][t, m] for k in range(3)}, np.zeros(shared), chained[t, m], kept[t, m])
+    found_local, found_shared = equations.solve(0.0)
+    expected = -np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+    np.testing.assert_allclose(np.concatenate([found_local.ravel(), found_shared]), expected, atol=1e-5)
+
+
+def test_bones_of_a_person_at_rest_are_the_rest_directions():
+    from rnd_trainer.estimating.fitting.start import joint_rotations
+
+    figure = default_figure()
+    marks = marks_of(figure)
+    points = (marks.places[None, :33]) @ TO_CAMERA
+    lifted = bones_of_points(points, np.ones((1, 33), bool))
+    world = TO_CAMERA @ joint_rotations(lifted)
+    angle = np.degrees(np.arccos(np.clip((np.trace(world, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
+    assert angle.max() < 25 and np.median(angle) < 8
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"height": 17.0}, "--height"), ({"focal_px": -1.0}, "focal length"), ({"few": 8}, "frames of the person")],
+)
+def test_refusals(person, options, said):
+    observations = person[0]
+    if "few" in options:
+        observations = observations.select(np.arange(options.pop("few")))
+    with pytest.raises(InputError, match=said):
+        estimate(observations, **options)
