@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import signal
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -206,3 +210,34 @@ def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_p
     assert all(row["subject"] == 0 and row["method"] == "ours" for row in result["rows"])
     again = people.run_study(sizes, tmp_path, perceptual=None, on_run=lambda *call: None)
     assert again["rows"] == result["rows"]
+
+
+_INTERRUPTED = """
+import sys, time
+from pathlib import Path
+from types import SimpleNamespace
+from rnd_bench.studies import people
+from rnd_runtime.cli.command import run_command
+people.prepare = lambda recipe, out: (out.mkdir(parents=True, exist_ok=True), SimpleNamespace(views=[]))[1]
+people.film = lambda production, out, on_image: (print("ready", flush=True), time.sleep(60))
+sizes = SimpleNamespace(subjects=1, recipe=lambda subject: None)
+sys.exit(run_command("rnd-bench", lambda: people.film_subjects(sizes, Path(sys.argv[1]), "llvm", print)))
+"""
+
+
+@pytest.mark.slow
+def test_the_cost_of_interrupted_runs_is_recorded(tmp_path) -> None:
+    file, seconds = tmp_path / "subject0" / people.COST_FILE, 0.0
+    for number in (signal.SIGTERM, signal.SIGINT):
+        with subprocess.Popen(
+            [sys.executable, "-c", _INTERRUPTED, str(tmp_path)],
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        ) as process:
+            assert process.stdout and process.stdout.readline() == "ready\n"
+            process.send_signal(number)
+        assert process.returncode == 128 + number
+        cost = json.loads(file.read_text())
+        assert cost["seconds"] > seconds and cost["variant"] == "llvm"
+        seconds = cost["seconds"]

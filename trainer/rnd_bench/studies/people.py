@@ -12,6 +12,7 @@ from typing import Any
 
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.files import write_json
+from rnd_runtime.core.signals import at_end
 from rnd_runtime.playback.doctor import machine
 from rnd_stage.film.film import film, prepare, recipe_for
 from rnd_stage.film.manifest import write_manifest
@@ -47,25 +48,36 @@ def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Call
             done += 1
             on_image(done, expected)
 
-        started, started_cpu = time.perf_counter(), time.process_time()
-        try:
-            film(production, out, on_image=count)
-        finally:
-            images = image_count([view for view in fresh if not missing(out, view, False)])
-            spent = {
-                "images": images,
-                "seconds": time.perf_counter() - started,
-                "cpu_seconds": time.process_time() - started_cpu,
-            }
-            cost = _added(out / COST_FILE, spent) | {"variant": variant, "machine": machine()}
-            write_json(out / COST_FILE, cost)
+        def images(fresh: list[Any] = fresh, out: Path = out) -> int:
+            return image_count([view for view in fresh if not missing(out, view, False)])
+
+        record = _Cost(out, {"variant": variant, "machine": machine()}, images)
+        with at_end(record.write):  # a signal that ends the process runs no finally
+            try:
+                film(production, out, on_image=count)
+            finally:
+                cost = record.write()
         write_manifest(production, out, variant, cost["cpu_seconds"] / max(cost["images"], 1))
 
 
-def _added(file: Path, spent: dict[str, float]) -> dict[str, Any]:
-    """``spent`` plus the costs of earlier runs in ``file``."""
-    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    return {name: value + before.get(name, 0) for name, value in spent.items()}
+class _Cost:
+    """The cost of rendering one subject: that of earlier runs, and of this one from now on."""
+
+    def __init__(self, folder: Path, about: dict[str, Any], images: Callable[[], int]) -> None:
+        self.file, self.about, self.images = folder / COST_FILE, about, images
+        self.before = json.loads(self.file.read_text(encoding="utf-8")) if self.file.exists() else {}
+        self.started, self.started_cpu = time.perf_counter(), time.process_time()
+
+    def write(self) -> dict[str, Any]:
+        """Write the cost so far, at any moment and from any thread."""
+        spent = {
+            "images": self.images(),
+            "seconds": time.perf_counter() - self.started,
+            "cpu_seconds": time.process_time() - self.started_cpu,
+        }
+        cost = {name: value + self.before.get(name, 0) for name, value in spent.items()} | self.about
+        write_json(self.file, cost)
+        return cost
 
 
 def run_study(
