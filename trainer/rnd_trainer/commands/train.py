@@ -102,13 +102,13 @@ class Ablations:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """Learn an avatar from one monocular capture.
+    """Learn an avatar from one monocular capture, or from a video of one person.
 
-    rnd-train captures/me --out runs/me --preset quick
+    rnd-train me.mp4 --out runs/me
     """
 
-    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE")]
-    """Folder with capture.json."""
+    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE|VIDEO")]
+    """Folder with capture.json; a video is first imported into OUT/capture."""
     out: Folder = Path("runs/avatar")
     """Folder for avatar.ckpt, previews/, metrics.jsonl, status.json and config.json."""
     resume: Flag = False
@@ -134,8 +134,6 @@ def _train(options: TrainOptions) -> None:
     from rnd_trainer.training.training import Training
 
     config, device, learning = _config(options), _device(options.schedule.device), options.learning
-    capture = load_capture(options.capture, motion_file=learning.motion)
-    log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
     folder = options.out
     state = folder / STATE_FILE
     if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
@@ -143,6 +141,9 @@ def _train(options: TrainOptions) -> None:
         raise InputError("holds a training already", file=folder, hint=hint)
     if options.resume:
         existing_file(state, what="state of a training to resume")
+    options = dataclasses.replace(options, capture=_capture_folder(options.capture, folder))
+    capture = load_capture(options.capture, motion_file=learning.motion)
+    log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
     perceptual, features = load_lpips(learning.perceptual_weights), load_features(learning.consistency_weights)
     with _memory_error_in_one_line():
         training = Training(capture, config, perceptual, device, consistency=features)
@@ -167,6 +168,24 @@ def _train(options: TrainOptions) -> None:
             raise KeyboardInterrupt
         _score_after_training(training, folder, options)
         finish(checkpoint, summary, then=f"rnd-export {shlex.quote(str(checkpoint))}")
+
+
+def _capture_folder(source: Path, out: Path) -> Path:
+    """``source``, or the capture in ``out`` that a video is imported into; one made before is taken as it is."""
+    from rnd_trainer.estimating.own_video import import_video, is_video_file
+    from rnd_trainer.importing.options import ImportOptions
+    from rnd_trainer.importing.report import import_and_report
+
+    if not is_video_file(source):
+        return source
+    folder = out / "capture"
+    if (folder / "capture.json").is_file():
+        log(f"{folder}: the capture of {source} as it was imported")
+        return folder
+    if import_and_report(source, folder, ImportOptions(), import_video):
+        hint = f"see {folder / 'check'}; rnd-data import {source} has options"
+        raise InputError("capture of the video", expected="one without faults", got="the above", file=folder, hint=hint)
+    return folder
 
 
 def _config(options: TrainOptions) -> TrainConfig:

@@ -72,6 +72,10 @@ class Masks:
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self[:].astype(dtype or np.uint8, copy=False)
 
+    def append(self, mask: Image) -> None:
+        """Encode one more mask."""
+        self.encoded.append(_encode(mask))
+
     def select(self, frames: NDArray[Any] | list[int]) -> Masks:
         """The masks of these frames, not decoded."""
         return Masks((self.encoded[int(k)] for k in np.arange(len(self))[frames]), self.image_size)

@@ -101,11 +101,11 @@ def import_source(
     Raises:
         InputError: with file and frame.
     """
-    _check_numbers(options)
+    check_numbers(options)
     layout, found = find_layout(source, options.layout)
     on_found(f"{layout}: {found}")
-    _refuse_occupied(out, source, options)
-    _refuse_unwritable(out)
+    refuse_occupied(out, source, options)
+    refuse_unwritable(out)
     if options.body is None:
         raise InputError("--body", expected="SMPL, SMPL-H or SMPL-X (.npz, .pkl), a body.npz, or anny", got="none")
     _refuse_unused(layout, options)
@@ -126,7 +126,7 @@ def import_source(
     samples = add_masks(samples, scene, dataset, options.mask_net, on_progress)
     samples, axes = add_normals(samples, scene, dataset, options)
     with folder_lock(output_folder(out), "rnd-data import"):
-        _refuse_occupied(out, source, options)  # by another import meanwhile
+        refuse_occupied(out, source, options)  # by another import meanwhile
         write_capture(out, dataset, scene, samples, on_progress, normal_axes=axes)
     return scene
 
@@ -155,7 +155,7 @@ def _summary(dataset: ImportedDataset) -> str:
     )
 
 
-def _refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
+def refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
     """Refuse a folder ``out`` with files that a capture would replace or mix with."""
     if out.resolve() == source.resolve():
         raise InputError("OUT", expected="another folder than the source", got=out)
@@ -173,7 +173,7 @@ def _refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
             raise InputError(f"holds {name} already", file=out, hint="choose another folder, or remove them")
 
 
-def _refuse_unwritable(out: Path) -> None:
+def refuse_unwritable(out: Path) -> None:
     """Refuse a folder ``out`` that cannot be created or written; leaves no new folder behind."""
     missing = [folder for folder in (out, *out.parents) if not folder.exists()]
     output_folder(out)
@@ -182,7 +182,7 @@ def _refuse_unwritable(out: Path) -> None:
             folder.rmdir()
 
 
-def _check_numbers(options: ImportOptions) -> None:
+def check_numbers(options: ImportOptions) -> None:
     selection = options.selection
     for name, value in (
         ("--every", selection.every),

@@ -42,15 +42,15 @@ class ImportOptions:
     """How to read a source, and what to take of it."""
 
     body: Annotated[str | None, option("FILE|anny")] = None
-    """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny"""
+    """SMPL, SMPL-H or SMPL-X (.npz or .pkl), a body.npz, or the word anny. Default, of a video: estimated"""
     layout: Annotated[str | None, option("LAYOUT", name="as")] = None
     """layout of SOURCE, such as zju, nerfstudio or video. Default: detected"""
     root: Annotated[Literal["smpl", "easymocap"] | None, option("smpl|easymocap")] = None
     """root convention of the poses. Default: the layout's"""
     poses: OptionalFile = None
-    """body poses from WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap or an SMPL .npz"""
+    """body poses from WHAM, GVHMR, 4D-Humans, ROMP, EasyMocap or an SMPL .npz. Default, of a video: estimated"""
     person: OptionalCount = None
-    """track number in --poses. Default: the longest track"""
+    """track number in --poses (default: the longest track); without them, which person, counted from the left from 0"""
     masks: OptionalFolder = None
     """masks (.png, .npy) by name or number of the frames, one folder per camera. Default: the source's, or estimated"""
     mask_net: OptionalFile = None
@@ -61,6 +61,8 @@ class ImportOptions:
     """normal network (.onnx) for the normals"""
     normal_axes: Annotated[str | None, option("AXES")] = None
     """the maps' axes that are right, down, forward, such as x,-y,-z. Default: found by the template"""
+    height: OptionalNumber = None
+    """the person's height in metres, of a video without --poses: fixes the scale"""
     intrinsics: Annotated[tuple[float, ...], option("N N N N")] = ()
     """fx fy cx cy of a video, in pixels"""
     distortion: Annotated[tuple[float, ...], option("N ...")] = ()

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.inference import run_session
+from rnd_trainer.estimating.observations import BLAZEPOSE, HAND_POINTS
 
-from ..observations import BLAZEPOSE, HAND_POINTS
 from .regions import Floats, Image, Region, Shrunk, moved
 
 SIDE = 224  # pixels of the network's input

@@ -5,21 +5,19 @@ Source: Grishchenko et al. 2022, BlazePose GHUM Holistic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.inference import run_session
+from rnd_trainer.estimating.observations import BLAZEPOSE
 
-from ..observations import BLAZEPOSE
 from .regions import Floats, Image, Region, Shrunk, moved, uncrop
 
 SIDE = 256  # pixels of the network's input
 POINTS = len(BLAZEPOSE)
-SCALES = (1.0, 1.12)
-"""of the views' regions; every view is taken as is and mirrored"""
 _HEAT_SIDE, _HEAT_REACH, _MIN_HEAT = 64, 4, 0.5  # heat maps: side, cells around a point, least probability
 
 
@@ -57,7 +55,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """All views of one image: arrays over the V views, and the mean of their masks [H, W] in 0…1."""
+    """Views of one image: arrays over the V views, and the mean of their masks [H, W] in 0…1."""
 
     points: Floats  # [V, 33, 2]
     metres: Floats  # [V, 33, 3]
@@ -65,6 +63,10 @@ class Views:
     score: float
     mask: NDArray[np.float32]
     region: Region
+
+    def without_mask(self) -> Views:
+        """The same with a mask of no pixels: many frames' masks fill the memory."""
+        return replace(self, mask=np.zeros((0, 0), np.float32))
 
 
 class LandmarkNetwork:
@@ -101,14 +103,11 @@ class LandmarkNetwork:
             to_image=to_image,
         )
 
-    def look_often(self, image: Image, region: Region, first: View | None = None) -> Views:
-        """All views of ``region``; ``first`` is the plain one where it has been taken."""
+    def look_twice(self, image: Image, region: Region, first: View | None = None) -> Views:
+        """Two views of ``region``, as is and mirrored; ``first`` is the former where it has been taken."""
         shrunk = Shrunk(image, region.size, SIDE)
-        views = []
-        for scale in SCALES:
-            for mirrored in (False, True):
-                given = first if scale == 1.0 and not mirrored else None
-                views.append(given or self.look(shrunk, region.scaled(scale), mirrored=mirrored))
+        plain = first or self.look(shrunk, region)
+        views = [plain, self.look(shrunk, region, mirrored=True)]
         size = image.shape[1], image.shape[0]
         mask = np.mean([uncrop(view.mask, view.to_image, size) for view in views], axis=0, dtype=np.float32)
         return Views(

@@ -39,7 +39,7 @@ _MIN_CONTRAST = 8.0  # deviations between person and background from which their
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """Background of a static camera: colour [H, W, 3], where it was seen [H, W], its deviation [H, W] in 8-bit steps."""
+    """A static camera's background: colour [H, W, 3], where it was seen, its deviation [H, W] in 8-bit steps."""
 
     colour: Floats32
     seen: NDArray[np.bool_]

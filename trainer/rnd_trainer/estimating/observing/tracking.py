@@ -84,7 +84,7 @@ def find_person(
 def follow(
     video: Frames, numbers: list[int], start: Start, detector: Detector, network: LandmarkNetwork
 ) -> Iterator[tuple[int, Views | None]]:
-    """Yield each frame's number and all views of the person in it, None where the person is not seen."""
+    """Yield each frame's number and the views of the person in it, None where the person is not seen."""
     region: Region | None = None
     last = start.region
     for number in numbers:
@@ -99,7 +99,7 @@ def follow(
             yield number, None
             continue
         used, view = first
-        yield number, network.look_often(image, used, view)
+        yield number, network.look_twice(image, used, view)
         last = region = view.next_region
 
 
@@ -135,7 +135,7 @@ def _nobody(video: Frames, sampled: list[int], detector: Detector, network: Land
     brightness = float(np.mean([image.mean() for image in images]))
     if brightness < _DARK:
         return InputError("images", expected="light enough to see a person", got=f"a mean of {brightness:.0f} of 255")
-    for quarters, name in ((1, "left"), (3, "right"), (2, "upside down")):
+    for quarters, name in ((1, "lying, head to the left"), (3, "lying, head to the right"), (2, "upside down")):
         for image in images:
             rotated = np.ascontiguousarray(np.rot90(image, -quarters))
             if any(_confirmed(rotated, one.region, network) for one in detector(rotated)):

@@ -53,7 +53,7 @@ def detect(source: Path) -> str | None:
     return None
 
 
-class _FrameFolder:
+class FrameFolder:
     """A folder of frames with the interface of ``VideoFile``.
 
     ``numbers`` are those in the images' names where ``numbered`` and all have one; otherwise they count from 0.
@@ -88,13 +88,13 @@ def read(
     give ``options.count`` training images, the last 1/5 a quarter of that as novel poses. A frame is known by its
     number in the video or the folder's order, from 0; for numbered poses and images, by those numbers.
     """
-    video: VideoFile | _FrameFolder
+    video: VideoFile | FrameFolder
     if source.is_file():
         video = VideoFile(source)
         fps = options.fps or video.fps
         found = replace(found, notes=(*video.notes, *found.notes))
     else:
-        video = _FrameFolder(source, found.numbered)
+        video = FrameFolder(source, found.numbered)
         fps = options.fps or found.fps or FPS
     K, notes = _intrinsics(found, video.width, video.height, options.intrinsics)
     camera = camera_of(K, np.eye(3), np.zeros(3), (video.width, video.height), corner=0)
@@ -103,8 +103,8 @@ def read(
     poses, paired = pair_with_frames(found, video.numbers, video.path)
     lenses, notes = {CAMERA: Lens(camera, options.distortion)}, (*found.notes, *notes, *paired)
     dataset = ImportedDataset(f"a video with {found.kind}'s poses", lenses, [], poses, fps, notes)
-    chosen = _choose(video, place_scene(dataset, model), dataset, options, on_progress)
-    stills = _stills(video, [frame for frame, _ in chosen])
+    chosen = choose_frames(video, place_scene(dataset, model), dataset, options, on_progress)
+    stills = stills_of(video, [frame for frame, _ in chosen])
     samples = [
         Sample(CAMERA, frame, partial(stills.__getitem__, k), split=split, name=video.name(frame))
         for k, (frame, split) in enumerate(chosen)
@@ -132,8 +132,8 @@ def _intrinsics(found: PoseFile, width: int, height: int, given: tuple[float, ..
     return own, (f"focal length {own[0, 0]:.0f} pixels, as {found.kind} has it",)
 
 
-def _choose(
-    video: VideoFile | _FrameFolder,
+def choose_frames(
+    video: VideoFile | FrameFolder,
     scene: PlacedScene,
     dataset: ImportedDataset,
     options: ImportOptions,
@@ -174,7 +174,7 @@ def _choose(
     return sorted(chosen)
 
 
-def _stills(video: VideoFile | _FrameFolder, frames: list[int]) -> np.ndarray:
+def stills_of(video: VideoFile | FrameFolder, frames: list[int]) -> np.ndarray:
     """Frames [n, H, W, 3] uint8 in a temporary file, for random access."""
     with tempfile.TemporaryFile() as file:
         if hasattr(os, "posix_fallocate"):  # otherwise a full disk is a bus error

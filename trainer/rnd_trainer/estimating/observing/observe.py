@@ -1,0 +1,151 @@
+"""What is seen of one person in a video, from its frames to ``Observations``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.estimating.observations import Masks, Observations
+
+from .detection import Detector
+from .hands import HandNetwork, Hands
+from .landmarks import LandmarkNetwork, Views
+from .masks import refine_masks
+from .networks import open_network
+from .regions import Floats, Image
+from .sides import Merged, merge_views
+from .tracking import Frames, find_person, follow
+
+OnProgress = Callable[[str, int, int], None]
+"""called with (phase, done, total)"""
+
+MIN_FRAMES = 20
+_WIDER = 1.12  # of the region, in the views without a background
+_AROUND = 0.02  # of the person's size: margin of the mask when the background is taken away
+
+
+class Clip(Frames):
+    """Frames of a video: ``Frames`` with their size and rate."""
+
+    fps: float
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class Networks:
+    """The networks that see a person."""
+
+    detector: Detector
+    landmarks: LandmarkNetwork
+    hands: HandNetwork
+
+    @classmethod
+    def open(cls, threads: int | None = None) -> Networks:
+        """The networks in the user's cache; raises ``InputError`` with the command that fetches missing ones."""
+        return cls(
+            Detector(open_network("person_detector", threads)),
+            LandmarkNetwork(open_network("pose_landmarks", threads)),
+            HandNetwork(open_network("hand_landmarks", threads)),
+        )
+
+
+def observe(
+    video: Clip,
+    networks: Networks,
+    *,
+    numbers: Sequence[int] | None = None,
+    person: int | None = None,
+    on_progress: OnProgress = lambda phase, done, total: None,
+) -> Observations:
+    """Observe one person in the frames ``numbers`` of ``video``, by default all.
+
+    Args:
+        person: which of several people, counted from the left.
+
+    Raises:
+        InputError: nobody or several people, or too few frames with the person.
+    """
+    numbers = list(video.numbers if numbers is None else numbers)
+    start = find_person(video, numbers, networks.detector, networks.landmarks, person)
+    frames: list[int] = []
+    first: list[Views] = []
+    soft = Masks([], (video.width, video.height))
+    for done, (number, views) in enumerate(follow(video, numbers, start, networks.detector, networks.landmarks)):
+        if views is not None:
+            frames.append(number)
+            soft.append(np.round(255 * views.mask).astype(np.uint8))
+            first.append(views.without_mask())
+        on_progress("landmarks", done + 1, len(numbers))
+    if len(frames) < MIN_FRAMES:
+        raise InputError("frames with the person in view", expected=f"at least {MIN_FRAMES}", got=len(frames))
+    masks = Masks([], soft.image_size)
+    refined = refine_masks(lambda k: video.frame(frames[k]), soft, lambda k, n: on_progress("masks", k, n))
+    second, outside = [], []
+    for k, mask in enumerate(refined):
+        masks.append(mask)
+        alone = _alone(video.frame(frames[k]), mask, soft[k], first[k].region.size)
+        views = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
+        second.append(views.without_mask())
+        outside.append(_outside(mask, soft[k], np.concatenate([first[k].points, views.points])))
+    merged = _merged(first, second, np.stack(outside), np.array(frames) / video.fps)
+    hands = _hands(video, frames, merged, networks.hands, on_progress)
+    return Observations(
+        fps=video.fps,
+        image_size=(video.width, video.height),
+        frames=np.array(frames),
+        keypoints_px=merged.points.astype(np.float32),
+        confidence=merged.confidence.astype(np.float32),
+        spread_px=merged.spread.astype(np.float32),
+        keypoints_m=merged.metres.astype(np.float32),
+        hands_px=np.stack([hand.points for hand in hands]),
+        hands_confidence=np.stack([hand.confidence for hand in hands]),
+        masks=masks,
+    )
+
+
+def _merged(first: list[Views], second: list[Views], outside: Floats, seconds: Floats) -> Merged:
+    points, metres, confidence = (
+        np.stack([np.concatenate([getattr(a, name), getattr(b, name)]) for a, b in zip(first, second)])
+        for name in ("points", "metres", "confidence")
+    )
+    sizes = np.array([views.region.size for views in first])
+    return merge_views(points, metres, confidence, outside, sizes, seconds)
+
+
+def _hands(
+    video: Clip, frames: list[int], merged: Merged, network: HandNetwork, on_progress: OnProgress
+) -> list[Hands]:
+    hands = []
+    for k, number in enumerate(frames):
+        hands.append(network(video.frame(number), merged.points[k], merged.confidence[k]))
+        on_progress("hands", k + 1, len(frames))
+    return hands
+
+
+def _alone(image: Image, mask: Image, soft: Image, size: float) -> Image:
+    """``image`` with its mean colour in place of the background, so that nothing there looks like a limb."""
+    reach = 2 * max(1, round(_AROUND * size)) + 1
+    person = np.maximum(mask, soft)
+    grown = cv2.dilate(person, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    share = cv2.blur(grown, (reach, reach))[..., None] / np.float32(255)
+    plain = image.mean((0, 1), dtype=np.float32)
+    return np.asarray(image * share + plain * (1 - share), np.uint8)
+
+
+def _outside(mask: Image, soft: Image, points: Floats) -> NDArray[np.float64]:
+    """Distances [V, 33] of ``points`` from the person, pixels; 0 inside."""
+    person = (np.maximum(mask, soft) > 127).astype(np.uint8)
+    if not person.any():
+        return np.zeros(points.shape[:2])
+    distance = cv2.distanceTransform(1 - person, cv2.DIST_L2, 5)
+    height, width = mask.shape
+    columns = np.clip(points[..., 0].astype(int), 0, width - 1)
+    rows = np.clip(points[..., 1].astype(int), 0, height - 1)
+    beyond = np.hypot(points[..., 0] - columns, points[..., 1] - rows)
+    return np.asarray(distance[rows, columns] + np.maximum(beyond - 1.5, 0), np.float64)
