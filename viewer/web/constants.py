@@ -24,7 +24,8 @@ SHARED = {
     ),
     "rnd_runtime.motion.smpl": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
     "rnd_runtime.motion.readers.arrays": (
-        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _DEFAULT_FPS FPS_LIMITS"
+        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _ORDERS"
+        " _DEFAULT_FPS FPS_LIMITS"
     ),
     "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS",
     "rnd_runtime.motion.skeleton": "_TURNS",
@@ -48,6 +49,7 @@ SHARED = {
     "rnd_runtime.raster.project": "HALF_LOG2_E LOG2_ALPHA_MIN",
     "rnd_runtime.raster.tiles": "RADIX_BITS",
     "rnd_runtime.playback.aov": "MIN_COVERAGE",
+    "rnd_runtime.playback.far": "MIN_PIXELS_PER_METRE MAX_FACTOR MARGIN",
     "rnd_runtime.playback.framing": "PADDING ELEVATION FIELD_OF_VIEW",
     "rnd_viewer.view.scene": "CLAY LARGEST_SKY",
 }

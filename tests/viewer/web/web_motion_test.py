@@ -279,6 +279,8 @@ REFUSED: dict[str, tuple[dict[str, object], str]] = {
     "NaN in a finger": (AMASS_X | {"pose_hand": _with(_poses(90), (1, 2), np.nan)}, "frame 1: pose_hand"),
     "one hand": (AMASS_X | {"left_hand_pose": _poses(45)}, "right_hand_pose is missing"),
     "millimetres": (SMPL | {"trans": TRANS * 1000}, "are these millimetres?"),
+    "times that repeat": (SMPL | {"times": [0, 0.1, 0.1, 0.2, 0.3]}, "frame 2: times: expected numbers that increase"),
+    "frames reversed": (SMPL | {"frame_ids": np.arange(FRAMES)[::-1]}, "got 3 after 4"),
     "kilometres of micrometres": (SMPL | {"trans": TRANS * 1e9}, "e+0"),
     "millimetres in Th": (EASYMOCAP | {"Th": TRANS * 1000}, "are these millimetres?"),
     "degrees": (SMPL | {"poses": _with(_poses(72), (2, 9), 180.0)}, "frame 2: poses: spine1"),

@@ -52,12 +52,6 @@ pytestmark = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _small_bodies_as_they_are(monkeypatch):
-    """The page has no finer grid for bodies of few pixels."""
-    monkeypatch.setattr("rnd_runtime.playback.far.MIN_PIXELS_PER_METRE", 1e-9)
-
-
 class _Quiet(http.server.SimpleHTTPRequestHandler):
     """A static host that keeps a list of what it was asked for."""
 
@@ -350,6 +344,8 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         {"light": 0, "shade": "lights:128"},
         {"shade": "brute", "exposure": 1.0},
         {"distance": 0.9, "elevation": 0.3, "shade": "table"},  # the body exceeds the image
+        *({"distance": metres, "light": 1} for metres in (12.0, 30.0, 90.0)),  # of few pixels: on a finer grid
+        {"distance": 40.0, "target": [0.6, 1.0, 7.0], "output": "normal"},
         # rounding puts the outermost Gaussian of the sun's map on a texel's centre
         {"light": 0, "yaw": -3.136260264236736, "time": 0.8695288902257207, "fov": 0.7, "distance": 3.6},
     ]

@@ -6,7 +6,7 @@ import { multiply, rotate, transposed } from "./rotations.js";
 
 const RADIANS = Math.PI / 180;
 
-/** The camera of a state: {width, height, focal, rotation [9], translation [3], position [3]}. */
+/** The camera of a state: {width, height, focal, centre [2], rotation [9], translation [3], position [3]}. */
 export function cameraOf({ azimuth, elevation, distance, target, fov, width, height }) {
   const flat = Math.cos(elevation);
   const back = [flat * Math.sin(azimuth), Math.sin(elevation), flat * Math.cos(azimuth)];
@@ -21,7 +21,7 @@ export function cameraOf({ azimuth, elevation, distance, target, fov, width, hei
   const rotation = [...right, ...down, ...forward];
   const translation = [0, 1, 2].map((row) =>
     -(rotation[3 * row] * position[0] + rotation[3 * row + 1] * position[1] + rotation[3 * row + 2] * position[2]));
-  return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), rotation, translation, position };
+  return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), centre: [width / 2, height / 2], rotation, translation, position };
 }
 
 /** The camera for points in a frame {rotation [9], translation [3]} → world. */

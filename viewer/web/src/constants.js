@@ -21,6 +21,7 @@ export const MANY_BEYOND_A_TURN = 0.2;
 export const MAX_DISTANCE = 1000.0;
 export const MAX_HEIGHT = 100.0;
 export const MAX_SPEED = 20.0;
+export const ORDERS = ["times", "timestamps", "frame_ids", "frame_id"];
 export const DEFAULT_FPS = 60.0;
 export const FPS_LIMITS = [0.001, 10000.0];
 // rnd_runtime.motion.motion
@@ -112,6 +113,10 @@ export const LOG2_ALPHA_MIN = -7.994353436858858;
 export const RADIX_BITS = 11;
 // rnd_runtime.playback.aov
 export const MIN_COVERAGE = 0.05;
+// rnd_runtime.playback.far
+export const MIN_PIXELS_PER_METRE = 110.0;
+export const MAX_FACTOR = 64;
+export const MARGIN = 0.35;
 // rnd_runtime.playback.framing
 export const PADDING = 0.14;
 export const ELEVATION = 5.0;

@@ -7,6 +7,7 @@ import { inFile, refusal } from "./errors.js";
 import { downsize, lightNotes, readLight } from "./shading/light.js";
 import { fitMotion, restMotion } from "./motion/motion.js";
 import { readMotionFile } from "./files/motion_files.js";
+import { fineView } from "./raster/far.js";
 import { project } from "./raster/project.js";
 import { multiply, transposed } from "./rotations.js";
 import { shBasis } from "./shading/sh.js";
@@ -83,13 +84,13 @@ async function render({ number, state }) {
   const features = state.output === "lit" || state.output === "light"
     ? radianceOf(state, gaussians, count, beside.position, grown) : material(state.output, gaussians, count, beside);
   clock("shading");
-  const records = project(gaussians, count, features, beside, grown, avatar.cull);
+  const view = fineView(beside, gaussians.rootJoints), records = project(gaussians, count, features, view.camera, grown, avatar.cull);
   clock("sorting");
   if (splatter.isLost()) {  // the driver was reset
     splatter = new Splatter();
     shownSky = null;
   }
-  splatter.draw(records, state.width, state.height, look(state, camera));
+  splatter.draw(records, view, state.width, state.height, look(state, camera));
   if (splatter.isLost()) throw new Error("the browser took WebGL2 away while it drew; it is asked for again with the next frame");
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from rnd_runtime.motion.motion import Motion, save_motion
 from rnd_runtime.playback import far
 from rnd_runtime.playback.frame import FrameRenderer
 
-MOMENTS_S = 4.0
+MOMENTS_S, PATIENCE_S = 4.0, 60.0
 FOCAL, HEIGHT_M = 4000.0, 1.75
 NEAR_PX, FAR_PX = 384, (100, 40, 16)
 SMALLEST_PX = 8
@@ -75,10 +76,15 @@ def signals(subject: Subject) -> Result:
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     for k in range(subject.few(3, 50)):
         number, after = numbers[k % 3], float(rng.uniform(0.5, MOMENTS_S))
+        shutil.rmtree(folder / "out", ignore_errors=True)
         process = _started(command, folder)
         time.sleep(after)
         process.send_signal(number)
-        errors = process.communicate(timeout=60)[1]
+        try:
+            errors = process.communicate(timeout=PATIENCE_S)[1]
+        except subprocess.TimeoutExpired:
+            process.kill()
+            errors = process.communicate()[1]
         if process.returncode == 0:  # it had ended
             continue
         sent += 1

@@ -1,7 +1,7 @@
 // Array layouts of motions, read into one record in the file's axes (rnd_runtime/motion/readers/arrays.py).
 
 import {
-  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, SMPLX_REST_ROOT, SMPL_REST_ROOT,
+  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, ORDERS, SMPLX_REST_ROOT, SMPL_REST_ROOT,
 } from "../constants.js";
 import { refusal, short, sizes } from "../errors.js";
 import { Npz } from "./npz.js";
@@ -31,6 +31,7 @@ export function readMotionFile(bytes, name) {
   else notes.push("no trans in the file: the root stays in place");
   checkTranslations(translations, name);
   if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
+  checkOrder(members, frames);
   const fps = readFrameRate(members, notes), zUp = readUpAxis(members, amass || easymocap ? "z" : "y") === "z";
   if (lookLikeMillimetres(translations, frames, fps, zUp ? 2 : 1))
     notes.push("trans is higher or faster than a person in metres: these look like millimetres");
@@ -140,6 +141,25 @@ function checkTranslations(translations, file) {
   const frame = Math.floor(far / 3), distance = Math.max(...translations.subarray(3 * frame, 3 * frame + 3).map(Math.abs));
   const expected = `metres, at most ${MAX_DISTANCE} from the origin`;
   throw refusal("trans", { expected, got: short(distance), file, frame, hint: "are these millimetres?" });
+}
+
+/** Refuses times or frame numbers that do not increase from frame to frame. */
+function checkOrder(members, frames) {
+  for (const member of ORDERS) {
+    if (!members.has(member)) continue;
+    let values;
+    try {
+      values = members.numbers(member);
+    } catch {  // names of images, say
+      continue;
+    }
+    const { shape, numbers } = values;
+    if (shape.length !== 1 || shape[0] !== frames) continue;
+    const back = numbers.findIndex((value, frame) => frame > 0 && !(value - numbers[frame - 1] > 0));
+    if (back < 0) continue;
+    const expected = "numbers that increase from frame to frame", hint = "sort the frames, and remove those that occur twice";
+    throw refusal(member, { expected, got: `${short(numbers[back])} after ${short(numbers[back - 1])}`, file: members.file, frame: back, hint });
+  }
 }
 
 function readFrameRate(members, notes) {

@@ -66,10 +66,11 @@ export class Avatar {
   }
 
   /** The Gaussians of what was encoded, as rnd_runtime/core/gaussians.py has them, in the frame of the `root`: {rotation [9],
-   *  translation [3]} → world; and joints [J·3] m in the world. */
+   *  translation [3]} → world; `rootJoints` [J·3] m in that frame, `joints` [J·3] m in the world. */
   posed({ values, bones, root, joints }) {
     const posed = this.rest ? this.rest.pose(values, bones) : values, { gaussians: count, opacities, albedo, roughness } = this;
-    return { count, ...Object.fromEntries(POSED_OUTPUTS.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, joints };
+    const rootJoints = moved(bones, this.skeleton.rest);
+    return { count, ...Object.fromEntries(POSED_OUTPUTS.map((name, k) => [name, posed[k]])), opacities, albedo, roughness, root, rootJoints, joints };
   }
 }
 
@@ -124,6 +125,14 @@ function boneTransforms(skeleton, rotations, translation) {
     }
   }
   return { bones, joints };
+}
+
+/** Joints `rest` [J·3] moved by `bones` [J·12]. */
+function moved(bones, rest) {
+  return rest.map((_, at) => {
+    const k = 3 * Math.floor(at / 3), row = 4 * k + 4 * (at % 3);
+    return bones[row] * rest[k] + bones[row + 1] * rest[k + 1] + bones[row + 2] * rest[k + 2] + bones[row + 3];
+  });
 }
 
 /** Joint positions [J·3] m at `time`. */

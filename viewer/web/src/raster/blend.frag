@@ -6,8 +6,11 @@ uniform usampler2D pairs;    // Gaussians, tile by tile, front to back
 uniform usampler2D tiles;    // first and last + 1 of a tile's pairs
 uniform sampler2D sky;       // lat-long radiance
 uniform ivec2 size;          // px
+uniform ivec2 corner;        // px: where the part of the image begins that shows Gaussians,
+uniform ivec2 extent;        // px: and its size
+uniform int factor;          // pixels of the Gaussians' finer grid along a pixel's side
 uniform int show;            // 0 radiance, 1 normals, 2 a number
-uniform int background;          // 0 one colour, 1 the sky
+uniform int background;      // 0 one colour, 1 the sky
 uniform vec3 colour;         // linear
 uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's frame
 uniform float gain;
@@ -36,6 +39,19 @@ vec4 blend(ivec2 pixel) {
     return sum;
 }
 
+/** The mean of a pixel's part of the finer grid, with outlines as sharp as a body's (rnd_runtime/raster/outline.py). */
+vec4 mean_of(ivec2 pixel) {
+    ivec2 first = (pixel - corner) * factor;
+    if (any(lessThan(pixel, corner)) || any(greaterThanEqual(pixel, corner + extent))) return vec4(0.0);
+    vec4 sum = vec4(0.0);
+    for (int row = 0; row < factor; row++)
+        for (int column = 0; column < factor; column++) {
+            vec4 value = blend(first + ivec2(column, row));
+            sum += value * value.a * (3.0 - 2.0 * value.a);
+        }
+    return sum / float(factor * factor);
+}
+
 vec3 texel(ivec2 at, ivec2 size) {
     return texelFetch(sky, ivec2((at.x + size.x) % size.x, clamp(at.y, 0, size.y - 1)), 0).rgb;
 }
@@ -58,8 +74,7 @@ vec3 srgb(vec3 linear) {
 
 void main() {
     ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
-    vec4 value = blend(at);
-    value *= value.a * (3.0 - 2.0 * value.a);  // outlines as sharp as a body's: rnd_runtime/raster/outline.py
+    vec4 value = mean_of(at);
     vec3 result;
     if (show == 0) {
         vec3 far = background == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;

@@ -14,8 +14,10 @@ const DIGITS = 1 << RADIX_BITS;
  * Gaussians with numbers that are not finite, without extent, or with n·v below `cull` are skipped: NaN fails every guard.
  */
 export function project({ means, covariances, opacities, normals }, count, features, camera, covarianceScale, cull) {
-  const { rotation: r, translation: t, position: eye, focal, width, height } = camera;
-  const limitX = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * width / focal, limitY = (0.5 + FIELD_OF_VIEW_MARGIN * 0.5) * height / focal;
+  const { rotation: r, translation: t, position: eye, focal, centre: [cx, cy], width, height } = camera;
+  const marginX = FIELD_OF_VIEW_MARGIN * 0.5 * width / focal, marginY = FIELD_OF_VIEW_MARGIN * 0.5 * height / focal;
+  const leftX = -cx / focal - marginX, rightX = (width - cx) / focal + marginX;
+  const topY = -cy / focal - marginY, bottomY = (height - cy) / focal + marginY;
   const records = new Float32Array(wholeRows(count, ROW_GAUSSIANS) * TEXELS * 4);
   const boxes = new Int32Array(4 * count), depths = new Float64Array(count), drawn = new Int32Array(count);
   let visible = 0;
@@ -28,7 +30,7 @@ export function project({ means, covariances, opacities, normals }, count, featu
     const awayX = eye[0] - mx, awayY = eye[1] - my, awayZ = eye[2] - mz;
     const along = awayX * normals[3 * i] + awayY * normals[3 * i + 1] + awayZ * normals[3 * i + 2];
     if (along < cull * Math.sqrt(awayX * awayX + awayY * awayY + awayZ * awayZ)) continue;
-    const slopeX = Math.min(Math.max(x / z, -limitX), limitX), slopeY = Math.min(Math.max(y / z, -limitY), limitY);
+    const slopeX = Math.min(Math.max(x / z, leftX), rightX), slopeY = Math.min(Math.max(y / z, topY), bottomY);
     const scale = focal / z;
     const a0 = scale * (r[0] - slopeX * r[6]), a1 = scale * (r[1] - slopeX * r[7]), a2 = scale * (r[2] - slopeX * r[8]);
     const b0 = scale * (r[3] - slopeY * r[6]), b1 = scale * (r[4] - slopeY * r[7]), b2 = scale * (r[5] - slopeY * r[8]);
@@ -39,7 +41,7 @@ export function project({ means, covariances, opacities, normals }, count, featu
     const pxx = a0 * sa0 + a1 * sa1 + a2 * sa2 + DILATION, pxy = b0 * sa0 + b1 * sa1 + b2 * sa2;
     const pyy = b0 * sb0 + b1 * sb1 + b2 * sb2 + DILATION, shear = pxy / pyy, conditional = pxx - pxy * shear;
     if (!(pyy > 0 && conditional > 0 && pxx < Infinity && pyy < Infinity)) continue;
-    const centerX = focal * x / z + width / 2, centerY = focal * y / z + height / 2, peak = Math.log2(opacity);
+    const centerX = focal * x / z + cx, centerY = focal * y / z + cy, peak = Math.log2(opacity);
     const reach = Math.max(peak - LOG2_ALPHA_MIN, 0) / HALF_LOG2_E;  // 2·ln(255·opacity)
     const reachX = Math.sqrt(reach * pxx) - 0.499, reachY = Math.sqrt(reach * pyy) - 0.499;  // to the last pixel centre
     const left = Math.max(centerX - reachX, 0), right = Math.min(centerX + reachX, width - 1);

@@ -42,8 +42,8 @@ export class Splatter {
     this.upload("sky", width, texels);
   }
 
-  /** Render the result of `project` to `canvas`, with the uniforms `look`. */
-  draw({ records, pairs, tiles, columns }, width, height, look) {
+  /** Render the result of `project` for the camera of `view` (fineView) to `canvas`, with the uniforms `look`. */
+  draw({ records, pairs, tiles, columns }, { factor, corner, extent }, width, height, look) {
     const { gl, canvas } = this;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     gl.viewport(0, 0, width, height);
@@ -51,7 +51,7 @@ export class Splatter {
     this.upload("pairs", ROW_PAIRS, pairs);
     this.upload("tiles", columns, tiles);
     const units = Object.fromEntries(TEXTURES.map((name, unit) => [name, unit]));
-    this.program.use({ ...units, size: [width, height], ...look });
+    this.program.use({ ...units, size: [width, height], factor, corner, extent, ...look });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
