@@ -16,6 +16,7 @@ from .lifter.options import Lifter
 from .options import Compare, Frame, Grid, Raster, Step
 from .stability.cli import Stability
 from .studies.options import Ablations, Agreement, Causes, Lengths, People
+from .studies.video_options import Video
 
 SPEED, STUDY = "rnd_bench.speed.cli", "rnd_bench.studies.cli"
 
@@ -40,6 +41,7 @@ STUDIES: dict[str, tuple[Any, str, str]] = {
     "lengths": (Lengths, STUDY, "run_trainings"),
     "people": (People, STUDY, "run_people"),
     "agreement": (Agreement, STUDY, "run_agreement"),
+    "video": (Video, "rnd_bench.studies.video", "run"),
     "lifter": (Lifter, "rnd_bench.lifter.cli", "run"),
 }
 

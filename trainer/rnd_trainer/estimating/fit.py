@@ -18,10 +18,11 @@ from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
 from .fitting.prior import pose_prior
 from .fitting.silhouette import Outlines, OutlineTerm, Surface, outlines_of
-from .fitting.start import bones_of_points, joint_rotations, local_rotations, root_positions
+from .fitting.start import joint_rotations, local_rotations, root_positions
 from .fitting.state import TO_CAMERA, Layout, State
 from .fitting.terms import BoneTerm, GroundTerm, Lens, PointTerm, PriorTerm, SharedTerm, SmoothTerm, mark_points
 from .lifted import Lifted
+from .lifter import lift
 from .observations import Observations
 
 Floats = NDArray[np.float64]
@@ -30,7 +31,7 @@ OnProgress = Callable[[float, float], None]
 
 MIN_FRAMES = 12
 """fewer frames tell too little of the body"""
-FOCAL_OF_SIDE = 1.15
+FOCAL_OF_SIDE = 1.1
 """usual focal length over the image's longer side: phones film at 0.8 to 1.6"""
 FOCAL_DEVIATION = 0.20
 KNOWN_FOCAL_DEVIATION = 0.003
@@ -115,7 +116,7 @@ def estimate(
     """Fit a body to all frames of ``observations`` at once.
 
     Args:
-        lifted: directions of bones in the same frames; by default those of ``observations.keypoints_m``.
+        lifted: directions of bones in the same frames; by default the shipped network's.
         body: a ``Body`` keeps its shape; a ``Figure`` is shaped; by default the figure that ships.
         height: of the person, m; fixes the scale. By default the mean adult's, as far as nothing else tells.
         focal_px: focal length in pixels, if known.
@@ -133,7 +134,8 @@ def estimate(
         raise InputError("focal length", expected="a positive number of pixels", got=focal_px)
     figure = default_figure() if body is None else known_figure(body) if isinstance(body, Body) else body
     if lifted is None:
-        lifted = bones_of_points(observations.keypoints_m.astype(np.float64), observations.confidence > 0.3)
+        lens = _lens(observations, focal_px, principal_px)
+        lifted = lift(observations, float(np.exp(lens.log_focal)), lens.centre)
     if len(lifted) != count:
         raise InputError("lifted bones", expected=f"{count} frames", got=len(lifted))
     fit = Fit(observations, lifted, figure, _lens(observations, focal_px, principal_px), height, weights)
