@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
-import struct
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -14,17 +12,16 @@ import numpy as np
 import onnx
 import onnxruntime as ort
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from rnd_runtime.avatar.avatar import Avatar
-from rnd_runtime.capture.body import Body, posed_vertices
+from rnd_runtime.capture.body import Body
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.amass import write_amass
-from rnd_runtime.motion.motion import load_motion, save_motion
+from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES, SMPLH_NAMES
 from rnd_runtime.playback.frame import FrameRenderer, in_root_frame
@@ -37,7 +34,8 @@ from rnd_viewer.convert.cli import main
 from rnd_viewer.convert.splat_files import TRANSFORM
 from rnd_viewer.convert.splats import fixed_colour, half_turned, make_splats, stored_colours
 from rnd_viewer.convert.visionary import check_clip, packed, write_visionary
-from support.tiny import ASSETS, body, motion
+from support.glb import read_glb
+from support.tiny import ASSETS, body
 
 AVATAR, BODY = ASSETS / "avatar.onnx", ASSETS / "body.npz"
 WALK, SKY = ASSETS / "walk.npz", ASSETS / "sky.exr"
@@ -60,27 +58,6 @@ def _ply(path: Path) -> dict[str, np.ndarray]:
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex "))
     rows = np.frombuffer(data, "<f4").reshape(count, len(names))
     return dict(zip(names, rows.T.astype(np.float64)))
-
-
-def _glb(path: Path):
-    """The JSON of a GLB and its accessors as arrays."""
-    content = path.read_bytes()
-    magic, version, length = struct.unpack_from("<4sII", content)
-    assert (magic, version, length) == (b"glTF", 2, len(content))
-    size, kind = struct.unpack_from("<I4s", content, 12)
-    assert kind == b"JSON"
-    document = json.loads(content[20 : 20 + size])
-    start = 20 + size + 8
-    assert struct.unpack_from("<I4s", content, 20 + size) == (len(content) - start, b"BIN\0")
-    arrays = []
-    for accessor in document["accessors"]:
-        view = document["bufferViews"][accessor["bufferView"]]
-        dtype = {5126: "<f4", 5121: "u1", 5123: "<u2", 5125: "<u4"}[accessor["componentType"]]
-        shape = {"SCALAR": (), "VEC3": (3,), "VEC4": (4,), "MAT4": (4, 4)}[accessor["type"]]
-        assert view["byteOffset"] % 4 == 0
-        values = np.frombuffer(content, dtype, accessor["count"] * math.prod(shape), start + view["byteOffset"])
-        arrays.append(values.reshape(-1, *shape))
-    return document, arrays
 
 
 def _covariances(quaternions_xyzw: np.ndarray, scales: np.ndarray) -> np.ndarray:
@@ -162,6 +139,16 @@ def test_ply_has_the_fields_of_3dgs_in_their_order(tmp_path):
     np.testing.assert_allclose(lengths, 1, atol=1e-4)
 
 
+def test_a_ply_may_carry_the_material(tmp_path):
+    ply = _ply(_splats(tmp_path, "--material"))
+    assert list(ply)[62:] == ["albedo_0", "albedo_1", "albedo_2", "roughness", "ambient_visibility"]
+    avatar = Avatar.load(AVATAR, threads=1)
+    posed = avatar.pose(load_motion(WALK, avatar.skeleton), FRAME / 30)
+    np.testing.assert_allclose(np.stack([ply[f"albedo_{k}"] for k in range(3)], -1), posed.albedo, atol=1e-6)
+    np.testing.assert_allclose(ply["roughness"], posed.roughness, atol=1e-6)
+    assert 0 <= ply["ambient_visibility"].min() < ply["ambient_visibility"].max() <= 1
+
+
 def test_fitted_sh_gives_the_colour_of_any_view(played, tmp_path):
     ply = _ply(_splats(tmp_path, "--coding", "linear", "--sh-degree", "3"))
     means = np.stack([ply[k] for k in "xyz"], axis=-1)
@@ -196,7 +183,7 @@ def test_fitted_sh_gives_the_colour_of_any_view(played, tmp_path):
 
 def test_gltf_splats_show_the_players_image(played, tmp_path):
     _splats(tmp_path, "--format", "glb", "--coding", "linear")
-    document, arrays = _glb(tmp_path / f"{FRAME:06d}.glb")
+    document, arrays = read_glb(tmp_path / f"{FRAME:06d}.glb")
     assert document["extensionsUsed"] == ["KHR_gaussian_splatting"]
     primitive = document["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0
@@ -323,7 +310,7 @@ def test_viewers_without_the_extension_get_linear_colours(tmp_path):
     """COLOR_0 is linear in glTF, however the SH coefficients are coded."""
     for coding, decoded in (("linear", np.asarray), ("srgb", srgb_to_linear)):
         _splats(tmp_path, "--format", "glb", "--coding", coding)
-        document, arrays = _glb(tmp_path / f"{FRAME:06d}.glb")
+        document, arrays = read_glb(tmp_path / f"{FRAME:06d}.glb")
         attributes = document["meshes"][0]["primitives"][0]["attributes"]
         sh = arrays[attributes["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"]]
         colour = decoded((0.5 + 0.28209479177387814 * sh).clip(0, 1))
@@ -334,7 +321,7 @@ def test_viewers_without_the_extension_get_linear_colours(tmp_path):
 def test_splat_transform_understands_our_ply(tmp_path):
     """Its glTF of our PLY, rotated upright again with all SH coefficients, is our glTF."""
     ply = _splats(tmp_path, "--format", "ply,glb", "--sh-degree", "3")
-    ours, theirs = (_glb(path) for path in (ply.with_suffix(".glb"), _transformed(ply, tmp_path / "theirs.glb")))
+    ours, theirs = (read_glb(path) for path in (ply.with_suffix(".glb"), _transformed(ply, tmp_path / "theirs.glb")))
     attributes = [document["meshes"][0]["primitives"][0]["attributes"] for document, _ in (ours, theirs)]
     assert attributes[0].keys() == attributes[1].keys()
     for name in attributes[0].keys() - {"COLOR_0"}:
@@ -363,76 +350,6 @@ def _transformed(source: Path, out: Path) -> Path:
     assert program
     subprocess.run([program, "--quiet", "--gpu", "cpu", str(source), str(out)], check=True)
     return out
-
-
-def _evaluated(document, arrays, time_s: float) -> np.ndarray:
-    """Vertices of a skinned GLB at a key time, by the words of the glTF specification."""
-    nodes = document["nodes"]
-    local = {k: [np.array(n.get("translation", [0, 0, 0])), Rotation.identity()] for k, n in enumerate(nodes)}
-    animation = document["animations"][0]
-    for channel in animation["channels"]:
-        sampler = animation["samplers"][channel["sampler"]]
-        key = int(np.abs(arrays[sampler["input"]] - time_s).argmin())
-        value = arrays[sampler["output"]][key]
-        if channel["target"]["path"] == "rotation":
-            local[channel["target"]["node"]][1] = Rotation.from_quat(value)
-        else:
-            local[channel["target"]["node"]][0] = value
-    world: dict[int, np.ndarray] = {}
-
-    def visit(node: int, parent: np.ndarray) -> None:
-        own = np.eye(4)
-        own[:3, :3], own[:3, 3] = local[node][1].as_matrix(), local[node][0]
-        world[node] = parent @ own
-        for child in nodes[node].get("children", []):
-            visit(child, world[node])
-
-    for root in document["scenes"][0]["nodes"]:
-        visit(root, np.eye(4))
-    skin = document["skins"][0]
-    inverse = np.swapaxes(arrays[skin["inverseBindMatrices"]], 1, 2).astype(np.float64)
-    matrices = np.stack([world[joint] @ inverse[k] for k, joint in enumerate(skin["joints"])])
-    attributes = document["meshes"][0]["primitives"][0]["attributes"]
-    points = np.c_[arrays[attributes["POSITION"]].astype(np.float64), np.ones(len(arrays[0]))]
-    posed = np.zeros((len(points), 4))
-    for k in range(sum(name.startswith("JOINTS_") for name in attributes)):
-        joints, weights = (arrays[attributes[f"{what}_{k}"]] for what in ("JOINTS", "WEIGHTS"))
-        for slot in range(4):
-            posed += weights[:, slot, None] * np.einsum("vrc,vc->vr", matrices[joints[:, slot]], points)
-    return posed[:, :3]
-
-
-def test_rigged_glb_moves_like_the_template(tmp_path):
-    template, moves = body(), motion(body())
-    save_motion(tmp_path / "turn.npz", moves)
-    line = ["mesh", str(ASSETS / "body.npz"), "--motion", str(tmp_path / "turn.npz")]
-    assert main([*line, "--out", str(tmp_path), "--format", "glb,obj", "--frames", "2:3"]) == 0
-    document, arrays = _glb(tmp_path / "body.glb")
-    for frame in (0, 2, 5):
-        expected = posed_vertices(template, moves.rotations[frame], moves.translations[frame])
-        assert np.abs(_evaluated(document, arrays, frame / moves.fps) - expected).max() < 1e-5
-    rotations = [s["output"] for s in document["animations"][0]["samplers"][1:]]
-    assert all((np.sum(arrays[r][1:] * arrays[r][:-1], axis=1) >= 0).all() for r in rotations)
-    scene = trimesh.load(tmp_path / "body.glb", process=False)
-    (mesh,) = scene.geometry.values()
-    np.testing.assert_allclose(mesh.vertices, template.vertices, atol=1e-6)
-    posed = trimesh.load(tmp_path / "000002.obj", process=False)
-    expected = posed_vertices(template, moves.rotations[2], moves.translations[2])
-    np.testing.assert_allclose(posed.vertices, expected, atol=1e-6)
-    np.testing.assert_array_equal(posed.faces, template.faces)
-    assert 0.03 < posed.volume < 0.15  # m³: a person, and not inside out
-
-
-def test_a_loops_animation_ends_where_it_begins(tmp_path, capsys):
-    """glTF's ends at its last key: without the first frame as that, the last interval would be left out."""
-    line = ["mesh", str(ASSETS / "body.npz"), "--motion", str(WALK), "--out", str(tmp_path), "--loop"]
-    assert main([*line, "--format", "glb"]) == 0
-    assert "3.9 s of motion" in capsys.readouterr().out  # 132 frames at 30 per second, less a seam of 15
-    document, arrays = _glb(tmp_path / "body.glb")
-    for sampler in document["animations"][0]["samplers"]:
-        times, values = arrays[sampler["input"]], arrays[sampler["output"]]
-        assert len(times) == len(values) == 118 and times[-1] == pytest.approx(3.9)
-        np.testing.assert_allclose(np.abs(values[-1]), np.abs(values[0]), atol=1e-6)  # q and −q turn alike
 
 
 # Motions
@@ -528,7 +445,8 @@ def test_motions_are_read_as_the_player_reads_them(tmp_path, capsys):
     assert "at 24 per second" in printed.out and "note:" not in printed.err
 
 
-SPLATS, MESH = ["splats", AVATAR, "--motion", WALK, "--out", "OUT"], ["mesh", BODY, "--motion", WALK, "--out", "OUT"]
+SPLATS = ["splats", AVATAR, "--motion", WALK, "--out", "OUT"]
+MESH = ["mesh", AVATAR, "--body", BODY, "--motion", WALK, "--out", "OUT"]
 
 
 @pytest.mark.parametrize(
@@ -542,11 +460,15 @@ SPLATS, MESH = ["splats", AVATAR, "--motion", WALK, "--out", "OUT"], ["mesh", BO
         ([*SPLATS, "--colour", "albedo", "--exposure", "1"], ["--exposure", "1"]),
         ([*SPLATS, "--sh-degree", "1", "--camera", "a.json"], ["--camera", "a.json"]),
         ([*SPLATS, "--format", "glb", "--ply-axes", "y-up"], ["--ply-axes", "y-up"]),
+        ([*SPLATS, "--format", "glb", "--material"], ["--material", ".ply"]),
         ([*SPLATS, "--exposure", "2000"], ["--exposure", "2000"]),
         ([*SPLATS, "--hdr-up", "z"], ["--hdr-up", "needs --hdr"]),
         ([*MESH, "--frames", "0:2"], ["--frames", "0:2"]),
         (["splats", WALK, "--motion", WALK, "--out", "OUT"], ["walk.npz"]),
-        (["mesh", WALK, "--motion", WALK, "--out", "OUT"], ["walk.npz"]),
+        ([*MESH, "--texture", "9"], ["--texture", "9"]),
+        ([*MESH, "--format", "fbx"], ["--format", "fbx"]),
+        (["mesh", WALK, "--body", BODY, "--motion", WALK, "--out", "OUT"], ["walk.npz"]),
+        (["mesh", AVATAR, "--body", WALK, "--motion", WALK, "--out", "OUT"], ["walk.npz"]),
         (["motion", "none.onnx", "--motion", WALK, "--out", "a.npz"], ["none.onnx", "not found"]),
         (["motion", AVATAR, "--motion", WALK, "--out", "a.bvh"], ["--out", "a.bvh"]),
         (["motion", BODY, "--motion", WALK, "--out", BODY], ["another file than what is read"]),

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar, Encoded
-from rnd_runtime.capture.body import Body, posed_vertices
+from rnd_runtime.capture.body import Body
 from rnd_runtime.cli.command import finish, log
 from rnd_runtime.cli.progress import track
-from rnd_runtime.core.errors import InputError, check_option
+from rnd_runtime.core.errors import check_option
 from rnd_runtime.core.files import existing_file, output_folder, refuse_input
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.signals import temporary_folder
@@ -21,25 +20,26 @@ from rnd_runtime.motion.amass import write_amass
 from rnd_runtime.motion.edit import resampled
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.motion.skeleton import Skeleton
-from rnd_runtime.playback.framing import CameraOptions, CameraPath, frame_motion, front_path
-from rnd_runtime.posing.forearm import share_twists
+from rnd_runtime.playback.framing import CameraOptions as FramingOptions
+from rnd_runtime.playback.framing import CameraPath, frame_motion, front_path
 from rnd_runtime.shading.light import light_notes
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.cameras import file_path
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import parse_frames
 
-from .mesh_files import write_obj, write_rigged_glb
-from .options import AmassOptions, MeshOptions, Options, SplatOptions
+from .cameras import read_cameras, write_cameras
+from .options import AmassOptions, CameraOptions, MeshOptions, Options, SplatOptions, chosen_formats
 from .splat_files import splat_transform, transform_ply, write_ply, write_splat_glb
 from .splats import Splats, are_finite, fixed_colour, half_turned, make_splats, stored_colours, view_dependent_colour
+from .usd_files import load_usd, write_splat_usd
 from .visionary import check_clip, packed, write_visionary
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-SPLAT_FORMATS, MESH_FORMATS = ("ply", "glb", "spz", "sog", "visionary"), ("glb", "obj")
+SPLAT_FORMATS = ("ply", "glb", "spz", "sog", "visionary", "usd")
 # rnd-play's front camera; only its position matters here.
-FRONT = CameraOptions(512, 512)
+FRONT = FramingOptions(512, 512)
 
 
 def convert(options: Options) -> None:
@@ -47,14 +47,20 @@ def convert(options: Options) -> None:
     if isinstance(options, SplatOptions):
         _splats(options)
     elif isinstance(options, MeshOptions):
-        _mesh(options)
+        from .mesh import convert_mesh
+
+        convert_mesh(options)
+    elif isinstance(options, CameraOptions):
+        _camera(options)
     else:
         _motion(options)
 
 
 def _splats(options: SplatOptions) -> None:
-    formats = _formats(options.format, SPLAT_FORMATS)
+    formats = chosen_formats(options.format, SPLAT_FORMATS)
     options.refuse_unfit(formats)
+    if "usd" in formats:
+        load_usd()
     program = splat_transform() if {"spz", "sog"} & set(formats) else None
     avatar = Avatar.load(options.avatar)
     motion = options.reading.read_motion(options.motion, avatar.skeleton)
@@ -69,6 +75,7 @@ def _splats(options: SplatOptions) -> None:
     camera_at = _camera_path(options.camera, avatar.skeleton, motion, frames)
     out = output_folder(options.out)
     clip: list[tuple[Floats32, Floats32]] = []
+    samples: list[Splats] = []
     left_out = 0
     for number in track("writing splats", frames, len(frames)):
         time = number / motion.fps
@@ -80,18 +87,24 @@ def _splats(options: SplatOptions) -> None:
         splats = make_splats(gaussians, _sh(options, avatar, gaussians, shade, camera_at(number, time).position))
         stored = half_turned(splats) if options.ply_axes == "3dgs" else splats
         if "ply" in formats:
-            write_ply(out / f"{number:06d}.ply", stored)
+            material = gaussians if options.material else None
+            write_ply(out / f"{number:06d}.ply", stored, material)
         if "glb" in formats:
             write_splat_glb(out / f"{number:06d}.glb", splats, options.coding)
         if program is not None:
             _transform(program, out / f"{number:06d}", stored, formats)
         if "visionary" in formats:
             clip.append(packed(stored))
+        if "usd" in formats:
+            samples.append(splats)
     if left_out:
         _log_notes([f"Gaussians with numbers that are not finite were left out, {left_out} of a frame at most"])
     if clip:
         write_visionary(out / "visionary.onnx", clip, motion.fps)
-    files = {suffix: f"{number:06d}.{suffix}" for suffix in formats} | {"visionary": "visionary.onnx"}
+    if samples:
+        write_splat_usd(out / "splats.usdc", samples, frames, motion.fps)
+    files = {suffix: f"{number:06d}.{suffix}" for suffix in formats}
+    files |= {"visionary": "visionary.onnx", "usd": "splats.usdc"}
     listed = ", ".join(f"{name} ({(out / files[name]).stat().st_size / 1e6:.2f} MB)" for name in formats)
     finish(out, f"{len(frames)} frames of {avatar.gaussians - left_out} Gaussians: {listed}")
 
@@ -129,26 +142,6 @@ def _transform(program: str, stem: Path, splats: Splats, formats: tuple[str, ...
                 transform_ply(program, ply, stem.with_suffix(f".{suffix}"))
 
 
-def _mesh(options: MeshOptions) -> None:
-    formats = _formats(options.format, MESH_FORMATS)
-    options.refuse_unfit(formats)
-    body = Body.load(options.body)
-    motion = options.reading.read_motion(options.motion, body.skeleton)
-    _log_notes(motion.notes)
-    motion = replace(motion, rotations=share_twists(body.skeleton, motion.rotations))  # as in the avatar
-    frames = parse_frames(options.frames, motion.frame_count)
-    out = output_folder(options.out)
-    if "glb" in formats:
-        write_rigged_glb(out / "body.glb", body, motion)
-        finish(out / "body.glb", f"{len(body.vertices)} vertices, {motion.duration:.1f} s of motion")
-    if "obj" in formats:
-        for number in track("writing meshes", frames, len(frames)):
-            now = motion.at([number / motion.fps])
-            vertices = posed_vertices(body, now.rotations[0], now.translations[0])
-            write_obj(out / f"{number:06d}.obj", vertices, body.faces)
-        finish(out, f"{len(frames)} posed meshes as obj")
-
-
 def _motion(options: AmassOptions) -> None:
     check_option(options.out.suffix.lower() == ".npz", "--out", "a name in .npz", options.out)
     file = existing_file(options.skeleton, what="avatar or body")
@@ -166,6 +159,19 @@ def _motion(options: AmassOptions) -> None:
     finish(options.out, f"{motion.frame_count} frames at {motion.fps:g} per second")
 
 
+def _camera(options: CameraOptions) -> None:
+    check_option(options.out.suffix.lower() == ".json", "--out", "a name in .json", options.out)
+    refuse_input(options.out, options.source)
+    width, height = options.size or (1920, 1080)
+    cameras = read_cameras(options.source, options.name, (width, height or width), options.fps or 30.0)
+    write_cameras(options.out, cameras)
+    first = cameras[0]
+    finish(
+        options.out,
+        f"{len(cameras)} of {first.width}x{first.height}, the first at {first.position.round(3).tolist()} m",
+    )
+
+
 def _log_notes(notes: Iterable[str]) -> None:
     for note in notes:
         log(f"note: {note}")
@@ -175,10 +181,3 @@ def _camera_path(text: str, skeleton: Skeleton, motion: Motion, frames: range) -
     if text == "front":
         return front_path(frame_motion(skeleton, motion), FRONT)
     return file_path(text, None, frames)
-
-
-def _formats(text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    names = {name.strip() for name in text.split(",") if name.strip()}
-    if not names or names - set(known):
-        raise InputError("--format", expected=f"some of {','.join(known)}", got=text or "nothing")
-    return tuple(name for name in known if name in names)

@@ -18,12 +18,13 @@ ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
 class GlbBuilder:
-    """Accessors of a file."""
+    """Accessors and images of a file."""
 
     def __init__(self) -> None:
         self._chunks: list[bytes] = []
         self._views: list[dict[str, Any]] = []
         self._accessors: list[dict[str, Any]] = []
+        self._images: list[dict[str, Any]] = []
         self._length = 0
 
     def accessor(
@@ -35,19 +36,25 @@ class GlbBuilder:
         except for vertex attributes and indices.
         """
         array = np.ascontiguousarray(values, _DTYPES[component])
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": self._length, "byteLength": array.nbytes}
         accessor = {"bufferView": len(self._views), "componentType": component, "count": len(array), "type": kind}
-        if target is not None:
-            view["target"] = target
         if bounds:
             flat = array.reshape(len(array), -1)
             accessor |= {"min": flat.min(axis=0).tolist(), "max": flat.max(axis=0).tolist()}
-        self._views.append(view)
+        self._append(array.tobytes(), {} if target is None else {"target": target})
         self._accessors.append(accessor)
-        chunk = array.tobytes() + bytes(-array.nbytes % 4)
+        return len(self._accessors) - 1
+
+    def image(self, png: bytes) -> int:
+        """Store a PNG file's ``png`` and return the image's index."""
+        self._images.append({"bufferView": len(self._views), "mimeType": "image/png"})
+        self._append(png, {})
+        return len(self._images) - 1
+
+    def _append(self, content: bytes, view: dict[str, Any]) -> None:
+        self._views.append({"buffer": 0, "byteOffset": self._length, "byteLength": len(content)} | view)
+        chunk = content + bytes(-len(content) % 4)
         self._chunks.append(chunk)
         self._length += len(chunk)
-        return len(self._accessors) - 1
 
     def write(self, path: Path, document: dict[str, Any]) -> None:
         """Write ``document`` with its arrays; the same arrays give the same bytes."""
@@ -58,6 +65,8 @@ class GlbBuilder:
             "bufferViews": self._views,
             "buffers": [{"byteLength": self._length}],
         }
+        if self._images:
+            document["images"] = self._images
         text = json.dumps(document, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         parts = [

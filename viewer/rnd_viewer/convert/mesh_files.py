@@ -1,4 +1,4 @@
-"""The posed template as a mesh: OBJ for one frame, glTF binary with skeleton, weights and the whole motion."""
+"""The clothed surface as files: OBJ for one frame, glTF binary with skeleton, textures, weights and the motion."""
 
 from __future__ import annotations
 
@@ -8,63 +8,77 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rnd_runtime.capture.body import Body
 from rnd_runtime.core.files import atomic_path
+from rnd_runtime.core.images import write_image
 from rnd_runtime.core.rotations import matrix_to_quaternion
+from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
+from rnd_runtime.motion.skeleton import Skeleton
 
 from .glb import ELEMENT_ARRAY_BUFFER, FLOAT, UNSIGNED_BYTE, UNSIGNED_INT, UNSIGNED_SHORT, GlbBuilder
+from .surface import JOINTS, Surface, vertex_normals
+from .texture import Textures, Unwrapped
 
 Floats = NDArray[np.float64]
-PER_SET = 4  # joints in one JOINTS_n attribute
+LINEAR_MIPMAP, LINEAR = 9987, 9729  # of glTF's samplers
 
 
-def vertex_normals(vertices: Floats, faces: NDArray[np.int32]) -> Floats:
-    """Area-weighted unit normals [V, 3]; Y where a vertex has no face."""
-    corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], crosses)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit: Floats = np.where(lengths > 0, normals / np.where(lengths > 0, lengths, 1), [0.0, 1.0, 0.0])
-    return unit
-
-
-def write_obj(path: Path, vertices: Floats, faces: NDArray[np.int32]) -> None:
-    """Wavefront OBJ with normals; metres, Y up."""
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
+def write_obj(path: Path, vertices: Floats, charts: Unwrapped, faces: NDArray[np.int32]) -> None:
+    """Wavefront OBJ of ``vertices`` [V, 3] and ``faces`` [F, 3], with normals and UVs; metres, Y up."""
+    lines = ["mtllib avatar.mtl", "usemtl avatar"]
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
+    lines += [f"vt {u:.6f} {v:.6f}" for u, v in charts.uv.tolist()]
     lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in vertex_normals(vertices, faces).tolist()]
-    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (faces + 1).tolist()]
+    for corners, texels in zip((charts.original[charts.faces] + 1).tolist(), (charts.faces + 1).tolist()):
+        lines.append("f " + " ".join(f"{k}/{t}/{k}" for k, t in zip(corners, texels)))
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def write_rigged_glb(path: Path, body: Body, motion: Motion) -> None:
-    """The rest mesh with its joints as nodes, all its weights, and ``motion`` as an animation.
+def write_mtl(path: Path, albedo: str) -> None:
+    """The material of ``write_obj``, its base colour the image ``albedo``."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(f"newmtl avatar\nKd 1 1 1\nmap_Kd {albedo}\n", encoding="ascii")
 
-    Weights are sorted: a reader of one JOINTS set gets the four strongest of each vertex.
-    """
-    glb = GlbBuilder()
-    skeleton, joints = body.skeleton, len(body.skeleton)
-    parents, rest = skeleton.parents, skeleton.rest_joints
+
+def write_rigged_glb(
+    path: Path, surface: Surface, charts: Unwrapped, textures: Textures, skeleton: Skeleton, motion: Motion
+) -> None:
+    """The textured surface at rest with joints as nodes, four weights a vertex, and ``motion`` as an animation."""
+    glb, original = GlbBuilder(), charts.original
+    joints, weights = strongest_joints(surface.weights[original])
+    component = UNSIGNED_BYTE if len(skeleton) <= 256 else UNSIGNED_SHORT
     attributes = {
-        "POSITION": glb.accessor(body.vertices, "VEC3", FLOAT, bounds=True),
-        "NORMAL": glb.accessor(vertex_normals(body.vertices, body.faces), "VEC3", FLOAT),
-        **_weight_sets(glb, body.skinning_weights),
+        "POSITION": glb.accessor(surface.vertices[original], "VEC3", FLOAT, bounds=True),
+        "NORMAL": glb.accessor(surface.normals[original], "VEC3", FLOAT),
+        "TANGENT": glb.accessor(charts.tangents, "VEC4", FLOAT),
+        "TEXCOORD_0": glb.accessor(charts.uv * [1, -1] + [0, 1], "VEC2", FLOAT),  # v down
+        "JOINTS_0": glb.accessor(joints, "VEC4", component),
+        "WEIGHTS_0": glb.accessor(weights, "VEC4", FLOAT),
     }
-    indices = glb.accessor(body.faces.ravel(), "SCALAR", UNSIGNED_INT, target=ELEMENT_ARRAY_BUFFER)
-    material = {"pbrMetallicRoughness": {"baseColorFactor": [0.6, 0.6, 0.6, 1], "metallicFactor": 0}}
+    indices = glb.accessor(charts.faces.ravel(), "SCALAR", UNSIGNED_INT, target=ELEMENT_ARRAY_BUFFER)
+    images = [glb.image(png_bytes(image)) for image in (textures.albedo, textures.normal, textures.material)]
+    material = {
+        "name": "avatar",
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 2},
+            "metallicFactor": 0,
+        },
+        "normalTexture": {"index": 1},
+        "occlusionTexture": {"index": 2},
+    }
     nodes: list[dict[str, Any]] = []
+    rest, parents = skeleton.rest_joints, skeleton.parents
     for joint, name in enumerate(skeleton.names):
         children = np.flatnonzero(parents == joint).tolist()
         offset = rest[joint] - (rest[parents[joint]] if joint else 0)
         nodes.append({"name": name, "translation": offset.tolist()} | ({"children": children} if children else {}))
     nodes.append({"name": "body", "mesh": 0, "skin": 0})
-    inverse = np.tile(np.eye(4), (joints, 1, 1))
+    inverse = np.tile(np.eye(4), (len(skeleton), 1, 1))
     inverse[:, 3, :3] = -rest  # column-major: the translation is the last row of the array
     skin = {
-        "joints": list(range(joints)),
+        "joints": list(range(len(skeleton))),
         "skeleton": 0,
         "inverseBindMatrices": glb.accessor(inverse, "MAT4", FLOAT, target=None),
     }
@@ -72,31 +86,33 @@ def write_rigged_glb(path: Path, body: Body, motion: Motion) -> None:
         path,
         {
             "scene": 0,
-            "scenes": [{"nodes": [0, joints]}],
+            "scenes": [{"nodes": [0, len(skeleton)]}],
             "nodes": nodes,
             "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
             "materials": [material],
+            "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP}],
+            "textures": [{"sampler": 0, "source": image} for image in images],
             "skins": [skin],
             "animations": [_animation(glb, rest[0], motion)],
         },
     )
 
 
-def _weight_sets(glb: GlbBuilder, weights: NDArray[np.float32]) -> dict[str, int]:
-    """JOINTS_n and WEIGHTS_n, as many sets as the vertex with the most joints needs."""
-    sets = -(-int((weights > 0).sum(axis=1).max()) // PER_SET)
-    order = np.argsort(-weights, axis=1, kind="stable")[:, : PER_SET * sets]
-    order = np.pad(order, ((0, 0), (0, PER_SET * sets - order.shape[1])))
+def strongest_joints(weights: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+    """Joints and weights [V, 4] of ``weights`` [V, J], the largest first; joint 0 where the weight is 0."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :JOINTS]
+    order = np.pad(order, ((0, 0), (0, JOINTS - order.shape[1])))
     strongest = np.take_along_axis(weights, order, axis=1)
     strongest[:, weights.shape[1] :] = 0
-    order[strongest == 0] = 0  # glTF requires joint 0 where the weight is 0
-    component = UNSIGNED_BYTE if weights.shape[1] <= 256 else UNSIGNED_SHORT
-    attributes = {}
-    for k in range(sets):
-        part = slice(PER_SET * k, PER_SET * (k + 1))
-        attributes[f"JOINTS_{k}"] = glb.accessor(order[:, part], "VEC4", component)
-        attributes[f"WEIGHTS_{k}"] = glb.accessor(strongest[:, part], "VEC4", FLOAT)
-    return attributes
+    order[strongest == 0] = 0
+    return order, strongest / strongest.sum(axis=1, keepdims=True)
+
+
+def png_bytes(image: NDArray[np.uint8]) -> bytes:
+    """The PNG file of ``image`` [H, W, C]."""
+    with temporary_folder() as folder:
+        write_image(folder / "image.png", np.ascontiguousarray(image))
+        return (folder / "image.png").read_bytes()
 
 
 def _animation(glb: GlbBuilder, rest_root: Floats, motion: Motion) -> dict[str, Any]:

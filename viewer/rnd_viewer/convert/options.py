@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.cli.command import File, Folder, Number, OptionalFile, OptionalNumber, option
-from rnd_runtime.core.errors import check_option, refuse_changed, refuse_outside
+from rnd_runtime.cli.command import File, Flag, Folder, Number, OptionalFile, OptionalNumber, OptionalSize, option
+from rnd_runtime.core.errors import InputError, check_option, refuse_changed, refuse_outside
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
 from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
 
@@ -29,7 +29,8 @@ class SplatOptions:
     out: Folder
     """Folder for 000000.ply and so on."""
     format: Annotated[str, option("LIST")] = "ply"
-    """Some of ply,glb,spz,sog (the last two by splat-transform) and visionary (all frames in one visionary.onnx)."""
+    """Some of ply,glb,spz,sog (the last two by splat-transform), and of all frames in one file: visionary
+    (visionary.onnx) and usd (splats.usdc with time samples)."""
     frames: Annotated[str, option("START:END")] = "0:1"
     """Frames of the motion, END excluded; either may be missing."""
     colour: Annotated[Literal["lit", "albedo"], option("lit|albedo")] = "lit"
@@ -52,6 +53,8 @@ class SplatOptions:
     """srgb for viewers that show colours as they are; linear radiance for renderers that code the blended image."""
     ply_axes: Annotated[Literal["3dgs", "y-up"], option("3dgs|y-up")] = "3dgs"
     """Axes of .ply, .spz and .sog. 3dgs: Y down, rotated by 180° about Z, as their viewers expect. A .glb is Y up."""
+    material: Flag = False
+    """Add albedo, roughness and ambient visibility to a .ply, so that other renderers can relight it."""
     reading: MotionGroup = field(default_factory=MotionOptions)
 
     def __post_init__(self) -> None:
@@ -68,6 +71,8 @@ class SplatOptions:
             refuse_changed(self, ["camera"], "--sh-degree above 0 is fitted over all directions")
         if set(formats) == {"glb"}:
             refuse_changed(self, ["ply_axes"], "a .glb is always Y up")
+        if "ply" not in formats:
+            refuse_changed(self, ["material"], "only a .ply has more properties")
         if "visionary" in formats:
             check_option(self.sh_degree == 0, "--sh-degree", "0 for visionary", self.sh_degree)
             check_option(self.coding == "srgb", "--coding", "srgb for visionary", self.coding)
@@ -75,27 +80,34 @@ class SplatOptions:
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """Write the posed template: one .glb with skeleton, weights and the whole motion, or an .obj a frame.
+    """Write the clothed surface, textured and rigged: one .glb or .usdz with the whole motion, or an .obj a frame.
 
-    rnd-convert mesh body.npz --motion walk.npz --format glb,obj --frames 0:10 --out out/mesh
+    rnd-convert mesh avatar.onnx --body body.npz --motion walk.npz --format glb,obj --frames 0:10 --out out/mesh
     """
 
-    body: Annotated[tyro.conf.Positional[Path], option("FILE")]
-    """body.npz, as in a capture's folder; an avatar holds Gaussians and no mesh."""
+    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx")]
+    """The avatar, a file of rnd-export."""
+    body: File
+    """body.npz of the capture that the avatar was trained on: the mesh that is moved onto its Gaussians."""
     motion: File
     """Body poses over time, in any format of rnd-play."""
     out: Folder
-    """Folder for body.glb, 000000.obj and so on."""
+    """Folder for avatar.glb, avatar.usdz, 000000.obj and so on."""
     format: Annotated[str, option("LIST")] = "glb"
-    """Some of glb,obj."""
+    """Some of glb,usd,obj. An .obj is posed as the avatar itself; the others have four joints a vertex."""
     frames: Annotated[str, option("START:END")] = "0:1"
     """Frames to write as .obj, END excluded; either may be missing."""
+    texture: Annotated[int, option("N")] = 1024
+    """Side of the textures in pixels."""
     reading: MotionGroup = field(default_factory=MotionOptions)
+
+    def __post_init__(self) -> None:
+        refuse_outside(self, {"texture": (64, 8192)})
 
     def refuse_unfit(self, formats: Sequence[str]) -> None:
         """Refuse options that files in ``formats`` cannot follow, with an ``InputError``."""
         if "obj" not in formats:
-            refuse_changed(self, ["frames"], "a .glb has the whole motion")
+            refuse_changed(self, ["frames"], "a .glb or .usdz has the whole motion")
 
 
 @dataclass(frozen=True)
@@ -119,5 +131,40 @@ class AmassOptions:
         refuse_outside(self, {"fps": FPS_LIMITS})
 
 
-Options = SplatOptions | MeshOptions | AmassOptions
-COMMANDS: dict[str, type[Options]] = {"splats": SplatOptions, "mesh": MeshOptions, "motion": AmassOptions}
+@dataclass(frozen=True)
+class CameraOptions:
+    """Write cameras of other programs as a file for rnd-play's --camera.
+
+    rnd-convert camera shot.glb --size 1920x1080 --out camera.json
+    """
+
+    source: Annotated[tyro.conf.Positional[Path], option("FILE")]
+    """nerfstudio's transforms.json, or a .gltf, .glb, .usd, .usda, .usdc or .usdz, as Blender writes them."""
+    out: File
+    """The .json to write."""
+    name: Annotated[str | None, option("NAME")] = None
+    """Camera of a file that holds several."""
+    size: OptionalSize = None
+    """Size of a frame in pixels, for files that have none. Default: 1920x1080."""
+    fps: OptionalNumber = None
+    """Frames per second at which an animated camera of a .glb is sampled. Default: 30."""
+
+    def __post_init__(self) -> None:
+        refuse_outside(self, {"fps": FPS_LIMITS})
+
+
+Options = SplatOptions | MeshOptions | AmassOptions | CameraOptions
+COMMANDS: dict[str, type[Options]] = {
+    "splats": SplatOptions,
+    "mesh": MeshOptions,
+    "motion": AmassOptions,
+    "camera": CameraOptions,
+}
+
+
+def chosen_formats(text: str, known: tuple[str, ...]) -> tuple[str, ...]:
+    """``ply,glb`` → names in the order of ``known``."""
+    names = {name.strip() for name in text.split(",") if name.strip()}
+    if not names or names - set(known):
+        raise InputError("--format", expected=f"some of {','.join(known)}", got=text or "nothing")
+    return tuple(name for name in known if name in names)

@@ -7,10 +7,13 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import atomic_path
+from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.images import srgb_to_linear
+from rnd_runtime.playback.aov import ambient_visibility
 
 from .glb import FLOAT, GlbBuilder
 from .splats import SH_0, Coding, Splats
@@ -22,6 +25,7 @@ PLY_FIELDS = (
     *(f"f_rest_{k}" for k in range(45)),
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+MATERIAL_FIELDS = ("albedo_0", "albedo_1", "albedo_2", "roughness", "ambient_visibility")
 MAX_OPACITY = 1 - 1e-6  # the logit of 1 is infinite
 KHR = "KHR_gaussian_splatting"
 KHR_SPACES = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
@@ -29,13 +33,14 @@ TRANSFORM = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
 
 
-def write_ply(path: Path, splats: Splats) -> None:
+def write_ply(path: Path, splats: Splats, material: Gaussians | None = None) -> None:
     """Binary little-endian PLY with 3DGS's 62 floats: log scales, logit opacities, quaternions wxyz.
 
-    ``f_rest`` holds R's fifteen coefficients, then G's, then B's. Normals are the surface's.
+    ``f_rest`` holds R's fifteen coefficients, then G's, then B's. Normals are the surface's. ``material`` adds
+    ``MATERIAL_FIELDS`` after them: linear Rec.709 albedo, perceptual roughness, and the visible share of the sky.
     """
     opacities = np.clip(splats.opacities, 1 - MAX_OPACITY, MAX_OPACITY)
-    columns = (
+    columns: tuple[NDArray[np.floating], ...] = (
         splats.means,
         splats.normals,
         splats.sh[:, 0],
@@ -44,9 +49,13 @@ def write_ply(path: Path, splats: Splats) -> None:
         np.log(splats.scales),
         splats.quaternions,
     )
+    fields = PLY_FIELDS
+    if material is not None:
+        columns += (material.albedo, material.roughness[:, None], ambient_visibility(material)[:, None])
+        fields += MATERIAL_FIELDS
     rows = np.concatenate(columns, axis=1).astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property float {name}" for name in PLY_FIELDS] + ["end_header", ""]
+    header += [f"property float {name}" for name in fields] + ["end_header", ""]
     with atomic_path(path) as temporary:
         temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
 
