@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from .errors import InputError
 from .files import atomic_path, existing_file
 
 Floats = NDArray[np.floating[Any]]  # float32 or float64, as given
+Attribute = str | tuple[str, tuple[float, ...]]
 Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
@@ -30,6 +31,7 @@ _STRIP = 256  # rows: OpenEXR's DWAB decodes as many at once
 # Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
 _MAX_UNBOUNDED = 1 << 31
+_MAX_HALF = np.float32(65504)
 
 
 def linear_to_srgb(linear: ArrayLike) -> Floats:
@@ -136,7 +138,14 @@ def _read_type(spec: Any, path: str | Path) -> str:
     return kinds[0] if kinds[0] in ("uint8", "uint16") else "float"
 
 
-def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str, ...] | None = None) -> None:
+def write_image(
+    path: str | Path,
+    array: ArrayLike,
+    *,
+    channel_names: tuple[str, ...] | None = None,
+    half: tuple[bool, ...] = (),
+    attributes: Mapping[str, Attribute] | None = None,
+) -> None:
     """Write [H, W] or [H, W, C] pixels as they are: uint8 or uint16 to PNG, float32 to EXR as FLOAT.
 
     FLOAT and not HALF, because sun texels exceed HALF's 65 504. Equal pixels give equal bytes. A PNG's
@@ -144,6 +153,8 @@ def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str,
 
     Args:
         channel_names: C names for an EXR's channels, such as ``("albedo.R", "albedo.G", "albedo.B")``.
+        half: which of an EXR's C channels are stored as HALF, clipped to its range.
+        attributes: of an EXR: text, or OpenImageIO's name of a type with its numbers.
     """
     path, pixels = Path(path), np.asarray(array)
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
@@ -160,6 +171,11 @@ def write_image(path: str | Path, array: ArrayLike, *, channel_names: tuple[str,
     if suffix == ".exr":
         spec.attribute("compression", "zip")
         spec.attribute("DateTime", "1970:01:01 00:00:00")  # otherwise the time of writing gets in
+        for name, value in (attributes or {}).items():
+            spec.attribute(name, *((value,) if isinstance(value, str) else value))
+        if any(half):
+            spec.channelformats = tuple("half" if low else "float" for low in half)
+            pixels = np.where(np.array(half), np.clip(pixels, -_MAX_HALF, _MAX_HALF), pixels)
     else:
         spec.attribute("oiio:UnassociatedAlpha", 1)  # otherwise colours are divided by alpha
     with atomic_path(path) as temporary:

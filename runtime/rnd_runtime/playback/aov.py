@@ -8,15 +8,23 @@ normal      (n + 1) / 2                              normal.X, .Y, .Z: unit
 roughness   linear                                   roughness.Y
 visibility  linear                                   visibility.Y: cosine-weighted share of a uniform sky
 depth       near is bright, over the body's reach    Z: metres along the camera's axis
+diffuse     sRGB, premultiplied, on black            diffuse.R, .G, .B: linear radiance, premultiplied
+specular    sRGB, premultiplied, on black            specular.R, .G, .B: the rest of the radiance, premultiplied
+shadow      sRGB, premultiplied, on black            shadow.R, .G, .B: radiance that cast shadows of directional
+                                                     lights take away, premultiplied: added, it undoes them
+motion      red, green: 0.5 + pixels / 64            forward.u, .v: pixels to the right and up, to the next frame
+parts       a colour for each joint's part           CryptoPart00 … 02: see ``playback.cryptomatte``
 ==========  =======================================  ==================================================
 
 Normals are in the camera's OpenCV axes, as captures have them: what faces the camera has z < 0.
-All but albedo are averages over the covered part of a pixel, zero below ``MIN_COVERAGE``.
+All but colours and parts are averages over the covered part of a pixel, zero below ``MIN_COVERAGE``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +34,11 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
+from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.shading.sh import COSINE_LOBE, sh_basis
+from rnd_runtime.shading.shader import Shader
+
+from . import cryptomatte
 
 # EXR channels of each output
 CHANNELS = {
@@ -35,7 +47,18 @@ CHANNELS = {
     "roughness": ("roughness.Y",),
     "visibility": ("visibility.Y",),
     "depth": ("Z",),
+    "diffuse": ("diffuse.R", "diffuse.G", "diffuse.B"),
+    "specular": ("specular.R", "specular.G", "specular.B"),
+    "shadow": ("shadow.R", "shadow.G", "shadow.B"),
+    "motion": ("forward.u", "forward.v"),
+    "parts": cryptomatte.CHANNELS,
 }
+COLOURS = ("albedo", "diffuse", "specular", "shadow")
+"""linear Rec.709, premultiplied"""
+GIVEN = ("motion", "parts")
+"""whose features [N, C] come from the caller: they need more than one frame's Gaussians"""
+MOTION_RANGE = 32.0
+"""pixels of motion at the ends of the 8-bit image"""
 MIN_COVERAGE = 0.05  # the captures' own limit for normals
 
 
@@ -47,15 +70,61 @@ def parse_aovs(text: str) -> tuple[str, ...]:
     return tuple(name for name in CHANNELS if name in names)
 
 
-def splat_features(names: Sequence[str], gaussians: Gaussians, camera: Camera) -> list[Floats32]:
-    """Features [N, C] to rasterise for each of ``names``; depth has none."""
+class Lit(NamedTuple):
+    """How Gaussians were shaded: by ``shader``, towards a camera at ``eye`` [3] m, to ``radiance`` [N, 3]."""
+
+    shader: Shader
+    eye: NDArray[np.float64]
+    seen: NDArray[np.bool_] | None
+    radiance: Floats32
+
+    def again(self, gaussians: Gaussians, *, shadows: bool = True) -> Floats32:
+        """Radiance [N, 3] of other ``gaussians``."""
+        return self.shader.shade(gaussians, self.eye, self.seen, shadows=shadows)
+
+
+def splat_features(
+    names: Sequence[str], gaussians: Gaussians, camera: Camera, lit: Lit, given: Mapping[str, Floats32]
+) -> list[Floats32]:
+    """Features [N, C] to rasterise for each of ``names``; depth has none. ``given``: those of ``GIVEN``.
+
+    Radiance is linear in albedo: what a black body reflects is specular, the rest is diffuse.
+    """
+    specular = (
+        lit.again(replace(gaussians, albedo=np.zeros_like(gaussians.albedo)))
+        if {"diffuse", "specular"} & {*names}
+        else np.zeros_like(gaussians.albedo)
+    )
     features = {
         "albedo": lambda: gaussians.albedo,
         "normal": lambda: gaussians.normals @ camera.world_to_camera[:3, :3].T.astype(np.float32),
         "roughness": lambda: gaussians.roughness[:, None],
         "visibility": lambda: ambient_visibility(gaussians)[:, None],
+        "diffuse": lambda: lit.radiance - specular,
+        "specular": lambda: specular,
+        "shadow": lambda: lit.again(gaussians, shadows=False) - lit.radiance,
     }
-    return [features[name]() for name in names if name != "depth"]
+    return [given[name] if name in GIVEN else features[name]() for name in names if name != "depth"]
+
+
+def pixel_motion(now: Gaussians, camera: Camera, following: Gaussians, next_camera: Camera) -> Floats32:
+    """Pixels [N, 2], right and up, by which Gaussians move to the next frame; each with the camera in its own frame.
+
+    Zero behind a camera.
+    """
+    (here, depth), (there, next_depth) = (
+        _pixels(gaussians.means, view) for gaussians, view in ((now, camera), (following, next_camera))
+    )
+    in_front = (depth > NEAR) & (next_depth > NEAR)
+    moved = np.where(in_front[:, None], there - here, 0) * [1, -1]
+    return moved.astype(np.float32)
+
+
+def _pixels(means: Floats32, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    seen = means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = seen[:, 2]
+    scaled = seen[:, :2] / np.where(depth > NEAR, depth, 1)[:, None]
+    return scaled * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2], depth
 
 
 def ambient_visibility(gaussians: Gaussians) -> Floats32:
@@ -66,22 +135,23 @@ def ambient_visibility(gaussians: Gaussians) -> Floats32:
     return share
 
 
-def aov_layers(names: Sequence[str], raster: Raster, first: int) -> dict[str, Floats32]:
+def aov_layers(names: Sequence[str], raster: Raster, first: int, given: Mapping[str, Floats32]) -> dict[str, Floats32]:
     """``aov_values`` of ``names``; their channels begin at ``first`` in the raster's image."""
     layers = {}
     for name in names:
         if name == "depth":
             splatted = raster.depth[..., None]
         else:
-            splatted = raster.image[..., first : first + len(CHANNELS[name])]
-            first += len(CHANNELS[name])
+            count = given[name].shape[1] if name in given else len(CHANNELS[name])
+            splatted = raster.image[..., first : first + count]
+            first += count
         layers[name] = aov_values(name, splatted, raster.alpha)
     return layers
 
 
 def aov_values(name: str, splatted: Floats32, alpha: Floats32) -> Floats32:
-    """EXR layer of ``name`` [H, W, C] from the raster's premultiplied channels."""
-    if name == "albedo":
+    """Layer of ``name`` [H, W, C] from the raster's premultiplied channels; of parts their coverage [H, W, P]."""
+    if name in COLOURS or name == "parts":
         return splatted
     covered = alpha >= MIN_COVERAGE
     mean: Floats32 = np.where(covered, 1 / np.where(covered, alpha, 1), 0).astype(np.float32)[..., None] * splatted
@@ -94,11 +164,16 @@ def aov_image(
     name: str, values: Floats32, alpha: Floats32, depth_range: tuple[float, float] = (0, 1)
 ) -> NDArray[np.uint8]:
     """8-bit image [H, W, 1 or 3] of ``aov_values``; ``depth_range``: m, shown white and black."""
-    if name == "albedo":
+    if name in COLOURS:
         return to_bytes(linear_to_srgb(values))
+    if name == "parts":
+        return cryptomatte.colours(values)
     covered = (alpha >= MIN_COVERAGE)[..., None]
     if name == "normal":
         return to_bytes((values + 1) / 2 * covered)
+    if name == "motion":
+        coded = to_bytes((values / MOTION_RANGE + 1) / 2)
+        return np.dstack([coded, np.zeros_like(coded[..., :1])])
     if name == "depth":
         near, far = depth_range
         return to_bytes(np.clip((far - values) / (far - near), 0, 1) * covered)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 
-from .aov import aov_layers, splat_features
+from .aov import Lit, aov_layers, splat_features
 from .far import fine_view
 from .rasterizer import ChosenRasterizer, Kind, make_rasterizer
 
@@ -148,6 +148,7 @@ class FrameRenderer:
         lit: bool = True,
         srgb: bool = True,
         scale: float = 1.0,
+        given: Mapping[str, Floats32] | None = None,
     ) -> RenderedFrame:
         """Render what is encoded or posed already.
 
@@ -156,15 +157,16 @@ class FrameRenderer:
             lit: False leaves the radiance zero, for frames of AOVs alone.
             srgb: make the 8-bit image at once.
             scale: share of the camera's width and height that is rendered and then enlarged. AOVs are rendered in full.
+            given: features [N, C] of the AOVs in ``playback.aov.GIVEN``.
         """
         camera = camera or self.camera
         assert camera is not None
         rendered = camera
         if scale != 1 and not aovs:
             rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
-        raster = self._raster(body, rendered, aovs, lit, antialias=rendered is camera)
+        raster = self._raster(body, rendered, aovs, lit, given or {}, antialias=rendered is camera)
         seconds = dict(raster.seconds)
-        layers = aov_layers(aovs, raster, 3 if lit else 0)
+        layers = aov_layers(aovs, raster, 3 if lit else 0, given or {})
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
         alpha, image_srgb = raster.alpha, raster.srgb
         started = perf_counter()
@@ -190,23 +192,37 @@ class FrameRenderer:
         self.close()
 
     def _raster(
-        self, body: Encoded | PosedAvatar, camera: Camera, aovs: Sequence[str], lit: bool, *, antialias: bool
+        self,
+        body: Encoded | PosedAvatar,
+        camera: Camera,
+        aovs: Sequence[str],
+        lit: bool,
+        given: Mapping[str, Floats32],
+        *,
+        antialias: bool,
     ) -> Raster:
         """In the root's frame; with ``antialias`` a body of few pixels is rendered on a finer grid and averaged."""
         shader, camera = in_root_frame(body.root, self.shader, camera)
         joints = body.joints if isinstance(body, PosedAvatar) else self.avatar.joints(body)
         fine = fine_view(camera, joints) if antialias else None
         if fine is None:
-            return self._splat(body, shader, camera, aovs, lit)
-        return fine.averaged(self._splat(body, shader, fine.camera, aovs, lit))
+            return self._splat(body, shader, camera, aovs, lit, given)
+        return fine.averaged(self._splat(body, shader, fine.camera, aovs, lit, given))
 
     def _splat(
-        self, body: Encoded | PosedAvatar, shader: Shader, camera: Camera, aovs: Sequence[str], lit: bool
+        self,
+        body: Encoded | PosedAvatar,
+        shader: Shader,
+        camera: Camera,
+        aovs: Sequence[str],
+        lit: bool,
+        given: Mapping[str, Floats32],
     ) -> Raster:
         """On OpenGL's device where that can be, else stage by stage."""
         cull = None if self.cull is None or self.cull <= -1 else self.cull
+        how: dict[str, Any] = {"cull": cull, "aovs": aovs, "lit": lit, "given": given}
         if isinstance(body, PosedAvatar):
-            return draw_gaussians(body.gaussians, shader, camera, self.rasterizer, cull=cull, aovs=aovs, lit=lit)
+            return draw_gaussians(body.gaussians, shader, camera, self.rasterizer, **how)
         if lit and not aovs and isinstance(self.rasterizer, ChosenRasterizer):
             unposed, device = self.avatar.unposed(body), self.rasterizer.renderer
             if unposed is not None and device is not None:
@@ -214,7 +230,7 @@ class FrameRenderer:
         started = perf_counter()
         gaussians = self.avatar.posed(body)
         posing = perf_counter() - started
-        raster = draw_gaussians(gaussians, shader, camera, self.rasterizer, cull=cull, aovs=aovs, lit=lit)
+        raster = draw_gaussians(gaussians, shader, camera, self.rasterizer, **how)
         return replace(raster, seconds={"posing": posing, **raster.seconds})
 
 
@@ -232,6 +248,7 @@ def draw_gaussians(
     cull: float | None = None,
     aovs: Sequence[str] = (),
     lit: bool = True,
+    given: Mapping[str, Floats32] | None = None,
 ) -> Raster:
     """Shade Gaussians in view, splat them and sharpen outlines.
 
@@ -239,6 +256,7 @@ def draw_gaussians(
         cull: as of ``raster.in_view.in_view``; None draws all.
         aovs: whose features follow the radiance in the image, see ``aov_layers``.
         lit: False leaves the radiance out.
+        given: features of AOVs, as of ``FrameRenderer.draw``.
 
     Returns:
         Linear radiance [H, W, 3] and AOVs; ``seconds`` have "shading" beside the rasteriser's stages.
@@ -247,8 +265,10 @@ def draw_gaussians(
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
     visible = visible_to(gaussians, camera, cull)
-    features = [shader.shade(gaussians, camera.position, visible)] if lit else []
-    features += splat_features(aovs, gaussians, camera)
+    shade = lit or {"diffuse", "shadow"} & {*aovs}
+    radiance = shader.shade(gaussians, camera.position, visible) if shade else np.zeros_like(gaussians.albedo)
+    features = [radiance] if lit else []
+    features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance), given or {})
     attributes = features[0] if len(features) == 1 else np.concatenate(features, axis=1)
     shading, depth = perf_counter() - started, "depth" in aovs
     arrays = gaussians.means, gaussians.covariances

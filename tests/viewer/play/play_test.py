@@ -91,7 +91,7 @@ def test_aovs_are_those_of_the_surface():
     camera = _camera()
     frame = _renderer().render(MOTION, 0.2, camera, aovs=parse_aovs("depth,visibility,roughness,normal,albedo"))
     inside = frame.alpha > INSIDE
-    assert list(frame.aovs) == list(CHANNELS)
+    assert list(frame.aovs) == list(CHANNELS)[:5]
     np.testing.assert_allclose(
         frame.aovs["albedo"], frame.alpha[..., None] * np.array([0.6, 0.4, 0.2], np.float32), atol=1e-5
     )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import linear_to_srgb, read_header, read_image, to_bytes
 from rnd_runtime.playback.aov import aov_image, aov_values
@@ -22,6 +23,7 @@ PATCH = 24  # pixels; the middle of a patch is far enough from its neighbours' c
 DECODED_WEBP = 8  # of 255, inside a patch whose neighbours are of any colour: quality 85 and halved chroma
 DECODED = 3  # of 255: two roundings to limited range (each ±0.5 · 255/219) and x264 at CRF 18
 REACH = (2.0, 4.0)
+CAMERA = Camera.look_at([0, 1, 3], [0, 1, 0], width=11, height=4, fov_y=0.6)
 
 
 def _flat(colour, height=4, width=6) -> np.ndarray:
@@ -165,7 +167,7 @@ def test_formats():
     assert parse_formats(None) == ("png", "mp4")
     assert parse_formats("webp,png") == ("png", "webp")
     for text in ("gif", "png,tiff", ""):
-        with pytest.raises(InputError, match="png,exr,mp4,webp"):
+        with pytest.raises(InputError, match="png,exr,mp4,mov,webp"):
             parse_formats(text)
 
 
@@ -185,7 +187,7 @@ def frame() -> RenderedFrame:
 
 def _write(tmp_path, frame: RenderedFrame, formats: tuple[str, ...]) -> set[str]:
     with frame_writer(tmp_path, formats, fps=30, times=StageTimes()) as write:
-        write(7, frame, REACH)
+        write(7, frame, REACH, CAMERA)
     return {str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file()}
 
 
@@ -195,8 +197,8 @@ def test_every_format_has_its_place(tmp_path, frame):
     assert _write(tmp_path / "e", frame, ("exr",)) == {"frames_exr/000007.exr"}
     assert _write(tmp_path / "m", frame, ("mp4",)) == {"play.mp4"} | aovs
     assert _write(tmp_path / "w", frame, ("webp",)) == {"play.webp"} | aovs
-    everything = {"frames/000007.png", "frames_exr/000007.exr", "play.mp4", "play.webp"} | aovs
-    assert _write(tmp_path / "a", frame, ("png", "exr", "mp4", "webp")) == everything
+    everything = {"frames/000007.png", "frames_exr/000007.exr", "play.mp4", "play.mov", "play.webp"} | aovs
+    assert _write(tmp_path / "a", frame, ("png", "exr", "mp4", "mov", "webp")) == everything
 
 
 def test_png_without_background_has_straight_alpha(tmp_path, frame):

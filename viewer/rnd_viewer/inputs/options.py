@@ -155,8 +155,8 @@ class PlayOptions:
     avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
     """The avatar, a file of rnd-export."""
     motion: OptionalFile = None
-    """Body poses over time: .npz of AMASS, SMPL or EasyMocap (or its folder), .pkl of AIST++, WHAM or 4D-Humans, .pt of
-    GVHMR, .npy of MDM, .bvh, or .amc with its .asf beside it."""
+    """Body poses over time: .npz of AMASS, SMPL, Kimodo or SLAHMR, .pkl of AIST++, WHAM, 4D-Humans or SAM 3D Body, .pt of
+    GVHMR or GEM-X, .npy of HumanML3D, Motion-X or TRAM, .bvh, .glb, .vrma, .amc with its .asf, and others: docs/formats.md."""
     hdr: OptionalFile = None
     """Light probe, lat-long EXR or HDR. Default: the light of the avatar's capture."""
     out: OptionalFolder = None
@@ -170,10 +170,15 @@ class PlayOptions:
     """Frames to render, END excluded, either may be missing. Pixels are those of the whole run; processes with
     different parts may share a folder. Default: all."""
     format: Annotated[str | None, option("LIST")] = None
-    """Some of png,exr,mp4,webp. A webp is a clip too, transparent where a png is. Default: png, and mp4 where PyAV is
-    installed."""
+    """Some of png,exr,mp4,webp,mov. webp and mov (ProRes 4444) are clips too, transparent where a png is. Default: png,
+    and mp4 where PyAV is installed."""
     aov: Annotated[str, option("LIST")] = ""
-    """Also write some of albedo,normal,roughness,visibility,depth. Normals are in the camera's OpenCV axes."""
+    """Also write some of albedo,normal,roughness,visibility,depth, of the split light diffuse,specular,shadow, of
+    motion (pixels to the next frame), and of parts (Cryptomatte by joint). Normals are in the camera's OpenCV axes."""
+    half: Flag = False
+    """Store colours of an .exr as half floats."""
+    colorspace: Annotated[Literal["rec709", "acescg"], option()] = "rec709"
+    """Primaries of the colours of an .exr, all linear."""
     doctor: Flag = False
     """Print renderer, providers, threads and versions, and what to install for what is missing."""
     reading: MotionGroup = field(default_factory=MotionOptions)
@@ -183,6 +188,8 @@ class PlayOptions:
 
     def __post_init__(self) -> None:
         refuse_outside(self, {"fps": (1e-3, 1000)})
+        if "exr" not in (self.format or ""):
+            refuse_changed(self, ["half", "colorspace"], "only of --format exr")
         if self.hdr is None:
             refuse_changed(self.lighting, ["hdr_up"], "needs --hdr")
 

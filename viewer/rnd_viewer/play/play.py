@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
@@ -36,6 +37,8 @@ from rnd_viewer.inputs.cameras import file_path, split_camera
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames
 
+from .exr import ExrWriter
+from .given import GivenFeatures
 from .pipeline import run
 from .run_folder import is_of_a_run, mark_of, part_name, refuse_others
 from .timing import StageTimes
@@ -163,6 +166,10 @@ class _Run:
         """Of the clips and the report."""
         return part_name("play", self.frames, self.count)
 
+    @cached_property
+    def _given(self) -> GivenFeatures:
+        return GivenFeatures(self.renderer.avatar, self.motion, self.fps, self.count, self.camera_at, self.aovs)
+
     def camera(self, number: int) -> Camera:
         return self.camera_at(number, number / self.fps)
 
@@ -172,12 +179,15 @@ class _Run:
         def begin(number: int) -> None:
             self.mark.touch()  # not before: a run that fails at once leaves the folder as it was
 
-        clips = frame_writer(self.out, self.formats, name=self.name, fps=self.fps, times=self.times, begin=begin)
+        exr = ExrWriter(self.fps, self.options.half, self.options.colorspace, parts=self.renderer.avatar.skeleton.names)
+        clips = frame_writer(
+            self.out, self.formats, name=self.name, fps=self.fps, times=self.times, begin=begin, exr=exr
+        )
         with self.renderer, clips as write:
             started = before = perf_counter()
 
             def put(number: int, rendered: tuple[RenderedFrame, Camera]) -> None:
-                write(number, rendered[0], _reach(self.framing, rendered[1]))
+                write(number, rendered[0], _reach(self.framing, rendered[1]), rendered[1])
 
             for _ in track("rendering", run(self.frames, self._encode, self._draw, put), len(self.frames)):
                 now = perf_counter()
@@ -194,7 +204,8 @@ class _Run:
         renderer, camera, lighting = self.renderer, self.camera(number), self.options.lighting
         if lighting.hdr_turn:
             renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * number / self.fps / lighting.hdr_turn)
-        frame = renderer.draw(pending.encoded, camera, aovs=self.aovs, srgb=False)
+        given = self._given.of(number, pending.encoded, camera)
+        frame = renderer.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given)
         for stage, seconds in frame.stage_seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):

@@ -3,9 +3,9 @@
 ::
 
     out/frames/000010.png        the frame: 8-bit sRGB, with straight alpha when there is no background
-    out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV
+    out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV, see ``play.exr``
     out/aov/normal/000010.png    AOVs as images
-    out/play.mp4, out/play.webp      clips; the WebP is transparent where the PNG is
+    out/play.mp4, .webp, .mov    clips; WebP and MOV (ProRes 4444) are transparent where the PNG is
     out/play.json                settings, notes, stage times
     out/play_000010-000050.*     the same of a part of a run, see ``play.run_folder``
 """
@@ -20,18 +20,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.images import write_image
-from rnd_runtime.playback.aov import CHANNELS, aov_image
+from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import RenderedFrame
 
+from .exr import ExrWriter
 from .timing import StageTimes
 from .video import CLIPS, clip_writer, load_pyav
 
 FORMATS = ("png", "exr", *CLIPS)
-TRANSPARENT = {"png", "webp"}  # without a background
-FrameWriter = Callable[[int, RenderedFrame, tuple[float, float]], None]
+TRANSPARENT = {"png", "webp", "mov"}  # without a background
+FrameWriter = Callable[[int, RenderedFrame, tuple[float, float], Camera], None]
 
 
 def parse_formats(text: str | None) -> tuple[str, ...]:
@@ -67,13 +69,14 @@ def frame_writer(
     fps: float,
     times: StageTimes,
     begin: Callable[[int], None] = lambda number: None,
+    exr: ExrWriter | None = None,
 ) -> Iterator[FrameWriter]:
-    """Yield ``write(number, frame, reach)``, which puts one frame into ``folder`` in all of ``formats``.
+    """Yield ``write(number, frame, reach, camera)``, which puts one frame into ``folder`` in all of ``formats``.
 
-    ``reach`` is the range of depths in metres that the depth image spans. AOVs go into the EXR if there is
-    one, and into images of their own if PNG is asked for or there is no EXR. Clips, called ``name``, appear
-    at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse, and before any
-    file of it is written.
+    ``reach`` is the range of depths in metres that the depth image spans, ``camera`` that of the frame. AOVs go into
+    the EXR if there is one, and into images of their own if PNG is asked for or there is no EXR. Clips, called
+    ``name``, appear at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse,
+    and before any file of it is written.
     """
     output_folder(folder)
     with ExitStack() as clips:
@@ -83,7 +86,9 @@ def frame_writer(
             if kind in CLIPS
         }
 
-        def write(number: int, frame: RenderedFrame, reach: tuple[float, float]) -> None:
+        exr_writer = exr or ExrWriter(fps)
+
+        def write(number: int, frame: RenderedFrame, reach: tuple[float, float], camera: Camera) -> None:
             files: dict[Path, NDArray[np.uint8]] = {}
             number_name = f"{number:06d}"
             with times.stage("write"):
@@ -99,12 +104,6 @@ def frame_writer(
                 for path, pixels in files.items():
                     write_image(path, pixels)
                 if "exr" in formats:
-                    _write_exr(folder / f"frames_exr/{number_name}.exr", frame)
+                    exr_writer.write(folder / f"frames_exr/{number_name}.exr", frame, camera)
 
         yield write
-
-
-def _write_exr(path: Path, frame: RenderedFrame) -> None:
-    layers = [frame.linear(), *frame.aovs.values()]
-    names = ("R", "G", "B", "A", *(channel for aov in frame.aovs for channel in CHANNELS[aov]))
-    write_image(path, np.concatenate(layers, axis=-1, dtype=np.float32), channel_names=names)
