@@ -64,7 +64,7 @@ def valid_files(subject: Subject) -> Path:
 
 def calibration_text(subject: Subject) -> Result:
     """H1: damaged calibration files of OpenCV, in a process that may die."""
-    figures, record = fuzz(valid_files(subject), subject.few(100, 5000), ("calibration",))
+    figures, record = fuzz(valid_files(subject), subject.few(40, 5000), ("calibration",))
     died = len(record["calibration"]["died"])
     return result(at_most("processes that damaged calibrations end", died, 0), *figures)
 
@@ -100,7 +100,7 @@ def _doubling() -> bytes:
 
 
 _PICKLES: dict[str, Callable[[], bytes]] = {
-    "bz2": lambda: bz2.compress(bytes(1 << 30)),
+    "bz2": lambda: bz2.compress(bytes(300 << 20)),
     "doubling": _doubling,
     "one_hash": lambda: pickle.dumps({(2**61 - 1) * k: 0 for k in range(1, 300)}, 2),
     "long_2_gb": lambda: b"\x80\x02\x8b\xff\xff\xff\x7f.",
@@ -114,12 +114,12 @@ def _written(path: Path, content: bytes) -> Path:
 
 
 def _wide_archive() -> bytes:
-    """An .npz of zeros: 1 GB in 1 MB."""
+    """An .npz of zeros: 0.5 GB in 0.5 MB."""
     header, whole = io.BytesIO(), io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 27,)})
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 26,)})
     with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("poses.npy", "w") as member:
         member.write(header.getvalue())
-        for _ in range(16):
+        for _ in range(8):
             member.write(bytes(64 << 20))
     return whole.getvalue()
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from rnd_bench.scenes.subject import Subject
 from rnd_bench.stability.figures import Result, at_most, below, holds, reported, result
-from rnd_bench.stability.processes import PLAY, Command, environment, play
+from rnd_bench.stability.processes import EXPORT, PLAY, TRAIN, Command, environment, export, play
+from rnd_bench.stability.small import studio
 from rnd_bench.stability.soak_view import visit_idle
 from rnd_runtime.cli.lock import LOCK_FILE
 from rnd_runtime.core.camera import Camera
@@ -21,7 +22,11 @@ from rnd_runtime.motion.motion import Motion, save_motion
 from rnd_runtime.playback import far
 from rnd_runtime.playback.frame import FrameRenderer
 
+CONVERT, VIEWER, DATA = "rnd_viewer.convert.cli", "rnd_viewer.view.cli", "rnd_trainer.commands.data"
 MOMENTS_S, PATIENCE_S = 4.0, 60.0
+_NAMES = {PLAY: "rnd-play", CONVERT: "rnd-convert", VIEWER: "rnd-view", TRAIN: "rnd-train", DATA: "rnd-data"}
+_NAMES[EXPORT] = "rnd-export"
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 FOCAL, HEIGHT_M = 4000.0, 1.75
 NEAR_PX, FAR_PX = 384, (100, 40, 16)
 SMALLEST_PX = 8
@@ -33,7 +38,7 @@ _NOWHERE = {"HOME": "/nonexistent", "XDG_CACHE_HOME": "/nonexistent", "NUMBA_CAC
 def _started(command: Command, folder: Path, **more: str) -> subprocess.Popen[str]:
     """A command that heeds all signals, also those that its parent ignores."""
     module, arguments = command
-    name = f"rnd-{module.split('.')[1]}"
+    name = _NAMES[module]
     code = (
         "import signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
         "signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -59,7 +64,7 @@ def no_home(subject: Subject) -> Result:
     folder = subject.work / "no_home"
     folder.mkdir(parents=True, exist_ok=True)
     wrong = []
-    for words in (["--help"], ["--doctor"]):
+    for words in (["--help"], ["--doctor"])[subject.few(1, 0) :]:
         process = _started((PLAY, words), folder, **_NOWHERE)
         errors = process.communicate()[1]
         if process.returncode != 0 or "Traceback" in errors:
@@ -68,32 +73,50 @@ def no_home(subject: Subject) -> Result:
 
 
 def signals(subject: Subject) -> Result:
-    """H3: SIGINT, SIGTERM and SIGHUP at random moments of rnd-play."""
-    folder, rng, wrong, sent = subject.work / "signals", np.random.default_rng(4), list[str](), 0
+    """H3: SIGINT, SIGTERM and SIGHUP at random moments of each command."""
+    folder, rng = subject.work / "signals", np.random.default_rng(4)
     folder.mkdir(parents=True, exist_ok=True)
-    motion = _motion_file(subject, folder, 4.0)
-    command = play(subject.avatar_file, motion, folder / "out", "--size", 64, "--format", "png,exr,mp4")
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    for k in range(subject.few(3, 50)):
-        number, after = numbers[k % 3], float(rng.uniform(0.5, MOMENTS_S))
-        shutil.rmtree(folder / "out", ignore_errors=True)
-        process = _started(command, folder)
-        time.sleep(after)
-        process.send_signal(number)
-        try:
-            errors = process.communicate(timeout=PATIENCE_S)[1]
-        except subprocess.TimeoutExpired:
-            process.kill()
-            errors = process.communicate()[1]
-        if process.returncode == 0:  # it had ended
-            continue
-        sent += 1
-        if process.returncode == -number and not errors:  # Python itself was being loaded
-            continue
-        if process.returncode != 128 + number or "Traceback" in errors or "interrupted" not in errors:
-            wrong.append(f"{number.name} after {after:.2f} s: exit {process.returncode}, {errors[-60:]!r}")
-        wrong += [f"left {file.name}" for file in (folder / "out").rglob(".*") if not file.name.startswith(".run-")]
-    return result(holds(f"{sent} signals that did not end rnd-play in one line with its code", wrong))
+    out, motion, capture = folder / "out", _motion_file(subject, folder, 4.0), studio(subject).folder
+    commands: dict[str, Command] = {
+        "rnd-play": play(subject.avatar_file, motion, out, "--size", 64, "--format", "png,exr,mp4"),
+        "rnd-convert": (
+            CONVERT,
+            ["splats", str(subject.avatar_file), "--motion", str(motion), "--out", str(out), "--frames", "0:100"],
+        ),
+        "rnd-view": (VIEWER, [str(subject.avatar_file), "--port", "0", "--no-browser", "--size", "64"]),
+        "rnd-export": export(subject.checkpoint, out / "avatar.onnx"),
+        "rnd-train": (TRAIN, [str(capture), "--out", str(out), "--preset", "quick", "--gaussians", "400"]),
+        "rnd-data": (DATA, ["check", str(capture), "--out", str(out)]),
+    }
+    figures = []
+    for name, command in list(commands.items())[: subject.few(1, len(commands))]:
+        wrong, sent = list[str](), 0
+        for k in range(subject.few(1, 50)):
+            shutil.rmtree(out, ignore_errors=True)
+            fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0.5, MOMENTS_S)))
+            sent += fault is not None
+            wrong += [fault] * bool(fault)
+            wrong += [f"left {file.name}" for file in out.rglob(".*") if not file.name.startswith(".run-")]
+        figures.append(holds(f"{name}: {sent} signals that did not end it in one line with its code", wrong))
+    return result(*figures)
+
+
+def _interrupted(command: Command, folder: Path, number: signal.Signals, after: float) -> str | None:
+    """Signal a command ``after`` seconds; its fault, "" for none, None where it had ended before."""
+    process = _started(command, folder)
+    time.sleep(after)
+    process.send_signal(number)
+    try:
+        errors = process.communicate(timeout=PATIENCE_S)[1]
+    except subprocess.TimeoutExpired:
+        process.kill()
+        errors = process.communicate()[1]
+    code = process.returncode
+    if code == 0:
+        return None
+    before_python = code == -number and not errors
+    ended = code == 128 + number and "Traceback" not in errors and errors.rstrip().endswith(": interrupted")
+    return "" if before_python or ended else f"{number.name} after {after:.2f} s: exit {code}, {errors[-60:]!r}"
 
 
 def far_away(subject: Subject) -> Result:
