@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -120,10 +121,23 @@ class _Lighting:
     background: Annotated[str, option("none|hdr|COLOUR")] = "none"
     """none is transparent; hdr is the light itself; a COLOUR is #rgb, #rrggbb or a name such as red (sRGB), or r,g,b
     (linear radiance)."""
+    ground: Annotated[str, option("none|auto|METRES")] = "none"
+    """Height of a ground that catches the shadow; auto finds it under the feet. On a background the shadow darkens
+    it; without one it is black in the alpha."""
 
     def __post_init__(self) -> None:
+        if self.ground not in ("none", "auto"):
+            check_option(abs(self.ground_height) <= 1e4, "--ground", "none, auto or metres", self.ground)
         refuse_outside(self, {"hdr_yaw": (-1e6, 1e6), "hdr_turn": (-1e6, 1e6), "exposure": (-30, 30)})
         check_option(self.hdr_turn != 0, "--hdr-turn", "not 0", 0)
+
+    @property
+    def ground_height(self) -> float:
+        """The height given for the ground, m; infinite where none is."""
+        try:
+            return float(self.ground)
+        except ValueError:
+            return math.inf
 
 
 @dataclass(frozen=True)
@@ -155,8 +169,9 @@ class PlayOptions:
     avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
     """The avatar, a file of rnd-export."""
     motion: OptionalFile = None
-    """Body poses over time: .npz of AMASS, SMPL, Kimodo or SLAHMR, .pkl of AIST++, WHAM, 4D-Humans or SAM 3D Body, .pt of
-    GVHMR or GEM-X, .npy of HumanML3D, Motion-X or TRAM, .bvh, .glb, .vrma, .amc with its .asf, and others: docs/formats.md."""
+    """Body poses over time: .npz of AMASS, SMPL, Kimodo or SLAHMR, .pkl of AIST++, WHAM, 4D-Humans or SAM 3D Body, .pt
+    of GVHMR or GEM-X, .npy of HumanML3D, Motion-X or TRAM, .bvh, .glb, .vrma, .amc with its .asf, and what
+    docs/formats.md lists."""
     hdr: OptionalFile = None
     """Light probe, lat-long EXR or HDR. Default: the light of the avatar's capture."""
     out: OptionalFolder = None
