@@ -330,6 +330,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         "gaussians": None,
         "width": SIZE,
         "height": SIZE,
+        "target": loaded.run("rnd.state.target"),
     }
     states: list[dict[str, Any]] = [
         {"shade": "table", "time": 0.21},

@@ -93,7 +93,7 @@ def signals(subject: Subject) -> Result:
         wrong, sent = list[str](), 0
         for k in range(subject.few(1, 50)):
             shutil.rmtree(out, ignore_errors=True)
-            fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0.5, MOMENTS_S)))
+            fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0, MOMENTS_S)))
             sent += fault is not None
             wrong += [fault] * bool(fault)
             wrong += [f"left {file.name}" for file in out.rglob(".*") if not file.name.startswith(".run-")]
@@ -102,8 +102,13 @@ def signals(subject: Subject) -> Result:
 
 
 def _interrupted(command: Command, folder: Path, number: signal.Signals, after: float) -> str | None:
-    """Signal a command ``after`` seconds; its fault, "" for none, None where it had ended before."""
+    """Signal a command ``after`` seconds; its fault, "" for none, None where it had ended before.
+
+    Seconds count from its handlers on: before, Python itself is being loaded.
+    """
     process = _started(command, folder)
+    while process.poll() is None and not _handles(process.pid, signal.SIGTERM):
+        time.sleep(0.01)
     time.sleep(after)
     process.send_signal(number)
     try:
@@ -114,9 +119,17 @@ def _interrupted(command: Command, folder: Path, number: signal.Signals, after: 
     code = process.returncode
     if code == 0:
         return None
-    before_python = code == -number and not errors
     ended = code == 128 + number and "Traceback" not in errors and errors.rstrip().endswith(": interrupted")
-    return "" if before_python or ended else f"{number.name} after {after:.2f} s: exit {code}, {errors[-60:]!r}"
+    return "" if ended else f"{number.name} after {after:.2f} s: exit {code}, {errors[-60:]!r}"
+
+
+def _handles(process: int, number: signal.Signals) -> bool:
+    """Whether ``process`` handles the signal; True where the system does not tell."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text(encoding="ascii")
+    except OSError:
+        return True
+    return bool(int(status.split("SigCgt:")[1].split()[0], 16) >> (number - 1) & 1)
 
 
 def far_away(subject: Subject) -> Result:
