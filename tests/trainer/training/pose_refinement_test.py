@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion, load_motion
 from rnd_runtime.posing.forearm import skinning_bones
+from rnd_trainer.estimating.uncertainty import PoseUncertainty, load_uncertainty, save_uncertainty
 from rnd_trainer.training.pose_refinement import (
+    DEVIATIONS,
     FADE_SECONDS,
     ROTATION_BOUND,
+    ROTATION_LIMITS,
     TRANSLATION_BOUND,
+    TRANSLATION_LIMITS,
     PoseRefinement,
     joint_error_degrees,
 )
@@ -48,6 +53,50 @@ def test_the_corrected_motion_has_the_corrected_bones_and_stays_within_bounds() 
     corrected = refinement.apply_to(moves)
     expected = skinning_bones(skeleton, corrected.rotations[4], corrected.translations[4])
     assert np.abs(refinement.bones(4).detach().numpy() - expected).max() < FLOAT32
+
+
+def test_corrections_go_as_far_as_the_estimate_is_unsure() -> None:
+    skeleton, moves = body().skeleton, motion(body())
+    deviations = PoseUncertainty(
+        np.full((moves.frame_count, len(skeleton), 3), 0.01), np.full((moves.frame_count, 3), 0.001)
+    )
+    deviations.rotations[1, 2] = 0.1
+    refinement = PoseRefinement(moves, skeleton, [1, 4], deviations)
+    with torch.no_grad():
+        for raw in refinement.raw:
+            raw.fill_(10.0)
+    rotation, shift = refinement.bounded(1)
+    assert rotation[2].tolist() == pytest.approx([0.1 * DEVIATIONS] * 3)
+    assert rotation[0].tolist() == pytest.approx([ROTATION_LIMITS[0]] * 3)
+    assert shift.tolist() == pytest.approx([TRANSLATION_LIMITS[0]] * 3)
+
+
+def test_neighbours_in_time_are_corrected_alike() -> None:
+    skeleton, moves = body().skeleton, motion(body())
+    slow = dataclasses.replace(moves, fps=2.0)
+    near, apart = (PoseRefinement(m, skeleton, [1, 2, 3]) for m in (moves, slow))
+    for refinement in (near, apart):
+        with torch.no_grad():
+            for raw in refinement.raw:
+                raw.fill_(0.05)
+        alike = float(refinement.prior(refinement.frames[1]))
+        with torch.no_grad():
+            refinement.raw[0].fill_(-0.05)
+        other = float(refinement.prior(refinement.frames[1]))
+        assert (other > 1.5 * alike) == (refinement is near), (alike, other)
+
+
+def test_deviations_of_a_capture_are_read_and_checked(tmp_path) -> None:
+    wanted = PoseUncertainty(np.full((3, 2, 3), 0.1), np.full((3, 3), 0.02))
+    assert load_uncertainty(tmp_path, 3, 2) is None
+    save_uncertainty(tmp_path, wanted)
+    found = load_uncertainty(tmp_path, 3, 2)
+    assert found is not None and np.allclose(found.rotations, 0.1) and np.allclose(found.translations, 0.02)
+    with pytest.raises(InputError, match="rotation_deviation"):
+        load_uncertainty(tmp_path, 4, 2)
+    save_uncertainty(tmp_path, PoseUncertainty(-wanted.rotations, wanted.translations))
+    with pytest.raises(InputError, match="negative"):
+        load_uncertainty(tmp_path, 3, 2)
 
 
 def test_between_training_frames_and_beyond_them_corrections_are_as_smooth_as_the_motion() -> None:

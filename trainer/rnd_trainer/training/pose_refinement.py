@@ -1,4 +1,4 @@
-"""Bounded corrections of estimated body poses, learned with the avatar.
+"""Bounded corrections of estimated body poses, learned with the avatar: as large as the estimate is unsure.
 
 Training corrects the bone transforms; motion windows and velocities remain those of the estimate.
 """
@@ -16,11 +16,21 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.posing.forearm import twist_angles
+from rnd_trainer.estimating.uncertainty import PoseUncertainty
 
 ROTATION_BOUND = 0.12
-"""bound of a joint's correction about each axis, rad (7°); estimators err by 1° to 3°"""
+"""bound of a joint's correction about each axis, rad (7°), where nothing is known of the poses' errors"""
 TRANSLATION_BOUND = 0.05
-"""bound of the root's correction along each axis, m"""
+"""bound of the root's correction along each axis, m, where nothing is known"""
+DEVIATIONS = 2.5
+"""bound of a correction in deviations of the estimate"""
+ROTATION_LIMITS = (0.03, 0.6)
+TRANSLATION_LIMITS = (0.01, 0.3)
+"""least and largest bound, rad and m"""
+SMOOTH_SECONDS = 0.15
+"""neighbours so near in time are corrected alike"""
+SMOOTH_WEIGHT = 5.0
+"""of the difference from the neighbours' mean correction, beside that of the correction itself"""
 FADE_SECONDS = 0.5
 """time over which corrections fade out before the first and after the last training frame, s"""
 
@@ -34,13 +44,18 @@ class PoseRefinement(nn.Module):
         motion: the estimated poses.
         skeleton: of the motion.
         frames: motion frames of the training images, repeats allowed.
+        uncertainty: of the motion's poses; its deviations bound the corrections.
     """
 
     rotations: Tensor
     translations: Tensor
     rest_joints: Tensor
+    rotation_bounds: Tensor
+    translation_bounds: Tensor
 
-    def __init__(self, motion: Motion, skeleton: Skeleton, frames: Sequence[int]) -> None:
+    def __init__(
+        self, motion: Motion, skeleton: Skeleton, frames: Sequence[int], uncertainty: PoseUncertainty | None = None
+    ) -> None:
         super().__init__()
         self.frames = sorted(set(frames))
         self.row = {frame: k for k, frame in enumerate(self.frames)}
@@ -50,17 +65,28 @@ class PoseRefinement(nn.Module):
             "rotations": motion.rotations[self.frames],
             "translations": motion.translations[self.frames],
             "rest_joints": skeleton.rest_joints,
+            "rotation_bounds": np.full((len(self.frames), len(self.parents), 3), ROTATION_BOUND),
+            "translation_bounds": np.full((len(self.frames), 3), TRANSLATION_BOUND),
         }
+        if uncertainty is not None:
+            rotations, translations = uncertainty.rotations[self.frames], uncertainty.translations[self.frames]
+            arrays["rotation_bounds"] = np.clip(DEVIATIONS * rotations, *ROTATION_LIMITS)
+            arrays["translation_bounds"] = np.clip(DEVIATIONS * translations, *TRANSLATION_LIMITS)
+        self.times = np.array(self.frames) / motion.fps
         for name, value in arrays.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32), persistent=False)
         joints = len(self.parents)
         self.raw = nn.ParameterList(torch.zeros(joints + 1, 3) for _ in self.frames)
 
     def bounded(self, frame: int) -> tuple[Tensor, Tensor]:
-        """δ [J, 3] as rotation vectors (rad) and the root's shift [3] m, of a motion frame."""
-        raw = self.raw[self.row[frame]]
-        rotation = ROTATION_BOUND * torch.tanh(raw[:-1] / ROTATION_BOUND)
-        return rotation, TRANSLATION_BOUND * torch.tanh(raw[-1] / TRANSLATION_BOUND)
+        """δ [J, 3] as rotation vectors (rad) and the root's shift [3] m, of a motion frame.
+
+        A step of the optimizer moves a correction in proportion to its bound.
+        """
+        row = self.row[frame]
+        raw, bounds = self.raw[row], self.rotation_bounds[row]
+        rotation = bounds * torch.tanh(raw[:-1] / ROTATION_BOUND)
+        return rotation, self.translation_bounds[row] * torch.tanh(raw[-1] / TRANSLATION_BOUND)
 
     def bones(self, frame: int) -> Tensor:
         """Bone transforms [J, 3, 4] of a motion frame, corrected; differentiable in the correction."""
@@ -90,9 +116,23 @@ class PoseRefinement(nn.Module):
         return torch.stack(shared)
 
     def prior(self, frame: int) -> Tensor:
-        """Mean square of a frame's correction in units of its bounds."""
-        rotation, shift = self.bounded(frame)
-        return (rotation / ROTATION_BOUND).square().mean() + (shift / TRANSLATION_BOUND).square().mean()
+        """Mean square of a frame's correction, and of its difference from its neighbours', in units of its bounds."""
+        row = self.row[frame]
+        rotation, shift = (part / bound for part, bound in zip(self.bounded(frame), self._bounds(row)))
+        result = rotation.square().mean() + shift.square().mean()
+        near = [k for k in (row - 1, row + 1) if 0 <= k < len(self.frames)]
+        near = [k for k in near if abs(self.times[k] - self.times[row]) <= SMOOTH_SECONDS]
+        if near:
+            with torch.no_grad():
+                around = [self.bounded(self.frames[k]) for k in near]
+                means = [torch.stack(parts).mean(0) / bound for parts, bound in zip(zip(*around), self._bounds(row))]
+            result = result + SMOOTH_WEIGHT * (
+                (rotation - means[0]).square().mean() + (shift - means[1]).square().mean()
+            )
+        return result
+
+    def _bounds(self, row: int) -> tuple[Tensor, Tensor]:
+        return self.rotation_bounds[row], self.translation_bounds[row]
 
     @torch.no_grad()
     def apply_to(self, motion: Motion) -> Motion:

@@ -20,6 +20,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.shading.light import texel_directions
 from rnd_trainer.config import TrainConfig
+from rnd_trainer.estimating.uncertainty import load_uncertainty
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
@@ -97,7 +98,9 @@ class Training:
         self.refinement: PoseRefinement | None = None
         if config.refine_poses:
             frames = [view.frame.frame for view in self.views]
-            self.refinement = PoseRefinement(capture.motion, capture.body.skeleton, frames).to(self.device)
+            motion, skeleton = capture.motion, capture.body.skeleton
+            unsure = load_uncertainty(capture.folder, motion.frame_count, len(skeleton))
+            self.refinement = PoseRefinement(motion, skeleton, frames, unsure).to(self.device)
 
         # objectives: of an image, and from the third stage on of unseen poses
         self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.consistency, self.generator)
