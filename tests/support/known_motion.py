@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rnd_runtime.capture.body import Body
-from rnd_runtime.motion.smpl import SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_REST_ROOT, SMPLH_NAMES, SMPLX_NAMES, SMPLX_REST_ROOT
 from support.paths import ASSETS
 
 SKELETON = Body.load(ASSETS / "body.npz").skeleton
@@ -29,6 +29,12 @@ def _motion() -> tuple[np.ndarray, np.ndarray]:
     t = np.linspace(0, 1, FRAMES)[:, None, None]
     poses = 0.5 * np.sin(2 * np.pi * t + rng.normal(size=(24, 3))) * rng.uniform(0.2, 1, (24, 3))
     poses[:, 22:] = 0
+    poses[:, [SMPL_NAMES.index(end) for end in ("head", "left_foot", "right_foot")]] *= 0.5
+    for joint, name in enumerate(SMPL_NAMES):  # knees and elbows bend about one axis
+        if name.endswith(("_knee", "_elbow")):
+            side = 1 if name.startswith("left") else -1
+            axis = np.array([1, 0, 0]) if name.endswith("_knee") else np.array([0, -side, 0])
+            poses[:, joint] = (0.7 + 0.5 * np.sin(2 * np.pi * t[:, 0] + joint)) * axis
     pelvis = np.stack([0.3 * t[:, 0, 0], 0.95 + 0.03 * np.sin(6 * t[:, 0, 0]), -0.2 * t[:, 0, 0]], -1)
     return poses, pelvis
 
@@ -223,7 +229,91 @@ def _gomavatar(folder):
     return folder / "sample.npy"
 
 
+def write_tram(folder):
+    """TRAM's of one person, before the camera, with its fourth image twice."""
+    matrices, trans = _before_a_camera()
+    order = [*range(FRAMES), 3]
+    content = {
+        "pred_cam": np.zeros((FRAMES + 1, 3)),
+        "pred_rotmat": matrices[order].astype(np.float32),
+        "pred_trans": trans[order, None],
+        "pred_shape": np.zeros((FRAMES + 1, 10)),
+        "frame": np.array(order),
+    }
+    np.save(folder / "hps_track_0.npy", content, allow_pickle=True)
+    return folder / "hps_track_0.npy"
+
+
+def write_vibe(folder):
+    """VIBE's, TCMR's and MAED's: before the camera, without positions."""
+    matrices, _ = _before_a_camera()
+    pose = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec().reshape(FRAMES, 72)
+    person = {"pose": pose, "betas": np.zeros((FRAMES, 10)), "pred_cam": np.ones((FRAMES, 3)), "joints2d": None}
+    return write_pickle(folder / "vibe_output.pkl", {1: person | {"frame_ids": np.arange(FRAMES)}})
+
+
+def _prompthmr(folder):
+    """PromptHMR's, a shorter person before ours."""
+    world = {"pose": flat(_wide(SMPLX_NAMES)), "trans": PELVIS - SMPLX_REST_ROOT, "shape": np.zeros((FRAMES, 10))}
+    short = {name: value[:3] for name, value in world.items()}
+    frames = np.arange(FRAMES)
+    people = {1: {"smplx_world": short, "frames": frames[:3]}, 2: {"smplx_world": world, "frames": frames}}
+    return write_pickle(folder / "results.pkl", {"camera": {"img_focal": 1000.0}, "people": people})
+
+
+def write_slahmr(folder, turn=None):
+    """SLAHMR's: two people, of whom the second is seen longer; its world is any, ``turn`` [3, 3] of ours."""
+    root, pelvis = Rotation.from_rotvec(POSES[:, 0]), PELVIS
+    plane = np.zeros(3)
+    if turn is not None:
+        root, pelvis, plane = Rotation.from_matrix(turn) * root, PELVIS @ turn.T, -2 * turn[:, 1]
+    mask = np.ones((2, FRAMES))
+    mask[0, 3:] = 0
+    members = {"root_orient": root.as_rotvec(), "pose_body": flat(POSES[:, 1:22]), "trans": pelvis - SMPL_REST_ROOT}
+    two = {name: np.stack([np.zeros_like(value), value]) for name, value in members.items()}
+    return write_npz(
+        folder / "me_000100_world_results.npz",
+        **two,
+        hand_pose=np.zeros((2, FRAMES, 90)),
+        floor_plane=[plane, plane],
+        track_mask=mask,
+        cam_R=np.tile(np.eye(3), (2, FRAMES, 1, 1)),
+    )
+
+
+def _motion_x(folder):
+    """Motion-X' 322 columns."""
+    numbers = np.zeros((FRAMES, 322))
+    numbers[:, :66], numbers[:, 309:312] = flat(POSES[:, :22]), PELVIS - SMPLX_REST_ROOT
+    numbers[:, 159:209] = 0.5  # expressions
+    np.save(folder / "motionx.npy", numbers)
+    return folder / "motionx.npy"
+
+
+def _beat2(folder):
+    """BEAT2's and EMAGE's: AMASS' members, but Y up."""
+    return write_npz(
+        folder / "beat2.npz",
+        poses=flat(_wide(SMPLX_NAMES)),
+        trans=PELVIS - SMPLX_REST_ROOT,
+        expressions=np.zeros((FRAMES, 100)),
+        model="smplx2020",
+        mocap_frame_rate=30,
+    )
+
+
+def _matrices(folder):
+    return write_npz(folder / "a.npz", poses=MATRICES, trans=PELVIS - SKELETON.rest_joints[0], fps=30)
+
+
+TILTED = Rotation.from_euler("xyz", [170, 20, 10], degrees=True).as_matrix()
+
 LAYOUTS = {
+    "SLAHMR": (write_slahmr, 30, DOUBLE),
+    "PromptHMR": (_prompthmr, 30, DOUBLE),
+    "Motion-X": (_motion_x, 30, DOUBLE),
+    "BEAT2": (_beat2, 30, DOUBLE),
+    "rotation matrices": (_matrices, 30, DOUBLE),
     "AMASS, SMPL-H": (_amass, 30, DOUBLE),
     "AMASS, SMPL-X": (lambda f: _amass(f, SMPLX_NAMES, SMPLX_REST_ROOT, "mocap_frame_rate"), 30, DOUBLE),
     "AMASS, split": (_stageii, 30, DOUBLE),

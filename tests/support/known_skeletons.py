@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 from support.known_motion import FRAMES, MATRICES, PELVIS, SKELETON, Y_UP
 
@@ -28,6 +29,32 @@ def _zero_pose(spread: dict[str, float]) -> np.ndarray:
             swing = Rotation.from_rotvec(spread[SMPL_NAMES[joint]] * across / np.linalg.norm(across))
             turns[joint] = turns[joint] @ swing.as_matrix()
     return turns
+
+
+_LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow")
+
+
+def world_rotations(rotations: np.ndarray, skeleton: Skeleton = SKELETON) -> np.ndarray:
+    """[F, J, 3, 3] of local ``rotations``."""
+    return skeleton.joint_transforms(rotations, np.zeros((len(rotations), 3)))[..., :3, :3]
+
+
+def degrees_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles [...] in degrees between rotations [..., 3, 3]."""
+    return np.degrees(np.arccos(np.clip(((a * b).sum((-1, -2)) - 1) / 2, -1, 1)))
+
+
+def assert_same_poses(rotations: np.ndarray, expected: np.ndarray, degrees: float = 5.0, limbs: float = 1.0) -> None:
+    """Local rotations [F, J, 3, 3] of ``SKELETON``: joints within ``degrees``, directions of limbs within ``limbs``."""
+    ours, theirs = world_rotations(rotations), world_rotations(expected)
+    apart = degrees_apart(ours, theirs).max(0)
+    assert apart.max() < degrees, {name: round(float(a), 1) for name, a in zip(SMPL_NAMES, apart) if a >= degrees}
+    for child, parent in enumerate(SMPL_PARENTS):
+        if SMPL_NAMES[parent].endswith(_LIMBS):
+            bone = SKELETON.rest_joints[child] - SKELETON.rest_joints[parent]
+            bone /= np.linalg.norm(bone)
+            cosines = ((ours[:, parent] @ bone) * (theirs[:, parent] @ bone)).sum(-1)
+            assert np.degrees(np.arccos(np.clip(cosines, -1, 1))).max() < limbs, SMPL_NAMES[parent]
 
 
 A_POSE = {"left_shoulder": -0.8, "right_shoulder": 0.8, "left_hip": 0.3, "right_hip": -0.3}

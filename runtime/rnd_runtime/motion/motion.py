@@ -17,24 +17,29 @@ from rnd_runtime.core.files import is_folder
 from rnd_runtime.core.kinds import explained
 from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import matrix_to_axis_angle
-from rnd_runtime.motion.readers.arrays import check_translations, read_motion_file
+from rnd_runtime.motion.formats.recordings import Recording, folder_files, read_recording
+from rnd_runtime.motion.formats.vectors import JointPaths
+from rnd_runtime.motion.readers.arrays import MotionRecord, check_translations
+from rnd_runtime.motion.readers.asf_amc import asf_beside
 
 from .interpolation import interpolate_points, interpolate_rotations
-from .joint_names import load_joint_map, match_joints
+from .joint_names import joints_of_map, load_joint_map, match_joints
+from .limbs import Bones
+from .retarget import Retargeted, retarget, retarget_tracks
 from .skeleton import Skeleton, moving_joints
 from .smpl import SMPL_REST_ROOT
+from .solving.solve import Tracks
+from .standing import UP_ROTATIONS, up_axis
 
 Floats = NDArray[np.float64]
 
-Z_UP_TO_Y_UP: Floats = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+Z_UP_TO_Y_UP: Floats = UP_ROTATIONS["z"]
 """(x, y, z) of a Z-up world → (x, z, −y)"""
 
 # In files with fingers the index finger's base drives SMPL's joint of the hand, as in ml-hugs.
 STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"}
 
 _PART_OF_A_FRAME = 1e-4  # tolerance of rounded durations and rates
-
-_MOCAP = (".bvh", ".amc")
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +153,13 @@ def load_motion(
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise InputError("fps", expected="a positive number", got=fps)
     try:
-        if Path(path).suffix.lower() in _MOCAP:
-            motion = _load_mocap(path, skeleton, up, joint_map)
+        recording = read_recording(path, joint_names)
+        if isinstance(recording, Recording):
+            motion = _load_recording(recording, path, skeleton, up, joint_map)
+        elif isinstance(recording, JointPaths):
+            motion = _load_positions(recording, path, skeleton, up)
         else:
-            motion = _load_arrays(path, skeleton, up, joint_names, joint_map)
+            motion = _load_arrays(recording, path, skeleton, up, joint_map)
     except InputError as error:
         raise explained(error, path, "motion") from error
     if fps is None:
@@ -161,75 +169,86 @@ def load_motion(
 
 
 def motion_inputs(path: str | Path) -> list[Path]:
-    """The files that ``load_motion`` reads of ``path``: itself, an .amc with its .asf, a folder's .json files.
+    """The files that ``load_motion`` reads of ``path``: itself, an .amc with its .asf, a folder's files.
 
     Raises:
         InputError: for an .amc without a skeleton.
     """
     path = Path(path)
     if is_folder(path):
-        from rnd_runtime.motion.readers.video_fits import easymocap_files
-
-        return easymocap_files(path)
-    if path.suffix.lower() != ".amc":
-        return [path]
-    from rnd_runtime.motion.readers.asf_amc import asf_beside
-
-    return [path, asf_beside(path)]
+        return folder_files(path)
+    return [path, asf_beside(path)] if path.suffix.lower() == ".amc" else [path]
 
 
-def _matched(names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | None) -> dict[str, int]:
+def _matched(
+    names: Sequence[str], skeleton: Skeleton, joint_map: str | Path | None, bones: Bones | None = None
+) -> dict[str, int]:
     table = None if joint_map is None else load_joint_map(joint_map)
-    return match_joints(names, skeleton.names, table, joint_map)
+    return match_joints(names, skeleton.names, table, joint_map, bones)
 
 
-def _load_mocap(path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None) -> Motion:
-    from .retarget import retarget
-
-    if Path(path).suffix.lower() == ".bvh":
-        from rnd_runtime.motion.readers.bvh import read_bvh
-
-        tree = read_bvh(path)
+def _load_recording(
+    recording: Recording, path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None
+) -> Motion:
+    tree = recording.tree
+    if recording.matched is None:
+        matched = _matched(tree.names, skeleton, joint_map, Bones(tree.parents, tree.offsets))
     else:
-        from rnd_runtime.motion.readers.asf_amc import read_amc
+        named = recording.matched | ({} if joint_map is None else joints_of_map(joint_map, tree.names, skeleton.names))
+        matched = {name: index for name, index in named.items() if name in skeleton.names}
+    moved = retarget(tree, skeleton, matched, up)
+    return _retargeted(moved, len(tree.rotations), tree.fps, path, skeleton)
 
-        tree = read_amc(path)
-    moved = retarget(tree, skeleton, _matched(tree.names, skeleton, joint_map), up)
-    first = len(tree.rotations) - len(moved.rotations)
+
+def _load_positions(paths: JointPaths, path: str | Path, skeleton: Skeleton, up: str) -> Motion:
+    points = {name: paths.positions[:, k] for k, name in enumerate(paths.names)}
+    moved = retarget_tracks(Tracks(points, fps=paths.fps), skeleton, up)
+    moved = replace(moved, notes=(*paths.notes, *moved.notes))
+    return _retargeted(moved, len(paths.positions), paths.fps, path, skeleton)
+
+
+def _retargeted(moved: Retargeted, frames: int, fps: float, path: str | Path, skeleton: Skeleton) -> Motion:
+    first = frames - len(moved.rotations)
     finite = np.isfinite(moved.rotations).all((1, 2, 3)) & np.isfinite(moved.translations).all(1)
     if not finite.all():
         got = "others after retargeting"
         raise InputError("motion", expected="finite numbers", got=got, frame=first + int(np.argmin(finite)))
     check_translations(moved.translations, path, first)
-    return Motion(
-        moved.rotations, moved.translations, tree.fps, skeleton.names, str(path), moved.notes, left_out=moved.left_out
-    )
+    names, notes = skeleton.names, moved.notes
+    return Motion(moved.rotations, moved.translations, fps, names, str(path), notes, left_out=moved.left_out)
 
 
 def _load_arrays(
-    path: str | Path, skeleton: Skeleton, up: str, joint_names: tuple[str, ...] | None, joint_map: str | Path | None
+    record: MotionRecord, path: str | Path, skeleton: Skeleton, up: str, joint_map: str | Path | None
 ) -> Motion:
-    record = read_motion_file(path, joint_names)
     names = list(record.joint_names)
     if joint_map is not None:
         matched = _matched(names, skeleton, joint_map)
         names = ["" if name in matched else name for name in names]
         for ours, column in matched.items():
             names[column] = ours
-    z_up = (record.up if up == "auto" else up) == "z"
     rotations, used, notes = _match_joints(record.rotations, tuple(names), skeleton, path)
     left_out = tuple(record.joint_names[k] for k in np.flatnonzero(moving_joints(record.rotations)) if k not in used)
+    axis, found = _up_of(record, rotations[:, 0], up)
     translations, rest_root = record.translations, record.rest_root
-    if z_up and rest_root is None:
+    if axis != "y" and rest_root is None:
         rest_root = SMPL_REST_ROOT
     if rest_root is not None:
-        root_positions = rest_root + translations
-        if z_up:
-            root_positions = root_positions @ Z_UP_TO_Y_UP.T
-            rotations[:, 0] = Z_UP_TO_Y_UP @ rotations[:, 0]
-        translations = root_positions - skeleton.rest_joints[0]
-    notes = record.notes + notes
+        world = UP_ROTATIONS[axis]
+        rotations[:, 0] = world @ rotations[:, 0]
+        translations = (rest_root + translations) @ world.T - skeleton.rest_joints[0]
+    notes = record.notes + found + notes
     return Motion(rotations, translations, record.fps, skeleton.names, str(path), notes, left_out=left_out)
+
+
+def _up_of(record: MotionRecord, root: Floats, up: str) -> tuple[str, tuple[str, ...]]:
+    """The up axis of the file, and notes: ``up`` unless "auto", what the file states, or how the trunk stands."""
+    if up != "auto":
+        return up, ()
+    if record.up_stated:
+        return record.up, ()
+    rest_root = SMPL_REST_ROOT if record.rest_root is None else record.rest_root
+    return up_axis(root[:, :, 1], rest_root + record.translations, record.up)
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:

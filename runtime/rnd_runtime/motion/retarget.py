@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +13,21 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.readers.tree import MocapTree
 
 from .skeleton import Skeleton, moving_joints
+from .solving.bones import SPINE, hips, leg_length
+from .solving.directions import unit
+from .solving.palms import palm_axes
+from .solving.solve import Tracks, solve
+from .standing import UP_ROTATIONS, up_axis
 
 Floats = NDArray[np.float64]
 
-# Joints whose bones keep their direction. Not the back, whose joints differ between skeletons; hands and feet follow
-# their parents.
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
-_STANDS = np.cos(np.radians(30))  # max lean of a standing zero pose
-_LIES, _STANDS_HIGH = (0.02, 0.65), (0.75, 1.3)  # height of hips above the floor, leg lengths
-_UP_CLEAR = 0.3  # min mean cosine of the trunk and the zero pose's up
+_LEG = 0.85  # m, against which heights are judged
+_APART = 1e-3  # of a leg, min distance of the hips and length of the trunk
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time, against noise
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, mean of bodies within 3 mm
 _STANDS_AT_ZERO = 0.05  # m, tolerance for the sole of a template that stands on y = 0
+_BACKWARDS = 0.5  # min mean cosine of toes and knees that say that left is right
 _T_POSE = np.radians(15)
 _T_POSE_LEAP = np.radians(20)
 
@@ -44,12 +46,7 @@ class Retargeted:
 
 
 def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up: str = "auto") -> Retargeted:
-    """Retarget the motion of ``tree`` to ``skeleton``.
-
-    A joint's world rotation is ``G_k = W Q_k Bᵀ A_k``: Q_k the recorded one, B and W the rotations from the zero pose's
-    and the world's axes to the avatar's, A_k the smallest rotation from the avatar's bone direction to the file's.
-    Lengths scale with the legs, and the feet stand on y = 0. The motion is rotated by quarters to begin facing +Z. A
-    leading reference T-pose is left out.
+    """Retarget the motion of ``tree`` to ``skeleton``: ``retarget_tracks`` of the joints' positions and rotations.
 
     Args:
         matched: index in ``tree`` of each of the avatar's joints; the others stay at rest.
@@ -58,47 +55,128 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
     Raises:
         InputError: ``matched`` lacks hips or knees, which give the person's size.
     """
+    recorded = tree.global_rotations()
+    positions = tree.positions(recorded)
+    tracks = Tracks(
+        {name: positions[:, joint] for name, joint in matched.items()},
+        {name: recorded[:, joint] for name, joint in matched.items()},
+        palm_axes(tree, positions, matched),
+        tree.fps,
+    )
+    moved = retarget_tracks(tracks, skeleton, up, "z" if _stands_along_z(tree, matched) else "y")
+    return replace(moved, notes=(*tree.notes, *moved.notes), left_out=_left_out(tree, set(matched.values())))
+
+
+def retarget_tracks(tracks: Tracks, skeleton: Skeleton, up: str = "auto", usual_up: str = "y") -> Retargeted:
+    """Retarget positions, and rotations where there are any, to ``skeleton`` (``.solve``).
+
+    Lengths scale with the legs, and the feet stand on y = 0. The motion is rotated by quarters to begin facing +Z. A
+    leading reference T-pose is left out. A mirrored recording, in left-handed axes, is mirrored back.
+
+    Args:
+        tracks: in the file's axes.
+        up: the file's up axis, "y" or "z"; "auto" infers it from the trunk.
+        usual_up: the axis that a person who lies is taken to lie on.
+
+    Raises:
+        InputError: ``tracks`` lack hips or knees, or have them in one position.
+    """
+    _check(tracks.points)
+    tracks, notes = _upright(tracks, up, usual_up)
+    rotations = _local_rotations(solve(tracks, skeleton), skeleton)
+    limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in tracks.points]
+    if first := _reference_frames(rotations[:, limbs]):
+        tracks = tracks.after(first)
+        rotations = _local_rotations(solve(tracks, skeleton), skeleton)
+    quarters = _quarters_to_front(rotations[0, 0])
+    heading = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
+    rotations[:, 0] = heading @ rotations[:, 0]
+
+    rest = dict(zip(skeleton.names, skeleton.rest_joints))
+    scale = leg_length({name: rest[name] for name in tracks.points}) / leg_length(tracks.points)
+    pelvis = scale * hips(tracks.points) @ heading.T - rotations[:, 0] @ (hips(rest) - skeleton.rest_joints[0])
+    translations = pelvis - skeleton.rest_joints[0]
+    translations[:, 1] -= _floor(skeleton, rotations, translations)
+    if quarters:
+        notes.append(f"rotated by {quarters * 90:+d}° about the vertical, to begin facing the front")
+    if first:
+        notes.append("the first frame, a T-pose for reference, is left out")
+    if resting := [name for name in skeleton.names if name not in tracks.points]:
+        notes.append(f"joints that the motion lacks stay at rest: {', '.join(resting)}")
+    return Retargeted(rotations, translations, tuple(notes), ())
+
+
+def _check(points: Mapping[str, Floats]) -> None:
     needed = ("left_hip", "right_hip", "left_knee", "right_knee")
-    if missing := [name for name in needed if name not in matched]:
+    if missing := [name for name in needed if name not in points]:
         raise InputError(
             "joints of the motion",
             expected=", ".join(needed),
             got=f"no {', '.join(missing)}",
             hint="name them in a file given as --joint-map",
         )
-    source_rest = tree.zero_positions()
-    theirs = {name: source_rest[index] for name, index in matched.items()}
-    ours = {name: skeleton.rest_joints[k] for k, name in enumerate(skeleton.names) if name in matched}
-    to_ours = _body_frame(ours) @ _body_frame(theirs).T
-    recorded = tree.global_rotations()
-    root = matched.get(skeleton.names[0], 0)
-    path = tree.path(root, recorded)
-    world, up_notes = _upright(recorded[:, root], path / _leg(theirs), to_ours, up)
-    rotations_world = _world_rotations(tree, recorded, world, to_ours, skeleton, matched)
-    rotations = _local_rotations(rotations_world, skeleton)
-    limbs = [k for k, name in enumerate(skeleton.names) if name in _LIMBS and name in matched]
-    first = _reference_frames(rotations[:, limbs])
-    quarters = _quarters_to_front(rotations_world[first, 0])
-    heading = axis_angle_to_matrix([0, quarters * np.pi / 2, 0])
-    rotations, world = rotations[first:], heading @ world
-    rotations[:, 0] = heading @ rotations[:, 0]
+    leg = leg_length(points)
+    if leg < 1e-9:
+        raise InputError("skeleton of the motion", expected="legs", got="hips and knees in one position")
+    apart = (points["left_hip"] - points["right_hip"], _trunk(points))
+    if min(float(np.median(np.linalg.norm(vector, axis=-1))) for vector in apart) < _APART * leg:
+        raise InputError("skeleton of the motion", expected="hips apart and a trunk", got="joints in one position")
 
-    scale = _leg(ours) / _leg(theirs)
-    hips_theirs = (theirs["left_hip"] + theirs["right_hip"]) / 2
-    hips_ours = (ours["left_hip"] + ours["right_hip"]) / 2 - skeleton.rest_joints[0]
-    hips = (path + recorded[:, root] @ (hips_theirs - source_rest[root]))[first:]
-    pelvis = scale * hips @ world.T - rotations[:, 0] @ hips_ours
-    translations = pelvis - skeleton.rest_joints[0]
-    translations[:, 1] -= _floor(skeleton, rotations, translations)
-    notes = [*tree.notes, *up_notes]
-    if quarters:
-        notes.append(f"rotated by {quarters * 90:+d}° about the vertical, to begin facing the front")
-    if first:
-        notes.append("the first frame, a T-pose for reference, is left out")
-    resting = [name for name in skeleton.names if name not in matched]
-    if resting:
-        notes.append(f"joints that the motion lacks stay at rest: {', '.join(resting)}")
-    return Retargeted(rotations, translations, tuple(notes), _left_out(tree, set(matched.values())))
+
+def _trunk(points: Mapping[str, Floats]) -> Floats:
+    """From the hips to the highest joint of the trunk [F, 3], or from the knees to the hips."""
+    high = next((points[name] for name in ("neck", "head", *SPINE[::-1]) if name in points), None)
+    return hips(points) - (points["left_knee"] + points["right_knee"]) / 2 if high is None else high - hips(points)
+
+
+def _stands_along_z(tree: MocapTree, matched: Mapping[str, int]) -> bool:
+    """Whether the zero pose's trunk points along +Z."""
+    zero = tree.zero_positions()
+    points = {name: zero[joint] for name, joint in matched.items()}
+    if not {"left_hip", "right_hip", "left_knee", "right_knee"} <= points.keys():
+        return False
+    return bool(unit(_trunk(points))[2] > 0.8)
+
+
+def _upright(tracks: Tracks, up: str, usual_up: str) -> tuple[Tracks, list[str]]:
+    """``tracks`` with Y up and right-handed, and notes."""
+    axis, notes = up, list[str]()
+    if up == "auto":
+        heights = hips(tracks.points) * _LEG / leg_length(tracks.points)
+        axis, found = up_axis(unit(_trunk(tracks.points)), heights, usual_up)
+        notes += [note for note in found if axis != "y" or usual_up == "y"]
+    world = UP_ROTATIONS[axis]
+    if _is_mirrored(tracks.points):
+        world = np.diag([-1.0, 1, 1]) @ world
+        notes.append("the skeleton's left is its right, as in left-handed axes: mirrored back")
+
+    def moved(vectors: Floats) -> Floats:
+        return vectors @ world.T
+
+    flip = np.diag([np.linalg.det(world), 1.0, 1.0])  # the recorded axes stay right-handed
+    return replace(
+        tracks,
+        points={name: moved(points) for name, points in tracks.points.items()},
+        rotations={name: world @ rotations @ flip for name, rotations in tracks.rotations.items()},
+        palms={side: (moved(axis), at_rest) for side, (axis, at_rest) in tracks.palms.items()},
+    ), notes
+
+
+def _is_mirrored(points: Mapping[str, Floats]) -> bool:
+    """Whether toes point and knees bend to where the back is, by the hips' left and right."""
+    forward = unit(np.cross(points["left_hip"] - points["right_hip"], _trunk(points)))
+    seen = []
+    for side in ("left", "right"):
+        hip, knee, ankle, toe = (points.get(f"{side}_{joint}") for joint in ("hip", "knee", "ankle", "foot"))
+        if ankle is None:
+            continue
+        if toe is not None and np.median(np.linalg.norm(toe - ankle, axis=-1)) > _APART * leg_length(points):
+            seen.append(float((unit(toe - ankle) * forward).sum(-1).mean()))
+        bend = unit(knee - hip) - unit(ankle - knee)  # points to where the knee does
+        weight = (bend * bend).sum(-1)
+        if (weight > 0.1).any():
+            seen.append(float((bend * forward).sum(-1)[weight > 0.1].mean() / np.sqrt(weight[weight > 0.1].mean())))
+    return len(seen) >= 2 and max(seen) < -_BACKWARDS
 
 
 def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
@@ -110,20 +188,6 @@ def _left_out(tree: MocapTree, matched: set[int]) -> tuple[str, ...]:
     return tuple(tree.names[k] for k in np.flatnonzero(moving_joints(tree.rotations)) if k not in carry)
 
 
-def _world_rotations(
-    tree: MocapTree, recorded: Floats, world: Floats, to_ours: Floats, skeleton: Skeleton, matched: Mapping[str, int]
-) -> Floats:
-    """World rotations G [F, J, 3, 3] of the avatar's joints from ``recorded`` [F, ·, 3, 3]."""
-    aligned = _alignments(skeleton, matched, tree, to_ours)
-    rotations: Floats = np.empty((len(recorded), len(skeleton), 3, 3))
-    for joint, name in enumerate(skeleton.names):
-        if joint == 0 or name in matched:
-            rotations[:, joint] = world @ recorded[:, matched.get(name, 0)] @ to_ours.T @ aligned[joint]
-        else:
-            rotations[:, joint] = rotations[:, skeleton.parents[joint]]
-    return rotations
-
-
 def _local_rotations(rotations: Floats, skeleton: Skeleton) -> Floats:
     """World rotations [F, J, 3, 3] in each parent's frame."""
     above = rotations[:, np.maximum(skeleton.parents, 0)].copy()
@@ -132,107 +196,11 @@ def _local_rotations(rotations: Floats, skeleton: Skeleton) -> Floats:
     return local
 
 
-def _body_frame(joints: Mapping[str, Floats]) -> Floats:
-    """[3, 3] whose columns are left (from the hips), up (the axis nearest to the trunk) and forward of the body."""
-    left = joints["left_hip"] - joints["right_hip"]
-    hips = (joints["left_hip"] + joints["right_hip"]) / 2
-    high = [joints[name] for name in ("head", "neck", "spine3", "spine2", "spine1") if name in joints]
-    knees = (joints["left_knee"] + joints["right_knee"]) / 2
-    up = high[0] - hips if high else hips - knees
-    axis = np.eye(3)[np.abs(up).argmax()] * np.sign(up[np.abs(up).argmax()])
-    if axis @ up > _STANDS * np.linalg.norm(up):
-        up = axis
-    forward = np.cross(left, up)
-    axes = np.stack([np.cross(up, forward), up, forward], -1)
-    lengths = np.linalg.norm(axes, axis=0)
-    if lengths.min() < 1e-9:
-        raise InputError("skeleton of the motion", expected="hips apart and a trunk", got="joints in one position")
-    frame: Floats = axes / lengths
-    return frame
-
-
-def _upright(root: Floats, path: Floats, to_ours: Floats, up: str) -> tuple[Floats, tuple[str, ...]]:
-    """Rotation [3, 3] from the file's up axis to Y, and a note where the trunk stands along another axis.
-
-    ``path`` [F, 3] is the root's in leg lengths: a person lies or crawls with hips half a leg above the floor.
-    """
-    trunk = to_ours.T[:, 1]  # up in the zero pose
-    stands = (root @ trunk).mean(0)
-    axis = trunk
-    notes: tuple[str, ...] = ()
-    if up != "auto":
-        axis = np.eye(3)["xyz".index(up)]
-    elif stands @ trunk <= _UP_CLEAR:
-        along = np.eye(3)[np.abs(stands).argmax()] * np.sign(stands[np.abs(stands).argmax()])
-        low, high = (float(np.median(path @ direction)) for direction in (trunk, along))
-        ours, other = _axis_name(trunk), _axis_name(along)
-        if _LIES[0] < low < _LIES[1] and not _STANDS_HIGH[0] < high < _STANDS_HIGH[1]:
-            notes = (f"the trunk lies along {other}, and {ours} stays up, as in the zero pose{_overrules(other)}",)
-        else:
-            axis = along
-            notes = (f"{other} is taken for up, as the trunk stands along it{_overrules(ours)}",)
-    return _swing(axis, np.array([0.0, 1.0, 0.0])), notes
-
-
-def _axis_name(axis: Floats) -> str:
-    """The coordinate axis nearest to ``axis``: "y", "-z"."""
-    largest = int(np.abs(axis).argmax())
-    return ("-" if axis[largest] < 0 else "") + "xyz"[largest]
-
-
-def _overrules(axis: str) -> str:
-    return f"; --motion-up {axis} overrules" if axis in ("y", "z") else ""
-
-
 def _quarters_to_front(root: Floats) -> int:
     """Quarter rotations about Y, −1 to 2, that bring a root rotation [3, 3] nearest to facing +Z."""
     x, _, z = root[:, 2]
     quarters = -round(np.arctan2(x, z) / (np.pi / 2)) if np.hypot(x, z) > 0.5 else 0  # 0 for a lying person
     return 2 if quarters == -2 else quarters
-
-
-def _alignments(skeleton: Skeleton, matched: Mapping[str, int], tree: MocapTree, to_ours: Floats) -> dict[int, Floats]:
-    """Rotation [3, 3] of each joint from the avatar's rest pose to the file's zero pose, in the avatar's axes."""
-    rest = tree.zero_positions()
-    aligned: dict[int, Floats] = {}
-    for joint, name in enumerate(skeleton.names):
-        parent = int(skeleton.parents[joint])
-        inherited = aligned[parent] if joint else np.eye(3)
-        aligned[joint] = inherited
-        children = [
-            child for child, above in enumerate(skeleton.parents) if above == joint and skeleton.names[child] in matched
-        ]
-        if name not in _LIMBS or name not in matched or not children:
-            continue
-        ours = inherited @ (skeleton.rest_joints[children[0]] - skeleton.rest_joints[joint])
-        theirs = to_ours @ (rest[matched[skeleton.names[children[0]]]] - rest[matched[name]])
-        if min(np.linalg.norm(ours), np.linalg.norm(theirs)) > 1e-9:
-            aligned[joint] = _swing(ours, theirs) @ inherited
-    return aligned
-
-
-def _swing(a: Floats, b: Floats) -> Floats:
-    """The smallest rotation from direction ``a`` to direction ``b``."""
-    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-9:
-        if cosine > 0:
-            return np.eye(3)
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        return axis_angle_to_matrix(np.pi * axis / np.linalg.norm(axis))
-    return axis_angle_to_matrix(axis / sine * np.arctan2(sine, cosine))
-
-
-def _leg(joints: Mapping[str, Floats]) -> float:
-    """Mean length from hip to knee, and to the ankle where known."""
-    lengths = []
-    for side in ("left", "right"):
-        chain = [joints[f"{side}_{joint}"] for joint in ("hip", "knee", "ankle") if f"{side}_{joint}" in joints]
-        lengths.append(sum(float(np.linalg.norm(b - a)) for a, b in pairwise(chain)))
-    if min(lengths) < 1e-9:
-        raise InputError("skeleton of the motion", expected="legs", got="hips and knees in one position")
-    return sum(lengths) / 2
 
 
 def _floor(skeleton: Skeleton, rotations: Floats, translations: Floats) -> float:

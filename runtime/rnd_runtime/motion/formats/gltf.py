@@ -142,9 +142,7 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     nodes = document.json.get("nodes", [])
     animations = document.json.get("animations", [])
     if not animations:
-        vrm = {"VRM", "VRMC_vrm"} & set(document.json.get("extensions", {}))
-        hint = "a VRM is a character: its motions are .vrma files" if vrm else "export the animation with the armature"
-        raise InputError("glTF file", expected="an animation", got="none", hint=hint)
+        raise InputError("glTF file", expected="an animation", got="none")
     parents = _parents(nodes)
     animation = animations[0]
     tracks = _channels(document, animation, len(nodes))

@@ -20,9 +20,9 @@ from rnd_runtime.motion.readers.tree import Floats, MocapTree
 from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_runtime.motion.readers.video_fits import trailing_number
 
-from .rigs import MHR127, rigidity, world_tree
+from .rigs import MHR127, WorldTree, rigidity, world_tree
 
-_NEEDED = ("pred_cam_t", "pred_joint_coords", "pred_global_rots")
+NEEDED = ("pred_cam_t", "pred_joint_coords", "pred_global_rots")
 _WRAPPERS = ("frames", "outputs", "results", "people", "persons")
 _SUFFIXES = (".npz", ".npy", ".pkl", ".pt", ".json")
 _FLIP = np.diag([1.0, -1.0, -1.0])  # camera's right, down, forward ↔ right, up, backward
@@ -55,10 +55,14 @@ class BodyTrack:
     focal: float | None
     notes: tuple[str, ...]
 
+    def as_seen(self) -> WorldTree:
+        """The skeleton of the pelvis and all below it at ``frames``, the camera at the origin."""
+        parents = [parent - 1 for parent in MHR127.parents[1:]]
+        return world_tree(MHR127.names[1:], parents, self.positions[:, 1:], self.rotations[:, 1:], VIDEO_FPS)
+
     def tree(self, path: str | Path) -> MocapTree:
         """The motion of the pelvis and all below it, with gaps interpolated, beginning above the origin."""
-        parents = [parent - 1 for parent in MHR127.parents[1:]]
-        tree = world_tree(MHR127.names[1:], parents, self.positions[:, 1:], self.rotations[:, 1:], VIDEO_FPS)
+        tree = self.as_seen()
         poses = matrix_to_axis_angle(tree.rotations).reshape(len(self.frames), -1)
         poses, world, filled = without_gaps(self.frames, poses, tree.world.reshape(len(self.frames), -1), path)
         rotations = axis_angle_to_matrix(poses.reshape(len(poses), -1, 3))
@@ -90,7 +94,7 @@ def read_sam3d(content: Any, path: str | Path) -> BodyTrack:
         last = places[index]
         chosen.append((frame, people[index]))
     frames = np.array([frame for frame, _ in chosen], np.int64)
-    persons = Members({name: [np.asarray(p[name], np.float64) for _, p in chosen] for name in _NEEDED}, path)
+    persons = Members({name: [np.asarray(p[name], np.float64) for _, p in chosen] for name in NEEDED}, path)
     joints, rotations = persons.numbers("pred_joint_coords"), persons.numbers("pred_global_rots")
     count = len(MHR127.names)
     if joints.shape[1:] != (count, 3) or rotations.shape[1:] != (count, 3, 3):
@@ -132,14 +136,14 @@ def _content(file: Path) -> Any:
             raise InputError("cannot be read", expected="JSON", got=str(error), file=file) from error
     if file.suffix.lower() == ".npz":
         with Npz(file, what="SAM 3D Body's results") as archive:
-            return {name: archive.numbers(name) for name in (*_NEEDED, "focal_length") if name in archive.names}
+            return {name: archive.numbers(name) for name in (*NEEDED, "focal_length") if name in archive.names}
     return read_pickle(file, what="SAM 3D Body's results")
 
 
 def _moments(content: Any) -> list[tuple[int, list[Person]]]:
     """(number, people) of each image in any of the forms in which the results are kept; empty for other content."""
     if isinstance(content, Mapping):
-        if set(_NEEDED) <= content.keys():
+        if set(NEEDED) <= content.keys():
             if np.ndim(content["pred_joint_coords"]) < 3:
                 return [(0, [content])]
             return [(k, [_row(content, k)]) for k in range(len(content["pred_joint_coords"]))]
@@ -165,7 +169,7 @@ def _ascending(moments: list[tuple[int, list[Person]]]) -> list[tuple[int, list[
 def _people(value: Any) -> list[Person]:
     """People of one image."""
     if isinstance(value, Mapping):
-        if set(_NEEDED) <= value.keys():
+        if set(NEEDED) <= value.keys():
             joints = value["pred_joint_coords"]
             return [value] if np.ndim(joints) < 3 else [_row(value, k) for k in range(len(joints))]
         inner = next((value[name] for name in _WRAPPERS if name in value), None)
@@ -173,13 +177,13 @@ def _people(value: Any) -> list[Person]:
             inner = list(value.values())
         return [] if isinstance(inner, Mapping) and not inner else _people(inner) if isinstance(inner, Sequence) else []
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [person for person in value if isinstance(person, Mapping) and set(_NEEDED) <= person.keys()]
+        return [person for person in value if isinstance(person, Mapping) and set(NEEDED) <= person.keys()]
     return []
 
 
 def _row(arrays: Person, k: int) -> Person:
     """Entry ``k`` of arrays over images or people."""
-    row = {name: np.asarray(arrays[name])[k] for name in _NEEDED}
+    row = {name: np.asarray(arrays[name])[k] for name in NEEDED}
     if arrays.get("focal_length") is not None:
         focal = np.reshape(arrays["focal_length"], -1)
         row["focal_length"] = focal[min(k, len(focal) - 1)]

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.files import is_folder
-from rnd_runtime.core.npz import Members, Npz
-from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.core.npz import Members
+from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPL_REST_ROOT, SMPLX_REST_ROOT
 
 Floats = NDArray[np.float64]
@@ -24,7 +23,7 @@ _MAX_DISTANCE = 1000.0  # m; more suggests millimetres
 _MAX_HEIGHT, _MAX_SPEED = 100.0, 20.0  # m, m/s, of the median frame: a sprinter has 12 m/s
 _ORDERS = ("times", "timestamps", "frame_ids", "frame_id")
 _DEFAULT_FPS = 60.0
-PICKLE_SUFFIXES = (".pkl", ".pickle", ".joblib", ".pt", ".pth", ".npy")
+_ORTHOGONAL = 0.02  # largest element of R Rᵀ − 1
 FPS_LIMITS = (1e-3, 1e4)
 
 
@@ -39,6 +38,7 @@ class MotionRecord:
         joint_names: J names.
         fps: frames per second.
         up: the up axis, "y" or "z".
+        up_stated: whether the file states it.
         notes: assumptions and omissions.
     """
 
@@ -48,11 +48,18 @@ class MotionRecord:
     joint_names: tuple[str, ...]
     fps: float
     up: str
+    up_stated: bool
     notes: tuple[str, ...]
 
 
-def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = None) -> MotionRecord:
-    """Read a motion from arrays of a known layout: an .npz, or a pickle or folder (``pickles.read_track``).
+def read_arrays(
+    members: Members,
+    joint_names: tuple[str, ...] | None = None,
+    rest_root: Floats | None = None,
+    notes: tuple[str, ...] = (),
+    up: str | None = None,
+) -> MotionRecord:
+    """Read a motion from arrays of a known layout.
 
     ======================================================  ==========================================  ====
     members                                                 joints                                      up
@@ -69,27 +76,19 @@ def read_motion_file(path: str | Path, joint_names: tuple[str, ...] | None = Non
     ``poses`` (F,3J) and ``joint_names`` (J)                any; what ``motion.save_motion`` writes  y
     ======================================================  ==========================================  ====
 
-    ``up_axis`` ("y" or "z") in the file overrides the column *up*. Frame rate: ``mocap_framerate``,
-    ``mocap_frame_rate`` or ``fps``; without one, 60 is assumed and noted.
+    ``poses`` may be rotation matrices (F,J,3,3). ``up_axis`` ("y" or "z") in the file overrides the column *up*.
+    Frame rate: ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``; without one, 60 is assumed and noted.
 
     Args:
         joint_names: the joints of the columns, for a file without names (a capture's motion).
+        rest_root: [3] m, the rest position that translations refer to; by default the layout's.
+        notes: of who found the members.
+        up: the layout's up axis; by default that of the table.
 
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
-    if is_folder(path) or Path(path).suffix.lower() in PICKLE_SUFFIXES:
-        from .pickles import read_track
-
-        track = read_track(path)
-        return _read(track.members, joint_names, track.rest_root, list(track.notes))
-    with Npz(path, what="motion") as archive:
-        return _read(archive, joint_names, None, [])
-
-
-def _read(
-    members: Members, joint_names: tuple[str, ...] | None, rest_root: Floats | None, notes: list[str]
-) -> MotionRecord:
+    notes = [*notes]
     easymocap = members.first_of("Rh", "Rh_all") is not None
     axis_angles = _axis_angles(members, notes, joint_names)
     names = names_of_joints(members, axis_angles.shape[1], joint_names)
@@ -119,13 +118,14 @@ def _read(
     if fps is None:
         notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
         fps = _DEFAULT_FPS
-    up = _up_axis(members, default="z" if amass or easymocap else "y")
+    stated = _up_axis(members)
+    up = stated or up or ("z" if amass or easymocap else "y")
     _check_order(members, len(rotations))
     if _look_like_millimetres(translations, fps, up):
         notes.append("trans is higher or faster than a person in metres: these look like millimetres")
     if rest_root is None and (amass or easymocap):
         rest_root = smpl_root
-    return MotionRecord(rotations, translations, rest_root, names, fps, up, tuple(notes))
+    return MotionRecord(rotations, translations, rest_root, names, fps, up, stated is not None, tuple(notes))
 
 
 def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
@@ -139,11 +139,13 @@ def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...
             file=archive.path,
         )
     poses = archive.numbers(member)
+    if poses.ndim == 4 and poses.shape[2:] == (3, 3):
+        poses = matrix_to_axis_angle(check_rotations(poses, member, archive.path))
     shape = poses.shape
     flat, by_joint = len(shape) == 2 and shape[1] % 3 == 0, len(shape) == 3 and shape[2] == 3
     if not (flat or by_joint):
         got = "×".join(map(str, shape)) or "a single number"
-        raise InputError(f"shape of {member}", expected="F×3J or F×J×3", got=got, file=archive.path)
+        raise InputError(f"shape of {member}", expected="F×3J, F×J×3 or F×J×3×3", got=got, file=archive.path)
     if shape[0] == 0:
         raise InputError(member, expected="at least one frame", got="none", file=archive.path)
     poses = poses.reshape(shape[0], shape[1] // 3 if flat else shape[1], 3)
@@ -208,6 +210,21 @@ def _per_frame(archive: Members, *members: str, frames: int) -> Floats:
             f"shape of {member}", expected=f"{frames}×3, as many frames as poses", got=got, file=archive.path
         )
     return array
+
+
+def check_rotations(matrices: Floats, name: str, path: str | Path) -> Floats:
+    """``matrices`` [F, J, 3, 3]; ``InputError`` with the frame of the first that is no rotation."""
+    if matrices.ndim != 4 or matrices.shape[-2:] != (3, 3) or not matrices.size:
+        raise InputError(f"shape of {name}", expected="F×J×3×3", got="×".join(map(str, matrices.shape)), file=path)
+    finite = np.isfinite(matrices).all((-2, -1))
+    checked = np.where(finite[..., None, None], matrices, 0)
+    off = np.abs(checked @ np.swapaxes(checked, -1, -2) - np.eye(3)).max((-2, -1))
+    good = finite & (off < _ORTHOGONAL) & (np.linalg.det(checked) > 0)
+    if not good.all():
+        frame, joint = np.argwhere(~good)[0]
+        got = "others" if finite[frame, joint] else "no numbers"
+        raise InputError(f"{name}: joint {joint}", expected="rotation matrices", got=got, file=path, frame=int(frame))
+    return matrices
 
 
 def _check_angles(axis_angles: Floats, names: tuple[str, ...], path: str | Path, notes: list[str]) -> None:
@@ -293,9 +310,9 @@ def frame_rate(archive: Members) -> float | None:
     return float(value.item())
 
 
-def _up_axis(archive: Members, *, default: str) -> str:
+def _up_axis(archive: Members) -> str | None:
     if "up_axis" not in archive.names:
-        return default
+        return None
     up = "".join(archive.strings("up_axis")).lower()
     if up not in ("y", "z"):
         raise InputError("up_axis", expected="y or z", got=up, file=archive.path)

@@ -60,14 +60,13 @@ class MocapTree:
             positions[joint] = positions[parent] + self.offsets[joint]
         return positions
 
-    def path(self, joint: int, global_rotations: Floats) -> Floats:
-        """Positions [F, 3] of ``joint`` in the file's world, given ``global_rotations`` of the tree."""
-        path = self.root_positions
-        while joint:
-            parent = self.parents[joint]
-            path = path + global_rotations[:, parent] @ self.offsets[joint]
-            joint = parent
-        return path
+    def positions(self, global_rotations: Floats) -> Floats:
+        """[F, J, 3] of the joints in the file's world, given ``global_rotations`` of the tree."""
+        positions = np.empty(global_rotations.shape[:-1])
+        positions[:, 0] = self.root_positions
+        for joint, parent in enumerate(self.parents[1:], 1):
+            positions[:, joint] = positions[:, parent] + global_rotations[:, parent] @ self.offsets[joint]
+        return positions
 
 
 def check_size(what: str, numbers: Sequence[float], frame: int | None = None) -> None:

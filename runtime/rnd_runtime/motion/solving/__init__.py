@@ -1,0 +1,1 @@
+"""Rotations of a skeleton's joints from the positions of a recording."""

@@ -1,0 +1,168 @@
+"""What a recording shows of the rolls of its bones: hinges of knees and elbows, feet, palms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.motion.skeleton import Skeleton
+
+from .bones import SPINE, find_bones, rest_directions
+from .directions import Floats, about, across, angle_about, swing, unit
+
+Complexes = NDArray[np.complex128]
+
+_HINGES = {"hip": ("hip", "knee", "ankle"), "shoulder": ("shoulder", "elbow", "wrist")}
+_HINGES |= {"knee": _HINGES["hip"], "elbow": _HINGES["shoulder"]}
+_FOOT, _PARENT = 0.2, 0.005  # weights, where a hinge bent by b has sin² b
+_APART = 0.2  # of the hips' distance
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """A recording under the avatar's joint names, Y up.
+
+    Attributes:
+        points: [F, 3] of each recorded joint, in any unit.
+        rotations: [F, 3, 3] of joints in the world, relative to any zero pose.
+        palms: by side, an axis [F, 3] across the palm and its direction [3] where the arm is held along ±X, palm down.
+        fps: frames per second.
+    """
+
+    points: Mapping[str, Floats]
+    rotations: Mapping[str, Floats] = field(default_factory=dict)
+    palms: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
+    fps: float = 30.0
+
+    def after(self, first: int) -> Tracks:
+        """Without the ``first`` frames."""
+        return replace(
+            self,
+            points={name: points[first:] for name, points in self.points.items()},
+            rotations={name: rotations[first:] for name, rotations in self.rotations.items()},
+            palms={side: (axis[first:], in_t_pose) for side, (axis, in_t_pose) in self.palms.items()},
+        )
+
+
+class Evidence(NamedTuple):
+    """An axis [F, 3] across a bone in the world, the same [3] at rest, and its weight [F]."""
+
+    axis: Floats
+    at_rest: Floats
+    weight: Floats
+
+    def rolls(self, bone: Floats, base: Floats) -> Complexes:
+        """Weighted e^{iφ} [F] of the rolls about ``bone`` [F, 3] from rotations ``base`` to what is seen."""
+        return self.weight * np.exp(1j * angle_about(bone, base @ self.at_rest, self.axis))
+
+
+class Recorded:
+    """The points of a recording with its bones and the trunk's axes.
+
+    Attributes:
+        tracks: [F] frames, Y up.
+        rest: joint positions [3] of the avatar at rest.
+        bones: of joints that have a direction.
+        at_rest: directions [3] of the avatar's bones that stand for ``bones``.
+        chest: the highest joint of the spine, or "".
+        pelvis_axis: from the right hip to the left [F, 3], and at rest [3].
+        chest_axis: the same of the collars, or the shoulders.
+    """
+
+    def __init__(self, tracks: Tracks, skeleton: Skeleton) -> None:
+        root = skeleton.names[0]
+        self.tracks, self.rest = tracks, dict(zip(skeleton.names, skeleton.rest_joints))
+        self.bones = find_bones(tracks.points, self.rest, root)
+        self.at_rest = rest_directions(self.bones, tracks.points, self.rest, root, tracks.fps)
+        spine = [name for name in SPINE if name in self.bones]
+        self.chest = spine[-1] if spine else ""
+        self.pelvis_axis = self._to_the_left("hip")
+        self.chest_axis = self._chest_axis()
+
+    def _to_the_left(self, pair: str) -> tuple[Floats, Floats]:
+        right, left = f"right_{pair}", f"left_{pair}"
+        return self.tracks.points[left] - self.tracks.points[right], self.rest[left] - self.rest[right]
+
+    def _chest_axis(self) -> tuple[Floats, Floats]:
+        wide = np.linalg.norm(self.pelvis_axis[0], axis=-1).mean()
+        for pair in ("collar", "shoulder"):
+            if {f"left_{pair}", f"right_{pair}"} <= self.tracks.points.keys():
+                axis = self._to_the_left(pair)
+                if np.linalg.norm(axis[0], axis=-1).mean() > _APART * wide:
+                    return axis
+        return self.pelvis_axis
+
+    def prior(self, name: str, bone: Floats, neutral: Floats) -> Evidence:
+        """The roll where nothing else shows it: between pelvis and chest, towards the toes, or the parent's."""
+        lateral = lateral_at_rest(name, self.at_rest[name])
+        weight = np.full(len(bone), _PARENT)
+        if name in SPINE:
+            spine = [joint for joint in SPINE if joint in self.bones]
+            share = (spine.index(name) + 1) / len(spine)
+            left = (1 - share) * unit(self.pelvis_axis[0]) + share * unit(self.chest_axis[0])
+            return Evidence(left, lateral, weight)
+        foot = self.foot_axis(name)
+        if foot is None:
+            return Evidence(neutral @ lateral, lateral, weight)
+        both = _PARENT + foot.rolls(bone, neutral)
+        axis = np.einsum("fij,fj->fi", about(bone, np.angle(both)), neutral @ lateral)
+        return Evidence(axis, lateral, np.abs(both))
+
+    def foot_axis(self, name: str) -> Evidence | None:
+        """The axis across shin and foot, for the joints of a leg."""
+        side, _, part = name.partition("_")
+        joints = [f"{side}_{joint}" for joint in ("knee", "ankle", "foot")]
+        if part not in ("hip", "knee", "ankle") or joints[1] not in self.bones or joints[0] not in self.bones:
+            return None
+        shin, foot = (unit(self.bones[joint].along(self.tracks.points)) for joint in joints[:2])
+        axis = np.cross(-shin, foot)
+        at_rest = np.cross(-self.at_rest[joints[0]], self.at_rest[joints[1]])
+        return Evidence(axis, at_rest, _FOOT * (axis * axis).sum(-1))
+
+    def shown(self, name: str, frames: int) -> Iterator[Evidence]:
+        """What the recording shows of the roll about the bone of joint ``name``."""
+        points, (side, _, part) = self.tracks.points, name.partition("_")
+        if part == "ankle" and (foot := self.foot_axis(name)) is not None:
+            yield foot._replace(weight=foot.weight / _FOOT)
+        if part == "wrist" and side in self.tracks.palms:
+            axis, in_t_pose = self.tracks.palms[side]
+            yield Evidence(axis, swing(outwards(side), self.at_rest[name]) @ in_t_pose, np.ones(frames))
+        joints = [f"{side}_{joint}" for joint in _HINGES.get(part, ())]
+        if joints and points.keys() >= set(joints):
+            upper, lower = unit(points[joints[1]] - points[joints[0]]), unit(points[joints[2]] - points[joints[1]])
+            axis = np.cross(upper, lower)
+            yield Evidence(axis, lateral_at_rest(name, self.at_rest[name]), (axis * axis).sum(-1))
+
+
+def lateral_at_rest(name: str, direction: Floats) -> Floats:
+    """The axis about which the limb of joint ``name`` bends, where its bone points along ``direction`` at rest."""
+    side, _, part = name.partition("_")
+    sideways = outwards(side)
+    if part in ("shoulder", "elbow"):
+        return swing(sideways, direction) @ np.array([0.0, -sideways[0], 0.0])
+    if side in ("left", "right") and part not in ("hip", "knee", "ankle", "foot"):
+        return swing(sideways, direction) @ np.array([0.0, 0.0, 1.0])
+    return across(np.array([1.0, 0, 0]), direction)
+
+
+def outwards(side: str) -> Floats:
+    """±X, where the arm of ``side`` points in a T-pose."""
+    return np.array([1.0 if side == "left" else -1.0, 0, 0])
+
+
+def coherence(rolls: Complexes) -> float:
+    """Mean resultant length, 0 to 1; 0 without weights."""
+    total = float(np.abs(rolls).sum())
+    return float(abs(rolls.sum())) / total if total > 1e-9 else 0.0
+
+
+def smooth(values: Complexes, sigma: float) -> Complexes:
+    """``values`` [F] through a Gaussian of ``sigma`` frames; the first and last go on beyond the ends."""
+    reach = int(np.ceil(3 * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
+    filtered: Complexes = np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), mode="valid")
+    return filtered

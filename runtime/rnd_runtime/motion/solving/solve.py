@@ -1,0 +1,214 @@
+"""Rotations of a skeleton's joints from where a recording has them.
+
+Every joint gets a frame from positions: the pelvis from the hips' axis and the spine above them, the chest from the
+collars' or shoulders' axis, a limb from its bone's direction and from what shows its roll: the axis about which a knee
+or an elbow bends, the toes, the knuckles. Where the recording has rotations too, they carry the frame through time by
+one constant rotation per joint, C_k, fitted over the clip: G_k(t) = Q_k(t) C_k. So neither the zero pose nor the axes
+of the recorded bones matter, and what positions do not show (a wrist's twist, a nod) stays as recorded. Where
+rotations contradict positions, as of programs that solve them for positions alone, positions decide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rnd_runtime.motion.skeleton import Skeleton
+
+from .bones import Bone
+from .directions import (
+    Floats,
+    about,
+    angle_about,
+    angle_between,
+    body_frame,
+    mean_rotation,
+    median_rotation,
+    swing,
+    unit,
+)
+from .evidence import Complexes, Evidence, Recorded, Tracks, coherence, lateral_at_rest, smooth
+
+_SLIGHT = np.sin(np.radians(20)) ** 2  # weight of a hinge; of a slighter bend, the wrong way round is noise
+# Coherences of rolls: of what is shown with rotations that carry it, with neutral ones where it is noise, and what
+# either may be worse by
+_COHERENT, _INCOHERENT, _NOISE = 0.97, 0.6, 0.03
+_AGREES, _TWISTS = 0.9, 0.5  # of recorded with neutral rolls, where nothing is shown; of a forearm, which twists far
+_NO_ROLL = 0.9995  # of rotations that are the smallest ones from bone to bone
+# Max median deviations of recorded rotations: from the trunk's frames, from a bone with which those of its children
+# may be compared, and of joints of which positions show nothing from their parents
+_RIGID, _NEARLY, _FREE = np.radians([20.0, 10.0, 45.0])
+_ABOUT_A_MEAN = ("head", "_wrist", "_hand")
+_HELD = np.radians(30)  # difference from neutral of a pose that is held over the clip, not of where a joint's axes are
+_SMOOTH = 0.1  # s, of a roll from positions alone
+_NATURAL_TWIST, _NATURAL_BEND = np.radians([45.0, 50.0])  # of a zero pose that is a person's
+
+
+def solve(tracks: Tracks, skeleton: Skeleton) -> Floats:
+    """World rotations [F, J, 3, 3] of ``skeleton``'s joints; a joint that ``tracks`` lacks follows its parent."""
+    solver = _Solver(tracks, skeleton)
+    rotations = solver.run(zero_is_rest=False)
+    return solver.run(zero_is_rest=True) if solver.zero_pose_is_a_persons() else rotations
+
+
+class _Solver:
+    def __init__(self, tracks: Tracks, skeleton: Skeleton) -> None:
+        self.recorded = Recorded(tracks, skeleton)
+        self.points, self.rotations, self.fps = tracks.points, tracks.rotations, tracks.fps
+        self.names, self.parents = skeleton.names, skeleton.parents
+        self.bones, self.at_rest, self.chest = self.recorded.bones, self.recorded.at_rest, self.recorded.chest
+        self._forget()
+
+    def _forget(self) -> None:
+        self.solved: dict[str, Floats] = {}
+        self.constants: dict[str, Floats] = {}  # C of joints whose rotations agree with positions
+        self.shown: set[str] = set()  # joints whose roll the recording shows
+        self.carried: set[str] = set()  # joints whose roll follows recorded rotations
+
+    def run(self, zero_is_rest: bool) -> Floats:
+        """World rotations [F, J, 3, 3].
+
+        Args:
+            zero_is_rest: whether poses that nothing shows and that are held over the clip are as in the zero pose.
+        """
+        self._forget()
+        for joint, name in enumerate(self.names):
+            parent = self.names[self.parents[joint]]
+            if joint == 0:
+                self.solved[name] = self._trunk(name, *self.recorded.pelvis_axis)
+            elif name not in self.points:
+                self.solved[name] = self.solved[parent]
+            elif name == self.chest:
+                self.solved[name] = self._trunk(name, *self.recorded.chest_axis)
+            elif name in self.bones:
+                self.solved[name] = self._bone(name, parent, zero_is_rest)
+            else:
+                self.solved[name] = self._end(name, parent, zero_is_rest)
+        return np.stack([self.solved[name] for name in self.names], 1)
+
+    def zero_pose_is_a_persons(self) -> bool:
+        """Whether the zero pose, seen through the constants, is one that a person can hold, without twists."""
+        constants, root, chest = self.constants, self.names[0], self.chest or self.names[0]
+        if not {root, chest} <= constants.keys() or angle_between(constants[root], constants[chest]) > _NATURAL_TWIST:
+            return False
+        legs = 0
+        for joint, name in enumerate(self.names):
+            parent = self.names[self.parents[joint]]
+            if name in (root, chest) or name not in self.bones or not {name, parent} <= constants.keys():
+                continue
+            own, above = constants[name], constants[parent]
+            before, after = above @ self.at_rest[name], own @ self.at_rest[name]
+            if name in self.shown and angle_between(swing(before, after) @ above, own) > _NATURAL_TWIST:
+                return False
+            if name.endswith(("_hip", "_knee", "_ankle")):
+                legs += 1
+                if before @ after < np.cos(_NATURAL_BEND):
+                    return False
+        return legs >= 4
+
+    def _trunk(self, name: str, left: Floats, left_at_rest: Floats) -> Floats:
+        """Pelvis or chest, by its axis to the left and the direction of the spine."""
+        if name in self.bones:
+            up, up_at_rest = self.bones[name].along(self.points), self.at_rest[name]
+        else:
+            legs = [Bone(f"{side}_knee", f"{side}_hip") for side in ("left", "right")]
+            up, up_at_rest = (sum(leg.along(joints) for leg in legs) for joints in (self.points, self.recorded.rest))
+        shown: Floats = body_frame(left, up) @ body_frame(left_at_rest, up_at_rest).T
+        return self._fitted(name, shown, _RIGID)
+
+    def _fitted(self, name: str, shown: Floats, tolerance: float) -> Floats:
+        """Recorded rotations with the constant that brings them nearest to ``shown``; it where they contradict it."""
+        if name not in self.rotations:
+            return shown
+        relative = np.swapaxes(self.rotations[name], -1, -2) @ shown
+        # toes are straight most of the time, hands and heads move about a mean
+        constant = mean_rotation(relative) if name.endswith(_ABOUT_A_MEAN) else median_rotation(relative)
+        if np.median(angle_between(relative, constant)) > tolerance:
+            return shown
+        self.constants[name] = constant
+        fitted: Floats = self.rotations[name] @ constant
+        return fitted
+
+    def _end(self, name: str, parent: str, zero_is_rest: bool) -> Floats:
+        """A joint of which positions show nothing, by its rotations relative to those of the joint above it."""
+        above = self.chest if name == "head" and self.chest in self.solved else parent  # level while the neck bends
+        compared = {above, parent} if parent in self.bones else {above}
+        if not compared <= self.constants.keys():
+            return self.solved[above]
+        neutral = self._fitted(name, self.solved[above], _FREE)
+        in_zero_pose = self.constants[above]
+        if zero_is_rest and name in self.constants and angle_between(self.constants[name], in_zero_pose) > _HELD:
+            self.constants[name] = in_zero_pose
+            return self.rotations[name] @ in_zero_pose
+        return neutral
+
+    def _bone(self, name: str, parent: str, zero_is_rest: bool) -> Floats:
+        """A joint whose bone has a direction, rolled about it."""
+        bone, at_rest, above = unit(self.bones[name].along(self.points)), self.at_rest[name], self.solved[parent]
+        neutral = swing(above @ at_rest, bone) @ above
+        prior, shown = self.recorded.prior(name, bone, neutral), list(self.recorded.shown(name, len(bone)))
+        by_position = _rolls(shown, bone, neutral)
+        constant = self._constant(name, parent, bone)
+        if constant is not None:
+            recorded = self.rotations[name] @ constant
+            base, lateral = swing(recorded @ at_rest, bone) @ recorded, lateral_at_rest(name, at_rest)
+            by_rotation = _rolls(shown, bone, base)
+            own = np.exp(1j * angle_about(bone, neutral @ lateral, base @ lateral))
+            if self._carries(name, parent, coherence(by_rotation), coherence(by_position), own):
+                roll = self._constant_roll(name, by_rotation, prior.rolls(bone, base), zero_is_rest)
+                self.constants[name] = constant @ about(at_rest, roll)
+                self.carried.add(name)
+                carried: Floats = about(bone, np.full(len(bone), roll)) @ base
+                return carried
+        to_prior = prior.rolls(bone, neutral)
+        wrong = (np.abs(by_position) < _SLIGHT) & ((by_position * to_prior.conj()).real < 0)
+        rolls = smooth(np.where(wrong, 0, by_position) + to_prior, _SMOOTH * self.fps)
+        solved: Floats = about(bone, np.angle(rolls)) @ neutral
+        if constant is not None:
+            self._fitted(name, solved, _NEARLY)
+        return solved
+
+    def _constant_roll(self, name: str, shown: Complexes, prior: Complexes, zero_is_rest: bool) -> float:
+        """The roll from recorded rotations to what is ``shown`` [F] over the clip, or to the ``prior`` [F]."""
+        visible = complex(shown.sum() * np.clip((coherence(shown) - 0.5) / 0.3, 0, 1))
+        size = (np.abs(shown) ** 2).sum() / max(np.abs(shown).sum(), 1e-12)
+        if size < _SLIGHT and (visible * prior.sum().conj()).real < 0:
+            visible = 0
+        if abs(visible) > abs(prior.sum()):
+            self.shown.add(name)
+        elif zero_is_rest and self.recorded.foot_axis(name) is None and abs(np.angle(prior.sum())) > _HELD:
+            return 0.0
+        return float(np.angle(visible + prior.sum()))
+
+    def _carries(self, name: str, parent: str, by_rotation: float, by_position: float, own: Complexes) -> bool:
+        """Whether the recorded rolls of joint ``name`` are a body's, not what a program chose for want of knowledge.
+
+        Args:
+            by_rotation: coherence of what is shown with the recorded rolls.
+            by_position: its coherence with neutral rolls.
+            own: e^{iφ} [F] of the recorded rolls relative to neutral ones.
+        """
+        twists = name.endswith(("_elbow", "_wrist"))
+        if by_position < _INCOHERENT:
+            return (parent in self.constants or not twists) and coherence(own) > (_TWISTS if twists else _AGREES)
+        if twists and parent in self.shown and by_rotation > _TWISTS:
+            return True
+        if name.endswith(("_elbow", "_knee")) and parent not in self.carried:  # the same hinge
+            return False
+        rolls = len(own) < 3 or coherence(own) < _NO_ROLL
+        return rolls and by_rotation >= min(_COHERENT, by_position - _NOISE)
+
+    def _constant(self, name: str, parent: str, bone: Floats) -> Floats | None:
+        """C with a neutral roll in the zero pose; None where the recorded rotations do not carry the ``bone``."""
+        if name not in self.rotations:
+            return None
+        in_bone = np.einsum("fji,fj->fi", self.rotations[name], bone)
+        local = unit(np.median(in_bone, axis=0))
+        if np.median(in_bone @ local) < np.cos(_RIGID):
+            return None
+        above = self.constants.get(parent, np.eye(3))
+        constant: Floats = swing(above @ self.at_rest[name], local) @ above
+        return constant
+
+
+def _rolls(shown: list[Evidence], bone: Floats, base: Floats) -> Complexes:
+    return sum((seen.rolls(bone, base) for seen in shown), np.zeros(len(bone), complex))
