@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,14 +13,18 @@ import pytest
 
 from rnd_bench.stability.determinism import backends_agree
 from rnd_bench.stability.fuzzing import run as module
+from rnd_bench.stability.fuzzing.damage import Random, damage
 from rnd_bench.stability.fuzzing.honest import write_files
 from rnd_bench.stability.fuzzing.readers import READERS
 from rnd_bench.stability.fuzzing.run import fuzz
 from rnd_bench.stability.kill import incomplete_files
 from rnd_bench.stability.processes import environment
+from rnd_runtime.core.errors import InputError
 
 pytestmark = pytest.mark.slow
 INPUTS = 40
+ALONE = ("pickle", "exr", "avatar")
+"""readers that are tested as the laboratory does, each in a process of its own"""
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +35,28 @@ def honest(subject):
     return folder
 
 
-@pytest.mark.parametrize("reader", READERS)
-def test_broken_files_are_refused_or_read(reader, honest):
+@pytest.mark.parametrize("reader", ALONE)
+def test_broken_files_are_refused_or_read_by_a_process_that_may_die(reader, honest):
     figures, record = fuzz(honest, INPUTS, (reader,))
     assert record[reader]["inputs"] == INPUTS and record[reader]["refused"] > 0
     assert [figure for figure in figures if not figure.passes] == []
+
+
+@pytest.mark.parametrize("name", [name for name in READERS if name not in ALONE])
+def test_broken_files_are_refused_or_read(name, honest, tmp_path):
+    reader = READERS[name]
+    valid, own = (honest / reader.file).read_bytes(), tmp_path / "own"
+    shutil.copytree(honest, own)
+    read, rng, refused = reader.prepare(honest), Random(0), 0
+    read(own / reader.file)
+    for _ in range(INPUTS):
+        (own / reader.file).write_bytes(damage(rng, valid, reader.mutation))
+        try:
+            read(own / reader.file)
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 0
 
 
 def test_batches_that_were_fed_are_not_fed_again(honest, monkeypatch):
