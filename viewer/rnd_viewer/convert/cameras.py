@@ -5,7 +5,8 @@ file                          what is read
 ============================  ====================================================================================
 transforms.json               nerfstudio, instant-ngp: camera-to-world in OpenGL's axes, Z up; ``camera_angle_x`` or
                               ``fl_x``; one camera per entry of ``frames``, in the order of their file names
-.gltf, .glb                   perspective cameras of the scene; an animated one gives a camera per frame
+.gltf, .glb                   perspective cameras of the scene; an animated one gives a camera per frame from its
+                              first key to its last. glTF has no lens shift
 .usd, .usda, .usdc, .usdz     UsdGeom cameras, sampled at the stage's time codes, whatever its up axis and unit
 ============================  ====================================================================================
 
@@ -62,7 +63,8 @@ def read_cameras(path: Path, name: str | None, size: tuple[int, int], fps: float
         raise error.at(file=file) from error
     except (KeyError, TypeError, ValueError, IndexError, struct.error) as error:
         raise InputError("camera file cannot be read", got=f"{type(error).__name__}: {error}", file=file) from error
-    raise InputError("camera file", expected=_SUFFIXES, got=path.name)
+    hint = "in Blender: File, Export, glTF or USD, or our add-on" if suffix == ".blend" else None
+    raise InputError("camera file", expected=_SUFFIXES, got=path.name, hint=hint)
 
 
 def write_cameras(path: Path, cameras: Sequence[Camera]) -> None:
@@ -90,7 +92,7 @@ def from_opengl(camera_to_world: Floats, K: Floats, size: tuple[int, int], *, z_
     matrix[:3, :3] /= scale
     if z_up:
         matrix[:3] = Z_UP_TO_Y_UP @ matrix[:3]
-    return Camera(*size, K, np.linalg.inv(matrix @ FLIP))
+    return Camera(*size, K, np.asarray(np.linalg.inv(matrix @ FLIP), np.float64))
 
 
 def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> Floats:
@@ -160,8 +162,9 @@ def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) ->
         chain.append(parents[chain[-1]])
         if len(chain) > len(nodes):
             raise InputError("nodes", expected="a tree", got="a circle")
-    tracks, end = _tracks(document, buffer, set(chain), file)
-    times = np.arange(round(end * fps) + 1) / fps if tracks else np.zeros(1)
+    tracks = _tracks(document, buffer, set(chain), file)
+    keys = np.concatenate([keys for paths in tracks.values() for keys, _ in paths.values()] or [np.zeros(1)])
+    times = keys.min() + np.arange(round(np.ptp(keys) * fps) + 1) / fps
     cameras = []
     for time in times:
         world = np.eye(4)
@@ -173,10 +176,10 @@ def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) ->
 
 def _tracks(
     document: Mapping[str, Any], buffer: bytes, wanted: set[int], file: Path
-) -> tuple[dict[int, dict[str, tuple[Floats, Floats]]], float]:
-    """Keys and values of each animated property of the ``wanted`` nodes, and the last key in s."""
+) -> dict[int, dict[str, tuple[Floats, Floats]]]:
+    """Keys, s, and values of each animated property of the ``wanted`` nodes."""
     tracks: dict[int, dict[str, tuple[Floats, Floats]]] = {}
-    budget, end = Budget.of(file), 0.0
+    budget = Budget.of(file)
     for animation in document.get("animations", []):
         for channel in animation["channels"]:
             node, path = channel["target"].get("node"), channel["target"]["path"]
@@ -187,8 +190,7 @@ def _tracks(
             if sampler.get("interpolation") == "CUBICSPLINE":
                 values = values[1::3]  # between their tangents
             tracks.setdefault(node, {})[path] = keys[:, 0], values
-            end = max(end, float(keys.max()))
-    return tracks, end
+    return tracks
 
 
 def _accessor(document: Mapping[str, Any], buffer: bytes, index: int, budget: Budget) -> Floats:

@@ -157,18 +157,19 @@ def _materials(points: Floats, normals: Floats, gaussians: Gaussians) -> Floats:
         front_first = np.argsort(np.einsum("tkc,tc->tk", offsets, normal), axis=1)
         alphas = np.take_along_axis(alphas, front_first, axis=1)
         weights = alphas * np.cumprod(np.c_[np.ones(len(alphas)), 1 - alphas[:, :-1]], axis=1)
-        weights /= np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
+        weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-30)
         result[part] = np.einsum("tk,tkc->tc", weights, features[np.take_along_axis(near, front_first, axis=1)])
     return result
 
 
-def _unit(vectors: Floats) -> Floats:
+def _unit(vectors: NDArray[np.floating]) -> Floats:
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.where(lengths > 0, lengths, 1)
+    unit: Floats = vectors / np.where(lengths > 0, lengths, 1)
+    return unit
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _rasterize(pixels, faces, face_of, inside):  # type: ignore[no-untyped-def]
+def _rasterize(pixels, faces, face_of, inside):
     """Fill ``face_of`` [S, S] and barycentric ``inside`` [S, S, 3] of triangles with corners ``pixels`` [V, 2]."""
     size = len(face_of)
     for face in range(len(faces)):

@@ -87,8 +87,7 @@ class ExrWriter:
         source, target = _IN_OCIO["rec709"], _IN_OCIO[self.space]
         converted = oiio.ImageBufAlgo.colorconvert(basis, source, target, colorconfig="ocio://default")
         assert not converted.has_error, converted.geterror()
-        matrix: NDArray[np.float32] = converted.get_pixels("float").reshape(3, 3)
-        return matrix
+        return np.asarray(converted.get_pixels("float"), np.float32).reshape(3, 3)
 
     def _attributes(self, frame: RenderedFrame, camera: Camera) -> dict[str, Attribute]:
         rate = frame_rate(self.fps)

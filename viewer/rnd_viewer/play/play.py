@@ -31,6 +31,8 @@ from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, frame_motion, front_path, orbit_path
+from rnd_runtime.playback.standing import UP, ground_of
+from rnd_runtime.shading.ground import Plane
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.cameras import file_path, split_camera
@@ -140,6 +142,10 @@ class _Run:
             if kernels_are_cold():
                 log(COMPILING)
             renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
+            if lighting.ground == "auto":
+                renderer.ground = ground_of(avatar, motion)
+            elif lighting.ground != "none":
+                renderer.ground = Plane(UP, lighting.ground_height)
         return cls(
             options=options,
             mark=mark,
