@@ -24,10 +24,11 @@ SHARED = {
     ),
     "rnd_runtime.motion.smpl": "NAMES_BY_COUNT SMPL_REST_ROOT SMPLX_REST_ROOT",
     "rnd_runtime.motion.readers.arrays": (
-        "_AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _ORDERS"
+        "_ORTHOGONAL _AMASS_MEMBERS _MAX_ANGLE _MANY_BEYOND_A_TURN _MAX_DISTANCE _MAX_HEIGHT _MAX_SPEED _ORDERS"
         " _DEFAULT_FPS FPS_LIMITS"
     ),
-    "rnd_runtime.motion.motion": "Z_UP_TO_Y_UP STAND_INS",
+    "rnd_runtime.motion.motion": "STAND_INS",
+    "rnd_runtime.motion.standing": "UP_ROTATIONS _UNCLEAR _CLEAR _LEG _LIES _STANDS _SHARE",
     "rnd_runtime.motion.skeleton": "_TURNS",
     "rnd_runtime.motion.interpolation": "LARGEST_STEP LARGEST_MOVE",
     "rnd_runtime.posing.forearm": "FREE MAX_SHARE",
@@ -68,9 +69,7 @@ def source() -> str:
 
 def _value(module: str, name: str) -> str:
     value: Any = getattr(import_module(module), name)
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    return json.dumps(value)
+    return json.dumps(value, default=lambda numbers: numbers.tolist())
 
 
 if __name__ == "__main__":

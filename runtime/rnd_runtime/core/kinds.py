@@ -20,6 +20,7 @@ _NAMES = {
     "checkpoint": "a checkpoint",
     "image": "an image",
     "light": "a light probe (.exr or .hdr)",
+    "mesh": "a glTF file without an animation",
     "motion": "a motion",
     "run": "a run's folder",
     "video": "a video",
@@ -43,6 +44,7 @@ _HINTS = {
     ("motion", "body model"): "a body model has no poses over time",
     ("motion", "capture"): "{}/motion.npz",
     ("motion", "light"): "a light probe goes to --hdr",
+    ("motion", "mesh"): "export it with its armature's animation; a .vrm is a character, its motions are .vrma files",
     ("motion", "video"): "rnd-data estimates poses from videos",
     ("light", "motion"): "a motion goes to --motion",
     ("light", "image"): "radiance needs floating-point numbers",
@@ -53,7 +55,7 @@ _BODY_MODEL = ("v_template", "kintree_table")
 
 
 def kind_of(path: str | Path) -> str:
-    """A ``Kind``, or "body model", "image", "ONNX model", "run", "video", "folder", or "unknown".
+    """A ``Kind``, or "body model", "image", "mesh", "ONNX model", "run", "video", "folder", or "unknown".
 
     Reads names and a few hundred kilobytes; nothing is decoded, executed or raised. "unknown" also of what is
     missing or cannot be read.
@@ -98,6 +100,8 @@ def _file(path: Path) -> str:
         return "image"
     if head[4:8] == b"ftyp" or suffix in (".avi", ".mkv", ".webm"):
         return "video"
+    if head[:4] == b"glTF":
+        return "motion" if b'"animations"' in head else "mesh"
     if suffix == ".json" and b'"rnd-capture/' in head:
         return "capture"
     if suffix in (".bvh", ".amc"):
@@ -114,7 +118,7 @@ def _archive(path: Path) -> str:
             names = {name.removesuffix(".npy") for name in archive.namelist()}
     except _ZIP_ERRORS:
         return "unknown"
-    if names & {"poses", "poses_all", "pose_body", "body_pose"}:
+    if names & {"poses", "poses_all", "pose_body", "body_pose", "local_rot_mats", "pred_joint_coords"}:
         return "motion"
     if {"vertices", "skinning_weights"} <= names:
         return "body"

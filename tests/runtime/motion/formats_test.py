@@ -1,5 +1,8 @@
 """Formats of other programs that are retargeted or fitted: a walk in each comes back."""
 
+import json
+import struct
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -13,6 +16,7 @@ from support.foreign_motion import (
     MATRICES,
     PELVIS,
     humanml_numbers,
+    sam3d_people,
     write_gemx,
     write_glb,
     write_kimodo,
@@ -147,3 +151,123 @@ def test_normalised_numbers_are_refused_with_the_way(tmp_path):
     numbers = humanml_numbers(JOINTS[:, :22])
     with pytest.raises(InputError, match=r"a\.npy: HumanML3D's 263 numbers: .* Std.npy and Mean.npy first"):
         load_motion(_save(tmp_path, (numbers - numbers.mean(0)) / (numbers.std(0) + 1)), SKELETON)
+
+
+def _document(path):
+    """JSON of a .glb, and a writer of it with another."""
+    content = path.read_bytes()
+    size = struct.unpack_from("<I", content, 12)[0]
+    binary = content[20 + size :]
+
+    def write(document) -> None:
+        text = json.dumps(document).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + binary
+        path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+    return json.loads(content[20 : 20 + size]), write
+
+
+def _circle(document):
+    document["nodes"][5]["children"] = [0]
+
+
+def _two_parents(document):
+    document["nodes"][24]["children"] = [2]
+
+
+def _sparse(document):
+    del document["accessors"][1]["bufferView"]
+
+
+def _compressed(document):
+    document["bufferViews"][1]["extensions"] = {"EXT_meshopt_compression": {}}
+
+
+def _outside(document):
+    document["buffers"][0]["uri"] = "../../secret.bin"
+
+
+def _long(document):
+    document["accessors"][1]["count"] = 10**9
+
+
+def _elsewhere(document):
+    document["animations"][0]["channels"][0]["target"]["node"] = 99
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_circle, "got a circle"),
+        (_two_parents, "one parent each"),
+        (_sparse, "expected a dense one"),
+        (_compressed, "expected an uncompressed one, got EXT_meshopt_compression"),
+        (_outside, "expected a file beside it"),
+        (_long, "got an end before"),
+        (_elsewhere, "expected one of 25 nodes, got 99"),
+        (lambda document: document.pop("accessors"), "expected a valid one, got KeyError"),
+        (lambda document: document.pop("asset"), "expected a glTF document"),
+        (lambda document: document["nodes"][1].update(rotation=[0, 0, 0]), "rotation, translation and scale"),
+    ],
+)
+def test_a_damaged_gltf_file_is_refused_in_one_line(tmp_path, change, words):
+    path = write_glb(tmp_path, MIXAMO)
+    document, write = _document(path)
+    change(document)
+    write(document)
+    with pytest.raises(InputError) as caught:
+        load_motion(path, SKELETON)
+    line = str(caught.value)
+    assert line.startswith(f"{path}: ") and words in line and "\n" not in line
+
+
+def test_a_cut_gltf_file_is_refused(tmp_path):
+    path = write_glb(tmp_path, MIXAMO)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(InputError, match=r"a\.glb: glTF file: expected \d+ bytes, got an end before"):
+        load_motion(path, SKELETON)
+
+
+def test_a_character_without_animation_names_the_way(tmp_path):
+    path = write_glb(tmp_path, BONES, VRM_1, "a.vrm")
+    document, write = _document(path)
+    del document["animations"]
+    write(document)
+    with pytest.raises(InputError, match=r"got a glTF file without an animation \(.* its motions are \.vrma files\)"):
+        load_motion(path, SKELETON)
+
+
+def test_of_several_animations_the_first_is_taken_and_the_others_named(tmp_path):
+    path = write_glb(tmp_path, MIXAMO)
+    document, write = _document(path)
+    document["animations"].append({"name": "jump", "channels": [], "samplers": []})
+    write(document)
+    assert "of the file's animations walk is taken; left out: jump" in load_motion(path, SKELETON).notes
+
+
+def test_sam3d_follows_one_person_through_gaps(tmp_path):
+    """Another stands behind, first in every other image; images without people are filled in."""
+    people = sam3d_people()
+    people[5:5] = [[], None]
+    motion = load_motion(write_pickle(tmp_path / "a.pkl", people), SKELETON)
+    assert len(motion.rotations) == len(people)
+    notes = " ".join(motion.notes)
+    assert "2 frames without the person" in notes and "nearest to the camera is followed" in notes
+    assert "the camera is taken to stand level" in notes and "shape and scale are ignored" in notes
+
+
+def test_kimodos_robot_is_refused_by_name(tmp_path):
+    rotations = np.tile(np.eye(3), (4, 34, 1, 1))
+    np.savez(tmp_path / "a.npz", local_rot_mats=rotations, root_positions=np.zeros((4, 3)))
+    with pytest.raises(InputError, match=r"expected 77 or 30 of SOMA \(34 are a Unitree G1's, a robot\), got 34"):
+        load_motion(tmp_path / "a.npz", SKELETON)
+
+
+def test_a_joint_map_names_more_joints_of_a_known_skeleton(tmp_path):
+    (tmp_path / "map.toml").write_text('spine3 = "Spine2"\n')
+    mapped = load_motion(write_kimodo(tmp_path), SKELETON, joint_map=tmp_path / "map.toml")
+    assert not np.allclose(mapped.rotations, load_motion(tmp_path / "kimodo.npz", SKELETON).rotations)
+    (tmp_path / "map.toml").write_text('spine3 = "Spine9"\n')
+    with pytest.raises(InputError, match="joint map: expected joints of the avatar and of the motion, got Spine9"):
+        load_motion(tmp_path / "kimodo.npz", SKELETON, joint_map=tmp_path / "map.toml")

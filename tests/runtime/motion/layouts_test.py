@@ -2,6 +2,7 @@
 
 import json
 import pickle  # noqa: TID251  # to write what others write
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.motion.smpl import SMPL_REST_ROOT
+from rnd_runtime.motion.standing import UP_ROTATIONS
 from support.known_motion import (
     DOUBLE,
     FRAMES,
@@ -19,10 +22,14 @@ from support.known_motion import (
     POSES,
     SINGLE,
     SKELETON,
+    TILTED,
     flat,
     write_easymocap,
     write_phalp,
     write_pickle,
+    write_slahmr,
+    write_tram,
+    write_vibe,
     write_wham,
     write_wham_in_camera,
 )
@@ -72,7 +79,7 @@ def test_of_whams_repeated_frames_the_first_counts_as_for_rnd_data_import(tmp_pa
         load_motion(write_pickle(file, {3: track}), SKELETON)
 
 
-@pytest.mark.parametrize("write", [write_phalp, write_wham_in_camera])
+@pytest.mark.parametrize("write", [write_phalp, write_wham_in_camera, write_tram])
 def test_what_a_camera_saw_is_turned_upright_over_the_origin(tmp_path, write):
     motion = load_motion(write(tmp_path), SKELETON)
     assert motion.fps == 30 and any("taken to stand level" in note for note in motion.notes)
@@ -163,3 +170,99 @@ def test_two_rows_that_are_no_rotation_are_refused(tmp_path, second):
     thetas[5, :, 2] = [1, 0, 0, *second]
     with pytest.raises(InputError, match=r"a\.pkl: frame 2: thetas: expected two rows of a rotation"):
         load_motion(write_pickle(tmp_path / "a.pkl", {"thetas": thetas, "root_translation": PELVIS.T}), SKELETON)
+
+
+def test_without_positions_a_person_stands_upright_in_place(tmp_path):
+    """VIBE's, TCMR's and MAED's."""
+    motion = load_motion(write_vibe(tmp_path), SKELETON)
+    assert_allclose(motion.rotations, MATRICES, atol=SINGLE)
+    assert (motion.translations == 0).all()
+    assert "no trans in the file: the root stays in place" in motion.notes
+
+
+def test_slahmrs_world_is_turned_by_its_floor(tmp_path):
+    """Its world is the first camera's; the floor's normal says what is up there, in either direction."""
+    motion = load_motion(write_slahmr(tmp_path, TILTED), SKELETON)
+    assert "person 1 is taken, who is seen longest; left out: 0" in motion.notes
+    heading = motion.rotations[0, 0] @ MATRICES[0, 0].T
+    assert_allclose(heading @ [0, 1, 0], [0, 1, 0], atol=DOUBLE)  # what the floor does not say
+    assert_allclose(motion.rotations[:, 0], heading @ MATRICES[:, 0], atol=DOUBLE)
+    assert_allclose(motion.rotations[:, 1:], MATRICES[:, 1:], atol=DOUBLE)
+    assert_allclose(motion.translations + SKELETON.rest_joints[0], PELVIS @ heading.T, atol=DOUBLE)
+
+
+CASES = Path(__file__).parents[2] / "cases/formats"
+WALKS = ("vibe_output.pkl", "hps_track_0.npy", "prompthmr.pkl", "rotmats.npz", "slahmr_world_results.npz")
+
+
+@pytest.mark.parametrize("name", [*WALKS, "motionx.npy", "y_up_165.npz"])
+def test_the_walk_of_other_programs_stands_and_walks(name):
+    motion = load_motion(CASES / name, SKELETON)
+    assert_allclose(motion.rotations[:, 0], np.tile(np.eye(3), (40, 1, 1)), atol=SINGLE)
+    step = motion.translations[-1] - motion.translations[0]
+    walked = {"vibe_output.pkl": 0, "hps_track_0.npy": -0.65}.get(name, 0.65)  # in place; away from the camera
+    assert_allclose(step, [0, 0, walked], atol=0.011)
+    same = load_motion(CASES / "rotmats.npz", SKELETON).rotations[:, 1:22]
+    assert_allclose(motion.rotations[:, 1:22], same, atol=SINGLE)
+    assert ("y is taken for up" in " ".join(motion.notes)) == (name == "y_up_165.npz")
+
+
+@pytest.mark.parametrize("name", ["joints.npy", "mdm_results.npy"])
+def test_positions_of_nobody_are_refused_with_their_shape(name):
+    with pytest.raises(InputError, match=rf"{name}: joint positions: .* 40×22×3 positions of joints without rotations"):
+        load_motion(CASES / name, SKELETON)
+
+
+@pytest.mark.parametrize("up", ["y", "-y", "z", "-z", "x"])
+def test_the_trunk_says_what_is_up(tmp_path, up):
+    """Whatever the layout has up: AMASS' here."""
+    world = UP_ROTATIONS[up].T
+    root = Rotation.from_matrix(world) * Rotation.from_rotvec(POSES[:, 0])
+    poses = np.zeros((FRAMES, 52, 3))
+    poses[:, :22], poses[:, 0] = POSES[:, :22], root.as_rotvec()
+    np.savez(tmp_path / "a.npz", poses=flat(poses), trans=PELVIS @ world.T - SMPL_REST_ROOT, fps=30)
+    motion = load_motion(tmp_path / "a.npz", SKELETON)
+    assert_allclose(motion.rotations, MATRICES, atol=DOUBLE)
+    assert_allclose(motion.translations + SKELETON.rest_joints[0], PELVIS, atol=DOUBLE)
+    notes = [note for note in motion.notes if "taken for up" in note]
+    expected = f"{up} is taken for up, as the trunk stands along it; --motion-up z overrules"
+    assert notes == ([] if up == "z" else [expected])
+
+
+def test_who_lies_stays_lying(tmp_path):
+    """AMASS, along Y and 0.15 m above the floor; a file that states its axis is believed."""
+    poses, trans = np.zeros((8, 52, 3)), np.zeros((8, 3))
+    trans[:, 2] = 0.15 + np.linspace(0, 0.02, 8)
+    np.savez(tmp_path / "a.npz", poses=flat(poses), trans=trans - SMPL_REST_ROOT, fps=30)
+    motion = load_motion(tmp_path / "a.npz", SKELETON)
+    assert_allclose(motion.rotations[:, 0] @ [0, 1, 0], np.tile([0, 0, -1], (8, 1)), atol=DOUBLE)
+    assert "the trunk lies along y, and z stays up, as in its layout; --motion-up y overrules" in motion.notes
+    np.savez(tmp_path / "b.npz", poses=flat(poses), trans=trans + np.array([0, 0, 1]), fps=30, up_axis="z")
+    assert not any("trunk" in note for note in load_motion(tmp_path / "b.npz", SKELETON).notes)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "words"),
+    [("fbx", "Blender"), ("c3d", "markers"), ("trc", "markers"), ("mvnx", "MVN Analyze"), ("usdc", "Blender")],
+)
+def test_formats_that_are_not_read_name_the_way(tmp_path, suffix, words):
+    path = tmp_path / f"a.{suffix}"
+    path.write_bytes(b"anything")
+    with pytest.raises(InputError, match=rf"a\.{suffix}: motion: expected .* got a \.{suffix} file \(.*{words}"):
+        load_motion(path, SKELETON)
+
+
+@pytest.mark.parametrize("shape", [(4, 60), (4, 30, 3), (3,), (4, 22, 2), ()])
+def test_other_arrays_are_refused_with_their_shape(tmp_path, shape):
+    np.save(tmp_path / "a.npy", np.zeros(shape))
+    got = "×".join(map(str, shape)) or "a single number"
+    with pytest.raises(InputError, match=rf"a\.npy: motion as one array: expected F×322 .*, got {got}"):
+        load_motion(tmp_path / "a.npy", SKELETON)
+
+
+def test_matrices_that_are_no_rotations_are_refused_with_their_frame(tmp_path):
+    matrices = MATRICES.copy()
+    matrices[3, 5] *= 2
+    np.savez(tmp_path / "a.npz", poses=matrices, trans=PELVIS, fps=30)
+    with pytest.raises(InputError, match=r"a\.npz: frame 3: poses: joint 5: expected rotation matrices, got others"):
+        load_motion(tmp_path / "a.npz", SKELETON)

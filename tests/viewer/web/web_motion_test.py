@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import Npz
+from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.motion.skeleton import Skeleton, smpl_skeleton
 from support.paths import ROOT
@@ -209,6 +210,8 @@ HANDS = {"pose_hand": _poses(90)}
 EASYMOCAP = {"poses": _poses(72), "Rh": _poses(3), "Th": TRANS, "fps": 50}
 NAMED = {"poses": _poses(15), "joint_names": ["root", "left_knee", "head", "tail", "left_index1"], "trans": TRANS}
 
+UPSIDE_DOWN = np.pi * np.eye(72)[0]
+
 LAYOUTS: dict[str, dict[str, object]] = {
     "SMPL": {"poses": _poses(72), "trans": TRANS, "fps": [30]},
     "SMPL, joints apart": {"poses": _poses(66).reshape(FRAMES, 22, 3), "transl": TRANS, "fps": 30},
@@ -245,6 +248,10 @@ LAYOUTS: dict[str, dict[str, object]] = {
     "still": {"poses": _poses(72)},
     "Python beside": {"poses": _poses(72), "trans": TRANS, "info": np.array([{"a": 1}, None])},
     "degrees": {"poses": _poses(72) * 30, "trans": TRANS, "fps": 30},
+    "matrices": {"poses": axis_angle_to_matrix(_poses(72).reshape(FRAMES, 24, 3)), "trans": TRANS, "fps": 30},
+    "SMPL-X, standing along Y": {"poses": 0.1 * _poses(165), "trans": TRANS, "mocap_frame_rate": 30},
+    "SMPL, standing along -Y": {"poses": 0.1 * _poses(72) + UPSIDE_DOWN, "trans": TRANS, "fps": 30},
+    "SMPL-H, lying": {"poses": 0.1 * _poses(156), "trans": 0.05 * TRANS + np.array([0, 9, 0]), "fps": 30},
 }
 
 
@@ -288,7 +295,9 @@ REFUSED: dict[str, tuple[dict[str, object], str]] = {
     "flat poses": (SMPL | {"poses": np.zeros(72)}, "shape of poses"),
     "a pose": (SMPL | {"poses": 1.0}, "a single number"),
     "odd columns": (SMPL | {"poses": np.zeros((FRAMES, 70))}, "shape of poses"),
-    "matrices": (SMPL | {"poses": np.zeros((FRAMES, 24, 3, 3))}, "shape of poses"),
+    "matrices of nothing": (SMPL | {"poses": np.zeros((FRAMES, 24, 3, 3))}, "frame 0: poses: joint 0"),
+    "mirrors": (SMPL | {"poses": np.tile(np.diag([1.0, 1, -1]), (FRAMES, 24, 1, 1))}, "expected rotation matrices"),
+    "parts of matrices": (SMPL | {"poses": np.zeros((FRAMES, 24, 3, 2))}, "shape of poses"),
     "no frames": (SMPL | {"poses": np.zeros((0, 72))}, "at least one frame"),
     "fewer trans": (SMPL | {"trans": TRANS[1:]}, "as many frames as poses"),
     "turned trans": (SMPL | {"trans": TRANS.T}, "as many frames as poses"),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,10 @@ import numpy as np
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.npz import Npz
 from rnd_runtime.core.signals import temporary_folder
+from rnd_runtime.motion.formats.sam3d import NEEDED, is_sam3d, is_sam3d_folder, read_folder
+from rnd_runtime.motion.formats.soma import is_gemx, is_kimodo
 from rnd_runtime.motion.readers.arrays import frame_rate, names_of_joints
+from rnd_runtime.motion.readers.tracks import is_prompthmr, is_slahmr
 from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_runtime.motion.readers.video_fits import (
     PHALP_FOCAL,
@@ -30,23 +33,11 @@ from rnd_runtime.motion.readers.video_fits import (
 
 from .dataset import Lens
 from .images import count_shift, list_files, natural_key, numbers_of
-from .poses import Floats, Poses, easymocap_poses, rows_of_three, smpl_poses, transformed
+from .poses import PoseFile, Poses, easymocap_poses, rows_of_three, smpl_poses, transformed
+from .recorded_poses import gemx_poses, prompthmr_poses, sam3d_poses, several, slahmr_poses, tram_poses
 
+_KNOWN = "WHAM's, GVHMR's, PHALP's, ROMP's, EasyMocap's, SAM 3D Body's, GEM-X', TRAM's, PromptHMR's or SLAHMR's"
 _ROMP_HALF_ANGLE = np.radians(30.0)
-
-
-@dataclass(frozen=True, eq=False)
-class PoseFile:
-    """Content of a file of body poses."""
-
-    kind: str  # the program that wrote it
-    poses: Poses  # in camera axes if ``in_camera``, otherwise in the world
-    K: Floats | None = None  # [3, 3] intrinsics
-    focal: Callable[[int, int], float] | None = None  # the program's assumed focal length in px of width and height
-    fps: float | None = None
-    notes: tuple[str, ...] = ()  # assumptions, one sentence each
-    numbered: bool = False  # one file per frame, numbered by name; otherwise frames count from 0
-    in_camera: bool = False
 
 
 def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
@@ -62,6 +53,12 @@ def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
                                                                                    256 pixels
     ROMP ``*.npz`` of a video, or a folder of them  smpl_thetas, cam_trans         cam_trans; field of view 60°
     EasyMocap folder of JSON, ``motion.npz``        Rh, Th, poses, shapes          (its own world)
+    SAM 3D Body, any of its forms, or a folder      pred_joint_coords,            pred_cam_t; focal_length (MHR,
+                                                    pred_global_rots, pred_cam_t   fitted to the body)
+    GEM-X ``hpe_results.pt``                        body_params_incam              itself; K_fullimg (SOMA, fitted)
+    TRAM ``hps_track_0.npy``                        pred_rotmat, pred_trans        itself; img_focal of camera.npy
+    PromptHMR ``results.pkl``                       people → smplx_cam             itself; img_focal (SMPL-X)
+    SLAHMR ``*_world_results.npz``                  cam_R, cam_t, trans [P, F, 3]  its cameras; intrins (SMPL-H)
     SMPL ``.npz``                                   poses | thetas | global_orient trans | transl
                                                     and body_pose
     ==============================================  =============================  ============================
@@ -73,6 +70,9 @@ def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
         InputError: any other file, or a ``person`` where people have no numbers.
     """
     try:
+        if path.is_dir() and is_sam3d_folder(path):
+            _refuse_person(person, "SAM 3D Body")
+            return sam3d_poses(read_folder(path), path)
         if path.is_dir():
             files = list_files(path, (".json", ".npz"))
             if files[0].suffix == ".json":
@@ -83,7 +83,16 @@ def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
         if path.suffix.lower() == ".npz":
             with Npz(path, what="body poses") as archive:
                 names = archive.names
-            _refuse_person(person, path.name)
+                if is_slahmr(archive):
+                    return slahmr_poses(archive, path, person)
+                _refuse_person(person, path.name)
+                if set(NEEDED) <= set(names):
+                    return sam3d_poses(
+                        {name: archive.numbers(name) for name in (*NEEDED, "focal_length") if name in names}, path
+                    )
+                if is_kimodo(archive):
+                    got = "Kimodo's, a generated motion"
+                    raise InputError("body poses", expected="poses of a video", got=got, hint="it goes to --motion")
             return _romp([path]) if "results" in names or "smpl_thetas" in names else _npz(path)
         return _from_pickle(path, person)
     except InputError as error:
@@ -94,14 +103,29 @@ def read_poses(path: Path, *, person: int | None = None) -> PoseFile:
 
 def _from_pickle(path: Path, person: int | None) -> PoseFile:
     content = read_pickle(path, what="body poses")
+    if is_sam3d(content):
+        _refuse_person(person, "SAM 3D Body")
+        return sam3d_poses(content, path)
     if not isinstance(content, dict):
         content = {type(content).__name__: content}
     try:
         if "smpl_params_incam" in content:
             _refuse_person(person, "GVHMR")
             return _gvhmr(content)
+        if is_gemx(content):
+            _refuse_person(person, "GEM-X")
+            return gemx_poses(content, path)
+        if {"pred_rotmat", "pred_trans"} <= content.keys():
+            _refuse_person(person, "TRAM: each person has a file")
+            return tram_poses(content, path)
+        if is_prompthmr(content):
+            return prompthmr_poses(content, person, path)
         values = [value for value in content.values() if isinstance(value, dict)]
         if values and all("frame_ids" in value and "pose" in value for value in values):
+            if not any("trans" in value for value in values):
+                got = "VIBE's, TCMR's or MAED's, which give no positions"
+                hint = "--motion plays them in place"
+                raise InputError("body poses", expected="poses with positions", got=got, hint=hint)
             return _wham(content, person, path)
         if is_phalp(content):
             found = _video_fits("4D-Humans / PHALP", read_phalp(content, path, person))
@@ -110,7 +134,7 @@ def _from_pickle(path: Path, person: int | None) -> PoseFile:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError("body poses", expected="the layout its keys promise", got=repr(error)) from error
     keys = ", ".join(map(str, list(content)[:6]))
-    raise InputError("body poses", expected="WHAM's, GVHMR's, PHALP's, ROMP's or EasyMocap's", got=keys)
+    raise InputError("body poses", expected=_KNOWN, got=keys)
 
 
 def pair_with_frames(found: PoseFile, numbers: Sequence[int], source: Path) -> tuple[Poses, tuple[str, ...]]:
@@ -159,7 +183,7 @@ def _video_fits(kind: str, fits: VideoFits) -> PoseFile:
         poses = smpl_poses(fits.frames, fits.axis_angles, fits.translations, shape, family=family)
     else:
         poses = easymocap_poses(fits.frames, fits.axis_angles, fits.turns, fits.translations, shape, family=family)
-    return PoseFile(kind, poses, notes=_several(fits.person, fits.others))
+    return PoseFile(kind, poses, notes=several(fits.person, fits.others))
 
 
 def _wham(content: dict[Any, Any], person: int | None, path: Path) -> PoseFile:
@@ -167,7 +191,7 @@ def _wham(content: dict[Any, Any], person: int | None, path: Path) -> PoseFile:
     chosen, others = one_of([key for key, entry in tracks.items() for _ in entry["frame_ids"]], person, path)
     entry = tracks[chosen]
     frames, members = in_order(entry["frame_ids"], *(entry[key] for key in ("pose", "trans", "betas")))
-    notes = _several(chosen, others)
+    notes = several(chosen, others)
     return PoseFile(
         "WHAM", smpl_poses(frames, *members), focal=lambda w, h: float(np.hypot(w, h)), notes=notes, in_camera=True
     )
@@ -285,9 +309,3 @@ def _word(archive: Npz, name: str) -> str:
         return archive.strings(name)[0]
     except (InputError, IndexError):
         return ""
-
-
-def _several(chosen: int, others: tuple[int, ...]) -> tuple[str, ...]:
-    if not others:
-        return ()
-    return (f"{len(others) + 1} people in the file: number {chosen} taken, --person chooses another",)

@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import NAMES_BY_COUNT, SMPL_NAMES
 
 Floats = NDArray[np.float64]
+BodyFit = Callable[[Skeleton], tuple[Floats, Floats]]
 RootConvention = Literal["smpl", "easymocap", "position"]
 
 
@@ -28,6 +30,8 @@ class Poses:
     family: str = "SMPL"  # or "SMPL-X": whose rest pelvis ``root`` takes
     betas: Floats | None = None  # shape
     convention: RootConvention = "position"  # "smpl": rest + trans, "easymocap": R rest + Th, "position": as stored
+    # of poses on another skeleton: rotations [F, J, 3, 3] and root positions [F, 3] of a body's own
+    fit: BodyFit | None = None
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -46,6 +50,20 @@ class Poses:
         finite = np.isfinite(self.rotations).all((1, 2, 3)) & np.isfinite(positions).all(1)
         if not finite.all():
             raise InputError("body poses", expected="finite numbers", frame=int(self.frames[~finite][0]))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFile:
+    """Content of a file of body poses."""
+
+    kind: str  # the program that wrote it
+    poses: Poses  # in camera axes if ``in_camera``, otherwise in the world
+    K: Floats | None = None  # [3, 3] intrinsics
+    focal: Callable[[int, int], float] | None = None  # the program's assumed focal length in px of width and height
+    fps: float | None = None
+    notes: tuple[str, ...] = ()  # assumptions, one sentence each
+    numbered: bool = False  # one file per frame, numbered by name; otherwise frames count from 0
+    in_camera: bool = False
 
 
 def smpl_poses(
@@ -118,9 +136,32 @@ def with_convention(poses: Poses, convention: RootConvention) -> Poses:
 def transformed(poses: Poses, motion: Floats) -> Poses:
     """``poses`` in another world, by the rigid transform ``motion`` [4, 4]."""
     rotation, shift = motion[:3, :3], motion[:3, 3]
-    rotations = poses.rotations.copy()
-    rotations[:, 0] = rotation @ rotations[:, 0]
-    return replace(poses, rotations=rotations, root=lambda rest: poses.root(rest) @ rotation.T + shift)
+
+    def rotated(rotations: Floats) -> Floats:
+        rotations = rotations.copy()
+        rotations[:, 0] = rotation @ rotations[:, 0]
+        return rotations
+
+    def fit(skeleton: Skeleton) -> tuple[Floats, Floats]:
+        assert poses.fit is not None
+        rotations, positions = poses.fit(skeleton)
+        return rotated(rotations), positions @ rotation.T + shift
+
+    return replace(
+        poses,
+        rotations=rotated(poses.rotations),
+        root=lambda rest: poses.root(rest) @ rotation.T + shift,
+        fit=None if poses.fit is None else fit,
+    )
+
+
+def on_body(poses: Poses, skeleton: Skeleton, family: str) -> Poses:
+    """``poses`` with the rotations of a body's ``skeleton``, where they were recorded on another."""
+    if poses.fit is None:
+        return poses
+    rotations, positions = poses.fit(skeleton)
+    names = skeleton.names
+    return replace(poses, rotations=rotations, root=lambda rest: positions, joint_names=names, family=family, fit=None)
 
 
 def rows_of_three(name: str, values: ArrayLike, count: int) -> Floats:

@@ -17,7 +17,7 @@ from rnd_runtime.motion.smpl import SMPL_REST_ROOT, SMPLX_REST_ROOT
 from .body_models import BodyModel
 from .dataset import ImportedDataset
 from .images import rotation_between
-from .poses import Poses
+from .poses import Poses, on_body
 
 Floats = NDArray[np.float64]
 
@@ -45,6 +45,8 @@ def place_scene(dataset: ImportedDataset, model: BodyModel, up: str | None = Non
     ``up`` is the source's up axis ("y", "-z", …). Default: the direction of the poses' pelvises.
     """
     poses, notes = dataset.poses, list(dataset.notes)
+    if poses.fit is not None:
+        poses = on_body(poses, model.shaped(None).skeleton, model.family)
     same_family = model.family == poses.family or (model.family, poses.family) == ("SMPL-H", "SMPL")
     body = model.shaped(poses.betas if same_family else None)
     rest = body.skeleton.rest_joints[0]

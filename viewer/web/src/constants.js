@@ -15,6 +15,7 @@ export const NAMES_BY_COUNT = {"22": ["pelvis", "left_hip", "right_hip", "spine1
 export const SMPL_REST_ROOT = [-0.0018, -0.2233, 0.0282];
 export const SMPLX_REST_ROOT = [0.0031, -0.3514, 0.012];
 // rnd_runtime.motion.readers.arrays
+export const ORTHOGONAL = 0.02;
 export const AMASS_MEMBERS = ["surface_model_type", "mocap_frame_rate", "mocap_framerate", "mocap_time_length"];
 export const MAX_ANGLE = 100.0;
 export const MANY_BEYOND_A_TURN = 0.2;
@@ -25,8 +26,15 @@ export const ORDERS = ["times", "timestamps", "frame_ids", "frame_id"];
 export const DEFAULT_FPS = 60.0;
 export const FPS_LIMITS = [0.001, 10000.0];
 // rnd_runtime.motion.motion
-export const Z_UP_TO_Y_UP = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]];
 export const STAND_INS = {"left_hand": "left_index1", "right_hand": "right_index1"};
+// rnd_runtime.motion.standing
+export const UP_ROTATIONS = {"y": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "-y": [[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]], "z": [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], "-z": [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], "x": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], "-x": [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]};
+export const UNCLEAR = 0.3;
+export const CLEAR = 0.8;
+export const LEG = 0.85;
+export const LIES = [-0.1, 0.65];
+export const STANDS = [0.75, 1.3];
+export const SHARE = 0.05;
 // rnd_runtime.motion.skeleton
 export const TURNS = 1e-06;
 // rnd_runtime.motion.interpolation

@@ -11,8 +11,9 @@ from rnd_bench.scenes.subject import Subject
 from rnd_bench.stability.figures import Result, at_most, holds, refusal, result
 from rnd_bench.stability.processes import Command, play, run_commands
 from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.formats.recordings import read_recording
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.motion.readers.arrays import read_motion_file
+from rnd_runtime.motion.readers.arrays import MotionRecord
 from rnd_runtime.motion.skeleton import smpl_skeleton
 
 HIGH = 6.0  # m; no camera sees both a body at this height and one at the origin
@@ -78,7 +79,8 @@ def joint_counts(subject: Subject) -> Result:
         still = np.zeros((2, 3))
         fields: dict[str, Any] = {key: poses, "trans": still, "root_orient": still, "mocap_framerate": 30.0}
         np.savez(file, **fields)
-        read = read_motion_file(file)
+        read = read_recording(file)
+        assert isinstance(read, MotionRecord)
         if len(read.joint_names) != columns // 3 + (columns in (63, 69)):
             wrong.append(f"{columns} columns: {len(read.joint_names)} joints")
         motion = load_motion(file, skeleton)
@@ -91,7 +93,7 @@ def joint_counts(subject: Subject) -> Result:
         file = subject.work / f"joints_{columns}.npz"
         np.savez(file, poses=np.zeros((2, columns)), trans=np.zeros((2, 3)))
         counts = "66, 72, 156 or 165", str(columns // 3)
-        wrong += refusal(f"{columns} columns", read_motion_file, file, words=counts)
+        wrong += refusal(f"{columns} columns", read_recording, file, words=counts)
     return result(holds("layouts not matched by name or not refused with both counts", wrong))
 
 

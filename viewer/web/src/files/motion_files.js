@@ -1,17 +1,17 @@
 // Array layouts of motions, read into one record in the file's axes (rnd_runtime/motion/readers/arrays.py).
 
 import {
-  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, ORDERS, SMPLX_REST_ROOT, SMPL_REST_ROOT,
+  AMASS_MEMBERS, DEFAULT_FPS, FPS_LIMITS, MANY_BEYOND_A_TURN, MAX_ANGLE, MAX_DISTANCE, MAX_HEIGHT, MAX_SPEED, NAMES_BY_COUNT, ORTHOGONAL, ORDERS, SMPLX_REST_ROOT, SMPL_REST_ROOT,
 } from "../constants.js";
 import { refusal, short, sizes } from "../errors.js";
 import { Npz } from "./npz.js";
-import { axisAngleToMatrix, multiply, rotate } from "../rotations.js";
+import { axisAngleToMatrix, cross, dot, matrixToAxisAngle, multiply, rotate, transposed } from "../rotations.js";
 
 const [MIN_FPS, MAX_FPS] = FPS_LIMITS;
 const FINGERS = 30;
 
 /** {name, rotations [F·J·9] local, translations [F·3] m relative to the root's rest position, restRoot [3] m of the file's
- *  skeleton or null, frames, joints, jointNames, fps, zUp, notes}; throws for anything but a person's motion. */
+ *  skeleton or null, frames, joints, jointNames, fps, up ("y" or "z"), upStated, notes}; throws for anything but a person's motion. */
 export function readMotionFile(bytes, name) {
   const members = new Npz(bytes, name, "motion"), notes = [];
   const easymocap = members.firstOf("Rh", "Rh_all") !== undefined;
@@ -32,11 +32,11 @@ export function readMotionFile(bytes, name) {
   checkTranslations(translations, name);
   if (members.has("betas")) notes.push("the file's betas are ignored: the avatar keeps its own shape");
   checkOrder(members, frames);
-  const fps = readFrameRate(members, notes), zUp = readUpAxis(members, amass || easymocap ? "z" : "y") === "z";
-  if (lookLikeMillimetres(translations, frames, fps, zUp ? 2 : 1))
+  const fps = readFrameRate(members, notes), stated = readUpAxis(members), up = stated ?? (amass || easymocap ? "z" : "y");
+  if (lookLikeMillimetres(translations, frames, fps, up === "z" ? 2 : 1))
     notes.push("trans is higher or faster than a person in metres: these look like millimetres");
   const restRoot = amass || easymocap ? smplRoot : null;
-  return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, zUp, notes };
+  return { name, rotations, translations, restRoot, frames, joints, jointNames, fps, up, upStated: stated !== null, notes };
 }
 
 /** Axis-angles [F·J·3] rad with the root first: {frames, joints, angles}. */
@@ -46,13 +46,31 @@ function readAngles(members, notes) {
     const expected = "a member called poses, poses_all, pose_body or body_pose";
     throw refusal("motion", { expected, got: members.names.join(", ") || "an empty archive", file });
   }
-  const { shape, numbers } = members.numbers(key), [frames, width] = shape;
+  const { shape, numbers } = axisAnglesOf(members.numbers(key), key, file), [frames, width] = shape;
   const flat = shape.length === 2 && width % 3 === 0, byJoint = shape.length === 3 && shape[2] === 3;
-  if (!flat && !byJoint) throw refusal(`shape of ${key}`, { expected: "F×3J or F×J×3", got: sizes(shape), file });
+  if (!flat && !byJoint) throw refusal(`shape of ${key}`, { expected: "F×3J, F×J×3 or F×J×3×3", got: sizes(shape), file });
   if (frames === 0) throw refusal(key, { expected: "at least one frame", got: "none", file });
   const joints = flat ? width / 3 : width;
   if ((joints !== 21 && joints !== 23) || members.has("joint_names")) return { frames, joints, angles: numbers };
   return joined(frames, [readRoot(members, frames, notes), numbers, ...readFingers(members, frames, joints, notes)]);
+}
+
+/** Rotation matrices F×J×3×3 as axis-angles F×J×3; others unchanged. */
+function axisAnglesOf({ shape, numbers }, key, file) {
+  if (shape.length !== 4 || shape[2] !== 3 || shape[3] !== 3) return { shape, numbers };
+  if (!numbers.length) throw refusal(`shape of ${key}`, { expected: "F×J×3×3", got: sizes(shape), file });
+  const count = numbers.length / 9, angles = new Float64Array(3 * count), product = new Float64Array(9);
+  for (let k = 0; k < count; k++) {
+    const rows = numbers.subarray(9 * k, 9 * k + 9), transpose = transposed(rows);
+    multiply(rows, 0, transpose, 0, product, 0);
+    const off = Math.max(...product.map((value, i) => Math.abs(value - (i % 4 === 0 ? 1 : 0))));
+    if (!(off < ORTHOGONAL && dot(cross(rows.slice(0, 3), rows.slice(3, 6)), rows.slice(6)) > 0)) {
+      const frame = Math.floor(k / shape[1]), what = `${key}: joint ${k % shape[1]}`;
+      throw refusal(what, { expected: "rotation matrices", got: "others", file, frame });
+    }
+    angles.set(matrixToAxisAngle(rows, 0), 3 * k);
+  }
+  return { shape: shape.slice(0, 3), numbers: angles };
 }
 
 /** The root's axis-angles [F·3] for a body without them. */
@@ -174,8 +192,8 @@ function readFrameRate(members, notes) {
   throw refusal(key, { expected: `frames per second, ${MIN_FPS} to ${MAX_FPS}`, got: `[${few.join(", ")}]`, file: members.file });
 }
 
-function readUpAxis(members, otherwise) {
-  if (!members.has("up_axis")) return otherwise;
+function readUpAxis(members) {
+  if (!members.has("up_axis")) return null;
   const up = members.strings("up_axis").join("").toLowerCase();
   if (up !== "y" && up !== "z") throw refusal("up_axis", { expected: "y or z", got: up, file: members.file });
   return up;

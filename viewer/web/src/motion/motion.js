@@ -1,19 +1,34 @@
 // Motions: poses of a file on an avatar's skeleton (rnd_runtime/motion/motion.py), and the encoder's window (posing/window.py).
 
-import { SMPL_REST_ROOT, STAND_INS, TURNS, Z_UP_TO_Y_UP } from "../constants.js";
+import { SMPL_REST_ROOT, STAND_INS, TURNS, UP_ROTATIONS } from "../constants.js";
 import { refusal } from "../errors.js";
 import { pointAt, rotationsAt } from "./interpolation.js";
-import { matrixToAxisAngle, multiply, transposedTimes } from "../rotations.js";
+import { matrixToAxisAngle, multiply, rotate, transposedTimes } from "../rotations.js";
+import { upAxis } from "./standing.js";
 
 /** A record of motion_files.js for `skeleton` ({names, rest}), Y up: {rotations [F·J·9], translations [F·3] m, frames, joints,
  *  fps, duration in s, name, notes}. */
 export function fitMotion(record, skeleton) {
-  const { name, frames, fps, zUp } = record, notes = [...record.notes];
-  const rotations = matchJoints(record, skeleton, notes), translations = record.translations.slice();
+  const { name, frames, fps } = record, notes = [], translations = record.translations.slice();
+  const rotations = matchJoints(record, skeleton, notes), axis = upOf(record, rotations, skeleton.names.length, notes);
+  notes.unshift(...record.notes);
   const motion = { name, rotations, translations, frames, joints: skeleton.names.length, fps, duration: (frames - 1) / fps, notes };
-  const restRoot = record.restRoot ?? (zUp ? SMPL_REST_ROOT : null);
-  if (restRoot) placeRoot(motion, restRoot, zUp, skeleton);
+  const restRoot = record.restRoot ?? (axis === "y" ? null : SMPL_REST_ROOT);
+  if (restRoot) placeRoot(motion, restRoot, UP_ROTATIONS[axis].flat(), skeleton);
   return motion;
+}
+
+/** The file's up axis: what it states, or how the trunk stands; its notes come before the others. */
+function upOf({ up, upStated, restRoot, translations, frames }, rotations, joints, notes) {
+  if (upStated) return up;
+  const rest = restRoot ?? SMPL_REST_ROOT, trunks = [], hips = [];
+  for (let f = 0; f < frames; f++) {
+    trunks.push([1, 4, 7].map((k) => rotations[9 * f * joints + k]));
+    hips.push([0, 1, 2].map((k) => rest[k] + translations[3 * f + k]));
+  }
+  const found = upAxis(trunks, hips, up);
+  notes.unshift(...found.notes);
+  return found.axis;
 }
 
 /** A motion of one frame in the rest pose. */
@@ -24,14 +39,13 @@ export function restMotion(skeleton) {
 }
 
 /** Translations relative to the avatar's rest position, from those relative to `restRoot`. */
-function placeRoot({ rotations, translations, frames, joints }, restRoot, zUp, skeleton) {
+function placeRoot({ rotations, translations, frames, joints }, restRoot, world, skeleton) {
   const product = new Float64Array(9);
   for (let f = 0; f < frames; f++) {
     const p = [0, 1, 2].map((k) => restRoot[k] + translations[3 * f + k]);
-    const placed = zUp ? [p[0], p[2], -p[1]] : p;
+    const placed = rotate(world, p);
     for (let k = 0; k < 3; k++) translations[3 * f + k] = placed[k] - skeleton.rest[k];
-    if (!zUp) continue;
-    multiply(Z_UP_TO_Y_UP.flat(), 0, rotations, 9 * f * joints, product, 0);
+    multiply(world, 0, rotations, 9 * f * joints, product, 0);
     rotations.set(product, 9 * f * joints);
   }
 }
