@@ -31,7 +31,7 @@ from rnd_trainer.importing.write import write_capture
 
 from .film_notes import cut_off, film_notes, refuse_unusable
 from .fit import FOCAL_OF_SIDE, Estimate, estimate
-from .lifter import NETWORK, lift
+from .lifter import lift
 from .observations import Observations
 from .observing.camera_motion import Steady, steady
 from .observing.frame_rate import Regular, regular
@@ -82,7 +82,8 @@ def import_video(
     video, numbers = _frames(source, options)
     on_found(f"{source.name}: {len(numbers)} frames of {video.width} x {video.height}, {video.fps:g} a second")
     try:
-        video = steady(video, numbers, partial(on_progress, "camera"))
+        people = [one.region for one in networks.detector(video.frame(numbers[0]))]
+        video = steady(video, numbers, people, partial(on_progress, "camera"))
         seen = observe(video, networks, numbers=numbers, person=options.person, on_progress=on_progress)
         refuse_unusable(seen, video.frame)
     except InputError as error:
@@ -133,7 +134,7 @@ def _fitted(seen: Observations, options: ImportOptions, on_progress: OnProgress)
     width, height = seen.image_size
     focal = options.intrinsics[0] if options.intrinsics else FOCAL_OF_SIDE * max(width, height)
     principal = options.intrinsics[2:] if options.intrinsics else (width / 2, height / 2)
-    lifted = lift(seen, focal, (principal[0], principal[1])) if NETWORK.exists() else None
+    lifted = lift(seen, focal, (principal[0], principal[1]))
     return estimate(
         seen,
         lifted,

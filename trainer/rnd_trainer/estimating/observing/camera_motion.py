@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 
-from .regions import Floats, Image
+from .regions import Floats, Image, Region
 
 _SIDE = 640  # pixels of the longer side in which the background is followed
 _FOCAL = 1.15  # focal length over the longer side: of small rotations any usual one gives the same images
 _FEATURES, _MIN_FEATURES = 400, 12  # fewer say nothing: a plain wall counts as still
+_BODY_WIDTH = 0.7  # of a person's region, of its height: arms
 _RETURN = 0.7  # pixels between a feature and where it comes back to
-_STILL = 0.35  # pixels of the full image: p95 of the motion of a camera on a tripod
+_STILL = 0.6  # pixels of the full image: p95 of the motion of a camera on a tripod
 _FAR = 0.15  # of the longer side: motion beyond that of a hand
 _PARALLAX = 2.0  # pixels of the small image: deviation of the background from a rotation
 _ZOOM = 0.06  # change of size beyond that of a hand
@@ -62,16 +63,22 @@ class Steady:
 
 
 def steady(
-    video: Any, numbers: Sequence[int], on_progress: Callable[[int, int], None] = lambda done, total: None
+    video: Any,
+    numbers: Sequence[int],
+    people: Sequence[Region] = (),
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Steady:
     """``video`` with hand-held sway taken out.
+
+    Args:
+        people: in the first frame; the background is followed beside them.
 
     Raises:
         InputError: a cut in the clip, or a camera that walks, pans or zooms.
     """
     scale = min(1.0, _SIDE / max(video.width, video.height))
     first = _grey(video.frame(numbers[0]), scale)
-    features = cv2.goodFeaturesToTrack(first, _FEATURES, 0.01, 8)
+    features = cv2.goodFeaturesToTrack(first, _FEATURES, 0.01, 8, mask=_beside(people, first.shape, scale))
     rotations, parallax, zoom, before = [np.zeros(3)], [0.0], [1.0], first
     lens = _lens(first.shape[1], first.shape[0])
     for done, number in enumerate(numbers[1:]):
@@ -91,6 +98,16 @@ def steady(
     return _checked(video, numbers, np.array(rotations), np.array(parallax), np.array(zoom), lens, scale)
 
 
+def _beside(people: Sequence[Region], shape: tuple[int, ...], scale: float) -> Image:
+    """255 where no one is: outside of an upright ellipse in each region."""
+    free = np.full(shape, 255, np.uint8)
+    for region in people:
+        centre = round(region.x * scale), round(region.y * scale)
+        axes = round(_BODY_WIDTH * region.size * scale / 2), round(region.size * scale / 2)
+        cv2.ellipse(free, centre, axes, float(np.degrees(region.rotation)), 0, 360, 0, -1)
+    return free
+
+
 def _checked(
     video: Any, numbers: Sequence[int], rotations: Floats, parallax: Floats, zoom: Floats, lens: Floats, scale: float
 ) -> Steady:
@@ -100,10 +117,10 @@ def _checked(
     moved = np.array([np.linalg.norm(_by(matrix, corners) - corners, axis=1).max() for matrix in small])
     far = moved.max() / (2 * lens[:2, 2].max())
     reason = None
-    if np.mean(parallax > _PARALLAX) > _OFTEN:
-        reason = f"one that walks: {np.median(parallax) / scale:.0f} pixels of parallax"
-    elif np.mean(np.abs(zoom - 1) > _ZOOM) > _OFTEN:
+    if np.mean(np.abs(zoom - 1) > _ZOOM) > _OFTEN:
         reason = f"one that walks or zooms: the background's size changes by {np.abs(zoom - 1).max():.0%}"
+    elif np.mean(parallax > _PARALLAX) > _OFTEN:
+        reason = f"one that walks: {np.median(parallax) / scale:.0f} pixels of parallax"
     elif far > _FAR:
         reason = f"one that pans: the background moves by {moved.max() / scale:.0f} pixels"
     if reason is not None:

@@ -79,9 +79,8 @@ def network_file(name: str) -> Path:
         raise InputError(f"network {name} is missing", file=folder, hint=f"{COMMAND} fetches it")
     known = noted.get("source_sha256") == wanted.sha256 and noted.get("conversion") == _CONVERSION
     if not known or noted.get("sha256") != sha256_of(path):
-        raise InputError(
-            f"network {name}", expected="the one this version reads", got="another", file=path, hint=COMMAND
-        )
+        hint = f"{COMMAND} fetches it"
+        raise InputError(f"network {name}", expected="this version's", got="another", file=path, hint=hint)
     return path
 
 

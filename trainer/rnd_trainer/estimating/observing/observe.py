@@ -89,10 +89,10 @@ def observe(
     second, outside = [], []
     for k, mask in enumerate(refined):
         masks.append(mask)
-        alone = _alone(video.frame(frames[k]), mask, soft[k], first[k].region.size)
+        alone = _alone(video.frame(frames[k]), mask, first[k].region.size)
         views = networks.landmarks.look_twice(alone, first[k].region.scaled(_WIDER))
         second.append(views.without_mask())
-        outside.append(_outside(mask, soft[k], np.concatenate([first[k].points, views.points])))
+        outside.append(_outside(mask, np.concatenate([first[k].points, views.points])))
     merged = _merged(first, second, np.stack(outside), np.array(frames) / video.fps)
     hands = _hands(video, frames, merged, networks.hands, on_progress)
     return Observations(
@@ -128,19 +128,18 @@ def _hands(
     return hands
 
 
-def _alone(image: Image, mask: Image, soft: Image, size: float) -> Image:
+def _alone(image: Image, mask: Image, size: float) -> Image:
     """``image`` with its mean colour in place of the background, so that nothing there looks like a limb."""
     reach = 2 * max(1, round(_AROUND * size)) + 1
-    person = np.maximum(mask, soft)
-    grown = cv2.dilate(person, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     share = cv2.blur(grown, (reach, reach))[..., None] / np.float32(255)
     plain = image.mean((0, 1), dtype=np.float32)
     return np.asarray(image * share + plain * (1 - share), np.uint8)
 
 
-def _outside(mask: Image, soft: Image, points: Floats) -> NDArray[np.float64]:
+def _outside(mask: Image, points: Floats) -> NDArray[np.float64]:
     """Distances [V, 33] of ``points`` from the person, pixels; 0 inside."""
-    person = (np.maximum(mask, soft) > 127).astype(np.uint8)
+    person = (mask > 127).astype(np.uint8)
     if not person.any():
         return np.zeros(points.shape[:2])
     distance = cv2.distanceTransform(1 - person, cv2.DIST_L2, 5)

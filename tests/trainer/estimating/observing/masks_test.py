@@ -1,0 +1,78 @@
+"""Masks by the background of a static camera, from the ragged ones of a network."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from rnd_trainer.checking.silhouette import mask_iou
+from rnd_trainer.estimating.observing.masks import refine_masks
+
+HEIGHT, WIDTH, COUNT = 200, 160, 14
+
+
+def textured(seed: int, mean: tuple[int, int, int], blur: float = 2.0) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), blur)
+    return np.clip(np.array(mean) + 25 * smooth / smooth.std(), 0, 255)
+
+
+def shape(k: int) -> np.ndarray:
+    """A body with an arm akimbo [H, W] 0…1, at four times the resolution: its gap shows the background."""
+    big = np.zeros((4 * HEIGHT, 4 * WIDTH), np.uint8)
+    x = 4 * (45 + 5 * k)
+    cv2.ellipse(big, (x, 400), (70, 260), 0, 0, 360, 255, -1)
+    cv2.line(big, (x + 40, 250), (x + 170, 380), 255, 30)
+    cv2.line(big, (x + 170, 380), (x + 40, 520), 255, 30)
+    return cv2.resize(big, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def clip(seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """Images with noise, true masks, and a network's: blurred, its gaps filled."""
+    rng = np.random.default_rng(seed)
+    behind, person = textured(1, (120, 130, 90)), textured(2, (150, 80, 60))
+    images, truths, soft = [], [], []
+    for k in range(COUNT):
+        alpha = shape(k)[..., None]
+        image = person * alpha + behind * (1 - alpha) + rng.normal(scale=2, size=behind.shape)
+        images.append(np.clip(image, 0, 255).astype(np.uint8))
+        truths.append((255 * alpha[..., 0]).astype(np.uint8))
+        closed = cv2.morphologyEx(truths[-1], cv2.MORPH_CLOSE, np.ones((25, 25), np.uint8))
+        soft.append(cv2.GaussianBlur(closed, (0, 0), 2.5))
+    return images, truths, soft
+
+
+def ious(masks: list[np.ndarray], truths: list[np.ndarray]) -> np.ndarray:
+    return np.array([mask_iou(mask > 127, truth > 127) for mask, truth in zip(masks, truths)])
+
+
+def test_the_background_of_a_static_camera_sharpens_masks() -> None:
+    images, truths, soft = clip()
+    before, after = ious(soft, truths), ious(list(refine_masks(images.__getitem__, soft)), truths)
+    assert before.mean() < 0.91
+    assert after.min() > 0.92 and after.mean() > 0.965
+
+
+def test_a_moving_background_leaves_the_networks_masks_about_as_they_are() -> None:
+    images, truths, soft = clip()
+    moved = [np.where(truth[..., None] > 0, image, textured(50 + k, (120, 130, 90)).astype(np.uint8))
+             for k, (image, truth) in enumerate(zip(images, truths))]  # fmt: skip
+    after = ious(list(refine_masks(moved.__getitem__, soft)), soft)
+    assert after.min() > 0.9
+
+
+def test_large_images_are_worked_on_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rnd_trainer.estimating.observing import masks
+
+    monkeypatch.setattr(masks, "MAX_SIDE", 90)
+    images, truths, soft = clip()
+    after = list(refine_masks(images.__getitem__, soft))
+    assert after[0].shape == (HEIGHT, WIDTH)
+    assert ious(after, truths).mean() > 0.92
+
+
+def test_an_empty_mask_stays_empty() -> None:
+    images, _, soft = clip()
+    soft[3] = np.zeros_like(soft[3])
+    assert list(refine_masks(images.__getitem__, soft))[3].max() == 0

@@ -1,0 +1,102 @@
+"""Whom to follow, by networks that find bright blocks: nobody, one, several, darkness, a rotated video."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from rnd_runtime.core.errors import InputError
+from rnd_trainer.estimating.observing.detection import Detection
+from rnd_trainer.estimating.observing.landmarks import SIDE, View, Views
+from rnd_trainer.estimating.observing.regions import Region
+from rnd_trainer.estimating.observing.tracking import find_person, follow
+
+COUNT = 20
+
+
+class Clip:
+    def __init__(self, images: list[np.ndarray]) -> None:
+        self.images, self.numbers = images, range(len(images))
+
+    def frame(self, number: int) -> np.ndarray:
+        return self.images[number]
+
+
+def blocks(image: np.ndarray) -> list[Detection]:
+    """A person where a red block is taller than wide."""
+    red = (image[..., 0] > 200) & (image[..., 1] < 100)
+    _, _, stats, centres = cv2.connectedComponentsWithStats(red.astype(np.uint8))
+    found = [
+        Detection(Region(float(x) + 0.5, float(y) + 0.5, float(stats[k, cv2.CC_STAT_HEIGHT])), 0.9)
+        for k, (x, y) in enumerate(centres)
+        if k > 0 and stats[k, cv2.CC_STAT_HEIGHT] > stats[k, cv2.CC_STAT_WIDTH]
+    ]
+    return sorted(found, key=lambda one: -one.region.size)
+
+
+class Network:
+    """Sees the red block nearest to the region's middle."""
+
+    def look(self, image, region: Region, *, mirrored: bool = False) -> View:
+        near = [one.region for one in blocks(image.image) if region.overlap(one.region) > 0.2]
+        found = near[0] if near else region
+        zeros = np.zeros((33, 2)), np.zeros((33, 3)), np.ones(33)
+        return View(*zeros, 1.0 if near else 0.0, found, np.zeros((SIDE, SIDE), np.float32), region.to_image(SIDE))
+
+    def look_twice(self, image: np.ndarray, region: Region, first: View | None = None) -> Views:
+        many = np.zeros((2, 33, 2)), np.zeros((2, 33, 3)), np.ones((2, 33))
+        return Views(*many, 1.0, np.zeros(image.shape[:2], np.float32), region)
+
+
+def image(*people: tuple[int, int], grey: int = 90) -> np.ndarray:
+    """People at these columns with these heights."""
+    pixels = np.full((120, 200, 3), grey, np.uint8)
+    for x, height in people:
+        pixels[60 - height // 2 : 60 + height // 2, x - height // 6 : x + height // 6] = (230, 20, 20)
+    return pixels
+
+
+def start_of(images: list[np.ndarray], person: int | None = None):
+    clip = Clip(images)
+    return find_person(clip, list(clip.numbers), blocks, Network(), person)
+
+
+def test_one_person_is_followed_and_found_again() -> None:
+    images = [image((60 + 3 * k, 60)) for k in range(COUNT)]
+    images[8] = image()
+    clip = Clip(images)
+    start = start_of(images)
+    assert (start.frame, round(start.region.x)) == (0, 60)
+    seen = dict(follow(clip, list(clip.numbers), start, blocks, Network()))
+    assert [number for number, views in seen.items() if views is None] == [8]
+    assert seen[19].region.x == pytest.approx(60 + 3 * 19, abs=4)
+
+
+def test_a_small_bystander_is_left_alone() -> None:
+    assert round(start_of([image((60, 80), (150, 30))] * COUNT).region.x) == 60
+
+
+def test_two_people_are_told_apart_by_an_option() -> None:
+    images = [image((60, 60), (150, 56))] * COUNT
+    with pytest.raises(
+        InputError, match=r"people: expected one, got 2 \(choose by --person: 0 at x = 60, 1 at x = 150"
+    ):
+        start_of(images)
+    assert round(start_of(images, person=1).region.x) == 150
+    with pytest.raises(InputError, match="--person: expected 0 to 1"):
+        start_of(images, person=2)
+
+
+@pytest.mark.parametrize(
+    "pixels, words",
+    [
+        (image(), "expected one in the video, got none"),
+        (image(grey=4), "light enough"),
+        (np.rot90(image((60, 60))), "head to the left"),
+        (np.rot90(image((60, 60)), -1), "head to the"),
+    ],
+)
+def test_why_nobody_is_found(pixels: np.ndarray, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        start_of([np.ascontiguousarray(pixels)] * COUNT)
