@@ -21,6 +21,7 @@ from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
+from rnd_runtime.ground.shadow import GroundLight, Plane, remaining_light
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.enlarge import enlarged
@@ -28,7 +29,7 @@ from rnd_runtime.raster.in_view import opacities_of, visible_to
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
-from rnd_runtime.shading.shader import Shader
+from rnd_runtime.shading.shader import Shader, shadow_radii
 
 from .aov import Lit, aov_layers, splat_features
 from .far import fine_view
@@ -45,6 +46,7 @@ class RenderedFrame:
         aovs: [H, W, C] by name, see ``playback.aov``.
         stage_seconds: duration of each stage, in order; they add up to the frame.
         background: linear radiance, [H, W, 3] or [3]; None for a transparent frame.
+        ground: [H, W, 3] share of the background's light that the body's shadow on the ground leaves; None without one.
         srgb_on_black: [H, W, 3] 8-bit sRGB without the background, where already made.
     """
 
@@ -53,6 +55,7 @@ class RenderedFrame:
     aovs: Mapping[str, Floats32] = field(default_factory=dict)
     stage_seconds: Mapping[str, float] = field(default_factory=dict)
     background: Floats32 | None = None
+    ground: Floats32 | None = None
     srgb_on_black: NDArray[np.uint8] | None = None
 
     @cached_property
@@ -60,18 +63,38 @@ class RenderedFrame:
         """8-bit sRGB [H, W, 3] over the background, or black."""
         if self.background is None and self.srgb_on_black is not None:
             return self.srgb_on_black
-        return tone_map(self.radiance, self.alpha, self.background)
+        return tone_map(self.radiance, self.alpha, self.shadowed_background)
 
     @cached_property
     def srgb_alpha(self) -> NDArray[np.uint8]:
-        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied (as in PNG)."""
-        return tone_map_straight(self.radiance, self.alpha)
+        """8-bit sRGB and alpha [H, W, 4] without the background, not premultiplied (as in PNG).
+
+        A shadow on the ground is black of its mean opacity.
+        """
+        return tone_map_straight(self.radiance, self._covering)
+
+    @property
+    def shadowed_background(self) -> Floats32 | None:
+        """The background with the shadow on it."""
+        if self.background is None or self.ground is None:
+            return self.background
+        shadowed: Floats32 = self.background * self.ground
+        return shadowed
+
+    @property
+    def _covering(self) -> Floats32:
+        """Alpha [H, W] of the body and of its shadow, taken as black."""
+        if self.ground is None:
+            return self.alpha
+        covering: Floats32 = self.alpha + (1 - self.alpha) * (1 - self.ground.mean(axis=-1))
+        return covering
 
     def linear(self) -> Floats32:
         """Linear RGBA [H, W, 4], premultiplied; alpha is 1 over a background."""
-        if self.background is None:
-            return np.dstack([self.radiance, self.alpha])
-        over = self.radiance + (1 - self.alpha)[..., None] * self.background
+        behind = self.shadowed_background
+        if behind is None:
+            return np.dstack([self.radiance, self._covering])
+        over = self.radiance + (1 - self.alpha)[..., None] * behind
         return np.dstack([over, np.ones_like(self.alpha)])
 
 
@@ -96,6 +119,9 @@ class FrameRenderer:
         raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see ``make_rasterizer``; or a rasteriser.
         cull: leaves out Gaussians whose n·v is below this cosine, such as −0.5; −1 draws all. By default as the
             avatar's file advises. See ``raster.in_view.in_view``.
+
+    Attributes:
+        ground: the plane that the body casts its shadow on, in the world; None for none.
     """
 
     def __init__(
@@ -112,6 +138,8 @@ class FrameRenderer:
         self.cull = avatar.advice.cull if cull is None else cull
         self.shader = Shader(light, shade) if isinstance(light, Light) else light
         self.rasterizer: Rasterizer = make_rasterizer(raster) if isinstance(raster, str) else raster
+        self.ground: Plane | None = None
+        self._ground_light: tuple[Light, GroundLight] | None = None
 
     @property
     def light(self) -> Light:
@@ -162,6 +190,8 @@ class FrameRenderer:
         camera = camera or self.camera
         assert camera is not None
         rendered = camera
+        if self.ground is not None and not isinstance(body, PosedAvatar):
+            body = PosedAvatar(self.avatar.posed(body), body.root, self.avatar.joints(body))
         if scale != 1 and not aovs:
             rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
         raster = self._raster(body, rendered, aovs, lit, given or {}, antialias=rendered is camera)
@@ -178,7 +208,20 @@ class FrameRenderer:
         if srgb and image_srgb is None:
             image_srgb = tone_map(radiance, alpha)
             seconds["tone map"] = perf_counter() - started
-        return RenderedFrame(radiance, alpha, layers, seconds, srgb_on_black=image_srgb)
+        ground = None
+        if self.ground is not None and isinstance(body, PosedAvatar):
+            started = perf_counter()
+            ground = self._shadow(body, camera, self.ground)
+            seconds["ground"] = perf_counter() - started
+        return RenderedFrame(radiance, alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
+
+    def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
+        """Share [H, W, 3] of the ground's light that the body leaves."""
+        if self._ground_light is None or self._ground_light[0] is not self.light:
+            self._ground_light = self.light, GroundLight(self.light, ground.normal)
+        plane = ground.in_frame(body.root)
+        grids = self._ground_light[1].shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3])
+        return remaining_light(grids, plane, camera.in_frame(body.root))
 
     def close(self) -> None:
         """Release the rasteriser."""

@@ -261,6 +261,7 @@ def test_warnings_name_what_was_found(files, tmp_path, capsys):
         ({"hdr": None, "hdr_up": "z"}, "--hdr-up: expected the default, got z (needs --hdr)"),
         ({"motion_fps": "inf"}, "--motion-fps: expected 0.001 to 10000, got inf"),
         ({"background": "bluish"}, "--background"),
+        ({"ground": "low"}, "--ground: expected none, auto or metres, got low"),
         ({"aov": "albedo,beauty"}, "--aov"),
         ({"format": "gif"}, "--format"),
         ({"camera": "above"}, "--camera"),

@@ -27,12 +27,12 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
+from rnd_runtime.ground.shadow import Plane
+from rnd_runtime.ground.standing import UP, ground_of
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, frame_motion, front_path, orbit_path
-from rnd_runtime.playback.standing import UP, ground_of
-from rnd_runtime.shading.ground import Plane
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.cameras import file_path, split_camera

@@ -1,0 +1,1 @@
+"""The ground that a body stands on, and its shadow there."""
