@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from rnd_runtime.cli.command import OptionalFile, OptionalFolder, is_quiet, log, option, parse, run_command, warn
+from rnd_runtime.cli.command import Flag, OptionalFile, OptionalFolder, is_quiet, log, option, parse, run_command, warn
 from rnd_runtime.core.errors import InputError, check_cull
 from rnd_runtime.core.files import is_folder, output_file, output_folder, refuse_input, write_json
 
@@ -64,6 +64,8 @@ class EvalOptions:
     """n·v below which Gaussians are left out, such as -0.5. Default: none are."""
     motion: Annotated[str | None, option("FILE")] = None
     """Another motion file of the capture. Default: the poses refined in training, else the capture's own."""
+    fit_poses: Flag = False
+    """Fit the poses of novel_pose frames to their images first, the avatar frozen: for estimated poses."""
     method: Annotated[str | None, option("NAME")] = None
     """Name of the rows. Default: the run folder's."""
 
@@ -96,6 +98,14 @@ def evaluate_run(options: EvalOptions) -> None:
         warn(note)
     capture = load_capture(options.capture, motion_file=options.motion or _refined_motion(path, checkpoint, options))
     log_all(capture_notes(capture, HELD_OUT))
+    if options.fit_poses:
+        from rnd_runtime.cli.progress import Progress
+        from rnd_trainer.evaluation.held_out_poses import fit_held_out
+
+        with Progress() as progress:
+            progress.phase("fitting held-out poses")
+            fitted = fit_held_out(checkpoint, capture, on_frame=lambda done, total: progress.update(done))
+        capture = replace(capture, motion=fitted)
     exported = path.with_suffix(".onnx")
     rows = score(
         checkpoint,

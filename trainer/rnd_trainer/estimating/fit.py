@@ -37,6 +37,8 @@ FOCAL_DEVIATION = 0.20
 KNOWN_FOCAL_DEVIATION = 0.003
 MAX_TURN, MAX_SHIFT = 0.5, 0.4
 """bounds of one step: rad of a joint, m of the root"""
+CORRELATION = 3.5
+"""errors of neighbouring frames and points are alike: measured errors over deviations that take them as independent"""
 _LESS_SURE = {11: 1.5, 12: 1.5, 23: 1.5, 24: 1.5, **dict.fromkeys(range(11), 1.3), **dict.fromkeys(range(17, 23), 1.5)}
 
 
@@ -46,7 +48,7 @@ class Weights:
 
     mark_m: float = 0.022  # deviation of a sure landmark at the person's distance
     spread: float = 1.0  # of the views of one frame, counted as deviation
-    points: float = 0.6
+    points: float = 1.0
     bones: float = 0.6
     prior: float = 0.03
     smooth: float = 0.5
@@ -309,7 +311,7 @@ class Fit:
         width, height = observations.image_size
         K = np.array([[state.focal, 0, self.lens.centre[0]], [0, state.focal, self.lens.centre[1]], [0, 0, 1]])
         camera = Camera(width, height, K, matrix)
-        deviations = np.sqrt(self._equations.variances())
+        deviations = CORRELATION * np.sqrt(self._equations.variances())
         turned = np.zeros((len(observations), len(names), 3))
         turned[:, self.layout.active] = deviations[:, :-3].reshape(len(observations), -1, 3)
         return Estimate(
