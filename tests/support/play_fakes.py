@@ -59,6 +59,10 @@ class FakeAvatar:
     def posed(self, encoded: Encoded) -> Gaussians:
         return self.pose(encoded.motion, encoded.time)
 
+    def joints(self, encoded: Encoded) -> np.ndarray:
+        now = encoded.motion.at([encoded.time])
+        return self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]
+
     def unposed(self, encoded: Encoded) -> None:
         """It has no networks."""
 

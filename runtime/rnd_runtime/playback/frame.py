@@ -90,10 +90,10 @@ class RenderedFrame:
         return covering
 
     def linear(self) -> Floats32:
-        """Linear RGBA [H, W, 4], premultiplied; alpha is 1 over a background."""
+        """Linear RGBA [H, W, 4], premultiplied; alpha is 1 over a background, and without one the body's alone."""
         behind = self.shadowed_background
         if behind is None:
-            return np.dstack([self.radiance, self._covering])
+            return np.dstack([self.radiance, self.alpha])
         over = self.radiance + (1 - self.alpha)[..., None] * behind
         return np.dstack([over, np.ones_like(self.alpha)])
 

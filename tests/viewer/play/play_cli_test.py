@@ -241,6 +241,23 @@ def test_warnings_name_what_was_found(files, tmp_path, capsys):
     assert "the light is dark: its largest radiance is 0" in capsys.readouterr().err
 
 
+def test_a_ground_catches_the_shadow(files, tmp_path):
+    exr = {"format": "png,exr", "frames": ":1", "elevation": 30, "background": "1,1,1"}
+    assert main(_arguments(files, tmp_path / "floats", **exr)) == 0
+    assert main(_arguments(files, tmp_path / "stands", ground="auto", **exr)) == 0
+    floats, stands = (read_image(tmp_path / name / "frames_exr/000000.exr") for name in ("floats", "stands"))
+    left = stands[..., 4:7]
+    assert floats.shape[2] == 4 and left.min() < 0.9 and left.max() == 1
+    behind = floats[..., :3] == 1  # the plate alone
+    assert behind.any() and np.allclose(stands[..., :3][behind], left[behind], atol=1e-6)
+    assert (
+        main(_arguments(files, tmp_path / "clear", ground="auto", **exr | {"background": None, "format": "png"})) == 0
+    )
+    alpha = read_image(tmp_path / "clear/frames/000000.png")[..., 3] / 255
+    plate = behind.all(-1)
+    assert np.abs(alpha - (1 - left.mean(-1)))[plate].max() < 0.005
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -419,4 +436,4 @@ def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):
     assert main(["--doctor"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[:3] == [["rasteriser", "cpu"], ["OpenGL,", "EGL", "missing"], ["→", "apt", "install", "libegl1"]]
-    assert lines[3][:3] == ["PyAV", "(mp4,", "webp)"]
+    assert lines[3][:2] == ["PyAV", "(mp4,"]

@@ -7,6 +7,7 @@ R, G, B, A                   linear radiance, premultiplied; alpha 1 over a back
 albedo, diffuse, specular,   linear, premultiplied; diffuse + specular is the radiance without a background,
 shadow                       and radiance + shadow has no cast shadows
 normal, roughness, …, Z      averages over the covered part of a pixel, not premultiplied
+ground                       share of a plate's light that the shadow on the ground leaves, not premultiplied
 CryptoPart00 … 02            Cryptomatte, always FLOAT
 ===========================  =============================================================================
 
@@ -61,6 +62,10 @@ class ExrWriter:
         """Write one frame with all of its AOVs."""
         linear = frame.linear()
         layers, names, half = [self._colours(linear[..., :3]), linear[..., 3:]], ["R", "G", "B", "A"], [self.half] * 4
+        if frame.ground is not None:
+            layers.append(frame.ground)
+            names += ["ground.R", "ground.G", "ground.B"]
+            half += [self.half] * 3
         for aov, values in frame.aovs.items():
             if aov in COLOURS:
                 values = self._colours(values)
