@@ -47,7 +47,7 @@ def regular(video: Any) -> Any:
     if usual <= 0 or np.mean(np.abs(gaps - usual) > _UNEVEN * usual) <= _OFTEN:
         return video
     at = times[0] + usual * np.arange(int(np.floor((times[-1] - times[0]) / usual + 0.5)) + 1)
-    shown = np.clip(np.searchsorted(times, at + usual / 2) - 1, 0, len(times) - 1)
+    shown = np.clip(np.searchsorted(times, at + usual / 4) - 1, 0, len(times) - 1)
     new = np.flatnonzero(np.diff(shown, prepend=-1) > 0)
     return Regular(video, 1 / usual, shown, new.tolist())
 
