@@ -1,6 +1,6 @@
 """Renders the mesh of rnd-convert in Blender's Cycles beside rnd-play's frame, under the same light and camera.
 
-    BLENDER_PYTHON=…/bin/python python scripts/compare_blender.py out/mesh --out out/blender
+    BLENDER_PYTHON=bpy/bin/python python scripts/compare_blender.py out/mesh --out out/blender
 
 OUT gets Cycles' frames as EXR and PNGs with both and three times their difference; rows go to
 assets/bench/blender.json. BLENDER_PYTHON is a Python with the module bpy. The folder holds avatar.glb and avatar.usdz
