@@ -38,7 +38,7 @@ def outside(seen: Observations, points: NDArray[np.int64]) -> Bools:
     width, height = seen.image_size
     pixels = seen.keypoints_px[:, points]
     inside = (pixels > -_MARGIN).all(-1) & (pixels[..., 0] < width + _MARGIN) & (pixels[..., 1] < height + _MARGIN)
-    return ~inside.all(-1)
+    return np.asarray(~inside.all(-1))
 
 
 def cut_off(seen: Observations) -> Bools:

@@ -79,6 +79,7 @@ def import_video(
     refuse_occupied(out, source, options)
     refuse_unwritable(out)
     networks = Networks.open()
+    video: Any
     video, numbers = _frames(source, options)
     on_found(f"{source.name}: {len(numbers)} frames of {video.width} x {video.height}, {video.fps:g} a second")
     try:

@@ -59,7 +59,7 @@ class Steady:
         shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # from indices to positions
         matrix = np.linalg.inv(shift) @ self.homographies[number] @ shift
         size = image.shape[1], image.shape[0]
-        return cv2.warpPerspective(image, matrix, size, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
+        return cv2.warpPerspective(image, matrix, size, borderMode=cv2.BORDER_REPLICATE)
 
 
 def steady(
@@ -192,8 +192,8 @@ def _by(matrix: Floats, points: Floats) -> Floats:
 def _grey(image: Image, scale: float) -> Image:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     if scale == 1:
-        return grey  # type: ignore[return-value]
-    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+        return grey
+    return cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
 def _is_cut(before: Image, after: Image) -> bool:

@@ -72,7 +72,8 @@ class HandNetwork:
 def _from_body(elbow: Floats, wrist: Floats, knuckles: Floats) -> Region:
     along = knuckles - wrist
     length = max(float(np.linalg.norm(along)), _FROM_ARM * float(np.linalg.norm(wrist - elbow)))
-    return Region(*(wrist + along), _FROM_BODY * length, float(np.arctan2(along[0], -along[1])))
+    x, y = wrist + along
+    return Region(float(x), float(y), _FROM_BODY * length, float(np.arctan2(along[0], -along[1])))
 
 
 def _from_hand(points: Floats) -> Region:

@@ -109,7 +109,8 @@ class LandmarkNetwork:
         plain = first or self.look(shrunk, region)
         views = [plain, self.look(shrunk, region, mirrored=True)]
         size = image.shape[1], image.shape[0]
-        mask = np.mean([uncrop(view.mask, view.to_image, size) for view in views], axis=0, dtype=np.float32)
+        masks = [uncrop(view.mask, view.to_image, size) for view in views]
+        mask = np.asarray(np.mean(masks, axis=0), np.float32)
         return Views(
             points=np.stack([view.points for view in views]),
             metres=np.stack([view.metres for view in views]),

@@ -5,8 +5,9 @@ Source: He et al. 2013, Guided image filtering; Qian and Sezan 1992, Video backg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -46,10 +47,16 @@ class Background:
     noise: Floats32
 
 
+class Soft(Protocol):
+    """Masks by index."""
+
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[Image]: ...
+    def __getitem__(self, index: int, /) -> Image: ...
+
+
 def refine_masks(
-    frame: Callable[[int], Image],
-    soft: Sequence[Image],
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    frame: Callable[[int], Image], soft: Soft, on_progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Iterator[Image]:
     """Yield a mask [H, W] uint8 for each of ``soft``, the network's masks of the images that ``frame`` gives by index.
 
@@ -65,7 +72,7 @@ def refine_masks(
         on_progress(k + 1, len(soft))
 
 
-def _learn_background(frame: Callable[[int], Image], soft: Sequence[Image], scale: float) -> Background | None:
+def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -> Background | None:
     """The background, or None of a moving camera; in rounds, the later ones with the person's own outline."""
     if len(soft) < _MIN_SEEN:
         return None
@@ -111,7 +118,7 @@ def _matte(image: Image, soft: Image, background: Background | None) -> Image:
     if not inside.any():
         return result
     window = bounding_box(inside, 2 * _FAR[1])
-    pixels, likely = image[window].astype(np.float32), soft[window].astype(np.float32) / 255
+    pixels, likely = image[window].astype(np.float32), np.asarray(soft[window] / 255, np.float32)
     near = None
     if background is not None:
         near = Background(background.colour[window], background.seen[window], background.noise[window])
@@ -172,7 +179,7 @@ def _mixed(alpha: Floats32, pixels: Floats32, background: Background) -> Floats3
 
 def _resized(pixels: Image, to: float | tuple[int, int]) -> Image:
     if isinstance(to, tuple):
-        return cv2.resize(pixels, to, interpolation=cv2.INTER_LINEAR)  # type: ignore[return-value]
+        return cv2.resize(pixels, to, interpolation=cv2.INTER_LINEAR)
     if to == 1:
         return pixels
-    return cv2.resize(pixels, None, fx=to, fy=to, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+    return cv2.resize(pixels, None, fx=to, fy=to, interpolation=cv2.INTER_AREA)

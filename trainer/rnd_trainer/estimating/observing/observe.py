@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -29,12 +30,15 @@ _WIDER = 1.12  # of the region, in the views without a background
 _AROUND = 0.02  # of the person's size: margin of the mask when the background is taken away
 
 
-class Clip(Frames):
-    """Frames of a video: ``Frames`` with their size and rate."""
+class Clip(Frames, Protocol):
+    """Frames of a video with their size and rate."""
 
-    fps: float
-    width: int
-    height: int
+    @property
+    def fps(self) -> float: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)

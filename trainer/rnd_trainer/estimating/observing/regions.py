@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,23 +59,23 @@ class Shrunk:
         height, width = image.shape[0] // self.factor, image.shape[1] // self.factor
         if self.factor > 1:
             whole = image[: height * self.factor, : width * self.factor]
-            image = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+            image = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
         self.image = image
 
     def crop(self, region: Region, side: int) -> NDArray[np.float32]:
         """RGB [side, side, 3] in 0…1; black outside of the image."""
-        return crop(self.image, region.to_image(side) / self.factor, side).astype(np.float32) / 255
+        return np.asarray(crop(self.image, region.to_image(side) / self.factor, side) / 255, np.float32)
 
 
-def crop(image: NDArray[np.generic], to_image: Floats, side: int) -> NDArray[np.generic]:
+def crop(image: NDArray[Any], to_image: Floats, side: int) -> NDArray[Any]:
     """The [side, side, …] pixels of ``image`` at the positions that ``to_image`` [2, 3] gives."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(image, _by_index(to_image), (side, side), flags=flags)  # type: ignore[call-overload,no-any-return]
+    return cv2.warpAffine(image, _by_index(to_image), (side, side), flags=flags)
 
 
 def uncrop(pixels: NDArray[np.float32], to_image: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
     """``pixels`` of a crop, put where ``to_image`` has them in an image of ``size``; zero elsewhere."""
-    return cv2.warpAffine(pixels, _by_index(to_image), size, flags=cv2.INTER_LINEAR)  # type: ignore[return-value]
+    return cv2.warpAffine(pixels, _by_index(to_image), size, flags=cv2.INTER_LINEAR)
 
 
 def moved(points: Floats, matrix: Floats) -> Floats:
