@@ -28,7 +28,7 @@ from .limbs import Bones
 from .retarget import Retargeted, retarget, retarget_tracks
 from .skeleton import Skeleton, moving_joints
 from .smpl import SMPL_REST_ROOT
-from .solving.solve import Tracks
+from .solving.evidence import Tracks
 from .standing import UP_ROTATIONS, up_axis
 
 Floats = NDArray[np.float64]
@@ -194,7 +194,8 @@ def _load_recording(
     if recording.matched is None:
         matched = _matched(tree.names, skeleton, joint_map, Bones(tree.parents, tree.offsets))
     else:
-        named = recording.matched | ({} if joint_map is None else joints_of_map(joint_map, tree.names, skeleton.names))
+        by_user = {} if joint_map is None else joints_of_map(joint_map, tree.names, skeleton.names)
+        named = {**recording.matched, **by_user}
         matched = {name: index for name, index in named.items() if name in skeleton.names}
     moved = retarget(tree, skeleton, matched, up)
     return _retargeted(moved, len(tree.rotations), tree.fps, path, skeleton)

@@ -15,8 +15,9 @@ from rnd_runtime.motion.readers.tree import MocapTree
 from .skeleton import Skeleton, moving_joints
 from .solving.bones import SPINE, hips, leg_length
 from .solving.directions import unit
+from .solving.evidence import Tracks
 from .solving.palms import palm_axes
-from .solving.solve import Tracks, solve
+from .solving.solve import solve
 from .standing import UP_ROTATIONS, up_axis
 
 Floats = NDArray[np.float64]
@@ -168,7 +169,7 @@ def _is_mirrored(points: Mapping[str, Floats]) -> bool:
     seen = []
     for side in ("left", "right"):
         hip, knee, ankle, toe = (points.get(f"{side}_{joint}") for joint in ("hip", "knee", "ankle", "foot"))
-        if ankle is None:
+        if hip is None or knee is None or ankle is None:
             continue
         if toe is not None and np.median(np.linalg.norm(toe - ankle, axis=-1)) > _APART * leg_length(points):
             seen.append(float((unit(toe - ankle) * forward).sum(-1).mean()))

@@ -39,7 +39,7 @@ def identifier(text: str) -> np.float32:
     bits = murmur3(text)
     if bits >> 23 & 255 in (0, 255):
         bits ^= 1 << 23
-    return np.frombuffer(bits.to_bytes(4, "little"), "<f4")[0]
+    return np.float32(np.frombuffer(bits.to_bytes(4, "little"), "<f4")[0])
 
 
 def layers(coverage: Floats32, names: Sequence[str]) -> Floats32:

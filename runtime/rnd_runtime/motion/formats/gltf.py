@@ -156,7 +156,7 @@ def _read(document: _Document) -> tuple[MocapTree, dict[str, int] | None]:
     names = _unique(["scene", *(str(nodes[node].get("name") or f"node {node}") for node in kept)])
     above = [-1, *(1 + kept.index(parents[node]) if parents[node] in joints else 0 for node in kept)]
     still = np.zeros((len(times), 1, 3)), np.tile(np.eye(3), (len(times), 1, 1, 1))
-    notes = ()
+    notes: tuple[str, ...] = ()
     if len(animations) > 1:
         others = ", ".join(str(other.get("name", k)) for k, other in enumerate(animations[1:], 1))
         notes = (f"of the file's animations {animation.get('name', 0)} is taken; left out: {others}",)
@@ -236,7 +236,8 @@ def _sampled(track: tuple[Floats, Floats, str], times: Floats, rotation: bool) -
         (_, a, out), (into, b, _) = values[after - 1].swapaxes(0, 1), values[after].swapaxes(0, 1)
         out, into = step[:, None] * out, step[:, None] * into
         cube, square = t**3, t**2
-        return a + (3 * square - 2 * cube) * (b - a) + (cube - 2 * square + t) * out + (cube - square) * into
+        cubic: Floats = a + (3 * square - 2 * cube) * (b - a) + (cube - 2 * square + t) * out + (cube - square) * into
+        return cubic
     a, b = values[after - 1], values[after]
     if not rotation:
         return (1 - t) * a + t * b

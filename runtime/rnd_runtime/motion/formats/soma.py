@@ -116,7 +116,8 @@ def _tree(rig: Rig, rotations: Floats, path: Floats, members: Members, joints: F
         lengths = [len(path)] if joints is None else [len(path), len(joints)]
         got = " and ".join(map(str, lengths))
         raise InputError("positions", expected=f"{len(rotations)}, as there are rotations", got=got, file=members.path)
-    fps, notes = frame_rate(members), ()
+    fps = frame_rate(members)
+    notes: tuple[str, ...] = ()
     if fps is None:
         fps, notes = _FPS, (_NOTE,)
     if joints is None:

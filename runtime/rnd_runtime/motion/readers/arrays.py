@@ -88,11 +88,11 @@ def read_arrays(
     Raises:
         InputError: for anything else, and for numbers that cannot be a person's motion, naming the frame.
     """
-    notes = [*notes]
+    remarks = [*notes]
     easymocap = members.first_of("Rh", "Rh_all") is not None
-    axis_angles = _axis_angles(members, notes, joint_names)
+    axis_angles = _axis_angles(members, remarks, joint_names)
     names = names_of_joints(members, axis_angles.shape[1], joint_names)
-    _check_angles(axis_angles, names, members.path, notes)
+    _check_angles(axis_angles, names, members.path, remarks)
     rotations = axis_angle_to_matrix(axis_angles)
     named = joint_names is not None or "joint_names" in members.names
     split = "pose_body" in members.names and "poses" not in members.names
@@ -109,23 +109,23 @@ def read_arrays(
     elif members.first_of("trans", "transl") is not None:
         translations = _per_frame(members, "trans", "transl", frames=len(rotations))
     else:
-        notes.append("no trans in the file: the root stays in place")
+        remarks.append("no trans in the file: the root stays in place")
         translations = np.zeros((len(rotations), 3))
     check_translations(translations, members.path)
     if "betas" in members.names:
-        notes.append("the file's betas are ignored: the avatar keeps its own shape")
+        remarks.append("the file's betas are ignored: the avatar keeps its own shape")
     fps = frame_rate(members)
     if fps is None:
-        notes.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
+        remarks.append(f"no frame rate in the file: {_DEFAULT_FPS:g} frames per second assumed")
         fps = _DEFAULT_FPS
     stated = _up_axis(members)
     up = stated or up or ("z" if amass or easymocap else "y")
     _check_order(members, len(rotations))
     if _look_like_millimetres(translations, fps, up):
-        notes.append("trans is higher or faster than a person in metres: these look like millimetres")
+        remarks.append("trans is higher or faster than a person in metres: these look like millimetres")
     if rest_root is None and (amass or easymocap):
         rest_root = smpl_root
-    return MotionRecord(rotations, translations, rest_root, names, fps, up, stated is not None, tuple(notes))
+    return MotionRecord(rotations, translations, rest_root, names, fps, up, stated is not None, tuple(remarks))
 
 
 def _axis_angles(archive: Members, notes: list[str], joint_names: tuple[str, ...] | None) -> Floats:
@@ -216,7 +216,7 @@ def check_rotations(matrices: Floats, name: str, path: str | Path) -> Floats:
     """``matrices`` [F, J, 3, 3]; ``InputError`` with the frame of the first that is no rotation."""
     if matrices.ndim != 4 or matrices.shape[-2:] != (3, 3) or not matrices.size:
         raise InputError(f"shape of {name}", expected="F×J×3×3", got="×".join(map(str, matrices.shape)), file=path)
-    finite = np.isfinite(matrices).all((-2, -1))
+    finite = np.asarray(np.isfinite(matrices).all((-2, -1)))
     checked = np.where(finite[..., None, None], matrices, 0)
     off = np.abs(checked @ np.swapaxes(checked, -1, -2) - np.eye(3)).max((-2, -1))
     good = finite & (off < _ORTHOGONAL) & (np.linalg.det(checked) > 0)

@@ -40,7 +40,7 @@ def swing(a: Floats, b: Floats) -> Floats:
     return result
 
 
-def about(axis: Floats, angle: Floats) -> Floats:
+def about(axis: Floats, angle: Floats | float) -> Floats:
     """Rotations [..., 3, 3] by ``angle`` [...] rad about the unit ``axis`` [..., 3]."""
     return axis_angle_to_matrix(np.asarray(angle)[..., None] * axis)
 

@@ -57,7 +57,8 @@ class Evidence(NamedTuple):
 
     def rolls(self, bone: Floats, base: Floats) -> Complexes:
         """Weighted e^{iφ} [F] of the rolls about ``bone`` [F, 3] from rotations ``base`` to what is seen."""
-        return self.weight * np.exp(1j * angle_about(bone, base @ self.at_rest, self.axis))
+        weighted: Complexes = self.weight * np.exp(1j * angle_about(bone, base @ self.at_rest, self.axis))
+        return weighted
 
 
 class Recorded:
@@ -143,9 +144,9 @@ def lateral_at_rest(name: str, direction: Floats) -> Floats:
     side, _, part = name.partition("_")
     sideways = outwards(side)
     if part in ("shoulder", "elbow"):
-        return swing(sideways, direction) @ np.array([0.0, -sideways[0], 0.0])
+        return np.asarray(swing(sideways, direction) @ np.array([0.0, -sideways[0], 0.0]))
     if side in ("left", "right") and part not in ("hip", "knee", "ankle", "foot"):
-        return swing(sideways, direction) @ np.array([0.0, 0.0, 1.0])
+        return np.asarray(swing(sideways, direction) @ np.array([0.0, 0.0, 1.0]))
     return across(np.array([1.0, 0, 0]), direction)
 
 

@@ -111,7 +111,7 @@ class _Solver:
             up, up_at_rest = self.bones[name].along(self.points), self.at_rest[name]
         else:
             legs = [Bone(f"{side}_knee", f"{side}_hip") for side in ("left", "right")]
-            up, up_at_rest = (sum(leg.along(joints) for leg in legs) for joints in (self.points, self.recorded.rest))
+            up, up_at_rest = (np.add(*(leg.along(j) for leg in legs)) for j in (self.points, self.recorded.rest))
         shown: Floats = body_frame(left, up) @ body_frame(left_at_rest, up_at_rest).T
         return self._fitted(name, shown, _RIGID)
 

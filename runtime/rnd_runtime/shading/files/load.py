@@ -48,6 +48,7 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         raise explained(InputError("light probe", expected="an .exr or .hdr file", got=got), path, "light")
     if not abs(exposure) <= _MAX_STOPS:
         raise InputError("exposure", expected=f"at most {_MAX_STOPS} stops either way", got=exposure)
+    scale = 2.0 ** np.float64(exposure)
     if suffix == ".exr" or not _is_radiance(path):
         radiance, repaired, notes = _read(path, path)
     else:
@@ -55,8 +56,9 @@ def load_light(path: str | Path, *, up: Up = "y", yaw: float = 0.0, exposure: fl
         with as_stored(path, stored) as copy:
             radiance, repaired, _ = _read(copy, path, across=stored.axes[1] == "X")
         notes = stored.notes + (() if stored.xyz else colour_notes(stored.primaries))
-        radiance = stored.upright(radiance if not stored.xyz else stored.rec709(radiance)) / np.float64(stored.exposure)
-    radiance = finite_float32(radiance * 2.0 ** np.float64(exposure))
+        radiance = stored.upright(radiance if not stored.xyz else stored.rec709(radiance))
+        scale /= np.float64(stored.exposure)
+    radiance = finite_float32(radiance * scale)
     return Light(radiance, yaw=yaw, up=up, repaired=repaired, notes=notes)
 
 
@@ -82,8 +84,7 @@ def _read(path: str | Path, name: str | Path, across: bool = False) -> tuple[Flo
             raise InputError("large light probe", expected="rows from left to right", got="columns", file=name)
         radiance, repaired, cut = (_read_reduced if large else _read_whole)(path, header, channels)
     except InputError as error:
-        named = {"expected": error.expected, "got": error.got, "hint": error.hint}
-        raise InputError(error.what, file=name, **named) from error
+        raise InputError(error.what, expected=error.expected, got=error.got, file=name, hint=error.hint) from error
     return radiance, repaired, notes + colour_notes(header.chromaticities) + _cut_notes(cut)
 
 

@@ -96,5 +96,5 @@ def _linear_table(transfer: int) -> Floats32:
         a, b, c = 0.17883277, 0.28466892, 0.55991073
         linear = np.where(signal <= 0.5, signal**2 / 3, (np.exp((signal - c) / a) + b) / 12)
     else:
-        linear = srgb_to_linear(signal)
+        linear = np.asarray(srgb_to_linear(signal), np.float64)
     return np.asarray(linear, np.float32)
