@@ -92,7 +92,7 @@ def _write_pickles(folder: Path, body: Body) -> None:
     import torch
     from scipy.sparse import csc_matrix
 
-    poses, trans = np.zeros((FRAMES, 72), np.float32), np.tile(np.float32([0, 1, 3]), (FRAMES, 1))
+    poses, trans = np.zeros((FRAMES, 72), np.float32), np.tile(np.array([0, 1, 3], np.float32), (FRAMES, 1))
     betas = np.zeros((FRAMES, 10), np.float32)
     track = {"pose": poses, "trans": trans, "pose_world": poses, "trans_world": trans, "betas": betas}
     wham = pickle.dumps({0: {**track, "frame_ids": np.arange(FRAMES)}}, protocol=4)

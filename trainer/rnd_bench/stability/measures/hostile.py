@@ -13,6 +13,7 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -169,6 +170,7 @@ def cut_sun(subject: Subject) -> Result:
     whole[sun] = 65504
     cut = np.where(sun[..., None], np.inf, whole).astype(np.float32)
     target = oiio.ImageOutput.create(str(file))
+    assert target is not None
     target.open(str(file), oiio.ImageSpec(2 * height, height, 3, "half"))
     target.write_image(cut)
     target.close()
@@ -187,7 +189,7 @@ def odd_motions(subject: Subject) -> Result:
     """H10: millimetres are noted; times and frame numbers that do not increase are refused."""
     skeleton, file = subject.avatar.skeleton, subject.work / "odd.npz"
     poses, count = np.zeros((6, 72)), 6
-    members = {"poses": poses, "trans": np.zeros((count, 3)), "mocap_framerate": 30.0}
+    members: dict[str, Any] = {"poses": poses, "trans": np.zeros((count, 3)), "mocap_framerate": 30.0}
     wrong = []
     np.savez(file, **{**members, "trans": np.outer(np.arange(count), [188 / 30, 0, 0])})
     if not any("millimetres" in note for note in load_motion(file, skeleton).notes):
@@ -198,7 +200,7 @@ def odd_motions(subject: Subject) -> Result:
         "shuffled": [0, 2, 1, 3, 5, 4],
     }.items():
         for member in ("times", "frame_ids"):
-            np.savez(file, **members, **{member: np.array(values)})
+            np.savez(file, **{**members, member: np.array(values)})
             wrong += refusal(f"{name} {member}", load_motion, file, skeleton, words=(member, "frame"))
     return result(holds("odd motions not noted or refused", wrong))
 

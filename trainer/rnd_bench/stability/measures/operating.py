@@ -95,7 +95,7 @@ def signals(subject: Subject) -> Result:
             shutil.rmtree(out, ignore_errors=True)
             fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0, MOMENTS_S)))
             sent += fault is not None
-            wrong += [fault] * bool(fault)
+            wrong += [fault] if fault else []
             wrong += [f"left {file.name}" for file in out.rglob(".*") if not file.name.startswith(".run-")]
         figures.append(holds(f"{name}: {sent} signals that did not end it in one line with its code", wrong))
     return result(*figures)
