@@ -36,6 +36,7 @@ class Bones:
         for chain in _CHAINS:
             present = [found[joint] for joint in chain if joint in found]
             wrong += sum(self._length(a, b) is None for a, b in pairwise(present))
+            wrong += bool(present) and chain[0].endswith(("_hip", "_shoulder")) and chain[0] not in found
         for side in ("left", "right"):
             for bones, low, high in _RATIOS:
                 joints = [(f"{side}_{bone}", f"{side}_{_AHEAD[bone]}") for bone in bones]

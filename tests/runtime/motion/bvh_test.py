@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import load_motion
-from support.known_motion import FRAMES, MATRICES, METRES, PELVIS, SKELETON, TEXT, Z_UP
+from support.known_motion import DOUBLE, FRAMES, MATRICES, METRES, PELVIS, SKELETON, TEXT, Z_UP
 from support.known_skeletons import NAMINGS, assert_same_poses, write_bvh
 
 
@@ -33,7 +33,24 @@ def test_hips_below_a_root_of_their_own_go_where_they_are_sent(tmp_path):
     assert_allclose(ours.rotations, plain.rotations, atol=TEXT)
 
 
+@pytest.mark.parametrize(
+    ("frames", "time"), [("Frames:12", "Frame Time:0.0083333"), ("Frames : 12", "Frame Time\t:\t.0083333")]
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be"])
+def test_spaces_and_encodings_make_no_difference(tmp_path, frames, time, encoding):
+    file = write_bvh(tmp_path / "a.bvh", NAMINGS["mixamo"])
+    plain, text = load_motion(file, SKELETON), file.read_text()
+    assert "Frames: 12\nFrame Time: 0.0083333" in text
+    text = text.replace("Frames: 12\nFrame Time: 0.0083333", f"{frames}\n{time}").replace("\n", "\r\n")
+    file.write_bytes((b"\xfe\xff" if encoding == "utf-16-be" else b"") + text.encode(encoding))
+    motion = load_motion(file, SKELETON)
+    assert motion.fps == plain.fps
+    assert_allclose(motion.rotations, plain.rotations, atol=DOUBLE)
+
+
 BROKEN_BVH = {
+    "frames": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames 3 Frame Time: 0.03 1 2",
+    "frame time": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 1 Xrotation } MOTION Frames: 1 FrameRate: 0.03 1",
     "cut in channels": "HIERARCHY ROOT a { OFFSET 0 0 0 CHANNELS 3 Xrotation Yrotation",
     "empty": "",
     "no motion": "HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\n",

@@ -8,10 +8,12 @@ from numpy.testing import assert_allclose
 
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.joint_names import load_joint_map, match_joints
+from rnd_runtime.motion.limbs import Bones
 from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.motion.smpl import SMPL_NAMES
+from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_PARENTS
 from support.known_motion import DOUBLE, FRAMES, MATRICES, METRES, PELVIS, POSES, SKELETON, write_npz
 from support.known_skeletons import NAMINGS, assert_same_poses, write_bvh
+from support.paths import CASES
 
 
 @pytest.mark.parametrize("collars", [True, False])
@@ -32,6 +34,99 @@ def test_every_naming_of_bvh_is_the_same_motion(tmp_path, naming):
     assert motion.fps == 120
     assert_same_poses(motion.rotations, MATRICES)
     assert_allclose(np.diff(motion.translations, axis=0), np.diff(PELVIS, axis=0), atol=METRES)
+
+
+_LEGS = {"*_hip": "UpLeg", "*_knee": "Leg", "*_ankle": "Foot", "*_foot": "ToeBase"}
+_ARMS = {"*_collar": "Shoulder", "*_shoulder": "Arm", "*_elbow": "ForeArm", "*_wrist": "Hand"}
+_TRUNK = {"pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck", "head": "Head"}
+_SMPL = {f"*_{joint}": joint.title() for joint in ("collar", "shoulder", "elbow", "wrist", "hand", "hip", "knee")}
+_SMPL |= {"*_ankle": "Ankle", "*_foot": "Foot", "pelvis": "Pelvis"} | {f"spine{k}": f"Spine{k}" for k in (1, 2, 3)}
+_LOW = {"*_elbow": "LowerArm", "*_shoulder": "UpperArm", "*_hip": "UpperLeg", "*_knee": "LowerLeg"}
+# Names of each joint, how a side is written around them, and what the two sides are called
+SPELLINGS = {
+    "LAFAN1": (_TRUNK | _ARMS | _LEGS | {"*_foot": "Toe"}, "{side}{name}", ("Left", "Right")),
+    "underscore": (_TRUNK | _ARMS | _LEGS, "mixamorig_{side}{name}", ("Left", "Right")),
+    "number": (_TRUNK | _ARMS | _LEGS, "mixamorig1{side}{name}", ("Left", "Right")),
+    "path": (_TRUNK | _ARMS | _LEGS, "Armature|mixamorig:{side}{name}", ("Left", "Right")),
+    "suffix": ({k: v.lower() for k, v in (_TRUNK | _ARMS | _LEGS).items()}, "{side}_{name}_JNT", ("l", "r")),
+    "side last": (_TRUNK | _ARMS | _LEGS, "{name}.{side}", ("L", "R")),
+    "SMPL of Unity": (_SMPL | {"neck": "Neck", "head": "Head"}, "m_avg_{side}_{name}", ("L", "R")),
+    "Bandai-Namco": (
+        {"pelvis": "Hips", "spine1": "Spine", "spine3": "Chest", "neck": "Neck", "head": "Head"}
+        | _ARMS
+        | _LEGS
+        | _LOW
+        | {"*_foot": "Toes"},
+        "{name}_{side}",
+        ("L", "R"),
+    ),
+    "VRM": (
+        _TRUNK | {"spine2": "Chest", "spine3": "UpperChest"} | _ARMS | _LEGS | _LOW,
+        "J_Bip_{side}_{name}",
+        ("L", "R"),
+    ),
+    "Genesis 9": (
+        {"pelvis": "hip", "spine1": "spine1", "spine2": "spine2", "spine3": "spine4", "neck": "neck1", "head": "head"}
+        | {"*_collar": "shoulder", "*_shoulder": "upperarm", "*_elbow": "forearm", "*_wrist": "hand"}
+        | {"*_hip": "thigh", "*_knee": "shin", "*_ankle": "foot", "*_foot": "toes"},
+        "{side}_{name}",
+        ("l", "r"),
+    ),
+    "MocapNET": (
+        {"pelvis": "hip", "spine1": "abdomen", "spine3": "chest", "neck": "neck", "head": "head"}
+        | {"*_collar": "collar", "*_shoulder": "shoulder", "*_elbow": "elbow", "*_wrist": "hand"}
+        | {"*_hip": "hip", "*_knee": "knee", "*_ankle": "foot", "*_foot": "toe"},
+        "{side}{name}",
+        ("l", "r"),
+    ),
+}
+_TREE = Bones(SMPL_PARENTS, SKELETON.rest_joints - SKELETON.rest_joints[[max(parent, 0) for parent in SMPL_PARENTS]])
+
+
+def _spelled(names: dict[str, str], form: str, sides: tuple[str, str]) -> dict[str, str]:
+    """Their names by ours; a joint in the middle has no side, or "C" where a separate letter is usual."""
+    middle = "C" if form.startswith("J_Bip") else ""
+    spelled = {}
+    for ours, name in names.items():
+        for side, theirs in zip(("left", "right"), sides) if "*" in ours else (("", middle),):
+            full = (
+                form.format(side=theirs, name=name)
+                if theirs
+                else form.replace("{side}_", "")
+                .replace("_{side}", "")
+                .replace(".{side}", "")
+                .replace("{side}", "")
+                .format(name=name)
+            )
+            spelled[ours.replace("*", side)] = full
+    return spelled
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_joints_are_found_however_they_are_spelled(spelling):
+    """None is missed or another's; a joint of the spine without a known name is found by its place."""
+    spelled = _spelled(*SPELLINGS[spelling])
+    theirs = [spelled.get(name, f"extra{joint}") for joint, name in enumerate(SMPL_NAMES)]
+    matched = match_joints(theirs, SMPL_NAMES, bones=_TREE)
+    known = spelled if "spine2" in spelled else spelled | {"spine2": "extra6"}
+    assert {name: theirs[index] for name, index in matched.items()} == known
+
+
+def test_the_tree_decides_whether_a_leg_is_a_thigh():
+    """ "LeftLeg" is a shin below a "LeftUpLeg", and a thigh above a "LeftShin", though as many names fit either."""
+    for legs in (_LEGS, {**_LEGS, "*_hip": "Leg", "*_knee": "Shin"}):
+        spelled = _spelled(_TRUNK | _ARMS | legs, "{side}{name}", ("Left", "Right"))
+        theirs = [spelled.get(name, f"extra{joint}") for joint, name in enumerate(SMPL_NAMES)]
+        matched = match_joints(theirs, SMPL_NAMES, bones=_TREE)
+        assert {name: theirs[index] for name, index in matched.items()} == spelled
+
+
+@pytest.mark.parametrize("file", sorted((CASES / "bvh_prefixed_names").glob("*.bvh")), ids=lambda file: file.stem)
+def test_a_prefix_that_all_joints_share_says_nothing(file):
+    plain = load_motion(CASES / "bvh_prefixed_names" / "mixamorig_colon.bvh", SKELETON)
+    motion = load_motion(file, SKELETON)
+    assert_allclose(motion.rotations, plain.rotations, atol=DOUBLE)
+    assert motion.notes == plain.notes
 
 
 @pytest.mark.parametrize("form", ["toml", "json"])

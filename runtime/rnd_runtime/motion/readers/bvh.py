@@ -32,7 +32,7 @@ def read_bvh(path: str | Path) -> MocapTree:
     """
     path = existing_file(path, what="motion")
     try:
-        return _read(iter(path.read_text(encoding="utf-8-sig", errors="replace").split()))
+        return _read(iter(_text(path.read_bytes()).split()))
     except StopIteration as error:
         raise InputError("BVH file", expected="HIERARCHY and MOTION", got="an end before", file=path) from error
     except ValueError as error:
@@ -122,10 +122,7 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
 
 
 def _motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats]:
-    header = [next(words) for _ in range(5)]  # Frames: N Frame Time: S
-    if (header[0], header[2], header[3]) != ("Frames:", "Frame", "Time:"):
-        raise InputError("BVH motion", expected="Frames: … Frame Time: …", got=" ".join(header))
-    frames, seconds = int(header[1]), float(header[4])
+    frames, seconds = int(_after("Frames", words)), float(_after("Frame Time", words))
     values = np.array([float(word) for word in words])
     if channels == 0:
         raise InputError("channels", expected="at least one", got="none")
@@ -140,6 +137,23 @@ def _motion(words: Iterator[str], channels: int) -> tuple[int, float, Floats]:
     frame = int(np.abs(values).max(1).argmax())
     check_size("BVH motion", values[frame].tolist(), frame)
     return frames, seconds, values
+
+
+def _after(label: str, words: Iterator[str]) -> str:
+    """The word after ``label`` and a colon, with or without spaces around it."""
+    head, wanted = "", label.replace(" ", "") + ":"
+    while len(head) < len(wanted):
+        head += next(words)
+    if not head.startswith(wanted):
+        raise InputError("BVH motion", expected="Frames: … Frame Time: …", got=head)
+    return head[len(wanted) :] or next(words)
+
+
+def _text(content: bytes) -> str:
+    """UTF-8, or UTF-16 by its mark, as some programs of Windows save a text."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16", errors="replace")
+    return content.decode("utf-8-sig", errors="replace")
 
 
 def _rounded(fps: float) -> float:
