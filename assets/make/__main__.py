@@ -1,4 +1,7 @@
-"""``python -m assets.make [body] [figure] [walk] [sky] [capture] [contact]``: remakes these, or all but the figure."""
+"""``python -m assets.make [body] [figure] [prior] [walk] [sky] [capture] [contact]``: remakes these.
+
+Without names it remakes all but figure and prior.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,12 @@ from rnd_runtime.motion.motion import save_motion
 from rnd_stage.film.dances import walk
 from rnd_stage.people.template import template_body
 from rnd_trainer.estimating.fitting.figure import TEMPLATE
+from rnd_trainer.estimating.fitting.prior import FILE
 
 from . import sky
 
 ASSETS = Path(__file__).parents[1]
-STEPS = ("body", "figure", "walk", "sky", "capture", "contact")
+STEPS = ("body", "figure", "prior", "walk", "sky", "capture", "contact")
 
 
 def main(steps: list[str]) -> None:
@@ -22,7 +26,7 @@ def main(steps: list[str]) -> None:
     unknown = set(steps) - set(STEPS)
     if unknown:
         raise SystemExit(f"assets.make: expected {', '.join(STEPS)}, got {', '.join(sorted(unknown))}")
-    steps = steps or [step for step in STEPS if step != "figure"]  # whose package is large
+    steps = steps or [step for step in STEPS if step not in ("figure", "prior")]  # which need what is not in the clone
     if "body" in steps:
         template_body().save(ASSETS / "body.npz")
     body = Body.load(ASSETS / "body.npz")
@@ -30,6 +34,10 @@ def main(steps: list[str]) -> None:
         from . import figure  # needs anny
 
         figure.make_figure(TEMPLATE)
+    if "prior" in steps:
+        from . import prior
+
+        prior.make_pose_prior(FILE)
     if "walk" in steps:
         save_motion(ASSETS / "walk.npz", walk(body.skeleton))
     if "sky" in steps:

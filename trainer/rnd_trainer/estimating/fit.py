@@ -57,7 +57,7 @@ class Weights:
     outline: float = 0.25
     inner: float = 0.15
     outline_m: float = 0.012
-    ground: float = 0.4
+    ground: float = 0.03
     shared: float = 0.1  # part of the frames that count as independent
 
 

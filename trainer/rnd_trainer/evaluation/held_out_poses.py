@@ -11,7 +11,6 @@ from torch import Tensor
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.capture.format import Split
 from rnd_runtime.motion.motion import Motion
-from rnd_trainer.estimating.uncertainty import load_uncertainty
 from rnd_trainer.losses.losses import image_loss, linear_to_srgb
 from rnd_trainer.model.checkpoint import Checkpoint
 from rnd_trainer.model.model import PoseInput
@@ -19,6 +18,7 @@ from rnd_trainer.render.probe import LightProbe, Texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.training.data import TrainingView, load_views, pose_input
 from rnd_trainer.training.pose_refinement import PoseRefinement
+from rnd_trainer.training.uncertainty import load_uncertainty
 
 STEPS = 40
 """of every frame"""

@@ -16,7 +16,8 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.posing.forearm import twist_angles
-from rnd_trainer.estimating.uncertainty import PoseUncertainty
+
+from .uncertainty import PoseUncertainty
 
 ROTATION_BOUND = 0.12
 """bound of a joint's correction about each axis, rad (7°), where nothing is known of the poses' errors"""

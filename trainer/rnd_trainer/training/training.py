@@ -20,7 +20,6 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.shading.light import texel_directions
 from rnd_trainer.config import TrainConfig
-from rnd_trainer.estimating.uncertainty import load_uncertainty
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
@@ -33,6 +32,7 @@ from .pose_refinement import PoseRefinement
 from .sampled_poses import perturbed_pose
 from .schedule import Schedule
 from .state import learned_sha256
+from .uncertainty import load_uncertainty
 from .unseen import UnseenPoses
 
 MAX_BAD_STEPS = 10

@@ -1,0 +1,44 @@
+"""Figures of the study of videos."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rnd_bench.studies.video import _aligned, _errors, outline_iou
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.motion.motion import Motion
+from support.tiny import body
+
+
+def test_alignment_takes_out_a_similarity_and_no_mirror_image():
+    points = np.random.default_rng(0).normal(size=(12, 3))
+    moved = 1.3 * points @ axis_angle_to_matrix([0.3, -1.0, 0.4]).T + [1.0, 2.0, 3.0]
+    assert _aligned(moved, points).max() < 1e-9
+    assert _aligned(points * [-1, 1, 1], points).mean() > 0.1
+
+
+def test_errors_are_millimetres_from_the_camera_and_from_the_root():
+    truth = np.random.default_rng(1).normal(size=(4, 12, 3))
+    found = truth + np.array([0.0, 0.0, 0.05])
+    errors = _errors(found, truth, found[:, 0], truth[:, 0])
+    assert errors["absolute_mm"] == pytest.approx(50)
+    assert errors["root_relative_mm"] == pytest.approx(0, abs=1e-6) and errors["pa_mm"] == pytest.approx(0, abs=1e-6)
+
+
+def test_outlines_overlap_where_the_body_is():
+    figure = body()
+    joints = len(figure.skeleton)
+    motion = Motion(np.tile(np.eye(3), (1, joints, 1, 1)), np.zeros((1, 3)), 30.0, figure.skeleton.names)
+    camera = Camera.look_at([0, 0.9, 4], [0, 0.9, 0], width=64, height=64, fov_y=0.6)
+    found = SimpleNamespace(body=figure, motion=motion, camera=camera)
+    empty = np.zeros((64, 64), bool)
+    assert outline_iou(found, [empty], 1) == 0
+    seen = figure.vertices @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    pixels = (seen[:, :2] / seen[:, 2:] * camera.K[0, 0] + 32).astype(int)
+    box = empty.copy()
+    box[pixels[:, 1].min() : pixels[:, 1].max(), pixels[:, 0].min() : pixels[:, 0].max()] = True
+    assert 0.1 < outline_iou(found, [box], 1) < 0.9
