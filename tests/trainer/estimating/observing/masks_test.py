@@ -56,8 +56,10 @@ def test_the_background_of_a_static_camera_sharpens_masks() -> None:
 
 def test_a_moving_background_leaves_the_networks_masks_about_as_they_are() -> None:
     images, truths, soft = clip()
-    moved = [np.where(truth[..., None] > 0, image, textured(50 + k, (120, 130, 90)).astype(np.uint8))
-             for k, (image, truth) in enumerate(zip(images, truths))]  # fmt: skip
+    moved = []
+    for k, (image, truth) in enumerate(zip(images, truths)):
+        elsewhere = textured(50 + k, (120, 130, 90)).astype(np.uint8)
+        moved.append(np.where(truth[..., None] > 0, image, elsewhere))
     after = ious(list(refine_masks(moved.__getitem__, soft)), soft)
     assert after.min() > 0.9
 
