@@ -21,8 +21,8 @@ from rnd_runtime.motion.readers.video_fits import in_order, one_of
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES, SMPL_REST_ROOT
 from rnd_runtime.motion.solving.bones import hips, leg_length
-from rnd_runtime.motion.solving.palms import palm_axes
 from rnd_runtime.motion.solving.evidence import Tracks
+from rnd_runtime.motion.solving.palms import palm_axes
 from rnd_runtime.motion.solving.solve import solve
 
 from .poses import Floats, PoseFile, Poses, smpl_poses
