@@ -17,6 +17,8 @@ def main(told):
     if told["glb"]:
         bpy.ops.import_scene.gltf(filepath=told["glb"])
         armature = next(each for each in scene.objects if each.type == "ARMATURE")
+        for each in scene.objects:
+            each.hide_render = each.type == "MESH"  # the splats take its place
     else:  # a foreign one: two bones under another name
         bpy.ops.object.armature_add()
         armature = bpy.context.object

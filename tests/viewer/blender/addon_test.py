@@ -20,6 +20,7 @@ from rnd_runtime.motion.motion import load_motion
 from rnd_viewer.convert.cameras import read_cameras
 from rnd_viewer.convert.cli import main
 from rnd_viewer.inputs.cameras import file_path
+from support.coarse_body import write_coarse_body
 from support.paths import ROOT
 from support.tiny import ASSETS
 
@@ -66,9 +67,12 @@ def rendered(tmp_path_factory) -> tuple[dict, Path]:
     """The walk through Blender: our rig and its animation there, and back by the add-on."""
     pytest.importorskip("xatlas")
     out = tmp_path_factory.mktemp("blender")
-    line = ["mesh", str(ASSETS / "avatar.onnx"), "--body", str(ASSETS / "body.npz"), "--texture", "64"]
+    body = write_coarse_body(out / "body.npz")
+    line = ["mesh", str(ASSETS / "avatar.onnx"), "--body", str(body), "--texture", "64"]
     assert main([*line, "--motion", str(ASSETS / "walk.npz"), "--out", str(out)]) == 0
-    return _blender(out, glb=str(out / "avatar.glb"), composite=True), out
+    result = _blender(out, glb=str(out / "avatar.glb"), composite=True)
+    assert "problem" not in result, result
+    return result, out
 
 
 @needs_blender

@@ -22,31 +22,20 @@ from rnd_runtime.shading.files.load import load_light
 from rnd_viewer.convert.cli import main
 from rnd_viewer.convert.surface import JOINTS, _on_simplex, _simplex_projection, clothed_surface, posed_weights
 from rnd_viewer.convert.texture import tangent_frames
+from support.coarse_body import write_coarse_body
 from support.glb import posed_vertices, read_glb, read_images
 from support.mesh_raster import rasterize, sampled
 from support.tiny import ASSETS
 
 AVATAR, BODY, WALK, SKY = (ASSETS / name for name in ("avatar.onnx", "body.npz", "walk.npz", "sky.exr"))
 FRAME = 20
-CELL = 0.03  # m, of the coarse template: xatlas takes 20 s for the whole one
 pytest.importorskip("xatlas")
 VALIDATOR = Path(os.environ.get("GLTF_VALIDATOR", ""))  # the npm package gltf-validator's folder
 
 
 @pytest.fixture(scope="module")
 def coarse(tmp_path_factory) -> Path:
-    """The embedded template with its vertices merged in cells."""
-    body = Body.load(BODY)
-    _, cell = np.unique(np.floor(body.vertices / CELL).astype(int), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell)[:, None]
-    vertices = np.stack([np.bincount(cell, column) for column in body.vertices.T], axis=1) / count
-    weights = np.stack([np.bincount(cell, column) for column in body.skinning_weights.T], axis=1) / count
-    faces = cell[body.faces]
-    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    path = tmp_path_factory.mktemp("body") / "coarse.npz"
-    Body(vertices, faces.astype(np.int32), weights.astype(np.float32), body.skeleton).save(path)
-    return path
+    return write_coarse_body(tmp_path_factory.mktemp("body") / "coarse.npz")
 
 
 @pytest.fixture(scope="module")
