@@ -172,6 +172,8 @@ def _train(options: TrainOptions) -> None:
 
 def _capture_folder(source: Path, out: Path) -> Path:
     """``source``, or the capture in ``out`` that a video is imported into; one made before is taken as it is."""
+    if not source.is_file() or source.suffix == ".json":
+        return source
     from rnd_trainer.estimating.own_video import import_video, is_video_file
     from rnd_trainer.importing.options import ImportOptions
     from rnd_trainer.importing.report import import_and_report
