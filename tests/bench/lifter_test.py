@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,9 @@ from rnd_bench.lifter.figures import Lifts, calibration, figures, procrustes, sy
 from rnd_bench.lifter.motions import MIRROR, TEST, VALIDATION, Clips, chained, load_clips, relative, sampled, subject_of
 from rnd_bench.lifter.network import export, negative_log_likelihood
 from rnd_bench.lifter.pose2sim import Calibrated, triangulated
+from rnd_bench.lifter.refining import loss_of, refine
 from rnd_bench.lifter.solving import solve
-from rnd_bench.lifter.synthesis import strided, vectors_of
+from rnd_bench.lifter.synthesis import batch, strided, vectors_of
 from rnd_bench.lifter.views import positions, sampled_cameras, sampled_offsets
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.lifted import JOINTS, REST_DIRECTIONS, ROLL_AXES
@@ -133,8 +136,21 @@ def test_the_solved_network_beats_the_landmarks_and_knows_its_errors(
         assert 0.5 < decile["actual_deg"] / decile["predicted_deg"] < 2
 
 
+def test_refining_lowers_the_loss_and_is_reproducible(clips: Clips, model: err.ErrorModel, solved) -> None:
+    made = batch(clips, model, 20, 24 + 2 * REACH, np.random.default_rng(9))
+    with torch.no_grad():
+        before = float(loss_of(solved[0], made))
+    first, again = (refine(copy.deepcopy(solved[0]), clips, model, 6, lambda step, loss: None) for _ in range(2))
+    with torch.no_grad():
+        assert float(loss_of(first, made)) < before
+    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters()))
+
+
 def test_the_file_computes_what_the_network_does(solved) -> None:
-    network, file = solved
+    network, file = copy.deepcopy(solved[0]), solved[1]
+    for weight in network.parameters():  # the file holds matrices in half precision
+        if weight.ndim == 2:
+            weight.data = weight.data.half().float()
     inputs = np.random.default_rng(8).normal(size=(2, 9, CHANNELS)).astype(np.float32)
     unit, kappa = run(inputs, file)
     padded = torch.from_numpy(np.pad(inputs, ((0, 0), (REACH, REACH), (0, 0)), mode="edge"))

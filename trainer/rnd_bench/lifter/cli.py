@@ -16,9 +16,10 @@ from .captured import observed, windows_of_capture
 from .errors import fit_errors
 from .figures import Lifts, of_windows, rows_of, synthetic
 from .motions import load_clips
-from .network import export
+from .network import STAGES, export
 from .options import Lifter
 from .pose2sim import figures_of_cameras
+from .refining import refine
 from .solving import solve
 
 STEP = 2
@@ -34,7 +35,7 @@ COLUMNS = (
 
 
 def run(options: Lifter) -> None:
-    """Fit, solve, score; print the table, write the rows."""
+    """Fit, solve, refine, score; print the table, write the rows."""
     options.check()
     out = output_folder(options.out)
     if options.json is not None:
@@ -44,27 +45,32 @@ def run(options: Lifter) -> None:
         progress.phase("landmarks and their errors")
         seen = observed(options.video, out / "observations.npz")
         errors = fit_errors(windows_of_capture(options.capture, seen))
-        errors.save(out / "errors.npz")
-        progress.phase("solving", 2 * options.batches)
-        network = solve(clips["train"], errors, options.batches, progress.update)
-        export(network, out / "lifter.onnx")
-        log(f"{out / 'lifter.onnx'}: {sha256_of(out / 'lifter.onnx')[:12]}")
+        network = out / "lifter.onnx"
+        if not network.exists():
+            progress.phase("solving", STAGES * options.batches)
+            solved = solve(clips["train"], errors, options.batches, progress.update)
+            progress.phase("refining", options.steps)
+
+            def on_step(step: int, loss: float) -> None:
+                progress.update(step, loss=loss)
+
+            export(refine(solved, clips["train"], errors, options.steps, on_step), network)
+        log(f"{network}: sha256 {sha256_of(network)[:12]}")
 
         def scored() -> Iterator[tuple[str, Lifts]]:
             for part in ("validation", "test"):
                 progress.phase(f"scoring, {part}")
-                yield f"synthetic, {part}", synthetic(clips[part], errors, out / "lifter.onnx")
-            yield (
-                "rendered, fitted to",
-                of_windows(windows_of_capture(options.capture, seen, None), out / "lifter.onnx", STEP),
-            )
+                yield f"synthetic, {part}", synthetic(clips[part], errors, network)
+            yield ("rendered, fitted to", of_windows(windows_of_capture(options.capture, seen, None), network, STEP))
 
         rows = rows_of(scored())
         if options.real is not None:
             progress.phase("scoring, real cameras")
-            rows += figures_of_cameras(options.real, out / "lifter.onnx", out)
+            rows += figures_of_cameras(options.real, network, out)
     if options.json is not None:
-        write_json(options.json, {"batches": options.batches, "machine": machine(), "rows": rows})
+        write_json(
+            options.json, {"batches": options.batches, "steps": options.steps, "machine": machine(), "rows": rows}
+        )
     table = Table("set", "frames", *COLUMNS, title="lifter beside the landmark network's own 3D")
     for row in rows:
         table.add_row(row["set"], str(row["frames"]), *(f"{row[name]:.1f}" for name in COLUMNS))

@@ -51,7 +51,7 @@ class Lifts:
     lengths: Floats32
 
 
-def synthetic(clips: Clips, errors: ErrorModel, network: Path, batches: int = 20) -> Lifts:
+def synthetic(clips: Clips, errors: ErrorModel, network: Path, batches: int = 10) -> Lifts:
     """Lifts of held-out ``clips``, not augmented, with the model's errors."""
     rng = np.random.default_rng(_SEED)
     parts = []

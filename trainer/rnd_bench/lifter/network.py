@@ -15,42 +15,50 @@ from rnd_trainer.estimating.lifted import JOINTS
 from rnd_trainer.estimating.lifter import CHANNELS, REACH
 
 VECTORS = 2 * (len(JOINTS) - 1)
-HALF = REACH // 2
+STAGES = 2
+HALF = REACH // STAGES
 """frames that each stage looks ahead and back"""
-SIZES = (4 * CHANNELS, 5 * 3 * VECTORS + 2 * CHANNELS)
+SIZES = (4 * CHANNELS, *(STAGES - 1) * (5 * 3 * VECTORS + 2 * CHANNELS,))
 """inputs of the stages"""
-HIDDEN = 1536
+COMPONENTS, HIDDEN = 256, 1536
 OUTPUTS = ("directions", "concentrations")
 _LIMITS = (0.5, 4000.0)  # of κ, rad⁻²
 
 
 class Stage(nn.Module):
-    """A hidden layer beside a linear map: [..., size] to [..., 42, outputs]."""
+    """A hidden layer on main components, beside a linear map: [..., size] to [..., 42, outputs]."""
 
     def __init__(self, size: int, hidden: int, outputs: int) -> None:
         super().__init__()
-        self.first = nn.Linear(size, hidden)
+        self.main = nn.Linear(size, COMPONENTS)
+        self.first = nn.Linear(COMPONENTS, hidden)
         self.skip = nn.Linear(size, outputs * VECTORS)
         self.head = nn.Linear(hidden, outputs * VECTORS, bias=False)
         self.outputs = outputs
 
+    def hidden(self, inputs: Tensor) -> Tensor:
+        """Hidden units [..., hidden]."""
+        return torch.relu(self.first(self.main(inputs)))
+
     def forward(self, inputs: Tensor) -> Tensor:
-        out = self.head(torch.relu(self.first(inputs))) + self.skip(inputs)
+        out = self.head(self.hidden(inputs)) + self.skip(inputs)
         return out.unflatten(-1, (VECTORS, self.outputs))
 
 
 class LifterNetwork(nn.Module):
     """Inputs [B, T + 2·REACH, CHANNELS] to unit vectors [B, T, 42, 3] and concentrations [B, T, 42], rad⁻².
 
-    The first stage guesses vectors from landmarks, the second from landmarks and the first's vectors over time.
+    The first stage guesses vectors from landmarks, each later one from landmarks and the last one's vectors over time.
     """
 
     def __init__(self, hidden: int = HIDDEN) -> None:
         super().__init__()
-        self.stages = nn.ModuleList(Stage(size, hidden, outputs) for size, outputs in zip(SIZES, (3, 4)))
+        self.stages = nn.ModuleList(
+            Stage(size, hidden, outputs) for size, outputs in zip(SIZES, (*(STAGES - 1) * (3,), 4))
+        )
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        out = self.stages[1](self.inputs_of(1, features))
+        out = self.stages[-1](self.inputs_of(STAGES - 1, features))
         low, high = _LIMITS
         return unit_of(out[..., :3]), (low + out[..., 3].exp()).clamp(max=high)
 
@@ -61,8 +69,8 @@ class LifterNetwork(nn.Module):
             wide = sum(_at(features, k) for k in range(-HALF, HALF + 1, 3)) / (2 * HALF // 3 + 1)
             motion = 2 * (_at(features, 5) - _at(features, -5))
             return torch.cat([_at(features, 0), near, wide, motion], -1)
-        guess = unit_of(self.stages[0](self.inputs_of(0, features))).flatten(-2)
-        inner = features[:, HALF:-HALF]
+        guess = unit_of(self.stages[stage - 1](self.inputs_of(stage - 1, features))).flatten(-2)
+        inner = features[:, stage * HALF : -stage * HALF]
         near = (_at(inner, -2) + _at(inner, 2)) / 2
         return torch.cat([*(_at(guess, k) for k in (-HALF, -2, 0, 2, HALF)), _at(inner, 0), near], -1)
 

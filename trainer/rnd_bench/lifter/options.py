@@ -24,15 +24,17 @@ class Lifter:
     """
 
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]
-    """folder for observations, errors.npz and lifter.onnx"""
+    """folder for observations and lifter.onnx, which are not made again where they are there"""
     motions: Folder
     """folder with .npz of motions at 30 frames a second, 22 joints"""
     capture: Folder
     """capture of a rendered person, whose training frames the landmark network's errors are fitted to"""
     video: File
     """video of these frames, 15 a second"""
-    batches: Count = 100
-    """of 900 samples each, to each of the network's two stages"""
+    batches: Count = 8
+    """of 900 samples each, from which each of the network's two stages is solved"""
+    steps: Count = 50
+    """of gradient descent after that"""
     real: OptionalFolder = None
     """Pose2Sim's folder Demo_SinglePerson: adds the rows of its cameras 01 and 03"""
     json: OptionalFile = None
@@ -41,3 +43,4 @@ class Lifter:
     def check(self) -> None:
         """Refuse sizes that cannot be fitted or trained."""
         check_option(self.batches >= 1, "--batches", "at least 1", self.batches)
+        check_option(self.steps >= 1, "--steps", "at least 1", self.steps)

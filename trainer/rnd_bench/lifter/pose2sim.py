@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 
 SCORED = ("cam01", "cam03")
 _REST_WIDTHS = {"hip": 2 * 0.086, "shoulder": 2 * (0.076 + 0.114)}  # m, of REST_OFFSETS
+_REST_TRUNK = 0.457  # m, from the middle of the hips to that of the shoulders
 _UNIT = 64.0  # of the file's intrinsics, a pixel
 _SURE = 0.5
 """confidence from which a point is triangulated"""
@@ -61,7 +62,7 @@ def load_cameras(file: Path) -> dict[str, Calibrated]:
             ]
         )
         names = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
-        rotation = np.diag([1.0, -1.0, -1.0]) @ axes.T
+        rotation = np.diag([1.0, -1.0, -1.0]) @ axes
         distortion = np.array([number[name] for name in names])
         cameras[node.attrib["serial"]] = Calibrated(rotation, -rotation @ centre, k, distortion)
     return cameras
@@ -132,6 +133,11 @@ def _row(lifted: Lifted, hint_m: NDArray[np.float32], truth: Floats) -> dict[str
         for end in ends:
             chain = [end] if part == "hip" else [end, end.replace("shoulder", "collar")]
             lengths[:, [JOINTS.index(n) - 1 for n in chain]] *= share
+    middles = [
+        truth[:, [BLAZEPOSE.index(f"{side}_{part}") for side in ("left", "right")]].mean(1) for part in _REST_WIDTHS
+    ]
+    share = np.median(np.linalg.norm(middles[1] - middles[0], axis=1)) / _REST_TRUNK
+    lengths[:, [JOINTS.index(n) - 1 for n in ("spine1", "spine2", "spine3")]] *= share
     for n in LIMBS:
         lengths[:, JOINTS.index(n) - 1] = np.median(np.linalg.norm(bones[n], axis=1))
     body = placed(np.concatenate([lifted.directions, lifted.roll], 1)[known], lengths)[

@@ -16,7 +16,7 @@ from rnd_trainer.estimating.lifter import REACH
 
 from .errors import ErrorModel
 from .motions import Clips, Generator
-from .network import HIDDEN, VECTORS, LifterNetwork, Stage, unit_of
+from .network import COMPONENTS, HIDDEN, VECTORS, LifterNetwork, Stage, unit_of
 from .synthesis import batch
 
 Floats = NDArray[np.float64]
@@ -36,11 +36,11 @@ class _Sums:
 
     def __init__(self, stage: Stage, mean: Tensor, scale: Tensor, outputs: int) -> None:
         self.stage, self.mean, self.scale = stage, mean, scale
-        size = stage.first.out_features + stage.first.in_features + 1
+        size = stage.first.out_features + stage.skip.in_features + 1
         self.gram, self.right = np.zeros((size, size)), np.zeros((size, outputs))
 
     def rows(self, inputs: Tensor) -> Tensor:
-        hidden = torch.relu(self.stage.first(inputs))
+        hidden = self.stage.hidden(inputs)
         return torch.cat([hidden, (inputs - self.mean) / self.scale, torch.ones(len(inputs), 1)], 1)
 
     def add(self, inputs: Tensor, target: Tensor) -> None:
@@ -79,9 +79,10 @@ def solve(
         assert isinstance(stage, Stage)
         inputs, target = _samples(network, number, clips, errors, 0)
         mean, scale = inputs.mean(0), inputs.std(0) + 0.05
-        _sample_units(stage, (inputs - mean) / scale, target, np.random.default_rng([_SEED, number]))
-        stage.first.weight /= scale
-        stage.first.bias -= stage.first.weight @ mean
+        scaled = (inputs - mean) / scale
+        stage.main.weight.copy_(torch.linalg.eigh(scaled.T @ scaled)[1][:, -COMPONENTS:].T / scale)
+        stage.main.bias.copy_(-stage.main.weight @ mean)
+        _sample_units(stage, stage.main(inputs), target, np.random.default_rng([_SEED, number]))
         sums = _Sums(stage, mean, scale, 3 * VECTORS)
         for k in range(batches):
             sums.add(*_samples(network, number, clips, errors, k + 1))
