@@ -104,7 +104,7 @@ def _real(folder: Path, out: Path) -> Iterator[dict[str, Any]]:
     shared = sorted(set.intersection(*(set(one.frames.tolist()) for one in seen.values())))
     rows = {name: np.searchsorted(seen[name].frames, shared) for name in names}
     rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px[rows[n]].astype(np.float64)) for n in names])
-    confidence = np.stack([seen[n].confidence[rows[n]] for n in names])
+    confidence = np.stack([seen[n].confidence[rows[n]] for n in names]).astype(np.float64)
     points = triangulated([cameras[n] for n in names], rays, confidence)[:, [BLAZEPOSE.index(n) for n in LIMBS]]
     whole = np.isfinite(points).all((1, 2))
     for name in SCORED:

@@ -14,13 +14,15 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
 
 from .fitting.figure import Figure, default_figure, known_figure
+from .fitting.kinematics import Posed
 from .fitting.marks import HAND_MARKS, KNUCKLES, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
+from .fitting.pose_terms import GroundTerm, PriorTerm, SmoothTerm
 from .fitting.prior import pose_prior
 from .fitting.silhouette import Outlines, OutlineTerm, Surface, outlines_of
 from .fitting.start import joint_rotations, local_rotations, root_positions
 from .fitting.state import TO_CAMERA, Layout, State
-from .fitting.terms import BoneTerm, GroundTerm, Lens, PointTerm, PriorTerm, SharedTerm, SmoothTerm, mark_points
+from .fitting.terms import BoneTerm, Lens, PointTerm, SharedTerm, mark_points, project
 from .lifted import Lifted
 from .lifter import lift
 from .observations import Observations
@@ -327,9 +329,7 @@ class Fit:
             state,
         )
 
-    def _residuals(self, posed) -> Floats:  # type: ignore[no-untyped-def]
-        from .fitting.terms import project
-
+    def _residuals(self, posed: Posed) -> Floats:
         pixels, _ = project(mark_points(self.state, posed, self.marks)[:, :33], self.state, self.lens)
         gaps = np.linalg.norm(pixels - self.observations.keypoints_px, axis=-1)
         sure = self.observations.confidence > 0.5

@@ -15,10 +15,11 @@ from rnd_runtime.motion.motion import Motion
 from .fitting.figure import JOINTS, Figure, default_figure, known_figure
 from .fitting.marks import JOINT_MARKS, Marks, marks_of
 from .fitting.normal_equations import NormalEquations
+from .fitting.pose_terms import PriorTerm, SmoothTerm
 from .fitting.prior import pose_prior
 from .fitting.start import bones_of_points, joint_rotations, local_rotations
 from .fitting.state import TO_CAMERA, Layout, State
-from .fitting.terms import BoneTerm, Lens, PositionTerm, PriorTerm, SharedTerm, SmoothTerm, mark_points
+from .fitting.terms import BoneTerm, Lens, PositionTerm, SharedTerm, mark_points
 from .lifted import Lifted
 from .observations import BLAZEPOSE
 
@@ -75,7 +76,7 @@ def fit_joints(
     count = len(points)
     marks = _with_joints(marks, figure, pinned)
     layout = Layout(figure, marks)
-    known = np.isfinite(points).all(-1)
+    known = np.asarray(np.isfinite(points).all(-1))
     if lifted is None:
         lifted = bones_of_points(np.nan_to_num(points[:, :33]) @ TO_CAMERA, known[:, :33], 100.0)
     rotations = local_rotations(TO_CAMERA @ joint_rotations(lifted), figure.body.skeleton)
@@ -154,7 +155,7 @@ def _with_joints(marks: Marks, figure: Figure, pinned: dict[int, str]) -> Marks:
     return Marks(joints, places, basis, mirror, freedom)
 
 
-def _solve(state: State, figure: Figure, marks: Marks, layout: Layout, terms: tuple) -> State:  # type: ignore[type-arg]
+def _solve(state: State, figure: Figure, marks: Marks, layout: Layout, terms: tuple) -> State:
     positions, bones, prior, smooth, shared = terms
     damping, cost = 1e-3, np.inf
 

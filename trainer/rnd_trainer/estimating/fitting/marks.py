@@ -83,7 +83,7 @@ def marks_of(figure: Figure) -> Marks:
     return Marks(joints, places, basis, mirror, freedom)
 
 
-def _face(head: Floats, on_surface) -> None:  # type: ignore[no-untyped-def]
+def _face(head: Floats, on_surface) -> None:
     """Nose, eyes, ears and mouth of the head's vertices [N, 3]."""
     nose = head[head[:, 2].argmax()]
     middle, depth = nose[0], np.median(head[:, 2])

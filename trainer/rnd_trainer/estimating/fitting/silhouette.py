@@ -48,7 +48,7 @@ class Outlines:
     scale: float
 
 
-def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Outlines:  # type: ignore[no-untyped-def]
+def outlines_of(masks, frames: int, size: tuple[int, int], seed: int = 0) -> Outlines:
     """Outlines of ``masks`` (T × [H, W] uint8 soft) of images of ``size`` (width, height)."""
     width, height = size
     scale = min(1.0, GRID / max(width, height))

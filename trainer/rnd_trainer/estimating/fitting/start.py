@@ -79,7 +79,7 @@ def bones_of_points(points: Floats, known: Bools, concentration: float = HINT_CO
     trunk = known[:, [11, 12, 23, 24]].all(1)
     head = _frame(points[:, 7] - points[:, 8], up)
     face = _frame_forward(points[:, 7] - points[:, 8], points[:, 0] - middle(7, 8))
-    seen_face = known[:, [0, 7, 8]].all(1)
+    seen_face = np.asarray(known[:, [0, 7, 8]].all(1))
     head = np.where(seen_face[:, None, None], face, chest)
     world[0], world[9], world[15] = pelvis, chest, head
     world[3] = nearest_rotation(2 * pelvis + chest)
@@ -94,7 +94,7 @@ def bones_of_points(points: Floats, known: Bools, concentration: float = HINT_CO
         if joint in world:
             rolls[:, joint - 1] = world[joint] @ ROLL_AXES[joint - 1]
             roll_kappa[:, joint - 1] = concentration * (seen_face if joint == 15 else trunk) * 0.5
-    for sign, right in ((1, 0), (-1, 1)):
+    for sign, right in ((1.0, 0), (-1.0, 1)):
         chain = {4: (23, 25), 7: (25, 27), 10: (29, 31), 18: (11, 13), 20: (13, 15)}
         for joint, (a, b) in chain.items():
             a, b, row = a + right, b + right, joint + right - 1
@@ -104,8 +104,7 @@ def bones_of_points(points: Floats, known: Bools, concentration: float = HINT_CO
             kappa[:, row] = concentration * (known[:, a] & known[:, b])
         # the hinge's axis is across the plane of the bent limb
         for upper, lower, rolling in ((4, 7, (1, 4)), (18, 20, (16, 18))):
-            a, b = directions[:, upper + right - 1], directions[:, lower + right - 1]
-            across = np.cross(a, b)
+            across: Floats = np.cross(directions[:, upper + right - 1], directions[:, lower + right - 1])
             bent = np.linalg.norm(across, axis=1)
             axis = _unit(across) * (1 if upper == 4 else sign)
             both = np.minimum(kappa[:, upper + right - 1], kappa[:, lower + right - 1])

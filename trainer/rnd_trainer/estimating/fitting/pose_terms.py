@@ -1,0 +1,214 @@
+"""The terms of poses by themselves: prior, hinges, smoothness in time, feet on the ground. See ``terms``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.core.rotations import matrix_to_axis_angle
+
+from .figure import JOINTS, Figure
+from .kinematics import Posed, attached, point_derivative
+from .marks import Marks
+from .normal_equations import NormalEquations
+from .prior import Prior
+from .state import Layout, State
+from .terms import marks_by_shape, robust
+
+Floats = NDArray[np.float64]
+
+HEEL_TOE = (29, 30, 31, 32)
+
+
+def right_jacobian_inverse(vectors: Floats) -> Floats:
+    """d log(exp(v) exp(δ)) / dδ [..., 3, 3] at δ = 0."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*x.shape, 3, 3)
+    safe = np.maximum(angle, 1e-3)
+    second = np.where(angle < 1e-3, 1 / 12, 1 / safe**2 - (1 + np.cos(safe)) / (2 * safe * np.sin(safe) + 1e-12))
+    return np.eye(3) + 0.5 * cross + second * (cross @ cross)
+
+
+@dataclass(frozen=True, eq=False)
+class PriorTerm:
+    """The pose prior, and knees and elbows that bend one way."""
+
+    prior: Prior
+    weight: float = 0.05
+    limit_deviation: float = 0.08  # rad past straight
+
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+        names = posed.skeleton.names
+        order = [names.index(name) for name in JOINTS[1:]]
+        columns = [int(np.flatnonzero(layout.active == k)[0]) for k in order]
+        vectors = matrix_to_axis_angle(posed.rotations[:, order])  # [T, 21, 3]
+        count = len(vectors)
+        residual = (vectors.reshape(count, -1) - self.prior.mean) @ self.prior.whiten.T
+        cost = self.weight * float((residual**2).sum())
+        hinge, signs = self._hinges(vectors)
+        cost += float((hinge**2).sum())
+        if equations is not None:
+            turn = right_jacobian_inverse(vectors)
+            local = np.zeros((count, residual.shape[1], layout.unknowns))
+            rows = np.zeros((count, hinge.shape[1], layout.unknowns))
+            for j, column in enumerate(columns):
+                here = slice(3 * column, 3 * column + 3)
+                local[:, :, here] = self.prior.whiten[:, 3 * j : 3 * j + 3] @ turn[:, j]
+            for row, (j, axis, sign) in enumerate(signs):
+                here = slice(3 * columns[j], 3 * columns[j] + 3)
+                active = (hinge[:, row] > 0)[:, None]
+                rows[:, row, here] = active * sign / self.limit_deviation * turn[:, j, axis]
+            equations.add(residual, np.full_like(residual, self.weight), local)
+            equations.add(hinge, np.ones_like(hinge), rows)
+        return cost
+
+    def _hinges(self, vectors: Floats) -> tuple[Floats, list[tuple[int, int, float]]]:
+        """Residuals [T, 4] of over-stretched hinges, and (joint, axis, sign that over-stretches)."""
+        signs = [
+            (JOINTS.index(name) - 1, axis, sign)
+            for name, axis, sign in (
+                ("left_knee", 0, -1.0),
+                ("right_knee", 0, -1.0),
+                ("left_elbow", 1, 1.0),
+                ("right_elbow", 1, -1.0),
+            )
+        ]
+        past = [np.maximum(sign * vectors[:, j, axis] - 0.05, 0) for j, axis, sign in signs]
+        return np.stack(past, 1) / self.limit_deviation, signs
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothTerm:
+    """Accelerations of joints (m/s²) and of their local rotations (rad/s²) against those of people."""
+
+    times: Floats
+    joints: Floats  # [J] m/s², deviations along each axis
+    rotations: Floats  # [J] rad/s²
+    weight: float = 1.0
+    limit: float = 4.0
+
+    def __call__(self, posed: Posed, layout: Layout, equations: NormalEquations | None) -> float:
+        if len(posed) < 3:
+            return 0.0
+        before, after = np.diff(self.times)[:-1], np.diff(self.times)[1:]
+        first, last = 2 / (before * (before + after)), 2 / (after * (before + after))
+        factors = np.stack([first, -first - last, last], 1)[:, :, None, None]  # [T − 2, 3, 1, 1]
+        active = layout.active
+        positions = posed.joints[:, active] / self.joints[active, None]
+        count = len(positions) - 2
+        chain = [positions[k : k + count] for k in range(3)]
+        residual = factors[:, 0] * chain[0] + factors[:, 1] * chain[1] + factors[:, 2] * chain[2]
+        cost, kept = robust((residual**2).sum(-1), self.limit)
+        turned = posed.rotations[:, active]
+        steps = matrix_to_axis_angle(np.swapaxes(turned[:-1], -1, -2) @ turned[1:])  # [T − 1, A, 3]
+        span = np.diff(self.times)[:, None, None]
+        middle = (0.5 * (before + after))[:, None, None]
+        rates = steps / span
+        spin = (rates[1:] - rates[:-1]) / middle / self.rotations[active, None]
+        spin_cost, spin_kept = robust((spin**2).sum(-1), self.limit)
+        if equations is not None:
+            by = point_derivative(posed, posed.joints[:, active], active, active) / self.joints[active, None, None]
+            by = by.reshape(len(by), -1, layout.unknowns)
+            parts = [factors[:, k] * by[k : k + count] for k in range(3)]
+            weight = self.weight * np.repeat(kept, 3, axis=1)
+            equations.add_chain(residual.reshape(count, -1), weight, parts)
+            self._add_spin(equations, steps, span, middle, spin, spin_kept, layout)
+        return self.weight * (cost + spin_cost)
+
+    def _add_spin(
+        self,
+        equations: NormalEquations,
+        steps: Floats,
+        span: Floats,
+        middle: Floats,
+        spin: Floats,
+        kept: Floats,
+        layout: Layout,
+    ) -> None:
+        forward, backward = right_jacobian_inverse(steps), -right_jacobian_inverse(-steps)  # by δ(t + 1), by δ(t)
+        scale = 1 / middle / self.rotations[layout.active, None]
+        early, late = 1 / span[:-1], 1 / span[1:]
+        blocks = [
+            -scale[..., None] * early[..., None] * backward[:-1],
+            scale[..., None] * (late[..., None] * backward[1:] - early[..., None] * forward[:-1]),
+            scale[..., None] * late[..., None] * forward[1:],
+        ]
+        count, joints = spin.shape[:2]
+        parts = []
+        for block in blocks:
+            part = np.zeros((count, joints, 3, layout.unknowns))
+            for j in range(joints):
+                part[:, j, :, 3 * j : 3 * j + 3] = block[:, j]
+            parts.append(part.reshape(count, -1, layout.unknowns))
+        equations.add_chain(spin.reshape(count, -1), self.weight * np.repeat(kept, 3, axis=1), parts)
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTerm:
+    """Feet stand on a plane, do not sink into it, and stay put where they stand."""
+
+    times: Floats
+    weight: float = 1.0
+    height_m: float = 0.025
+    reach_m: float = 0.06  # a point higher is in the air
+    slip: float = 0.15  # m/s of a standing foot
+    moving: float = 0.8  # m/s; a faster foot does not stand
+
+    def __call__(
+        self,
+        state: State,
+        posed: Posed,
+        figure: Figure,
+        marks: Marks,
+        layout: Layout,
+        equations: NormalEquations | None,
+    ) -> float:
+        chosen = np.array(HEEL_TOE)
+        soles = _part(marks, chosen)
+        places = soles.places + np.tensordot(state.shape, soles.basis, 1)
+        points = attached(posed, soles.joints, places)
+        up = state.up
+        heights = points @ up - state.ground[0]
+        lowest = np.minimum(heights, self.reach_m * 3)
+        cost, kept = robust((lowest / self.height_m) ** 2, self.reach_m / self.height_m)
+        kept = np.where(heights < self.reach_m * 3, kept, 0)
+        below = np.where(heights < 0, 1.0, 0.0)
+        sunk = np.minimum(heights, 0) / self.height_m
+        cost += float((sunk**2).sum())
+        standing = np.exp(-0.5 * np.maximum(heights, 0) ** 2 / self.reach_m**2)
+        span = np.diff(self.times)[:, None, None]
+        slide = np.diff(points, axis=0) / span / self.slip
+        weights = np.minimum(standing[1:], standing[:-1])
+        squares = (slide**2).sum(-1)
+        slide_kept = 1 / (1 + squares / (self.moving / self.slip) ** 2)
+        slide_cost = float((weights * slide_kept * squares).sum())
+        if equations is not None:
+            local = point_derivative(posed, points, soles.joints, layout.active)
+            height_by = np.einsum("i,tpid->tpd", up, local)
+            shared = np.zeros((*heights.shape, layout.shared))
+            shared[..., layout.shape] = np.einsum("i,tpik->tpk", up, marks_by_shape(posed, figure, soles))
+            shared[..., layout.ground.start] = -1
+            for k, axis in ((1, 0), (2, 2)):
+                shared[..., layout.ground.start + k] = points[..., axis] - up[axis] * (points @ up)
+            scale = 1 / self.height_m
+            weight = self.weight * (kept + below)
+            equations.add(heights * scale, weight, height_by * scale, shared * scale)
+            moved = (local / self.slip).reshape(len(local), -1, layout.unknowns)
+            by = [-moved[:-1] / span, moved[1:] / span]
+            pair = np.repeat(weights * slide_kept**2, 3, axis=1) * self.weight
+            equations.add_chain(slide.reshape(len(slide), -1), pair, by)
+        return self.weight * (cost + slide_cost)
+
+
+def _part(marks: Marks, chosen: NDArray[np.int64]) -> Marks:
+    return Marks(
+        marks.joints[chosen],
+        marks.places[chosen],
+        marks.basis[:, chosen],
+        marks.mirror[chosen],
+        marks.freedom_m[chosen],
+    )
