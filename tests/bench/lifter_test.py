@@ -1,4 +1,4 @@
-"""The laboratory of the lifter: motions, bodies, the errors of landmarks, likelihood, training, figures."""
+"""``rnd-bench study lifter``: motions, bodies, the errors of landmarks, likelihood, training, figures."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from rnd_bench.cli import main
 from rnd_bench.lifter import errors as err
 from rnd_bench.lifter.figures import Lifts, calibration, figures, procrustes, synthetic
 from rnd_bench.lifter.motions import MIRROR, TEST, VALIDATION, Clips, chained, load_clips, relative, sampled, subject_of
@@ -196,3 +197,10 @@ def test_triangulation_finds_points_again() -> None:
     seen = np.stack([points @ c.rotation.T + c.translation for c in cameras])
     found = triangulated(cameras, seen[..., :2] / seen[..., 2:], np.ones((3, 2, 5)))
     np.testing.assert_allclose(found, points, atol=1e-9)
+
+
+def test_no_batches_are_refused(tmp_path, capsys) -> None:
+    folders = ["--motions", "a", "--capture", "b", "--video", "c"]
+    assert main(["study", "lifter", str(tmp_path / "out"), *folders, "--batches", "0"]) == 2
+    assert "--batches: expected at least 1, got 0" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_trainer.estimating.lifted import JOINTS
-from rnd_trainer.estimating.observations import HAND_POINTS, Masks, Observations, load_observations, save_observations
-from rnd_trainer.estimating.observing.detection import Detector
-from rnd_trainer.estimating.observing.landmarks import LandmarkNetwork
-from rnd_trainer.estimating.observing.networks import open_network
-from rnd_trainer.estimating.observing.sides import merge_views
-from rnd_trainer.estimating.observing.tracking import find_person, follow
+from rnd_trainer.estimating.observations import Observations, load_observations, save_observations
+from rnd_trainer.estimating.observing.observe import Networks, observe
 from rnd_trainer.importing.videos.video_file import VideoFile
 
 from .errors import Window
@@ -25,36 +23,10 @@ FRAMES = 12
 
 
 def observed(file: Path, kept: Path, every: int = 1) -> Observations:
-    """What the landmark network sees of every n-th frame of a video; stored as .npz, and read from there again."""
+    """What the networks see of every n-th frame of a video; stored as .npz, and read from there again."""
     if not kept.exists():
-        detector = Detector(open_network("person_detector", 1))
-        network = LandmarkNetwork(open_network("pose_landmarks", 1))
         video = VideoFile(file)
-        numbers = list(video.numbers)[::every]
-        start = find_person(video, numbers, detector, network)
-        seen = [(n, views) for n, views in follow(video, numbers, start, detector, network) if views is not None]
-        frames, found = np.array([n for n, _ in seen]), [views for _, views in seen]
-        merged = merge_views(
-            np.stack([views.points for views in found]),
-            np.stack([views.metres for views in found]),
-            np.stack([views.confidence for views in found]),
-            np.array([views.region.size for views in found]),
-            frames / video.fps,
-        )
-        size = video.width, video.height
-        observations = Observations(
-            video.fps,
-            size,
-            frames,
-            merged.points.astype(np.float32),
-            merged.confidence.astype(np.float32),
-            merged.spread.astype(np.float32),
-            merged.metres.astype(np.float32),
-            np.full((len(frames), 2, HAND_POINTS, 2), np.nan, np.float32),
-            np.zeros((len(frames), 2), np.float32),
-            Masks.of((np.uint8(255 * views.mask + 0.5) for views in found), size),
-        )
-        save_observations(kept, observations)
+        save_observations(kept, observe(video, Networks.open(1), numbers=list(video.numbers)[::every]))
     return load_observations(kept)
 
 
@@ -68,9 +40,7 @@ def windows_of_capture(folder: Path, seen: Observations, frames: int | None = FR
     capture = load_capture(folder)
     chosen = sorted(capture.split("train"), key=lambda frame: frame.frame)
     if len(chosen) <= seen.frames.max():
-        raise InputError(
-            "observations", expected=f"of {len(chosen)} frames", got=int(seen.frames.max()) + 1, file=observed
-        )
+        raise InputError("observations", expected=f"of {len(chosen)} frames", got=int(seen.frames.max()) + 1)
     chosen = [chosen[k] for k in seen.frames]
     index = [frame.frame for frame in chosen]
     camera, motion, skeleton = capture.cameras[chosen[0].camera], capture.motion, capture.body.skeleton
@@ -79,7 +49,7 @@ def windows_of_capture(folder: Path, seen: Observations, frames: int | None = FR
     to_camera = np.asarray(camera.world_to_camera, np.float64)
     moved = to_camera[:3, :3] @ bones[..., :3] @ skeleton.rest_joints[None, :, :, None]
     joints = moved[..., 0] + bones[..., 3] @ to_camera[:3, :3].T + to_camera[:3, 3]
-    window = {
+    window: dict[str, NDArray[Any]] = {
         "rays": (seen.keypoints_px - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]],
         "confidence": seen.confidence,
         "hint_m": seen.keypoints_m,

@@ -8,6 +8,7 @@ Points of low confidence err more. All is fitted to a rendered person (``capture
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ FOLDS = 4
 """of the windows, for errors beside the mean"""
 _HIPS = [BLAZEPOSE.index("left_hip"), BLAZEPOSE.index("right_hip")]
 _SHOULDERS = [BLAZEPOSE.index("left_shoulder"), BLAZEPOSE.index("right_shoulder")]
-_PLAIN = np.float32([-1, 1, 1])
+_PLAIN = np.array([-1, 1, 1], np.float32)
 
 
 def _attached() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -242,8 +243,8 @@ def seen_with_errors(points: Floats32, model: ErrorModel, rng: Generator) -> tup
     flat = ahead[..., :2] / ahead[..., 2:] + error[..., :66].reshape(count, frames, POINTS, 2) / middle[..., 2:]
     hint = ahead - middle + error[..., 66:165].reshape(count, frames, POINTS, 3)
     _swap(flat, hint, chance, rng)
-    rays = np.concatenate([flat, np.ones_like(flat[..., :1])], -1) @ view
-    rays = rays[..., :2] / np.maximum(rays[..., 2:], 0.05)
+    ends = np.concatenate([flat, np.ones_like(flat[..., :1])], -1) @ view
+    rays = ends[..., :2] / np.maximum(ends[..., 2:], 0.05)
     return rays.astype(np.float32), chance.astype(np.float32), hint.astype(np.float32)
 
 
@@ -260,11 +261,12 @@ def _noise(count: int, frames: int, model: ErrorModel, rng: Generator) -> Floats
     for value in np.unique(memory):
         chosen, keep = memory == value, np.float32(value)
         gain = np.sqrt(1 - keep**2)
-        moving[..., chosen] = lfilter(np.stack([gain]), np.float32([1, -keep]), moving[..., chosen], axis=1)
-    return np.sqrt(constant) * white(1) + np.sqrt(1 - constant) * moving[:, 8:]
+        moving[..., chosen] = lfilter(np.stack([gain]), np.array([1, -keep], np.float32), moving[..., chosen], axis=1)
+    noise: Floats32 = np.sqrt(constant) * white(1) + np.sqrt(1 - constant) * moving[:, 8:]
+    return noise
 
 
-def _events(error: Floats, chance: Floats, rng: Generator) -> None:
+def _events(error: NDArray[Any], chance: NDArray[Any], rng: Generator) -> None:
     """Limbs that are hidden or mistaken for a while."""
     count, frames = error.shape[:2]
     groups = [
@@ -275,7 +277,7 @@ def _events(error: Floats, chance: Floats, rng: Generator) -> None:
         [27, 29, 31],
         [28, 30, 32],
     ]
-    for b, group in zip(np.flatnonzero(rng.random(count) < 0.25), rng.integers(len(groups), size=count)):
+    for b, group in zip(np.flatnonzero(rng.random(count) < 0.25), rng.integers(0, len(groups), count).tolist()):
         start, length = rng.integers(frames), rng.integers(3, 20)
         part, members = slice(start, start + length), groups[group]
         shift = rng.normal(0, 0.08, 3)
@@ -285,11 +287,13 @@ def _events(error: Floats, chance: Floats, rng: Generator) -> None:
         chance[b, part, members] *= rng.uniform(0.1, 1.0)
 
 
-def _swap(flat: Floats, hint: Floats, chance: Floats, rng: Generator) -> None:
+def _swap(flat: NDArray[Any], hint: NDArray[Any], chance: NDArray[Any], rng: Generator) -> None:
     """Left and right that are mistaken for each other for some frames: legs, wrists or all."""
     count, frames = flat.shape[:2]
     kinds = [list(range(25, 33)), [15, 16, 17, 18, 19, 20, 21, 22], list(range(POINTS))]
-    for b, kind in zip(np.flatnonzero(rng.random(count) < 0.08), rng.choice(3, count, p=[0.5, 0.35, 0.15])):
+    for b, kind in zip(
+        np.flatnonzero(rng.random(count) < 0.08), rng.choice(np.arange(3), count, p=[0.5, 0.35, 0.15]).tolist()
+    ):
         start = rng.integers(frames)
         part, members = slice(start, start + rng.integers(2, 10)), np.array(kinds[kind])
         for array in (flat, hint, chance):

@@ -128,7 +128,7 @@ def placed(vectors: Floats32, lengths: Floats32) -> Floats:
     return joints
 
 
-def root_relative(joints: Floats, truth: Floats, scaled: bool = False) -> Floats:
+def root_relative(joints: Floats, truth: Floats, scaled: bool = False) -> float:
     """Mean distance from the middle of the hips; with ``scaled``, by the one scale that fits all frames best."""
     hips = [BODY.index("left_hip"), BODY.index("right_hip")]
     a, b = (x - x[:, hips].mean(1, keepdims=True) for x in (joints, truth))

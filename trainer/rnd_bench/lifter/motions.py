@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.npz import Npz
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS
 
@@ -76,7 +76,7 @@ def load_clips(folder: Path) -> dict[str, Clips]:
     return {part: _joined(clips) for part, clips in parts.items()}
 
 
-def _check(archive: Npz, file: Path) -> None:
+def _check(archive: Any, file: Path) -> None:
     if tuple(archive["joint_names"]) != JOINTS or float(archive["fps"]) != FPS:
         raise InputError(
             "motions", expected=f"{len(JOINTS)} joints at {FPS:g} frames per second", got="others", file=file
@@ -154,7 +154,7 @@ def sampled(clips: Clips, count: int, frames: int, rng: Generator, augment: bool
     rotations[chosen] = _perturbed(rotations[chosen], rng)
     mirrored = rng.random(count) < 0.5
     rotations[mirrored] = _FLIP @ rotations[mirrored][:, :, MIRROR] @ _FLIP
-    roots[mirrored] *= np.float32([-1, 1, 1])
+    roots[mirrored] *= np.array([-1, 1, 1], np.float32)
     return rotations, roots
 
 
@@ -188,7 +188,7 @@ def _perturbed(rotations: Floats32, rng: Generator) -> Floats32:
             hips = hips @ axis_angle_to_matrix(np.stack([-flexed + noise[0], zero, zero], -1))
             local[seated, :, hip] = hips[:, None]
             local[seated, :, bend] = axis_angle_to_matrix(np.stack([np.abs(knee + noise[1]), zero, zero], -1))[:, None]
-    lean = np.where(rng.random(count) < 0.1, np.radians(60.0), np.radians(6.0))[:, None]
+    lean = np.radians(np.where(rng.random(count) < 0.1, [60.0], [6.0]))[:, None]
     local[:, :, 0] = (
         axis_angle_to_matrix(rng.normal(size=(count, 3)) * lean * [1, 0.1, 0.7]).astype(np.float32)[:, None]
         @ local[:, :, 0]

@@ -65,8 +65,8 @@ class LifterNetwork(nn.Module):
     def inputs_of(self, stage: int, features: Tensor) -> Tensor:
         """What ``stage`` sees [B, T - 2·HALF·(stage + 1), SIZES[stage]] of inputs [B, T, CHANNELS]."""
         if stage == 0:
-            near = sum(_at(features, k) for k in (-2, 0, 2)) / 3
-            wide = sum(_at(features, k) for k in range(-HALF, HALF + 1, 3)) / (2 * HALF // 3 + 1)
+            near = torch.stack([_at(features, k) for k in (-2, 0, 2)]).mean(0)
+            wide = torch.stack([_at(features, k) for k in range(-HALF, HALF + 1, 3)]).mean(0)
             motion = 2 * (_at(features, 5) - _at(features, -5))
             return torch.cat([_at(features, 0), near, wide, motion], -1)
         guess = unit_of(self.stages[stage - 1](self.inputs_of(stage - 1, features))).flatten(-2)
