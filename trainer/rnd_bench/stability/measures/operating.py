@@ -172,8 +172,9 @@ def _amounts(renderer: FrameRenderer, motion: Motion, middle: np.ndarray, pixels
 def two_writers(subject: Subject) -> Result:
     """H7: of two plays into one folder the second is told who holds it."""
     folder, wrong = subject.work / "two", list[str]()
-    folder.mkdir(parents=True, exist_ok=True)
-    command = play(subject.avatar_file, _motion_file(subject, folder, 60.0), folder / "out", "--size", 256)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    command = play(subject.avatar_file, _motion_file(subject, folder, 600.0), folder / "out", "--size", 256)
     first = _started(command, folder)
     try:
         while first.poll() is None and not (folder / "out" / LOCK_FILE).exists():
