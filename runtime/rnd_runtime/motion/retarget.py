@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 
 _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "hip", "knee")}
 _LEG = 0.85  # m, against which heights are judged
+_STANDS = 0.5  # mean cosine of the trunk and the up axis of a recording, which may crouch and jump
+_CLEARLY, _HIPS = 0.7, (0.6, 1.3)  # the same, and heights of hips in legs, that make Z up before Y is doubted
 _APART = 1e-3  # of a leg, min distance of the hips and length of the trunk
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time, against noise
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, mean of bodies within 3 mm
@@ -144,7 +146,12 @@ def _upright(tracks: Tracks, up: str, usual_up: str) -> tuple[Tracks, list[str]]
     axis, notes = up, list[str]()
     if up == "auto":
         heights = hips(tracks.points) * _LEG / leg_length(tracks.points)
-        axis, found = up_axis(unit(_trunk(tracks.points)), heights, usual_up)
+        trunk = unit(_trunk(tracks.points))
+        clear = usual_up == "y" and trunk[:, 2].mean() > _CLEARLY and _at_leg_height(heights[:, 2])
+        if clear and not _at_leg_height(heights[:, 1]):
+            axis, found = "z", ("z is taken for up, as the trunk stands along it; --motion-up y overrules",)
+        else:
+            axis, found = up_axis(trunk, heights, usual_up, _STANDS)
         notes += [note for note in found if axis != "y" or usual_up == "y"]
     world = UP_ROTATIONS[axis]
     if _is_mirrored(tracks.points):
@@ -161,6 +168,12 @@ def _upright(tracks: Tracks, up: str, usual_up: str) -> tuple[Tracks, list[str]]
         rotations={name: world @ rotations @ flip for name, rotations in tracks.rotations.items()},
         palms={side: (moved(axis), at_rest) for side, (axis, at_rest) in tracks.palms.items()},
     ), notes
+
+
+def _at_leg_height(heights: Floats) -> bool:
+    """Whether hips at ``heights`` [F] m may be those of somebody who stands or crouches on a floor at 0."""
+    low, middle = np.quantile(heights, [0.05, 0.5]) / _LEG
+    return bool(low > 0 and _HIPS[0] < middle < _HIPS[1])
 
 
 def _is_mirrored(points: Mapping[str, Floats]) -> bool:

@@ -25,7 +25,7 @@ _STANDS = (0.75, 1.3)
 _SHARE = 0.05  # of the frames at either end of the heights
 
 
-def up_axis(trunk: Floats, hips: Floats, assumed: str) -> tuple[str, tuple[str, ...]]:
+def up_axis(trunk: Floats, hips: Floats, assumed: str, clear: float = _CLEAR) -> tuple[str, tuple[str, ...]]:
     """The up axis, a key of ``UP_ROTATIONS``, and a note where it is not ``assumed``, or where it may not be.
 
     The trunk's mean direction decides, except for a person who lies: whose hips stay near the floor of the assumed
@@ -35,11 +35,12 @@ def up_axis(trunk: Floats, hips: Floats, assumed: str) -> tuple[str, tuple[str, 
         trunk: [F, 3] unit directions from the hips to the chest, in the file's world.
         hips: [F, 3] m.
         assumed: the layout's axis, "y" or "z".
+        clear: mean cosine of the trunk and another axis that makes it up.
     """
     mean = trunk.mean(0)
     along = int(np.abs(mean).argmax())
     found = ("-" if mean[along] < 0 else "") + "xyz"[along]
-    if mean["xyz".index(assumed)] > _UNCLEAR or abs(mean[along]) < _CLEAR or found == assumed:
+    if mean["xyz".index(assumed)] > _UNCLEAR or abs(mean[along]) < clear or found == assumed:
         return assumed, ()
     low, high = np.quantile(hips[:, "xyz".index(assumed)] / _LEG, [_SHARE, 1 - _SHARE])
     stands = float(np.median(hips[:, along]) * np.sign(mean[along]) / _LEG)

@@ -9,13 +9,17 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.motion.joint_names import match_joints
+from rnd_runtime.motion.limbs import Bones
 from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.motion.readers.bvh import read_bvh
 from rnd_runtime.motion.retarget import Retargeted, retarget
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.motion.smpl import SMPL_NAMES
 from support.known_motion import FRAMES, MATRICES, METRES, PELVIS, SKELETON, TEXT, Z_UP
 from support.known_skeletons import NAMINGS, assert_same_poses, write_bvh
 from support.paths import SHARED
+from support.zero_poses import random_rotations
 
 SHARED_DATA = SHARED / "data" / "motion"
 
@@ -122,6 +126,26 @@ def test_what_retargeting_makes_no_numbers_of_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("rnd_runtime.motion.motion.retarget", torn)
     with pytest.raises(InputError, match=r"a\.bvh: frame 3: motion: expected finite numbers"):
         load_motion(write_bvh(tmp_path / "a.bvh", NAMINGS["smpl"]), SKELETON)
+
+
+@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data is not here; all else here is self-made")
+@pytest.mark.parametrize("name", ["cmu_12_03.bvh", "dab.bvh", "jumping.bvh"])
+def test_real_recordings_do_not_depend_on_their_zero_pose(name):
+    """Every sixth frame of it, as it is and with random axes of all bones."""
+    tree = read_bvh(SHARED_DATA / "bvh" / name)
+    tree = replace(tree, rotations=tree.rotations[::6], root_positions=tree.root_positions[::6], fps=tree.fps / 6)
+    matched = match_joints(tree.names, SMPL_NAMES, bones=Bones(tree.parents, tree.offsets))
+    axes = random_rotations(np.random.default_rng(1), len(tree.names))
+    world = tree.global_rotations() @ np.swapaxes(axes, -1, -2)
+    local, offsets = world.copy(), tree.offsets.copy()
+    for joint, parent in enumerate(tree.parents[1:], 1):
+        local[:, joint] = np.swapaxes(world[:, parent], -1, -2) @ world[:, joint]
+        offsets[joint] = axes[parent] @ offsets[joint]
+    plain = retarget(tree, SKELETON, matched)
+    odd = retarget(replace(tree, rotations=local, offsets=offsets), SKELETON, matched)
+    assert_same_poses(odd.rotations, plain.rotations)
+    assert_allclose(odd.translations, plain.translations, atol=1e-3)
+    assert {note for note in odd.notes if "taken for up" not in note} == set(plain.notes)
 
 
 @pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared data is not here; all else here is self-made")

@@ -38,7 +38,7 @@ _NO_ROLL = 0.9995  # of rotations that are the smallest ones from bone to bone
 # may be compared, and of joints of which positions show nothing from their parents
 _RIGID, _NEARLY, _FREE = np.radians([20.0, 10.0, 45.0])
 _ABOUT_A_MEAN = ("head", "_wrist", "_hand")
-_HELD = np.radians(30)  # difference from neutral of a pose that is held over the clip, not of where a joint's axes are
+_HELD = np.radians(40)  # difference from neutral of a pose that is held over the clip, not of where a joint's axes are
 _SMOOTH = 0.1  # s, of a roll from positions alone
 _NATURAL_TWIST, _NATURAL_BEND = np.radians([45.0, 50.0])  # of a zero pose that is a person's
 
@@ -136,7 +136,8 @@ class _Solver:
             return self.solved[above]
         neutral = self._fitted(name, self.solved[above], _FREE)
         in_zero_pose = self.constants[above]
-        if zero_is_rest and name in self.constants and angle_between(self.constants[name], in_zero_pose) > _HELD:
+        held = zero_is_rest and name in self.constants and name.endswith(_ABOUT_A_MEAN)
+        if held and angle_between(self.constants[name], in_zero_pose) > _HELD:
             self.constants[name] = in_zero_pose
             return self.rotations[name] @ in_zero_pose
         return neutral
