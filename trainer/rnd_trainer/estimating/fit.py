@@ -50,13 +50,13 @@ class Weights:
 
     mark_m: float = 0.022  # deviation of a sure landmark at the person's distance
     spread: float = 1.0  # of the views of one frame, counted as deviation
-    points: float = 1.0
-    bones: float = 0.6
+    points: float = 2.0
+    bones: float = 0.45
     prior: float = 0.03
-    smooth: float = 0.5
+    smooth: float = 0.3
     acceleration: float = 4.0  # m/s² of the trunk along each axis; limbs two to three times that
     spin: float = 20.0  # rad/s²
-    outline: float = 0.25
+    outline: float = 0.5
     inner: float = 0.15
     outline_m: float = 0.012
     ground: float = 0.03
