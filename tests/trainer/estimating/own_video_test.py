@@ -1,4 +1,4 @@
-"""A video and nothing else, to a capture and a training: with ideal networks, and with the real ones."""
+"""rnd-train with a video and nothing else, as after rnd-data networks: with ideal networks, and with the real ones."""
 
 from __future__ import annotations
 
