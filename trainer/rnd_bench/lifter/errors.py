@@ -262,8 +262,8 @@ def _noise(count: int, frames: int, model: ErrorModel, rng: Generator) -> Floats
         chosen, keep = memory == value, np.float32(value)
         gain = np.sqrt(1 - keep**2)
         moving[..., chosen] = lfilter(np.stack([gain]), np.array([1, -keep], np.float32), moving[..., chosen], axis=1)
-    noise: Floats32 = np.sqrt(constant) * white(1) + np.sqrt(1 - constant) * moving[:, 8:]
-    return noise
+    noise = np.sqrt(constant) * white(1) + np.sqrt(1 - constant) * moving[:, 8:]
+    return np.asarray(noise, np.float32)
 
 
 def _events(error: NDArray[Any], chance: NDArray[Any], rng: Generator) -> None:
@@ -277,7 +277,9 @@ def _events(error: NDArray[Any], chance: NDArray[Any], rng: Generator) -> None:
         [27, 29, 31],
         [28, 30, 32],
     ]
-    for b, group in zip(np.flatnonzero(rng.random(count) < 0.25), rng.integers(0, len(groups), count).tolist()):
+    hidden = np.flatnonzero(rng.random(count) < 0.25)
+    chosen = np.asarray(rng.integers(0, len(groups), count))
+    for b, group in zip(hidden, chosen):
         start, length = rng.integers(frames), rng.integers(3, 20)
         part, members = slice(start, start + length), groups[group]
         shift = rng.normal(0, 0.08, 3)
