@@ -149,10 +149,11 @@ def _upright(tracks: Tracks, up: str, usual_up: str) -> tuple[Tracks, list[str]]
         trunk = unit(_trunk(tracks.points))
         clear = usual_up == "y" and trunk[:, 2].mean() > _CLEARLY and _at_leg_height(heights[:, 2])
         if clear and not _at_leg_height(heights[:, 1]):
-            axis, found = "z", ("z is taken for up, as the trunk stands along it; --motion-up y overrules",)
+            axis = "z"
+            notes.append("z is taken for up, as the trunk stands along it; --motion-up y overrules")
         else:
             axis, found = up_axis(trunk, heights, usual_up, _STANDS)
-        notes += [note for note in found if axis != "y" or usual_up == "y"]
+            notes += [note for note in found if axis != "y" or usual_up == "y"]
     world = UP_ROTATIONS[axis]
     if _is_mirrored(tracks.points):
         world = np.diag([-1.0, 1, 1]) @ world
