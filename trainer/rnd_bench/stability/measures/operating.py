@@ -170,16 +170,17 @@ def _amounts(renderer: FrameRenderer, motion: Motion, middle: np.ndarray, pixels
 
 
 def two_writers(subject: Subject) -> Result:
-    """H7: of two plays into one folder the second is told who holds it."""
+    """H7: of two different plays into one folder the second is told who holds it."""
     folder, wrong = subject.work / "two", list[str]()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    command = play(subject.avatar_file, _motion_file(subject, folder, 600.0), folder / "out", "--size", 256)
-    first = _started(command, folder)
+    motion = _motion_file(subject, folder, 600.0)
+    commands = [play(subject.avatar_file, motion, folder / "out", "--size", size) for size in (256, 128)]
+    first = _started(commands[0], folder)
     try:
         while first.poll() is None and not (folder / "out" / LOCK_FILE).exists():
             time.sleep(0.02)
-        second = _started(command, folder)
+        second = _started(commands[1], folder)
         errors = second.communicate()[1]
         held = first.poll() is None
         if held and (second.returncode != 2 or f"process {first.pid}" not in errors):
