@@ -62,7 +62,7 @@ def features(rays: Floats32, confidence: Floats32, hint_m: Floats32, gap_s: Floa
     views = looking_at(middle)
     rotated = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ np.swapaxes(views, -1, -2)
     flat = rotated[..., :2] / np.maximum(rotated[..., 2:], 0.05)
-    metric, distance = _in_metres(flat, seen, hint_m)
+    metric, distance = _in_metres(np.asarray(flat, np.float32), seen, hint_m)
     bones = metric[:, :, LIMBS[:, 1]] - metric[:, :, LIMBS[:, 0]]
     hinted = hint_m[:, :, LIMBS[:, 1]] - hint_m[:, :, LIMBS[:, 0]]
     length = np.linalg.norm(hinted, axis=-1)
@@ -143,9 +143,10 @@ def lift(
     """
     times, at = _network_times(observations)
     rays = (observations.keypoints_px - np.asarray(principal_px, np.float32)) / np.float32(focal_px)
-    keep = [_resampled(values, times, at) for values in (rays, observations.confidence, observations.keypoints_m)]
+    recorded = rays, observations.confidence, observations.keypoints_m
+    rays, confidence, hint_m = (_resampled(values, times, at)[None] for values in recorded)
     gap = np.abs(times[:, None] - at[None]).min(0).astype(np.float32)
-    inputs = features(*(values[None] for values in keep), gap[None])
+    inputs = features(rays, confidence, hint_m, gap[None])
     means, kappas = run(inputs.inputs, network)
     back = np.swapaxes(inputs.views, -1, -2)[:, :, None]
     vectors = (back @ means[..., None])[0, ..., 0]
