@@ -114,7 +114,7 @@ def test_options_that_would_do_nothing_are_refused(
 class _Formula:
     """A workbench whose files are their recipes and whose measures follow from them."""
 
-    seen, held_out = "seen", "held out"
+    search, held_out = "search", "held out"
 
     def __init__(self, harder: float = 0.0) -> None:
         self.config, self._harder = CONFIG, harder
@@ -227,7 +227,7 @@ class _StaticAtLast(_Formula):
 
 def _smallest(bench: _Formula) -> float:
     deepest = Plan(**{name: len(rungs) for name, rungs in LADDERS.items()})
-    return bench.measure(deepest.recipe(CONFIG), "seen").mb
+    return bench.measure(deepest.recipe(CONFIG), "search").mb
 
 
 @pytest.mark.parametrize("share", [1.001, 1.02, 1.4])
@@ -242,7 +242,7 @@ def test_a_size_that_any_file_has_is_found(share) -> None:
 def test_what_saves_most_for_its_cost_may_be_far_down_its_ladder() -> None:
     """Static skinning costs this formula 2e-5 for a third of the size, and 0.85 of the Gaussians 1.5e-5 for a tenth."""
     bench, steps = _StaticAtLast(), []
-    search(bench, Bound("mb", 0.27 * bench.measure(Recipe(), "seen").mb), steps.append)
+    search(bench, Bound("mb", 0.27 * bench.measure(Recipe(), "search").mb), steps.append)
     plan = steps[-1].plan
     assert (plan.precision, plan.dynamic_mm, plan.gaussians) == (2, len(LADDERS["dynamic_mm"]), 0)
 
@@ -256,7 +256,7 @@ class _Exact(_Formula):
 
 def test_a_precision_that_moves_places_too_far_is_not_taken() -> None:
     deepest = {name: len(rungs) for name, rungs in LADDERS.items()} | {"precision": 1}
-    smallest = _Exact().measure(Plan(**deepest).recipe(CONFIG), "seen").mb
+    smallest = _Exact().measure(Plan(**deepest).recipe(CONFIG), "search").mb
     assert search(_Exact(), Bound("mb", 1.01 * smallest), lambda _: None).plan.precision == 1
     with pytest.raises(InputError, match="no file keeps"):
         search(_Exact(), Bound("mb", 0.99 * smallest), lambda _: None)

@@ -43,9 +43,10 @@ class ImportCommand:
 
     def run(self) -> int:
         from rnd_trainer.estimating.own_video import import_video, is_own_video
-        from rnd_trainer.importing.importer import import_source
+        from rnd_trainer.importing.importer import check_numbers, import_source
         from rnd_trainer.importing.report import import_and_report
 
+        check_numbers(self.reading)
         importer = import_video if is_own_video(self.source, self.reading) else import_source
         return import_and_report(self.source, self.out, self.reading, importer)
 

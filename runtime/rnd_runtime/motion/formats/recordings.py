@@ -14,11 +14,9 @@ from rnd_runtime.core.files import is_folder
 from rnd_runtime.core.npz import Members, Npz
 from rnd_runtime.motion.readers.arrays import MotionRecord, read_arrays
 from rnd_runtime.motion.readers.asf_amc import read_amc
-from rnd_runtime.motion.readers.bvh import read_bvh
 from rnd_runtime.motion.readers.pickles import track_of, track_of_folder
 from rnd_runtime.motion.readers.tracks import Track, is_slahmr, slahmr
 from rnd_runtime.motion.readers.tree import MocapTree
-from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_runtime.motion.readers.video_fits import easymocap_files
 
 from .gltf import SUFFIXES as GLTF
@@ -77,12 +75,16 @@ def read_recording(
             expected = "a .bvh, .glb, .npz or another documented motion"
             raise InputError("motion", expected=expected, got=f"a {suffix} file", file=path, hint=_ELSEWHERE[suffix])
         if suffix == ".bvh":
+            from rnd_runtime.motion.readers.bvh import read_bvh  # here and below: most runs read arrays
+
             return Recording(read_bvh(path))
         if suffix == ".amc":
             return Recording(read_amc(path))
         if suffix in GLTF:
             return Recording(*read_gltf(path))
         if suffix in _PICKLES:
+            from rnd_runtime.motion.readers.unpickle import read_pickle
+
             return _pickle(read_pickle(path, what="motion"), path, joint_names)
         with Npz(path, what="motion") as archive:
             return _archive(archive, joint_names)

@@ -17,7 +17,6 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix, matrix_to_axis_angl
 from rnd_runtime.motion.readers.arrays import check_rotations
 from rnd_runtime.motion.readers.tracks import VIDEO_FPS, without_gaps
 from rnd_runtime.motion.readers.tree import Floats, MocapTree
-from rnd_runtime.motion.readers.unpickle import read_pickle
 from rnd_runtime.motion.readers.video_fits import trailing_number
 
 from .rigs import MHR127, WorldTree, rigidity, world_tree
@@ -137,6 +136,8 @@ def _content(file: Path) -> Any:
     if file.suffix.lower() == ".npz":
         with Npz(file, what="SAM 3D Body's results") as archive:
             return {name: archive.numbers(name) for name in (*NEEDED, "focal_length") if name in archive.names}
+    from rnd_runtime.motion.readers.unpickle import read_pickle
+
     return read_pickle(file, what="SAM 3D Body's results")
 
 
