@@ -114,12 +114,12 @@ def _average(values, width, line):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, error_model="numpy")
-def look_up(rays, eye, normal, offset, inverse, start, values, left):  # type: ignore[no-untyped-def]
+def look_up(rays, eye, normal, offset, inverse, start, values, remaining):  # type: ignore[no-untyped-def]
     """Subtract the blocked share at every pixel, bilinear, 0 outside of the grid."""
     rows, columns = values.shape[:2]
     above = offset - (normal[0] * eye[0] + normal[1] * eye[1] + normal[2] * eye[2])
-    for row in numba.prange(left.shape[0]):
-        for column in range(left.shape[1]):
+    for row in numba.prange(remaining.shape[0]):
+        for column in range(remaining.shape[1]):
             u, v = column + 0.5, row + 0.5
             dx = u * rays[0, 0] + v * rays[1, 0] + rays[2, 0]
             dy = u * rays[0, 1] + v * rays[1, 1] + rays[2, 1]
@@ -137,4 +137,4 @@ def look_up(rays, eye, normal, offset, inverse, start, values, left):  # type: i
             for c in range(3):
                 near = values[i0, j0, c] * (1 - b) + values[i0, j0 + 1, c] * b
                 far = values[i0 + 1, j0, c] * (1 - b) + values[i0 + 1, j0 + 1, c] * b
-                left[row, column, c] -= near * (1 - a) + far * a
+                remaining[row, column, c] -= near * (1 - a) + far * a

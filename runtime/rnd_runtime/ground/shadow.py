@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rnd_runtime.core.arrays import floats
+from rnd_runtime.core.arrays import floats, shallow_copy
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.directional import extract_directional
@@ -35,6 +35,8 @@ NEAR_GROUND = 0.25
 """m, height below which the sky's shadow is sharp and needs small spheres"""
 LOW_SPHERES, HIGH_SPHERES, SUN_SPHERES = 512, 640, 8192
 """largest numbers that stand for the body: near the ground and above it for the sky, and for a directional light"""
+BANDS = (0.12, 0.3, 0.6, 1.0, 1.5)
+"""m, heights between which spheres are blurred alike"""
 GROWN, LARGEST = 1.2, 0.045
 """factor on the discs' radii that closes the gaps of a thinned body; their bound, m, about that of a forearm"""
 MIN_ELEVATION = math.radians(3)
@@ -69,13 +71,15 @@ class GroundLight:
     """A light's irradiance on the ground, split into sky directions and directional lights.
 
     Args:
-        light: the probe; its yaw counts.
+        light: the probe; ``with_yaw`` changes its yaw at little cost.
         normal: [3] unit, of the ground in the world.
     """
 
     def __init__(self, light: Light, normal: ArrayLike = (0.0, 1.0, 0.0)) -> None:
         normal = np.asarray(normal, np.float64)
-        sky, suns = extract_directional(light)
+        self.light, self._normal = light, normal
+        sky, self._suns_of_probe = extract_directional(light)
+        self._sky_of_probe = sky.resized(16, 32)
         count = np.arange(SKY_DIRECTIONS) + 0.5
         radius, azimuth = np.sqrt(count / SKY_DIRECTIONS), count * math.pi * (3 - math.sqrt(5))  # Malley's method
         tangent, bitangent = _tangents(normal)
@@ -84,11 +88,21 @@ class GroundLight:
             + (radius * np.sin(azimuth))[:, None] * bitangent
             + np.sqrt(1 - radius**2)[:, None] * normal
         )
-        self.sky: Floats = sky.resized(16, 32).sample(self.directions).astype(np.float64) * math.pi / SKY_DIRECTIONS
+        self._light_up(light)
+
+    def with_yaw(self, light: Light) -> GroundLight:
+        """The same for ``light``, which differs by its yaw alone."""
+        turned = shallow_copy(self, light=light)
+        turned._light_up(light)
+        return turned
+
+    def _light_up(self, light: Light) -> None:
+        sky = self._sky_of_probe.with_yaw(light.yaw).sample(self.directions)
+        self.sky: Floats = sky.astype(np.float64) * math.pi / SKY_DIRECTIONS
         self.suns: list[tuple[Floats, Floats, float]] = []  # direction, irradiance on the ground, spread
-        for sun in suns:
+        for sun in self._suns_of_probe:
             direction = light.rotation @ sun.direction
-            cosine = float(direction @ normal)
+            cosine = float(direction @ self._normal)
             if cosine > math.sin(MIN_ELEVATION):
                 self.suns.append((direction, sun.irradiance * cosine, sun.spread))
         self.irradiance: Floats = self.sky.sum(0) + sum((e for _, e, _ in self.suns), np.zeros(3))
@@ -102,7 +116,7 @@ class GroundLight:
             plane: in that frame.
             frame_to_world: [3, 3].
         """
-        if not self.irradiance.max() > 0:
+        if not self.irradiance.max() > 0 or not radii.any():
             return []
         grids = []
         total = np.maximum(self.irradiance, 1e-12 * self.irradiance.max())
@@ -130,17 +144,20 @@ class GroundLight:
 def remaining_light(grids: list[Grid], plane: Plane, camera: Camera) -> Floats32:
     """Share [H, W, 3] of the ground's irradiance at every pixel that sees the ground; 1 elsewhere."""
     rays = np.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]  # direction = column · x + row · y + z
-    left = np.ones((camera.height, camera.width, 3), np.float32)
+    remaining = np.ones((camera.height, camera.width, 3), np.float32)
     for grid in grids:
         inverse = np.linalg.pinv(np.stack([grid.along, grid.across], axis=1))  # [2, 3], cells of a metre
         look_up(
-            rays, camera.position, plane.normal, plane.offset, inverse, inverse @ grid.origin + 0.5, grid.values, left
+            rays,
+            camera.position,
+            plane.normal,
+            plane.offset,
+            inverse,
+            inverse @ grid.origin + 0.5,
+            grid.values,
+            remaining,
         )
-    return np.maximum(left, 0, out=left)
-
-
-BANDS = (0.12, 0.3, 0.6, 1.0, 1.5)
-"""m, heights between which spheres are blurred alike"""
+    return np.maximum(remaining, 0, out=remaining)
 
 
 class Spheres(NamedTuple):
@@ -181,7 +198,7 @@ def _tangents(normal: Floats) -> tuple[Floats, Floats]:
 def _grid_below(spheres: Spheres, plane: Plane) -> Grid:
     """The sky's grid around the body's foot."""
     tangent, bitangent = _tangents(plane.normal)
-    centre = spheres.centres.mean(axis=0, dtype=np.float64) if len(spheres.centres) else np.zeros(3)
+    centre = spheres.centres.mean(axis=0, dtype=np.float64)
     centre = centre - (plane.normal @ centre - plane.offset) * plane.normal
     cells = round(2 * SKY_REACH / SKY_CELL)
     origin = centre - SKY_REACH * (tangent + bitangent)
@@ -198,15 +215,12 @@ def _grid_towards(spheres: Spheres, plane: Plane, towards: Floats) -> Grid:
     height = np.maximum(spheres.centres @ plane.normal - plane.offset, 0)
     hits = spheres.centres - height[:, None] / sine * towards
     places = hits @ np.stack([along, across], axis=1)  # [n, 2] m
-    margin = float(spheres.radii.max(initial=0.0)) * np.array([1 / sine, 1.0]) + 0.03
-    low, high = places.min(axis=0, initial=np.inf) - margin, places.max(axis=0, initial=-np.inf) + margin
-    nearest = float(places[:, 0].max(initial=0.0))  # the feet's end of a long shadow is kept
-    low[0] = max(low[0], nearest - SUN_REACH)
-    size = np.maximum(high - low, 0)
-    cell = np.maximum(size / SUN_CELLS, SUN_CELL)
-    cells = np.maximum(np.ceil(size / cell).astype(int), 1) if np.isfinite(size).all() else np.ones(2, int)
-    start = np.where(np.isfinite(low), low, 0)
-    origin = start[0] * along + start[1] * across + plane.offset * plane.normal
+    margin = float(spheres.radii.max()) * np.array([1 / sine, 1.0]) + 0.03
+    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
+    low[0] = max(low[0], float(places[:, 0].max()) - SUN_REACH)  # the feet's end of a long shadow is kept
+    cell = np.maximum((high - low) / SUN_CELLS, SUN_CELL)
+    cells = np.ceil((high - low) / cell).astype(int)
+    origin = low[0] * along + low[1] * across + plane.offset * plane.normal
     return Grid(np.zeros((*cells, 3), np.float32), origin, cell[0] * along, cell[1] * across)
 
 

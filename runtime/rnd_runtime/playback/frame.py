@@ -139,7 +139,7 @@ class FrameRenderer:
         self.shader = Shader(light, shade) if isinstance(light, Light) else light
         self.rasterizer: Rasterizer = make_rasterizer(raster) if isinstance(raster, str) else raster
         self.ground: Plane | None = None
-        self._ground_light: tuple[Light, GroundLight] | None = None
+        self._ground_light: GroundLight | None = None
 
     @property
     def light(self) -> Light:
@@ -190,12 +190,15 @@ class FrameRenderer:
         camera = camera or self.camera
         assert camera is not None
         rendered = camera
-        if self.ground is not None and not isinstance(body, PosedAvatar):
+        seconds: dict[str, float] = {}
+        if self.ground is not None and not isinstance(body, PosedAvatar):  # its shadow needs the Gaussians
+            started = perf_counter()
             body = PosedAvatar(self.avatar.posed(body), body.root, self.avatar.joints(body))
+            seconds["posing"] = perf_counter() - started
         if scale != 1 and not aovs:
             rendered = camera.resized(*(max(round(side * scale), 1) for side in (camera.width, camera.height)))
         raster = self._raster(body, rendered, aovs, lit, given or {}, antialias=rendered is camera)
-        seconds = dict(raster.seconds)
+        seconds |= raster.seconds
         layers = aov_layers(aovs, raster, 3 if lit else 0, given or {})
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
         alpha, image_srgb = raster.alpha, raster.srgb
@@ -217,10 +220,13 @@ class FrameRenderer:
 
     def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
         """Share [H, W, 3] of the ground's light that the body leaves."""
-        if self._ground_light is None or self._ground_light[0] is not self.light:
-            self._ground_light = self.light, GroundLight(self.light, ground.normal)
-        plane = ground.in_frame(body.root)
-        grids = self._ground_light[1].shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3])
+        known, light = self._ground_light, self.light
+        if known is None or known.light.radiance is not light.radiance:
+            known = GroundLight(light, ground.normal)
+        elif known.light is not light:
+            known = known.with_yaw(light)
+        self._ground_light, plane = known, ground.in_frame(body.root)
+        grids = known.shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3])
         return remaining_light(grids, plane, camera.in_frame(body.root))
 
     def close(self) -> None:

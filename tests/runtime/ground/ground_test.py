@@ -89,6 +89,15 @@ def test_a_shadow_turns_and_moves_with_its_frame():
     assert np.abs(here - there).mean() < 0.01  # the sky's cells lie elsewhere
 
 
+def test_a_turned_light_is_split_once():
+    light = probe(sun=400.0)
+    turned, again = GroundLight(light).with_yaw(light.with_yaw(1.1)), GroundLight(light.with_yaw(1.1))
+    np.testing.assert_array_equal(turned.sky, again.sky)
+    assert len(turned.suns) == len(again.suns) == 1
+    for one, other in zip(turned.suns[0], again.suns[0]):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
 def test_without_light_or_body_nothing_is_shadowed():
     gaussians, radii = body_surface(*posed_body())
     camera = Camera.look_at([1.5, 1.8, 2.5], [0, 0.3, 0], width=16, height=16, fov_y=0.9)
