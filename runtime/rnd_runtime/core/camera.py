@@ -53,6 +53,11 @@ class Camera:
         """Camera centre [3] in world metres."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
+    @property
+    def rays(self) -> Floats:
+        """[3, 3]; (column, row, 1) @ rays is the world direction, of depth 1, that an image point sees."""
+        return np.linalg.inv(self.K).T @ self.world_to_camera[:3, :3]
+
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution; intrinsics scale with the image."""
         scale = np.diag([width / self.width, height / self.height, 1.0])

@@ -143,7 +143,7 @@ class GroundLight:
 
 def remaining_light(grids: list[Grid], plane: Plane, camera: Camera) -> Floats32:
     """Share [H, W, 3] of the ground's irradiance at every pixel that sees the ground; 1 elsewhere."""
-    rays = np.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]  # direction = column · x + row · y + z
+    rays = camera.rays
     remaining = np.ones((camera.height, camera.width, 3), np.float32)
     for grid in grids:
         inverse = np.linalg.pinv(np.stack([grid.along, grid.across], axis=1))  # [2, 3], cells of a metre

@@ -77,9 +77,7 @@ class Background:
         """Linear radiance of the background at every pixel of ``camera``: [H, W, 3] or, for one colour, [3]."""
         if self.kind != "hdr":
             return np.array(self.colour, np.float32)
-        x, y, z = (
-            np.linalg.inv(camera.K).T @ camera.world_to_camera[:3, :3]
-        )  # world direction = column · x + row · y + z
+        x, y, z = camera.rays
         columns = (np.arange(camera.width) + 0.5)[:, None] * x
         rows = (np.arange(camera.height) + 0.5)[:, None, None] * y + z
         image = np.empty((camera.height, camera.width, 3), np.float32)
