@@ -39,6 +39,12 @@ class Encoded(NamedTuple):
         """The same, to be posed in the world."""
         return self._replace(bones=taken_along(self.bones, self.root), root=np.eye(4))
 
+    def in_frame(self, frame: NDArray[np.float64]) -> Encoded:
+        """The same, to be posed in another ``frame`` [4, 4] (frame → world, rigid, m)."""
+        if np.array_equal(frame, self.root):
+            return self
+        return self._replace(bones=taken_along(self.bones, np.linalg.inv(frame) @ self.root), root=frame)
+
 
 class Avatar:
     """An avatar read from ``avatar.onnx``, ready to be posed. Get one with ``load``.
@@ -46,6 +52,7 @@ class Avatar:
     Attributes:
         skeleton: its joint tree. window_poses, window_seconds: the motion window. gaussians: N.
         spacing: mean distance between Gaussians, m. trained_light: [32, 64, 3] linear radiance.
+        posed_outside: False for a graph that poses, which it does in the root's frame alone.
         metadata: all of the file's metadata. advice: how it may be played.
     """
 
@@ -58,6 +65,7 @@ class Avatar:
         self.gaussians, self.spacing = metadata.gaussians, metadata.spacing_m
         self._opacities, albedo, self._roughness = networks.materials
         self._albedo = np.minimum(albedo, np.float32(LARGEST_ALBEDO))
+        self.posed_outside = networks.posed_outside
         self._rest = _rest_pose(networks) if networks.posed_outside else None
 
     @classmethod

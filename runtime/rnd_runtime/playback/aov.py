@@ -37,6 +37,7 @@ from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.shading.sh import COSINE_LOBE, sh_basis
 from rnd_runtime.shading.shader import Shader
+from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 
 from . import cryptomatte
 
@@ -77,10 +78,11 @@ class Lit(NamedTuple):
     eye: NDArray[np.float64]
     seen: NDArray[np.bool_] | None
     radiance: Floats32
+    casters: Casters = NO_CASTERS
 
     def again(self, gaussians: Gaussians, *, shadows: bool = True) -> Floats32:
         """Radiance [N, 3] of other ``gaussians``."""
-        return self.shader.shade(gaussians, self.eye, self.seen, shadows=shadows)
+        return self.shader.shade(gaussians, self.eye, self.seen, shadows=shadows, casters=self.casters)
 
 
 def splat_features(

@@ -8,8 +8,10 @@ smaller pixels do.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import permutations
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,15 +41,89 @@ class FineView:
 
     def averaged(self, raster: Raster) -> Raster:
         """``raster`` of ``camera``, box-filtered and put into the full image."""
-        image, alpha, depth = (self._averaged(layer) for layer in (raster.image, raster.alpha, raster.depth))
+        full = []
+        for small in self.means(raster):
+            layer = np.zeros((self.full.height, self.full.width, *small.shape[2:]), np.float32)
+            layer[self.region] = small
+            full.append(layer)
+        image, alpha, depth = full
         return replace(raster, image=image, alpha=alpha, depth=depth, srgb=None)
 
-    def _averaged(self, layer: Floats32) -> Floats32:
+    @property
+    def region(self) -> tuple[slice, slice]:
+        """Rows and columns of the part in the full image."""
+        height, width = self.camera.height // self.factor, self.camera.width // self.factor
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    def means(self, raster: Raster) -> list[Floats32]:
+        """Image, alpha and depth of the part, box-filtered."""
+        return [self._means(layer) for layer in (raster.image, raster.alpha, raster.depth)]
+
+    def _means(self, layer: Floats32) -> Floats32:
         height, width, s = self.camera.height // self.factor, self.camera.width // self.factor, self.factor
-        full = np.zeros((self.full.height, self.full.width, *layer.shape[2:]), np.float32)
         blocks = layer.reshape(height, s, width, s, *layer.shape[2:])
-        full[self.top : self.top + height, self.left : self.left + width] = blocks.mean(axis=(1, 3), dtype=np.float32)
-        return full
+        means: Floats32 = blocks.mean(axis=(1, 3), dtype=np.float32)
+        return means
+
+
+class Extent(NamedTuple):
+    """What a body takes up in a view: depths in m, the ``factor`` of its ``FineView``, and pixels.
+
+    It may cover columns ``left`` to ``right`` and rows ``top`` to ``bottom``, the last excluded; all of them where it
+    is not completely in front of the eye.
+    """
+
+    nearest: float
+    farthest: float
+    factor: int
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def overlaps(self, other: Extent) -> bool:
+        """Whether they may share pixels."""
+        columns = max(self.left, other.left) < min(self.right, other.right)
+        return columns and max(self.top, other.top) < min(self.bottom, other.bottom)
+
+    def union(self, other: Extent) -> Extent:
+        """Of both, on the finer grid."""
+        nearest, farthest = min(self.nearest, other.nearest), max(self.farthest, other.farthest)
+        left, top = min(self.left, other.left), min(self.top, other.top)
+        right, bottom = max(self.right, other.right), max(self.bottom, other.bottom)
+        return Extent(nearest, farthest, max(self.factor, other.factor), left, top, right, bottom)
+
+    def view(self, camera: Camera) -> FineView:
+        """Its part of the view of ``camera``."""
+        s = self.factor
+        grid: Floats = np.diag([s, s, 1.0]) @ np.array([[1, 0, -self.left], [0, 1, -self.top], [0, 0, 1.0]])
+        width, height = (self.right - self.left) * s, (self.bottom - self.top) * s
+        return FineView(Camera(width, height, grid @ camera.K, camera.world_to_camera), s, self.left, self.top, camera)
+
+
+def extent(camera: Camera, points: NDArray[np.floating[Any]]) -> Extent:
+    """The ``Extent`` of a body around ``points`` [N, 3] m in the frame of ``camera``'s ``world_to_camera``.
+
+    The factor is 1 where the body is large enough, not completely in front of the eye, or beside the image.
+    """
+    depths = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    nearest, farthest = float(depths.min(initial=np.inf)) - MARGIN, float(depths.max(initial=-np.inf)) + MARGIN
+    everywhere = Extent(nearest, farthest, 1, 0, 0, camera.width, camera.height)
+    if not NEAR <= nearest < np.inf:  # NaN too
+        return everywhere
+    low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    corners = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    if not corners[:, 2].min() >= NEAR:
+        return everywhere
+    pixels = corners[:, :2] / corners[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    size = np.array([camera.width, camera.height])
+    (left, top), (right, bottom) = (
+        np.clip(edge, 0, size).astype(int).tolist() for edge in (np.floor(pixels.min(0)), np.ceil(pixels.max(0)))
+    )
+    factor = min(math.ceil(MIN_PIXELS_PER_METRE * nearest / min(camera.K[0, 0], camera.K[1, 1])), MAX_FACTOR)
+    in_image = left < right and top < bottom
+    return Extent(nearest, farthest, max(factor, 1) if in_image else 1, left, top, right, bottom)
 
 
 def fine_view(camera: Camera, points: NDArray[np.floating[Any]]) -> FineView | None:
@@ -55,25 +131,44 @@ def fine_view(camera: Camera, points: NDArray[np.floating[Any]]) -> FineView | N
 
     ``points`` are in the frame of ``camera``'s ``world_to_camera``.
     """
-    depths = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
-    nearest = float(depths.min(initial=np.inf)) - MARGIN
-    if not NEAR <= nearest < np.inf:  # NaN too
-        return None
-    factor = min(math.ceil(MIN_PIXELS_PER_METRE * nearest / min(camera.K[0, 0], camera.K[1, 1])), MAX_FACTOR)
-    if factor <= 1:
-        return None
-    low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
-    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
-    corners = corners @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    if not corners[:, 2].min() >= NEAR:
-        return None
-    pixels = corners[:, :2] / corners[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    size = np.array([camera.width, camera.height])
-    (left, top), (right, bottom) = (
-        np.clip(edge, 0, size) for edge in (np.floor(pixels.min(0)), np.ceil(pixels.max(0)))
-    )
-    if left >= right or top >= bottom:
-        return None
-    grid: Floats = np.diag([factor, factor, 1.0]) @ np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]])
-    width, height = int(right - left) * factor, int(bottom - top) * factor
-    return FineView(Camera(width, height, grid @ camera.K, camera.world_to_camera), factor, int(left), int(top), camera)
+    seen = extent(camera, points)
+    return None if seen.factor == 1 else seen.view(camera)
+
+
+class Group(NamedTuple):
+    """Bodies, by number, that are splatted together into a part of the image."""
+
+    bodies: list[int]
+    extent: Extent
+
+
+def depth_groups(extents: Sequence[Extent]) -> list[Group]:
+    """Groups in front-to-back order: composited so, they are as one sort of all Gaussians by depth.
+
+    The first group is that of bodies on the image's own grid, if any. A body that is not completely in front of one on
+    a finer grid, and may cover the same pixels, is rendered on the finer grid too.
+    """
+    factors = [seen.factor for seen in extents]
+    pairs = [(i, j) for i, j in permutations(range(len(extents)), 2) if extents[i].overlaps(extents[j])]
+    changed = True
+    while changed:
+        changed = False
+        for i, j in pairs:
+            if factors[i] < factors[j] and extents[i].farthest > extents[j].nearest:
+                factors[i], changed = factors[j], True
+    groups: list[Group] = []
+    for factor in sorted({*factors}):
+        parts: list[Group] = []
+        for i, seen in enumerate(extents):
+            if factors[i] != factor:
+                continue
+            part = Group([i], seen._replace(factor=factor))
+            touching = parts if factor == 1 else [other for other in parts if other.extent.overlaps(part.extent)]
+            while touching:
+                parts = [other for other in parts if other not in touching]
+                for other in touching:
+                    part = Group([*other.bodies, *part.bodies], other.extent.union(part.extent))
+                touching = [other for other in parts if other.extent.overlaps(part.extent)]
+            parts.append(part)
+        groups += [Group(sorted(part.bodies), part.extent) for part in parts]
+    return groups

@@ -25,11 +25,12 @@ from rnd_runtime.ground.shadow import GroundLight, Plane, remaining_light
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.enlarge import enlarged
-from rnd_runtime.raster.in_view import opacities_of, visible_to
+from rnd_runtime.raster.in_view import visible_to
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import tone_map, tone_map_straight
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader, shadow_radii
+from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 
 from .aov import Lit, aov_layers, splat_features
 from .far import fine_view
@@ -314,18 +315,46 @@ def draw_gaussians(
         return rasterizer.renderer.draw(gaussians, shader, camera, cull=cull)
     started = perf_counter()
     visible = visible_to(gaussians, camera, cull)
-    shade = lit or {"diffuse", "shadow"} & {*aovs}
-    radiance = shader.shade(gaussians, camera.position, visible) if shade else np.zeros_like(gaussians.albedo)
-    features = [radiance] if lit else []
-    features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance), given or {})
-    attributes = features[0] if len(features) == 1 else np.concatenate(features, axis=1)
-    shading, depth = perf_counter() - started, "depth" in aovs
-    arrays = gaussians.means, gaussians.covariances
-    if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
-        raster = raster_cpu.rasterize(
-            *arrays, gaussians.opacities, attributes, camera, depth=depth, outlines=True, visible=visible
-        )
-    else:
-        opacities = opacities_of(gaussians, visible)
-        raster = sharpened(rasterizer(*arrays, opacities, attributes.astype(np.float32), camera, depth=depth))
+    features = features_of(gaussians, shader, camera, visible, aovs=aovs, lit=lit, given=given or {})
+    shading = perf_counter() - started
+    geometry = gaussians.means, gaussians.covariances, gaussians.opacities
+    raster = splat(geometry, features, camera, rasterizer, visible, depth="depth" in aovs)
     return replace(raster, seconds={"shading": shading, **raster.seconds})
+
+
+def features_of(
+    gaussians: Gaussians,
+    shader: Shader,
+    camera: Camera,
+    visible: NDArray[np.bool_],
+    *,
+    aovs: Sequence[str],
+    lit: bool,
+    given: Mapping[str, Floats32],
+    casters: Casters = NO_CASTERS,
+) -> Floats32:
+    """Features [N, C] to splat: radiance if ``lit``, then those of the AOVs. ``casters`` cast shadows too."""
+    shade = lit or {"diffuse", "shadow"} & {*aovs}
+    radiance = np.zeros_like(gaussians.albedo)
+    if shade:
+        radiance = shader.shade(gaussians, camera.position, visible, casters=casters)
+    features = [radiance] if lit else []
+    features += splat_features(aovs, gaussians, camera, Lit(shader, camera.position, visible, radiance, casters), given)
+    return features[0] if len(features) == 1 else np.concatenate(features, axis=1)
+
+
+def splat(
+    geometry: tuple[Floats32, Floats32, Floats32],
+    features: Floats32,
+    camera: Camera,
+    rasterizer: Rasterizer,
+    visible: NDArray[np.bool_],
+    *,
+    depth: bool,
+) -> Raster:
+    """Splat ``visible`` Gaussians (means, covariances, opacities) with their features, and sharpen outlines."""
+    means, covariances, opacities = geometry
+    if getattr(rasterizer, "name", "") == "cpu":  # which sharpens as it blends
+        return raster_cpu.rasterize(*geometry, features, camera, depth=depth, outlines=True, visible=visible)
+    opacities = np.where(visible, opacities, np.float32(0))
+    return sharpened(rasterizer(means, covariances, opacities, features.astype(np.float32), camera, depth=depth))

@@ -69,11 +69,6 @@ def visible_to(gaussians: Gaussians, camera: Camera, cull: float | None = None) 
     return in_view(*arrays, camera, normals=gaussians.normals, cull=cull)
 
 
-def opacities_of(gaussians: Gaussians, visible: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Opacities [N], 0 where not ``visible``, for rasterisers without a mask."""
-    return np.where(visible, gaussians.opacities, np.float32(0))
-
-
 @njit(inline="always")
 def _side(view: Pinhole, axis: int, focal: float, centre: float, low: float, high: float):  # type: ignore[no-untyped-def]
     """Plane of an image's side: x, y, z, constant, and the reach of a ball of σ = 1 m beyond it.

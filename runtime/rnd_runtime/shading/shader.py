@@ -27,7 +27,7 @@ from .ambient import AmbientLight
 from .direct import DirectionalArrays, add_directional
 from .directional import DirectionalLight, extract_directional
 from .light import Light
-from .shadow import directional_visibility
+from .shadow import NO_CASTERS, Casters, directional_visibility
 from .sum import DistantLights
 from .tables import SkyTables
 
@@ -99,11 +99,12 @@ class Shader:
         visible: ArrayLike | None = None,
         *,
         shadows: bool = True,
+        casters: Casters = NO_CASTERS,
     ) -> Floats32:
         """Linear radiance [N, 3], not negative, of each Gaussian towards the camera at [3] m.
 
         Gaussians that are not ``visible`` [N] keep radiance 0 and still cast shadows; all are visible by default.
-        Without ``shadows`` directional lights are unoccluded.
+        Without ``shadows`` directional lights are unoccluded; ``casters`` occlude them too.
         """
         light_to_world = self.light_to_world
         visible = mask(visible, len(gaussians.means))
@@ -119,6 +120,7 @@ class Shader:
                     radii=shadow_radii(gaussians),
                     resolution=SHADOW_RESOLUTION,
                     receivers=visible,
+                    casters=casters,
                 )
             surfaces = (gaussians.means, gaussians.normals, gaussians.albedo, gaussians.roughness, gaussians.visibility)
             eye = np.array(camera_position, np.float32)

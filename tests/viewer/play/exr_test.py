@@ -16,6 +16,7 @@ from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.cryptomatte import RANKS, attributes, identifier, layers, murmur3
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
+from rnd_runtime.playback.scene import Person
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.play.exr import CHROMATICITIES, ExrWriter, camera_matrices
@@ -42,7 +43,7 @@ def frame(scene) -> RenderedFrame:
     renderer, walk, camera = scene
     aovs = parse_aovs(NAMES)
     encoded = renderer.avatar.encode(walk, FRAME * STEP / walk.fps)
-    features = GivenFeatures(renderer.avatar, walk, walk.fps / STEP, 26, lambda k, t: camera, aovs)
+    features = GivenFeatures(Person(renderer.avatar, walk), walk.fps / STEP, 26, lambda k, t: camera, aovs)
     return renderer.draw(encoded, camera, aovs=aovs, given=features.of(FRAME, encoded, camera))
 
 
@@ -80,9 +81,8 @@ def test_a_camera_that_moves_gives_motion_too(scene):
     """A camera that shifts its principal point by five pixels."""
     renderer, walk, camera = scene
     shifted = replace(camera, K=camera.K + np.array([[0, 0, 5.0], [0, 0, 0], [0, 0, 0]]))
-    features = GivenFeatures(
-        renderer.avatar, walk, walk.fps, walk.frame_count, lambda k, t: [camera, shifted][k > FRAME], ("motion",)
-    )
+    person = Person(renderer.avatar, walk)
+    features = GivenFeatures(person, walk.fps, walk.frame_count, lambda k, t: [camera, shifted][k > FRAME], ("motion",))
     still = replace(features, camera_at=lambda k, t: camera)
     encoded = renderer.avatar.encode(walk, FRAME / walk.fps)
     moves, stays = (each.of(FRAME, encoded, camera)["motion"] for each in (features, still))

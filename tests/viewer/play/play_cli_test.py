@@ -13,12 +13,16 @@ import pytest
 from PIL import Image
 
 import rnd_viewer.play.play
+from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.core.kernels import COMPILING
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.doctor import Finding
 from rnd_runtime.playback.frame import FrameRenderer
+from rnd_viewer.inputs.options import PlayOptions
+from rnd_viewer.inputs.scenes import read_scene
+from rnd_viewer.play.cast import load_people
 from rnd_viewer.play.cli import main
 from support.paths import ROOT
 from support.play_fakes import FakeAvatar, fake_motion
@@ -29,7 +33,7 @@ FRAMES = 6
 @pytest.fixture
 def files(tmp_path, monkeypatch) -> dict[str, Path]:
     """Input files, and an avatar that needs none."""
-    monkeypatch.setattr(rnd_viewer.play.play.Avatar, "load", lambda path, **_: FakeAvatar())
+    monkeypatch.setattr(Avatar, "load", lambda path, **_: FakeAvatar())
     monkeypatch.setattr(rnd_viewer.play.play, "kernels_are_cold", lambda: False)  # whatever ran before
     save_motion(tmp_path / "walk.npz", fake_motion(FRAMES))
     rng = np.random.default_rng(0)
@@ -131,7 +135,7 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     assert main(_arguments(files, tmp_path / "whole")) == 0
     code = "import sys; sys.path.insert(0, 'tests'); from support import play_fakes\n"
     code += "import rnd_viewer.play.play, rnd_viewer.play.cli\n"
-    code += "rnd_viewer.play.play.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
+    code += "rnd_viewer.play.cast.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
     code += "sys.exit(rnd_viewer.play.cli.main(sys.argv[1:]))"
     parts = [_arguments(files, tmp_path / "out", frames=part) for part in (":2", "2:")]
     processes = [subprocess.Popen([sys.executable, "-c", code, *part], cwd=ROOT) for part in parts]
@@ -437,3 +441,69 @@ def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[:3] == [["rasteriser", "cpu"], ["OpenGL,", "EGL", "missing"], ["→", "apt", "install", "libegl1"]]
     assert lines[3][:2] == ["PyAV", "(mp4,"]
+
+
+def _scene(files: dict[str, Path], text: str) -> Path:
+    file = files["walk.npz"].with_name("scene.toml")
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def _play_scene(files: dict[str, Path], text: str, folder: Path, **changes: object) -> int:
+    return main([str(_scene(files, text)), *_arguments(files, folder, motion=None, **changes)[1:]])
+
+
+PERSON = '[[person]]\navatar = "avatar.onnx"\nmotion = "walk.npz"\n'
+
+
+def test_a_scene_of_one_is_the_avatar(files, tmp_path):
+    assert main(_arguments(files, tmp_path / "avatar")) == 0
+    assert _play_scene(files, PERSON, tmp_path / "scene") == 0
+    alone, scene = (_tree(tmp_path / name) for name in ("avatar", "scene"))
+    assert sum(name.endswith(".png") for name in alone) == FRAMES
+    for name in alone:
+        assert name.endswith(".json") or alone[name] == scene[name], name
+    assert _play_scene(files, PERSON + "start = 0.1\n", tmp_path / "later") == 0  # three frames of its first pose
+    later = _tree(tmp_path / "later")
+    assert later["frames/000000.png"] == later["frames/000003.png"]
+    assert sum(name.endswith(".png") for name in later) == FRAMES + 3
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "[[person]] tables, got none"),
+        ("person = 3", "[[person]] tables, got 3"),
+        ("person = [1, 2]", "person: expected [[person]] tables, got 1"),
+        ("[[person]\n", "scene file: expected TOML, got "),
+        ("\ncamera = 1\n" + PERSON, "line 2: camera: expected [[person]] tables alone"),
+        ("[light]\nx = 1\n" + PERSON, "line 1: light: "),
+        (PERSON + "\n[[person]]\nmotion = 'a.npz'\n", "line 5: avatar: expected the name of a file, got nothing"),
+        (
+            PERSON + PERSON + "motion_ = 1\n",
+            "line 7: motion_: expected one of avatar, motion, position, heading, start",
+        ),
+        (PERSON + "position = [1]\n", "line 4: position: expected [x, z] of at most 10000 metres, got [1]"),
+        (PERSON + "position = [nan, 0]\n", "line 4: position: "),
+        (PERSON + "heading = true\n", "line 4: heading: expected a number of at most 1e+06, got True"),
+        (PERSON + "# so\nstart = inf\n", "line 5: start: "),
+        (PERSON.replace('"walk.npz"', "7"), "line 3: motion: expected the name of a file, got 7"),
+    ],
+)
+def test_a_scene_file_is_refused_by_key_and_line(files, tmp_path, capsys, text, says):
+    assert _play_scene(files, text, tmp_path / "out") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "scene.toml: " in line and says in line, line
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_brings_its_motions_and_loads_an_avatar_once(files, tmp_path, capsys, monkeypatch):
+    words = _arguments(files, tmp_path / "out")
+    assert main([str(_scene(files, PERSON)), *words[1:]]) == 2
+    assert "--motion: expected the default" in capsys.readouterr().err
+    loaded = []
+    monkeypatch.setattr(Avatar, "load", lambda path, **_: loaded.append(path) or FakeAvatar())
+    options = PlayOptions(avatar=_scene(files, PERSON + "position = [1, 0]\n" + PERSON), out=tmp_path / "out")
+    here, there = load_people(read_scene(options.avatar), options)
+    assert len(loaded) == 1 and here.avatar is there.avatar and here.motion is there.motion
+    assert here.place[0, 3] == 1 and (there.place == np.eye(4)).all()

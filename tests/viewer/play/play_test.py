@@ -34,7 +34,7 @@ class FlatShader:
     def __init__(self, radiance: float, light: Light) -> None:
         self.radiance, self.light = radiance, light
 
-    def shade(self, gaussians: Gaussians, camera_position: np.ndarray, seen=None) -> np.ndarray:
+    def shade(self, gaussians: Gaussians, camera_position: np.ndarray, seen=None, **options) -> np.ndarray:
         return np.full((len(gaussians.means), 3), self.radiance, np.float32)
 
     def in_frame(self, frame_to_world: np.ndarray) -> FlatShader:

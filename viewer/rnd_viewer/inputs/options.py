@@ -166,8 +166,8 @@ class PlayOptions:
     rnd-play avatar.onnx --motion walk.npz --hdr sky.exr --out out/
     """
 
-    avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx")] = None
-    """The avatar, a file of rnd-export."""
+    avatar: Annotated[tyro.conf.Positional[Path | None], option("AVATAR.onnx|SCENE.toml")] = None
+    """The avatar, a file of rnd-export; or several, with motions and positions, in a scene file: docs/formats.md."""
     motion: OptionalFile = None
     """Body poses over time: .npz of AMASS, SMPL, Kimodo or SLAHMR, .pkl of AIST++, WHAM, 4D-Humans or SAM 3D Body, .pt
     of GVHMR or GEM-X, .npy of HumanML3D, Motion-X or TRAM, .bvh, .glb, .vrma, .amc with its .asf, and what

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from rnd_runtime.cli.command import parse, run_command, show
 from rnd_runtime.playback.start import load_ahead
 from rnd_viewer.inputs.options import PlayOptions
+from rnd_viewer.inputs.scenes import is_scene
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,7 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _play(options: PlayOptions) -> int:
     if options.doctor:
         return _doctor()
-    ahead = load_ahead(options.avatar, options.rendering.threads)
+    scene = options.avatar is not None and is_scene(options.avatar)
+    ahead = load_ahead(None if scene else options.avatar, options.rendering.threads)
     from .play import play  # here, so that --help and --doctor work where a library does not load
 
     return play(options, ahead)

@@ -8,21 +8,20 @@ from functools import cached_property
 
 import numpy as np
 
-from rnd_runtime.avatar.avatar import Avatar, Encoded
+from rnd_runtime.avatar.avatar import Encoded
 from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.aov import pixel_motion
 from rnd_runtime.playback.framing import CameraPath
+from rnd_runtime.playback.scene import Person
 from rnd_runtime.posing.window import moment
 
 
 @dataclass(frozen=True, eq=False)
 class GivenFeatures:
-    """Features of a run of ``count`` frames at ``fps``."""
+    """Features of ``person`` in a run of ``count`` frames at ``fps``."""
 
-    avatar: Avatar
-    motion: Motion
+    person: Person
     fps: float
     count: int
     camera_at: CameraPath
@@ -38,9 +37,10 @@ class GivenFeatures:
         return given
 
     def _motion(self, number: int, encoded: Encoded, camera: Camera) -> Floats32:
-        following = number + 1 if self.motion.closed else min(number + 1, self.count - 1)
-        later = self.avatar.encode(self.motion, following / self.fps)
-        now, then = self.avatar.posed(encoded), self.avatar.posed(later)
+        avatar = self.person.avatar
+        following = number + 1 if self.person.motion.closed else min(number + 1, self.count - 1)
+        later = self.person.encode(following / self.fps)
+        now, then = avatar.posed(encoded), avatar.posed(later)
         try:
             next_camera = self.camera_at(following, following / self.fps)
         except IndexError:  # the last of a file with one camera per frame
@@ -50,7 +50,9 @@ class GivenFeatures:
     @cached_property
     def _parts(self) -> Floats32:
         """One-hot [N, J]: the joint with the largest weight in the first pose."""
-        avatar = self.avatar
-        first = moment(self.motion, 0.0, avatar.skeleton, poses=avatar.window_poses, seconds=avatar.window_seconds)
+        avatar = self.person.avatar
+        first = moment(
+            self.person.motion, 0.0, avatar.skeleton, poses=avatar.window_poses, seconds=avatar.window_seconds
+        )
         (weights,) = avatar.run((first.window, first.velocity, first.bones), ("skinning_weights",))
         return np.eye(weights.shape[1], dtype=np.float32)[weights.argmax(axis=1)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from rich.console import Console
 from rich.table import Table
 
 from rnd_runtime import __version__
-from rnd_runtime.avatar.avatar import Avatar, Encoded
+from rnd_runtime.avatar.avatar import Encoded
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.cli.command import finish, is_quiet, log, size_text, warn
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.cli.progress import track
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, refuse_changed
 from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
@@ -32,13 +32,16 @@ from rnd_runtime.ground.standing import UP, ground_of
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
-from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, frame_motion, front_path, orbit_path
+from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, front_path, orbit_path
+from rnd_runtime.playback.scene import SceneRenderer, frame_people
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.cameras import file_path, split_camera
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames
+from rnd_viewer.inputs.scenes import PersonRecord, is_scene, read_scene
 
+from .cast import load_people
 from .exr import ExrWriter
 from .given import GivenFeatures
 from .pipeline import run
@@ -76,10 +79,10 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
 
 
 class _Pending(NamedTuple):
-    """An encoded frame; ``asked`` is when its encoding began, in seconds."""
+    """Everybody's poses of a frame; ``asked`` is when their encoding began, in seconds."""
 
     asked: float
-    encoded: Encoded
+    encoded: list[Encoded]
 
 
 @dataclass(eq=False)
@@ -88,7 +91,8 @@ class _Run:
 
     Attributes:
         mark: of the folder.
-        frames: those that this process renders, out of ``count``; frame k shows the motion at k / ``fps`` seconds.
+        scene: the people, one where an avatar is played; rendered by ``renderer``.
+        frames: those that this process renders, out of ``count``; frame k shows the scene at k / ``fps`` seconds.
         notes: of the inputs' readers and of the run.
         in_view: whether a frame has shown anything of the avatar yet.
     """
@@ -98,8 +102,8 @@ class _Run:
     formats: tuple[str, ...]
     aovs: tuple[str, ...]
     renderer: FrameRenderer
+    scene: SceneRenderer
     backdrop: Backdrop
-    motion: Motion
     fps: float
     frames: range
     count: int
@@ -112,7 +116,7 @@ class _Run:
     @classmethod
     def of(cls, options: PlayOptions, ahead: Future[Networks] | None) -> _Run:
         """Check the options, the cheap ones first, and load what they name."""
-        avatar_file, motion_file, out = _required(options)
+        cast, out = _required(options)
         lighting, rendering = options.lighting, options.rendering
         background, aovs, formats = (
             Background.parse(lighting.background),
@@ -122,17 +126,19 @@ class _Run:
         set_threads(rendering.threads)
         times = StageTimes()
         with times.stage("load"):
-            avatar = Avatar.load(avatar_file, threads=rendering.threads, ahead=ahead)
-            motion = options.reading.read_motion(motion_file, avatar.skeleton)
+            people = load_people(cast, options, ahead)
+            avatar, motions = people[0].avatar, list(dict.fromkeys(person.motion for person in people))
+            if "parts" in aovs and len({person.avatar.skeleton.names for person in people}) > 1:
+                raise InputError("--aov parts", expected="avatars with the same joints", got="different ones")
             light = chosen_light(
                 avatar, options.hdr, up=lighting.hdr_up, yaw=lighting.hdr_yaw, exposure=lighting.exposure
             )
-            fps = options.fps or motion.fps
-            count = motion.frames_at(fps)
+            fps = options.fps or motions[0].fps
+            count = max(person.frames_at(fps) for person in people)
             frames = parse_frames(options.frames, count)
-            framing = frame_motion(avatar.skeleton, motion)
+            framing = frame_people(people)
             camera_at = _camera_path(options, framing, frames)
-            inputs = _inputs(options)
+            inputs = _inputs(options, cast)
             for path in inputs:
                 if is_of_a_run(path, out):
                     raise InputError("cannot be an input: runs write such files into --out", file=path)
@@ -142,8 +148,9 @@ class _Run:
             if kernels_are_cold():
                 log(COMPILING)
             renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
+            scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
-                renderer.ground = ground_of(avatar, motion)
+                renderer.ground = ground_of(avatar, motions[0])
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
         return cls(
@@ -152,14 +159,14 @@ class _Run:
             formats=formats,
             aovs=aovs,
             renderer=renderer,
+            scene=scene,
             backdrop=Backdrop(background),
-            motion=motion,
             fps=fps,
             frames=frames,
             count=count,
             framing=framing,
             camera_at=camera_at,
-            notes=[*motion.notes, *motion.loop_notes(fps), *light_notes(light), *clip_notes(formats, fps)],
+            notes=[*_motion_notes(motions, fps), *light_notes(light), *clip_notes(formats, fps)],
             times=times,
         )
 
@@ -173,8 +180,9 @@ class _Run:
         return part_name("play", self.frames, self.count)
 
     @cached_property
-    def _given(self) -> GivenFeatures:
-        return GivenFeatures(self.renderer.avatar, self.motion, self.fps, self.count, self.camera_at, self.aovs)
+    def _given(self) -> list[GivenFeatures]:
+        how = self.fps, self.count, self.camera_at, self.aovs
+        return [GivenFeatures(person, *how) for person in self.scene.people]
 
     def camera(self, number: int) -> Camera:
         return self.camera_at(number, number / self.fps)
@@ -204,14 +212,14 @@ class _Run:
     def _encode(self, number: int) -> _Pending:
         asked = perf_counter()
         with self.times.stage("encoders"):
-            return _Pending(asked, self.renderer.avatar.encode(self.motion, number / self.fps))
+            return _Pending(asked, self.scene.encode(number / self.fps))
 
     def _draw(self, number: int, pending: _Pending) -> tuple[RenderedFrame, Camera]:
         renderer, camera, lighting = self.renderer, self.camera(number), self.options.lighting
         if lighting.hdr_turn:
             renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * number / self.fps / lighting.hdr_turn)
-        given = self._given.of(number, pending.encoded, camera)
-        frame = renderer.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given)
+        given = [of.of(number, encoded, camera) for of, encoded in zip(self._given, pending.encoded)]
+        frame = self.scene.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given)
         for stage, seconds in frame.stage_seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):
@@ -279,22 +287,34 @@ def _settings(options: PlayOptions) -> dict[str, object]:
     return {name: value for name, value in values.items() if name not in ("out", "doctor")}
 
 
-def _required(options: PlayOptions) -> tuple[Path, Path, Path]:
-    """Avatar, motion and folder."""
-    given = {"AVATAR.onnx": options.avatar, "--motion": options.motion, "--out": options.out}
+def _motion_notes(motions: Sequence[Motion], fps: float) -> list[str]:
+    return list(dict.fromkeys(note for motion in motions for note in (*motion.notes, *motion.loop_notes(fps))))
+
+
+def _required(options: PlayOptions) -> tuple[list[PersonRecord], Path]:
+    """The people, and the folder."""
+    given = {"AVATAR.onnx or SCENE.toml": options.avatar, "--motion": options.motion, "--out": options.out}
+    if options.avatar and is_scene(options.avatar):
+        refuse_changed(options, ["motion"], "the scene has its motions")
+        del given["--motion"]
     if missing := [name for name, value in given.items() if value is None]:
         raise InputError(f"missing {', '.join(missing)}", hint="rnd-play AVATAR.onnx --motion FILE --out FOLDER")
-    assert options.avatar and options.motion and options.out
-    if is_folder(options.motion) and options.out.resolve() == options.motion.resolve():
-        raise InputError("--out", expected="another folder than the motion's", got=options.out)
-    return options.avatar, options.motion, output_folder(options.out)
+    assert options.avatar and options.out
+    cast = [PersonRecord(options.avatar, options.motion)] if options.motion else read_scene(options.avatar)
+    if len(cast) > 1 and options.lighting.ground != "none":
+        raise InputError("--ground", expected="none for several people", got=options.lighting.ground)
+    for motion in {person.motion for person in cast}:
+        if is_folder(motion) and options.out.resolve() == motion.resolve():
+            raise InputError("--out", expected="another folder than the motion's", got=options.out)
+    return cast, output_folder(options.out)
 
 
-def _inputs(options: PlayOptions) -> list[Path]:
+def _inputs(options: PlayOptions, cast: Sequence[PersonRecord]) -> list[Path]:
     """Every file that the frames depend on."""
     given = [options.avatar, options.hdr, options.reading.joint_map]
-    if options.motion:
-        given += motion_inputs(options.motion)
+    for motion in dict.fromkeys(person.motion for person in cast):
+        given += motion_inputs(motion)
+    given += [file for file in dict.fromkeys(person.avatar for person in cast) if file != options.avatar]
     if options.view.camera not in OWN_CAMERAS:
         given.append(split_camera(options.view.camera)[0])
     return [path for path in given if path is not None]

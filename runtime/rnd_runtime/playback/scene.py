@@ -1,0 +1,249 @@
+"""Several avatars in one image: they occlude one another and cast sun shadows on one another.
+
+All are posed in the frame of the first one's root and kept in common arrays, body after body. Each is shaded by itself,
+with its neighbours as casters of shadows. One sort by depth puts all of them in order; bodies of few pixels are
+splatted on finer grids, which ``far.depth_groups`` puts in order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rnd_runtime.avatar.avatar import Avatar, Encoded
+from rnd_runtime.core.arrays import Floats32
+from rnd_runtime.core.camera import Camera, Floats
+from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.gaussians import Gaussians, Raster
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.raster.in_view import visible_to
+from rnd_runtime.raster.tone import tone_map
+from rnd_runtime.shading.shader import Shader, shadow_radii
+from rnd_runtime.shading.shadow import NO_CASTERS, Casters
+
+from .aov import aov_layers
+from .far import MARGIN, depth_groups, extent
+from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, splat
+from .framing import Framing, frame_motion
+
+_PART_OF_A_FRAME = 1e-4  # tolerance of rounded times
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """An avatar in a scene.
+
+    Attributes:
+        motion: mapped to its skeleton; begins at ``start`` s of the scene.
+        place: [4, 4] the motion's world → the scene's, rigid, m.
+    """
+
+    avatar: Avatar
+    motion: Motion
+    start: float = 0.0
+    place: Floats = field(default_factory=lambda: np.eye(4))
+
+    def frames_at(self, fps: float) -> int:
+        """Number of the scene's frames until the motion ends."""
+        return max(self.motion.frames_at(fps) + math.ceil(self.start * fps - _PART_OF_A_FRAME), 1)
+
+    def encode(self, time_s: float) -> Encoded:
+        """Its pose at ``time_s`` of the scene."""
+        encoded = self.avatar.encode(self.motion, time_s - self.start)
+        return encoded._replace(root=self.place @ encoded.root)
+
+
+def place_at(x: float, z: float, heading: float) -> Floats:
+    """A ``Person.place``: origin at (x, 0, z) m, turned by ``heading`` rad to the left; π/2 turns +Z to +X."""
+    placed = np.eye(4)
+    cosine, sine = np.cos(heading), np.sin(heading)
+    placed[0, [0, 2, 3]], placed[2, [0, 2, 3]] = (cosine, sine, x), (-sine, cosine, z)
+    return placed
+
+
+def frame_people(people: Sequence[Person]) -> Framing:
+    """The ``Framing`` of all motions; it faces as the first person does."""
+    framings = [frame_motion(person.avatar.skeleton, person.motion) for person in people]
+    places = [person.place for person in people]
+    joints = np.concatenate([each.joints @ at[:3, :3].T + at[:3, 3] for each, at in zip(framings, places)])
+    facing = framings[0].facing + float(np.arctan2(places[0][0, 2], places[0][2, 2]))
+    padding = max(each.padding for each in framings)
+    return Framing(joints, (joints.min(axis=0) + joints.max(axis=0)) / 2, padding, facing)
+
+
+class SceneRenderer:
+    """Renders N people with the light, the rasteriser and the ground of ``renderer``, which is of the first avatar.
+
+    Of one person it renders the frames of ``renderer``. ``cull`` is as of that, for everybody.
+
+    Raises:
+        InputError: the graph of one of several avatars poses by itself.
+    """
+
+    def __init__(self, people: Sequence[Person], renderer: FrameRenderer, *, cull: float | None = None) -> None:
+        self.people, self.renderer = people, renderer
+        self._culls = [person.avatar.advice.cull if cull is None else cull for person in people]
+        if len(people) > 1 and not all(person.avatar.posed_outside for person in people):
+            raise InputError("avatar of a scene", expected="a file of rnd-export", got="a graph that poses")
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def encode(self, time_s: float) -> list[Encoded]:
+        """Everybody's pose, for ``draw``."""
+        return [person.encode(time_s) for person in self.people]
+
+    def draw(
+        self,
+        bodies: Sequence[Encoded],
+        camera: Camera,
+        *,
+        aovs: Sequence[str] = (),
+        srgb: bool = True,
+        given: Sequence[Mapping[str, Floats32]] | None = None,
+    ) -> RenderedFrame:
+        """Render what is encoded; arguments as of ``FrameRenderer.draw``, ``given`` for each person."""
+        given = given or [{}] * len(bodies)
+        if len(bodies) == 1:
+            return self.renderer.draw(bodies[0], camera, aovs=aovs, srgb=srgb, given=given[0])
+        seconds, started = {}, perf_counter()
+        frame = bodies[0].root
+        moved = [body.in_frame(frame) for body in bodies]
+        avatars = [person.avatar for person in self.people]
+        posed = [avatar.posed(body) for avatar, body in zip(avatars, moved)]
+        joints = [avatar.joints(body) for avatar, body in zip(avatars, moved)]
+        seconds["posing"], started = perf_counter() - started, perf_counter()
+        shader, view = in_root_frame(frame, self.renderer.shader, camera)
+        visible, features = self._shaded(posed, joints, shader, view, aovs, given)
+        seconds["shading"] = perf_counter() - started
+        raster = self._splatted(posed, joints, visible, features, view, "depth" in aovs)
+        for stage, spent in raster.seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + spent
+        layers = aov_layers(aovs, raster, 3, given[0])
+        radiance, started = raster.image[..., :3], perf_counter()
+        image_srgb = tone_map(radiance, raster.alpha) if srgb else None
+        seconds["tone map"] = perf_counter() - started
+        return RenderedFrame(radiance, raster.alpha, layers, seconds, srgb_on_black=image_srgb)
+
+    def _shaded(
+        self,
+        posed: Sequence[Gaussians],
+        joints: Sequence[NDArray[np.float64]],
+        shader: Shader,
+        camera: Camera,
+        aovs: Sequence[str],
+        given: Sequence[Mapping[str, Floats32]],
+    ) -> tuple[list[NDArray[np.bool_]], list[Floats32]]:
+        """Who is visible [N] and features [N, C], for each body."""
+        shadows = _Shadows.of(posed, joints, shader)
+        visible, features = [], []
+        for number, (gaussians, cull) in enumerate(zip(posed, self._culls)):
+            seen = visible_to(gaussians, camera, None if cull is None or cull <= -1 else cull)
+            casters = shadows.casters_on(number) if seen.any() else NO_CASTERS
+            visible.append(seen)
+            features.append(
+                features_of(gaussians, shader, camera, seen, aovs=aovs, lit=True, given=given[number], casters=casters)
+            )
+        return visible, features
+
+    def _splatted(
+        self,
+        posed: Sequence[Gaussians],
+        joints: Sequence[NDArray[np.float64]],
+        visible: Sequence[NDArray[np.bool_]],
+        features: Sequence[Floats32],
+        camera: Camera,
+        depth: bool,
+    ) -> Raster:
+        """Everybody, groups of ``far.depth_groups`` composited front to back."""
+        height, width = camera.height, camera.width
+        seconds: dict[str, float] = {}
+        result: Raster | None = None
+        for bodies, part in depth_groups([extent(camera, points) for points in joints]):
+            fine = part.view(camera) if part.factor > 1 else None
+            arrays = [[getattr(posed[i], name) for i in bodies] for name in ("means", "covariances", "opacities")]
+            means, covariances, opacities, attributes, seen = (
+                self._together(name, parts)
+                for name, parts in zip(
+                    ("means", "covariances", "opacities", "features", "visible"),
+                    [*arrays, [features[i] for i in bodies], [visible[i] for i in bodies]],
+                )
+            )
+            geometry, grid = (means, covariances, opacities), camera if fine is None else fine.camera
+            raster = splat(geometry, attributes, grid, self.renderer.rasterizer, seen, depth=depth)
+            for stage, spent in raster.seconds.items():
+                seconds[stage] = seconds.get(stage, 0.0) + spent
+            started = perf_counter()
+            if fine is None:
+                result = raster
+                continue
+            if result is None:
+                shape = height, width
+                image = np.zeros((*shape, attributes.shape[1]), np.float32)
+                result = Raster(image, np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+            open_share = 1 - result.alpha[fine.region]
+            for layer, behind in zip((result.image, result.alpha, result.depth), fine.means(raster)):
+                layer[fine.region] += behind * (open_share[..., None] if behind.ndim == 3 else open_share)
+            seconds["compositing"] = seconds.get("compositing", 0.0) + perf_counter() - started
+        assert result is not None
+        return replace(result, seconds=seconds, srgb=None)
+
+    def _together(self, name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """``parts`` one after another, in an array that is kept from frame to frame."""
+        if len(parts) == 1:
+            return parts[0]
+        rows, first = sum(map(len, parts)), parts[0]
+        kept = self._arrays.get(name)
+        if kept is None or len(kept) < rows or kept.shape[1:] != first.shape[1:]:
+            kept = self._arrays[name] = np.empty((rows, *first.shape[1:]), first.dtype)
+        return np.concatenate(parts, out=kept[:rows])
+
+
+@dataclass(frozen=True, eq=False)
+class _Shadows:
+    """Bodies as casters of the shadows of directional lights.
+
+    Attributes:
+        points, normals, radii: of all Gaussians, body after body.
+        rows: those that cast, for each body.
+        centres: [B, 3] m, and radii ``reach`` [B] m, of spheres around the bodies.
+        towards: [K, 3] unit, towards the lights.
+    """
+
+    points: Floats32
+    normals: Floats32
+    radii: Floats32
+    rows: Sequence[NDArray[np.int64]]
+    centres: Floats
+    reach: Floats
+    towards: Floats
+
+    @classmethod
+    def of(cls, posed: Sequence[Gaussians], joints: Sequence[NDArray[np.float64]], shader: Shader) -> _Shadows:
+        towards = shader.directional_arrays().directions.astype(np.float64)
+        low, high = (np.array([side(points, axis=0) for points in joints]) for side in (np.min, np.max))
+        spheres = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2 + MARGIN
+        if not len(towards):
+            none = NO_CASTERS
+            return cls(none.points, none.normals, none.radii, [none.rows] * len(posed), *spheres, towards)
+        radii = [shadow_radii(gaussians) for gaussians in posed]
+        starts = np.cumsum([0, *map(len, radii)])
+        rows = [first + np.flatnonzero(of > 0) for first, of in zip(starts, radii)]
+        points, normals = (
+            np.concatenate([getattr(gaussians, name) for gaussians in posed]) for name in ("means", "normals")
+        )
+        return cls(points, normals, np.concatenate(radii), rows, *spheres, towards)
+
+    def casters_on(self, receiver: int) -> Casters:
+        """Those of other bodies that may stand between the body ``receiver`` and a light."""
+        offsets, apart = self.centres - self.centres[receiver], self.reach + self.reach[receiver]
+        along = offsets @ self.towards.T  # [B, K]
+        across = np.sqrt(np.maximum((offsets**2).sum(1)[:, None] - along**2, 0))
+        casting = ((across < apart[:, None]) & (along > -apart[:, None])).any(axis=1)
+        casting[receiver] = False
+        rows = [self.rows[i] for i in np.flatnonzero(casting).tolist()]
+        return Casters(self.points, self.normals, self.radii, np.concatenate(rows)) if rows else NO_CASTERS

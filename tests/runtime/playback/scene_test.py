@@ -1,0 +1,153 @@
+"""Several people in one image, against all of their Gaussians taken to the world and splatted at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.playback.far import Extent, depth_groups
+from rnd_runtime.playback.frame import FrameRenderer
+from rnd_runtime.playback.scene import Person, SceneRenderer, frame_people, place_at
+from rnd_runtime.raster.cpu import rasterize
+from rnd_runtime.raster.outline import sharpened
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light, texel_directions
+from support.paths import ASSETS
+
+TIME = 0.4  # s
+TRIANGLE = np.triu_indices(3)
+CAMERA = Camera.look_at([0.3, 1.4, 5.0], [0, 0.9, 0], width=320, height=370, fov_y=0.5)
+
+
+@pytest.fixture(scope="module")
+def avatar():
+    return Avatar.load(ASSETS / "avatar.onnx")
+
+
+@pytest.fixture(scope="module")
+def motion(avatar):
+    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
+
+
+@pytest.fixture(scope="module")
+def sky():
+    return load_light(ASSETS / "sky.exr")
+
+
+def _sun(*direction: float) -> Light:
+    """A grey sky and one texel towards ``direction``."""
+    radiance = np.full((32, 64, 3), 0.01, np.float32)
+    texel = np.argmax(texel_directions(32, 64) @ (np.array(direction) / np.linalg.norm(direction)))
+    radiance.reshape(-1, 3)[texel] = 100
+    return Light(radiance)
+
+
+def _all_at_once(people, camera):
+    """Albedo and alpha of everybody, posed and moved in the world."""
+    arrays = []
+    for person in people:
+        posed = person.avatar.pose(person.motion, TIME - person.start)
+        turn, shift = person.place[:3, :3], person.place[:3, 3]
+        means = posed.means @ turn.T + shift
+        upper = np.zeros((len(means), 3, 3))
+        upper[:, *TRIANGLE] = upper[:, *TRIANGLE[::-1]] = posed.covariances
+        covariances = (turn @ upper @ turn.T)[:, *TRIANGLE]
+        arrays.append((means, covariances, posed.opacities, posed.albedo))
+    whole = (np.concatenate(parts).astype(np.float32) for parts in zip(*arrays))
+    return sharpened(rasterize(*whole, camera))
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_one_order_of_depth_for_everybody(avatar, motion, sky, swapped):
+    """Two people who stand in one another's way, a third half behind them."""
+    spots = [place_at(0.0, 0.15, 0.4), place_at(0.2, 0.0, -2.0), place_at(-0.3, -1.5, 0.0)]
+    people = [Person(avatar, motion, 0.3 * k, at) for k, at in enumerate(spots[:: -1 if swapped else 1])]
+    with FrameRenderer(avatar, sky, shade="ao", cull=-1) as renderer:
+        scene = SceneRenderer(people, renderer, cull=-1)
+        frame = scene.draw(scene.encode(TIME), CAMERA, aovs=("albedo", "depth"))
+    expected = _all_at_once(people, CAMERA)
+    np.testing.assert_allclose(frame.alpha, expected.alpha, atol=2e-3)
+    difference = np.abs(frame.aovs["albedo"] - expected.image).max(axis=2)
+    assert np.quantile(difference, 0.999) < 2e-3 and difference.max() < 0.1  # rounding may swap two Gaussians
+    inside = expected.alpha > 0.9
+    depth = expected.depth[inside] / expected.alpha[inside]
+    np.testing.assert_allclose(frame.aovs["depth"][inside][:, 0], depth, atol=0.02)
+
+
+def test_figures_of_few_pixels_are_in_order(avatar, motion, sky):
+    """A row of people from 4 to 30 m, one behind the other, against a grid that is fine for everybody."""
+    people = [
+        Person(avatar, motion, 0.2 * k, place_at(0.1 * k, 1 - d, 0.5 * k)) for k, d in enumerate((0, 3, 8, 16, 26))
+    ]
+    camera = Camera.look_at([0.2, 1.7, 5.0], [0, 0.9, 0], width=150, height=150, fov_y=0.6)
+    with FrameRenderer(avatar, sky, shade="ao", cull=-1) as renderer:
+        scene = SceneRenderer(people, renderer, cull=-1)
+        bodies = scene.encode(TIME)
+        frame = scene.draw(bodies, camera, aovs=("albedo",))
+        reverse = SceneRenderer(people[::-1], renderer, cull=-1)
+        again = reverse.draw(bodies[::-1], camera, aovs=("albedo",))
+    np.testing.assert_allclose(again.aovs["albedo"], frame.aovs["albedo"], atol=0.02)
+    fine = _all_at_once(people, camera.resized(1200, 1200))
+    albedo, alpha = (layer.reshape(150, 8, 150, 8, -1).mean(axis=(1, 3)) for layer in (fine.image, fine.alpha))
+    np.testing.assert_allclose(frame.alpha.sum(), alpha.sum(), rtol=0.01)
+    assert np.sqrt(np.mean((frame.aovs["albedo"] - albedo) ** 2)) < 0.012  # any other order: 0.03
+
+
+def test_groups_are_composited_in_order_of_depth():
+    near, far = Extent(2, 3, 1, 0, 0, 50, 90), Extent(8, 9, 3, 30, 20, 60, 40)
+    aside = Extent(8.5, 9.5, 3, 70, 20, 90, 40)
+    assert [group.bodies for group in depth_groups([far, near, aside])] == [[1], [0], [2]]
+    through = near._replace(farthest=8.2)  # as somebody who lies: not completely in front of the second
+    groups = depth_groups([far, through, aside])
+    assert [group.bodies for group in groups] == [[0, 1], [2]]
+    assert groups[0].extent == Extent(2, 9, 3, 0, 0, 60, 90)
+    assert [group.bodies for group in depth_groups([far, aside, Extent(7, 8, 3, 55, 0, 75, 90)])] == [[0, 1, 2]]
+    # who is behind a body that was moved to the finer grid follows it
+    behind = Extent(3.5, 5, 1, 10, 0, 40, 80)
+    assert [group.bodies for group in depth_groups([far, through, behind])] == [[0, 1, 2]]
+
+
+def test_a_body_between_another_and_the_sun_shades_it(avatar, motion):
+    """The sun in the west (−X) and low."""
+    view = Camera.look_at([0, 1.2, 7.0], [0, 0.9, 0], width=240, height=160, fov_y=0.45)
+    spots = [(-1.0, 0.0), (1.0, 0.0)]
+
+    def light_of(people, side):
+        scene = SceneRenderer(people, renderer)
+        frame = scene.draw(scene.encode(TIME), view)
+        return float(frame.radiance[:, :120].sum() if side == "left" else frame.radiance[:, 120:].sum())
+
+    with FrameRenderer(avatar, _sun(-1, 0.05, 0), shade="table+sun") as renderer:
+        left, right = (Person(avatar, motion, 0, place_at(x, z, np.pi / 2)) for x, z in spots)
+        apart = Person(avatar, motion, 0, place_at(-1.0, 30.0, 0))  # behind the camera
+        alone = light_of([right, apart], "right")
+        assert light_of([right, left], "right") < 0.5 * alone
+        assert light_of([left, right], "left") == pytest.approx(light_of([left, apart], "left"), rel=1e-3)
+
+
+def test_one_person_is_the_avatar(avatar, motion, sky):
+    with FrameRenderer(avatar, sky, CAMERA) as renderer:
+        scene = SceneRenderer([Person(avatar, motion)], renderer)
+        frame, alone = scene.draw(scene.encode(TIME), CAMERA), renderer.render(motion, TIME)
+        np.testing.assert_array_equal(frame.radiance, alone.radiance)
+        moved = SceneRenderer([Person(avatar, motion, 0.1, place_at(20.0, -4.0, 1.0))], renderer)
+        camera = replace(CAMERA, world_to_camera=CAMERA.world_to_camera @ np.linalg.inv(place_at(20.0, -4.0, 1.0)))
+        renderer.turn(-1.0)  # a turn from +X towards +Z is one to the right
+        taken = moved.draw(moved.encode(TIME + 0.1), camera)
+    np.testing.assert_allclose(taken.radiance, alone.radiance, atol=2e-3)
+
+
+def test_a_heading_turns_to_the_left_and_the_camera_sees_everybody(avatar, motion):
+    placed = place_at(3.0, -2.0, np.pi / 2)
+    np.testing.assert_allclose(placed @ [0, 0, 1, 1], [4, 0, -2, 1], atol=1e-12)
+    here, there = Person(avatar, motion), Person(avatar, motion, 1.0, placed)
+    one, both = frame_people([there]), frame_people([here, there])
+    assert one.facing == pytest.approx(frame_people([here]).facing + np.pi / 2)
+    np.testing.assert_allclose(one.centre - [3, 0, -2], placed[:3, :3] @ frame_people([here]).centre, atol=1e-9)
+    assert both.radius > one.radius and len(both.joints) == 2 * len(one.joints)
+    assert there.frames_at(10) == here.frames_at(10) + 10

@@ -1,0 +1,33 @@
+"""The people of a run, loaded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import Future
+from pathlib import Path
+
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.avatar.networks import Networks
+from rnd_runtime.motion.motion import Motion
+from rnd_runtime.playback.scene import Person, place_at
+from rnd_viewer.inputs.options import PlayOptions
+from rnd_viewer.inputs.scenes import PersonRecord
+
+
+def load_people(
+    cast: Sequence[PersonRecord], options: PlayOptions, ahead: Future[Networks] | None = None
+) -> list[Person]:
+    """Load ``cast``: every avatar once, every motion once for each avatar. ``ahead``: networks of a lone avatar."""
+    avatars: dict[Path, Avatar] = {}
+    motions: dict[tuple[Path, Path], Motion] = {}
+    people = []
+    for record in cast:
+        file, source = record.avatar.resolve(), record.motion.resolve()
+        if file not in avatars:
+            avatars[file] = Avatar.load(record.avatar, threads=options.rendering.threads, ahead=ahead)
+        if (file, source) not in motions:
+            motions[file, source] = options.reading.read_motion(record.motion, avatars[file].skeleton)
+        place = place_at(*record.position, math.radians(record.heading))
+        people.append(Person(avatars[file], motions[file, source], record.start, place))
+    return people
