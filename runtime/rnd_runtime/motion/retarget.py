@@ -18,6 +18,7 @@ from .solving.directions import unit
 from .solving.evidence import Tracks
 from .solving.palms import palm_axes
 from .solving.solve import solve
+from .solving.tips import find_tips
 from .standing import UP_ROTATIONS, up_axis
 
 Floats = NDArray[np.float64]
@@ -26,6 +27,7 @@ _LIMBS = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulde
 _LEG = 0.85  # m, against which heights are judged
 _STANDS = 0.5  # mean cosine of the trunk and the up axis of a recording, which may crouch and jump
 _CLEARLY, _HIPS = 0.7, (0.6, 1.3)  # the same, and heights of hips in legs, that make Z up before Y is doubted
+_FARTHEST = 1e9  # from the origin, in any unit
 _APART = 1e-3  # of a leg, min distance of the hips and length of the trunk
 _FLOOR_PERCENTILE = 5  # of the lowest foot's height over time, against noise
 _ABOVE_SOLE = {"_ankle": 0.076, "_foot": 0.028}  # m, mean of bodies within 3 mm
@@ -65,6 +67,7 @@ def retarget(tree: MocapTree, skeleton: Skeleton, matched: Mapping[str, int], up
         {name: recorded[:, joint] for name, joint in matched.items()},
         palm_axes(tree, positions, matched),
         tree.fps,
+        find_tips(tree, positions, recorded, matched),
     )
     moved = retarget_tracks(tracks, skeleton, up, "z" if _stands_along_z(tree, matched) else "y")
     return replace(moved, notes=(*tree.notes, *moved.notes), left_out=_left_out(tree, set(matched.values())))
@@ -118,6 +121,9 @@ def _check(points: Mapping[str, Floats]) -> None:
             got=f"no {', '.join(missing)}",
             hint="name them in a file given as --joint-map",
         )
+    largest = max(float(np.abs(place).max()) for place in points.values())
+    if not largest < _FARTHEST:  # nor NaN
+        raise InputError("skeleton of the motion", expected=f"finite places, at most {_FARTHEST:g}", got=f"{largest:g}")
     leg = leg_length(points)
     if leg < 1e-9:
         raise InputError("skeleton of the motion", expected="legs", got="hips and knees in one position")
@@ -168,6 +174,7 @@ def _upright(tracks: Tracks, up: str, usual_up: str) -> tuple[Tracks, list[str]]
         points={name: moved(points) for name, points in tracks.points.items()},
         rotations={name: world @ rotations @ flip for name, rotations in tracks.rotations.items()},
         palms={side: (moved(axis), at_rest) for side, (axis, at_rest) in tracks.palms.items()},
+        tips={name: moved(tip) for name, tip in tracks.tips.items()},
     ), notes
 
 

@@ -27,6 +27,7 @@ from support.known_motion import SKELETON, write_pickle
 
 LIMBS = ("shoulder", "elbow", "hip", "knee")
 POINTS, ROLLS = 2.0, 6.0  # degrees: of limbs' directions, of their rotations
+HANDS = 20.0  # of wrists, whose fingers' joints other rigs have elsewhere
 POSITIONS_ALONE = 4.0
 
 
@@ -48,13 +49,13 @@ def _worst_direction(motion) -> float:
     return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
 
 
-def _worst_rotation(motion) -> float:
+def _worst_rotation(motion, parts=LIMBS) -> float:
     """Of the limbs' joints in the world, degrees."""
     worst = 0.0
     given = SKELETON.joint_transforms(motion.rotations, np.zeros(3))[..., :3, :3]
     known = SKELETON.joint_transforms(MATRICES, np.zeros(3))[..., :3, :3]
     for k, name in enumerate(SKELETON.names):
-        if name.endswith(LIMBS):
+        if name.endswith(parts):
             between = Rotation.from_matrix(given[:, k].swapaxes(-1, -2) @ known[:, k])
             worst = max(worst, float(np.degrees(between.magnitude()).max()))
     return worst
@@ -108,6 +109,7 @@ def test_every_recorded_skeleton_gives_the_known_motion(tmp_path, name):
     assert motion.fps == fps
     assert _worst_direction(motion) < POINTS
     assert _worst_rotation(motion) < ROLLS
+    assert _worst_rotation(motion, ("_wrist",)) < HANDS
     assert _path_off(motion) < 0.03
 
 

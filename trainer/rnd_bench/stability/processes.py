@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 PLAY, EXPORT, TRAIN = "rnd_viewer.play.cli", "rnd_export.cli", "rnd_trainer.commands.train"
-PATIENCE_S = 600
+PATIENCE_S = 3600  # kernels compile, on machines that have other work
 
 Command = tuple[str, list[str]]  # the module whose ``main`` is run, and its arguments
 

@@ -23,6 +23,7 @@ from .measures import (
     stress,
     trainings,
     twists,
+    zero_poses,
 )
 
 AVATAR = "the avatar"
@@ -55,6 +56,7 @@ ROWS: tuple[Row, ...] = (
     Row("P15", "betas", motions.other_betas),
     Row("P16", "wrong up axis or camera", motions.wrong_camera),
     Row("P17", "noisy poses in training", trainings.noisy_training_poses, SHORT),
+    Row("P18", "any zero pose of a recording", zero_poses.any_zero_pose),
     Row("G1", "needles in unseen views", splats.needles),
     Row("G2", "zero, NaN, denormal quaternion; q and −q", splats.broken_quaternions, MADE),
     Row("G3", "camera inside, at a Gaussian, behind", splats.fly_through),

@@ -39,8 +39,10 @@ WARM = 1200
 """clients before memory is watched: each thread of the server takes an arena of malloc's"""
 EVERY = 20
 """clients between two readings of memory"""
-PAUSE_S = 0.05
-"""between two clients"""
+PAUSE_S = 0.5
+"""between two clients: an hour of them takes a tenth of a core"""
+RETRY_S = 0.05
+"""until a refused client comes again"""
 TRIES = 20
 ANSWER_S = 2.0
 SLOPE_BYTES = 1000.0
@@ -124,7 +126,7 @@ def _visit(visit: Callable[[str], None], url: str) -> int:
             visit(url)
             return refused
         except (OSError, HTTPException, WebSocketException):
-            sleep(PAUSE_S)
+            sleep(RETRY_S)
     visit(url)
     return TRIES
 

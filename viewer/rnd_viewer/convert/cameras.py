@@ -37,6 +37,7 @@ FLIP = np.diag([1.0, -1, -1, 1])
 """OpenGL's camera axes (Y up, looking along −Z) ↔ OpenCV's"""
 _SUFFIXES = ".json (transforms.json), .gltf, .glb, .usd, .usda, .usdc or .usdz"
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_MAX_FRAMES = 200_000
 _UNDISTORTED = 1e-4  # max coefficient of a lens that counts as a pinhole
 
 
@@ -61,7 +62,7 @@ def read_cameras(path: Path, name: str | None, size: tuple[int, int], fps: float
             return _of_usd(file, name, size)
     except InputError as error:
         raise error.at(file=file) from error
-    except (KeyError, TypeError, ValueError, IndexError, struct.error) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError, struct.error) as error:
         raise InputError("camera file cannot be read", got=f"{type(error).__name__}: {error}", file=file) from error
     hint = "in Blender: File, Export, glTF or USD, or our add-on" if suffix == ".blend" else None
     raise InputError("camera file", expected=_SUFFIXES, got=path.name, hint=hint)
@@ -110,9 +111,12 @@ def _of_transforms(document: Mapping[str, Any], size: tuple[int, int]) -> list[C
     if "frames" not in document:
         hint = "--camera of rnd-play takes it as it is" if {"K", "cameras"} & document.keys() else None
         raise InputError("camera file", expected="transforms.json with frames", got="none", hint=hint)
-    frames = sorted(document["frames"], key=lambda frame: str(frame.get("file_path", "")))
+    frames = document["frames"]
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError("frames of the camera file", expected="a list of objects", got="others")
     if not frames:
         raise InputError("camera file holds no camera")
+    frames = sorted(frames, key=lambda frame: str(frame.get("file_path", "")))
     return [_of_entry({**document, **frame}, size) for frame in frames]
 
 
@@ -164,7 +168,10 @@ def _of_gltf(file: Path, name: str | None, size: tuple[int, int], fps: float) ->
             raise InputError("nodes", expected="a tree", got="a circle")
     tracks = _tracks(document, buffer, set(chain), file)
     keys = np.concatenate([keys for paths in tracks.values() for keys, _ in paths.values()] or [np.zeros(1)])
-    times = keys.min() + np.arange(round(np.ptp(keys) * fps) + 1) / fps
+    frames = round(float(np.ptp(keys)) * fps) + 1
+    if frames > _MAX_FRAMES:
+        raise InputError("animation of the camera", expected=f"at most {_MAX_FRAMES} frames", got=frames)
+    times = keys.min() + np.arange(frames) / fps
     cameras = []
     for time in times:
         world = np.eye(4)

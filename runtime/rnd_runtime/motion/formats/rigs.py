@@ -63,7 +63,7 @@ def _soma77() -> Rig:
         "Head": "head",
     }
     parts = {
-        **{"Shoulder": "collar", "Arm": "shoulder", "ForeArm": "elbow", "Hand": "wrist", "HandMiddle1": "hand"},
+        **{"Shoulder": "collar", "Arm": "shoulder", "ForeArm": "elbow", "Hand": "wrist", "HandMiddle2": "hand"},
         **{"Leg": "hip", "Shin": "knee", "Foot": "ankle", "ToeBase": "foot"},
     }
     ours |= {f"{side}{theirs}": f"{side.lower()}_{part}" for side in _SIDES for theirs, part in parts.items()}

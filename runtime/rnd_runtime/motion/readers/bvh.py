@@ -22,6 +22,7 @@ class _Joint:
     parent: int
     offset: Floats = field(default_factory=lambda: np.zeros(3))
     channels: tuple[str, ...] = ()
+    end: Floats | None = None
 
 
 def read_bvh(path: str | Path) -> MocapTree:
@@ -65,7 +66,8 @@ def _read(words: Iterator[str]) -> MocapTree:
     notes = (f"positions of joints but the root are left out: {', '.join(moving[:3])}, …",) if moving else ()
     names, parents = tuple(joint.name for joint in joints), tuple(joint.parent for joint in joints)
     offsets = np.array([joint.offset for joint in joints])
-    return MocapTree(names, parents, offsets, rotations, root_positions, _rounded(1 / seconds), notes)
+    ends = {number: joint.end for number, joint in enumerate(joints) if joint.end is not None}
+    return MocapTree(names, parents, offsets, rotations, root_positions, _rounded(1 / seconds), notes, ends)
 
 
 def _root_path(joints: list[_Joint], rotations: Floats, positions: Floats) -> tuple[Floats, list[int]]:
@@ -105,8 +107,10 @@ def _hierarchy(words: Iterator[str]) -> list[_Joint]:
             if not np.isfinite(offset).all():
                 raise InputError("OFFSET", expected="finite numbers", got=offset.tolist())
             check_size("OFFSET", offset.tolist())
-            if open_joints[-1] >= 0:  # else of an end site, which is no joint
+            if open_joints[-1] >= 0:
                 joints[open_joints[-1]].offset = offset
+            elif len(open_joints) > 1:
+                joints[open_joints[-2]].end = offset
         elif word == "CHANNELS" and open_joints:
             names = tuple([next(words).capitalize() for _ in range(int(next(words)))])
             known = {f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}

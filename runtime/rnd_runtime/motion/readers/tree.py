@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ class MocapTree:
         root_positions: [F, 3].
         fps: frames per second.
         notes: assumptions and omissions.
+        ends: offsets [3] of end sites, by the joint above.
 
     Raises:
         InputError: names or parents are not those of one tree.
@@ -40,6 +41,7 @@ class MocapTree:
     root_positions: Floats
     fps: float
     notes: tuple[str, ...] = ()
+    ends: Mapping[int, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         apart = [joint for joint, parent in enumerate(self.parents) if joint and not 0 <= parent < joint]

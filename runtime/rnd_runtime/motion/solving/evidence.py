@@ -13,6 +13,7 @@ from rnd_runtime.motion.skeleton import Skeleton
 
 from .bones import SPINE, find_bones, rest_directions
 from .directions import Floats, about, across, angle_about, swing, unit
+from .tips import with_tips
 
 Complexes = NDArray[np.complex128]
 
@@ -31,12 +32,14 @@ class Tracks:
         rotations: [F, 3, 3] of joints in the world, relative to any zero pose.
         palms: by side, an axis [F, 3] across the palm and its direction [3] where the arm is held along ±X, palm down.
         fps: frames per second.
+        tips: [F, 3] of what lies beyond the last joint of a limb or the head, by that joint.
     """
 
     points: Mapping[str, Floats]
     rotations: Mapping[str, Floats] = field(default_factory=dict)
     palms: Mapping[str, tuple[Floats, Floats]] = field(default_factory=dict)
     fps: float = 30.0
+    tips: Mapping[str, Floats] = field(default_factory=dict)
 
     def after(self, first: int) -> Tracks:
         """Without the ``first`` frames."""
@@ -45,6 +48,7 @@ class Tracks:
             points={name: points[first:] for name, points in self.points.items()},
             rotations={name: rotations[first:] for name, rotations in self.rotations.items()},
             palms={side: (axis[first:], in_t_pose) for side, (axis, in_t_pose) in self.palms.items()},
+            tips={name: tip[first:] for name, tip in self.tips.items()},
         )
 
 
@@ -67,6 +71,7 @@ class Recorded:
     Attributes:
         tracks: [F] frames, Y up.
         rest: joint positions [3] of the avatar at rest.
+        points: [F, 3] of the joints, and of tips that stand in for some (``tips.with_tips``).
         bones: of joints that have a direction.
         at_rest: directions [3] of the avatar's bones that stand for ``bones``.
         chest: the highest joint of the spine, or "".
@@ -77,8 +82,9 @@ class Recorded:
     def __init__(self, tracks: Tracks, skeleton: Skeleton) -> None:
         root = skeleton.names[0]
         self.tracks, self.rest = tracks, dict(zip(skeleton.names, skeleton.rest_joints))
-        self.bones = find_bones(tracks.points, self.rest, root)
-        self.at_rest = rest_directions(self.bones, tracks.points, self.rest, root, tracks.fps)
+        self.points = with_tips(tracks.points, tracks.tips)
+        self.bones = find_bones(self.points, self.rest, root)
+        self.at_rest = rest_directions(self.bones, self.points, self.rest, root, tracks.fps)
         spine = [name for name in SPINE if name in self.bones]
         self.chest = spine[-1] if spine else ""
         self.pelvis_axis = self._to_the_left("hip")
@@ -119,14 +125,14 @@ class Recorded:
         joints = [f"{side}_{joint}" for joint in ("knee", "ankle", "foot")]
         if part not in ("hip", "knee", "ankle") or joints[1] not in self.bones or joints[0] not in self.bones:
             return None
-        shin, foot = (unit(self.bones[joint].along(self.tracks.points)) for joint in joints[:2])
+        shin, foot = (unit(self.bones[joint].along(self.points)) for joint in joints[:2])
         axis = np.cross(-shin, foot)
         at_rest = np.cross(-self.at_rest[joints[0]], self.at_rest[joints[1]])
         return Evidence(axis, at_rest, _FOOT * (axis * axis).sum(-1))
 
     def shown(self, name: str, frames: int) -> Iterator[Evidence]:
         """What the recording shows of the roll about the bone of joint ``name``."""
-        points, (side, _, part) = self.tracks.points, name.partition("_")
+        points, (side, _, part) = self.points, name.partition("_")
         if part == "ankle" and (foot := self.foot_axis(name)) is not None:
             yield foot._replace(weight=foot.weight / _FOOT)
         if part == "wrist" and side in self.tracks.palms:

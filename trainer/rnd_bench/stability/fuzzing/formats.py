@@ -51,6 +51,20 @@ def damaged_npz(honest: bytes, rng: Random) -> bytes:
     return _archive(members)
 
 
+def damaged_npy(honest: bytes, rng: Random) -> bytes:
+    """An array with another shape, type, or number, as one of an archive."""
+    return _members(damaged_npz(_archive({"a.npy": honest, "b.npy": honest}), rng)).get("a.npy", b"")
+
+
+def damaged_glb(honest: bytes, rng: Random) -> bytes:
+    """A glTF binary with a broken JSON chunk of the right length."""
+    size = int.from_bytes(honest[12:16], "little")
+    text = damaged_json(honest[20 : 20 + size], rng)
+    text += b" " * (-len(text) % 4)
+    rest = honest[20 + size :]
+    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(rest), len(text), b"JSON") + text + rest
+
+
 def damaged_torch(honest: bytes, rng: Random) -> bytes:
     """torch's zip file with a damaged pickle or another damaged member."""
     members = _members(honest)

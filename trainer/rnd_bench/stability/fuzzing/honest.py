@@ -17,6 +17,8 @@ from rnd_runtime.core.images import write_image
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.motion.skeleton import Skeleton
 
+from .honest_rigs import write_rigs
+
 FRAMES = 3
 COMPLETE = "complete"
 """a file that is written when all others are"""
@@ -39,6 +41,7 @@ def write_files(folder: Path, avatar: Path, checkpoint: Path, capture: Path) -> 
     _write_pickles(folder, body)
     _write_bvh(folder / "walk.bvh", skeleton)
     _write_acclaim(folder / "mocap", skeleton)
+    write_rigs(folder, skeleton)
     _write_images(folder)
     _write_network(folder / "network.onnx")
     (folder / COMPLETE).touch()

@@ -12,6 +12,8 @@ from .damage import Mutation, damaged_json, damaged_json_lines, damaged_text
 from .formats import (
     damaged_below_compression,
     damaged_exr,
+    damaged_glb,
+    damaged_npy,
     damaged_npz,
     damaged_onnx,
     damaged_pickle,
@@ -59,6 +61,12 @@ def _camera(folder: Path) -> Read:
     from rnd_viewer.inputs.cameras import file_path
 
     return lambda path: file_path(str(path), (64, None), range(1))
+
+
+def _foreign_camera(folder: Path) -> Read:
+    from rnd_viewer.convert.cameras import read_cameras
+
+    return lambda path: read_cameras(path, None, (64, 48), 30.0)
 
 
 def _request(folder: Path) -> Read:
@@ -161,6 +169,8 @@ def _avatar(folder: Path) -> Read:
 READERS: dict[str, Reader] = {
     "request": Reader("request.json", _request, damaged_json),
     "camera": Reader("camera.json", _camera, damaged_json),
+    "transforms": Reader("transforms.json", _foreign_camera, damaged_json),
+    "gltf camera": Reader("camera.glb", _foreign_camera, damaged_glb),
     "joint map": Reader("joints.json", _joint_map, damaged_json),
     "metrics": Reader("run/metrics.jsonl", _losses, damaged_json_lines),
     "colmap": Reader("colmap/images.txt", _colmap, damaged_text),
@@ -173,6 +183,10 @@ READERS: dict[str, Reader] = {
     "bvh": Reader("walk.bvh", _motion, damaged_text),
     "amc": Reader("mocap/02_01.amc", _motion, damaged_text),
     "asf": Reader("mocap/02.asf", _motion_of_skeleton_file, damaged_text),
+    "kimodo": Reader("kimodo.npz", _motion, damaged_npz),
+    "sam3d": Reader("sam3d.pkl", _motion, damaged_pickle),
+    "humanml": Reader("humanml.npy", _motion, damaged_npy),
+    "glb": Reader("walk.glb", _motion, damaged_glb),
     "png": Reader("image.png", _image, damaged_png),
     "exr": Reader("light.exr", _light, damaged_exr),
     "hdr": Reader("light.hdr", _light),
