@@ -69,6 +69,8 @@ class TrainConfig:
     """'true': the capture's exact normals (oracle)"""
     probe_channels: Literal[1, 3] = 3
     """1: a grey light, as in the paper"""
+    skin: int | None = None
+    """Fitzpatrick type 1 to 6 of the skin, which fixes the level of albedo and light; None: by likelihood"""
     light_search: bool = True
     """initialise the probe with a least-squares sky and directional lights; False: white"""
     rate_networks: float = 2e-3
@@ -119,8 +121,8 @@ class TrainConfig:
     """steps between evaluations of the repulsion, which builds a k-d tree"""
     weight_visibility: float = 0.2
     """square error of the SH visibility against traced visibility"""
-    weight_light_grey: float = 0.02
-    """chroma of the mean light"""
+    weight_light_chroma: float = 0.1
+    """chroma of the probe in every direction, relative to the light search's"""
     weight_light_sky: float = 0.03
     """robust distance of the probe from a natural sky"""
 
@@ -137,6 +139,8 @@ class TrainConfig:
     pose_noise: float = 0.05
     """standard deviation of the noise on the encoders' input poses, rad"""
 
+    hold_out: bool = False
+    """leave every fifth training frame out, as the split ``validation``"""
     refine_poses: bool = False
     """correct the capture's body poses while training"""
     refine_after: float = 0.08

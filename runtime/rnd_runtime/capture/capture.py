@@ -26,6 +26,8 @@ from .format import Frame as Frame
 from .format import Split as Split
 
 Floats32 = NDArray[np.float32]
+VALIDATION_EVERY = 5
+"""training frames per frame of the validation split"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,12 @@ class Capture:
     def split(self, name: Split) -> list[Frame]:
         """The frames of one split, in file order."""
         return [frame for frame in self.frames if frame.split == name]
+
+    def holding_out(self) -> Capture:
+        """This capture with every ``VALIDATION_EVERY``-th training frame moved to the split ``validation``."""
+        held_out = set(map(id, self.split("train")[VALIDATION_EVERY // 2 :: VALIDATION_EVERY]))
+        frames = (msgspec.structs.replace(f, split="validation") if id(f) in held_out else f for f in self.frames)
+        return replace(self, frames=tuple(frames))
 
     def load_frame(self, frame: Frame) -> FrameImages:
         """Read and decode the images of ``frame``."""

@@ -16,7 +16,7 @@ from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.images import read_header, read_image
 
 Floats32 = NDArray[np.float32]
-Split = Literal["train", "novel_view", "novel_pose", "relight"]
+Split = Literal["train", "validation", "novel_view", "novel_pose", "relight"]
 TRAIN_SHARE = 0.8
 """of the training camera's frames, without splits of their own; as in the paper"""
 

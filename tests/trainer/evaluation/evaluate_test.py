@@ -220,6 +220,20 @@ def test_rows_name_all_scores_and_their_provenance(tiny_run, tiny_capture, tmp_p
     assert (tmp_path / "novel_view.png").exists() and len(list((tmp_path / "novel_view").glob("*.png"))) == 2
 
 
+def test_a_training_that_held_frames_out_is_scored_on_those_alone(tiny_run, tiny_capture) -> None:
+    everything = tiny_capture.split("train")
+    held = tiny_capture.holding_out()
+    learned, validation = held.split("train"), held.split("validation")
+    assert len(validation) == max(1, round(len(everything) / 5)) and len(learned) + len(validation) == len(everything)
+    assert not {f.image for f in learned} & {f.image for f in validation}
+    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
+    config = dataclasses.replace(checkpoint.config, hold_out=True)
+    views = Training(tiny_capture, config).views
+    assert [view.frame.image for view in views] == [frame.image for frame in learned]
+    rows = score(dataclasses.replace(checkpoint, config=config), tiny_capture, method="m")
+    assert [(row["split"], row["frames"]) for row in rows] == [("validation", len(validation))]
+
+
 def test_strips_have_unique_names_and_are_png() -> None:
     assert strip_names(["images/a.jpg", "images/b.png"]) == {"images/a.jpg": "a", "images/b.png": "b"}
     cameras = ["cam0/000001.jpg", "cam1/000001.jpg", "cam1/000002.jpg"]

@@ -11,7 +11,7 @@ import torch
 
 from rnd_runtime.core import images
 from rnd_trainer.losses.losses import (
-    grey_prior,
+    chroma_prior,
     image_loss,
     linear_to_srgb,
     multiscale_dssim,
@@ -115,18 +115,14 @@ def test_skinning_divergence_is_kullback_leibler() -> None:
     assert float(skinning_divergence(weights, template.log())) == pytest.approx(0.5 * math.log(2))
 
 
-def test_grey_prior_sees_colour_not_brightness() -> None:
-    grey = torch.rand(4, 8, 1).expand(4, 8, 3)
-    assert float(grey_prior(grey, torch.ones(4, 8))) == pytest.approx(0, abs=1e-6)
-    red = torch.tensor([3.0, 0.0, 0.0]).expand(4, 8, 3)
-    assert float(grey_prior(red, torch.ones(4, 8))) == pytest.approx(4 / 3)
-    assert float(grey_prior(7 * red, torch.ones(4, 8))) == pytest.approx(4 / 3)
-
-
-def test_grey_prior_lets_a_low_sun_be_orange_and_the_sky_blue() -> None:
-    sky = torch.tensor([0.6, 0.8, 1.0]).repeat(4, 8, 1)
-    sky[0, 0] = torch.tensor([1 + 31 * 0.4, 1 + 31 * 0.2, 1.0])
-    assert float(grey_prior(sky, torch.ones(4, 8))) == pytest.approx(0, abs=1e-6)
+def test_chroma_prior_sees_colour_in_every_direction_but_no_brightness() -> None:
+    start = 0.1 + torch.rand(4, 8, 3)
+    angles = torch.rand(4, 8)
+    assert float(chroma_prior(start * (1 + torch.rand(4, 8, 1)), start, angles)) == pytest.approx(0, abs=1e-6)
+    red, blue = torch.tensor([math.e, 1.0, 1.0]), torch.tensor([1.0, 1.0, math.e])
+    assert float(chroma_prior(start * red, start, angles)) == pytest.approx(0.5, rel=1e-5)
+    half = torch.stack([red, blue]).repeat(4, 4, 1)  # grey in the mean
+    assert float(chroma_prior(start * half, start, angles)) == pytest.approx(0.5, rel=1e-5)
 
 
 def test_sky_prior_is_zero_for_a_natural_sky_and_a_sun_costs_little() -> None:

@@ -26,6 +26,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.commands.eval import EvalOptions, evaluate_run
 from rnd_trainer.commands.train import Learning
+from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.losses import linear_to_srgb
 from rnd_trainer.losses.perceptual import load_features, load_lpips
 from rnd_trainer.losses.perceptual_nets import BACKBONES
@@ -73,7 +74,7 @@ def test_all_stages_write_a_complete_checkpoint(tiny_run, tiny_config) -> None:
     rows = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == list(range(14))
     assert [row["stage"] for row in rows] == [1] * 6 + [2] * 6 + [3] * 2
-    assert "grey" in rows[11] and "grey" not in rows[0]
+    assert "chroma" in rows[11] and "chroma" not in rows[0]
     assert "image" in rows[11] and set(rows[-1]) == {"step", "stage", "seconds", "distillation", "edges", "smoothness"}
     assert load_checkpoint(tiny_run / "avatar.ckpt").info["step"] == 14
     status = json.loads((tiny_run / "status.json").read_text())
@@ -120,7 +121,7 @@ def test_warm_up_evaluates_every_term_without_effect(tiny_capture, tiny_config, 
     monkeypatch.setattr(warmed, "objective", spy)
     warmed.warm_up()
     monkeypatch.undo()
-    assert {"image", "mask", "visibility", "grey", "sky"} <= set(asked[0])
+    assert {"image", "mask", "visibility", "chroma", "sky"} <= set(asked[0])
     assert warmed.step_index == 0 and warmed.seconds > 0
     assert [plain.step().terms for _ in range(8)] == [warmed.step().terms for _ in range(8)]
 
@@ -297,7 +298,9 @@ def test_a_training_is_scored_in_its_refined_poses(changes, motion, tiny_capture
     scored: list[EvalOptions] = []
     monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
     options = rnd_trainer.commands.train.TrainOptions(Path("capture"), learning=Learning(**changes))
-    rnd_trainer.commands.train._score_after_training(SimpleNamespace(capture=tiny_capture), tmp_path, options)
+    rnd_trainer.commands.train._score_after_training(
+        SimpleNamespace(capture=tiny_capture, config=TrainConfig()), tmp_path, options
+    )
     assert scored[0].motion == (motion and motion.replace("OUT", str(tmp_path)))
 
 

@@ -22,6 +22,7 @@ COLUMNS = {
     "psnr": ("PSNR", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS", "{:.4f}"),
+    "psnr_person": ("PSNR person", "{:.2f}"),
     "psnr_box": ("PSNR box", "{:.2f}"),
     "ssim_box": ("SSIM box", "{:.4f}"),
     "lpips_box": ("LPIPS box", "{:.4f}"),
@@ -83,7 +84,7 @@ def evaluate_run(options: EvalOptions) -> None:
 
     from rnd_runtime.capture.capture import load_capture
     from rnd_runtime.shading.shader import check_mode
-    from rnd_trainer.evaluation.evaluate import HELD_OUT
+    from rnd_trainer.evaluation.evaluate import scored_splits
     from rnd_trainer.evaluation.held_out import score
     from rnd_trainer.losses.perceptual import load_lpips
     from rnd_trainer.model.checkpoint import load_checkpoint
@@ -97,7 +98,7 @@ def evaluate_run(options: EvalOptions) -> None:
     if note := checkpoint.note():
         warn(note)
     capture = load_capture(options.capture, motion_file=options.motion or _refined_motion(path, checkpoint, options))
-    log_all(capture_notes(capture, HELD_OUT))
+    log_all(capture_notes(capture, scored_splits(checkpoint.config)))
     if options.fit_poses:
         from rnd_runtime.cli.progress import Progress
         from rnd_trainer.evaluation.held_out_poses import fit_held_out

@@ -80,6 +80,10 @@ class Learning:
     """Another of them, or its first blocks, for the consistency loss."""
     unseen_poses: bool = True
     """Teach the skinning out-of-distribution poses after the images."""
+    hold_out: Flag = False
+    """Leave every fifth training frame out and score those alone: what choices are made by."""
+    skin: OptionalCount = None
+    """Tone of the skin, 1 (palest) to 6 (darkest) by Fitzpatrick: how bright albedo is against light."""
     refine_poses: Flag = False
     """Correct the capture's body poses while training; writes refined_motion.npz."""
     motion: Annotated[str | None, option("FILE")] = None
@@ -205,10 +209,13 @@ def _config(options: TrainOptions) -> TrainConfig:
         probe_channels=ablations.probe_channels,
         unseen_fraction=config.unseen_fraction if options.learning.unseen_poses else 0.0,
         refine_poses=options.learning.refine_poses,
+        hold_out=options.learning.hold_out,
+        skin=options.learning.skin,
         image_scale=config.image_scale if schedule.image_scale is None else schedule.image_scale,
         save_every=config.save_every if schedule.save_every is None else schedule.save_every,
     )
     check_option(0 <= schedule.seed < 2**63, "--seed", "0 to 2^63 - 1", schedule.seed)
+    check_option(config.skin is None or 1 <= config.skin <= 6, "--skin", "1 to 6", config.skin)
     if ablations.light != "learn":
         refuse_changed(ablations, ["probe_channels"], f"--light {ablations.light} learns no light")
     if ablations.light == "none":
@@ -296,11 +303,11 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:
     """Score the held-out splits in the training's poses, refined if ``--refine-poses``."""
-    from rnd_trainer.evaluation.evaluate import HELD_OUT
+    from rnd_trainer.evaluation.evaluate import scored_splits
     from rnd_trainer.training.saving import REFINED_MOTION
 
     learning = options.learning
-    if any(training.capture.split(split) for split in HELD_OUT):
+    if any(training.capture.split(split) for split in scored_splits(training.config)):
         scoring = EvalOptions(
             folder,
             options.capture,

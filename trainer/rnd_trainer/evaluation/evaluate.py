@@ -16,6 +16,7 @@ from rnd_runtime.core.images import srgb_to_linear
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
+from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.checkpoint import Checkpoint
 from rnd_trainer.training.data import pose_input, usable
@@ -24,8 +25,14 @@ from .evaluator import Rendered, render_runtime
 from .scores import frame_scores, to_srgb8
 
 HELD_OUT: tuple[Split, ...] = ("novel_view", "novel_pose", "relight")
+"""test splits"""
 FLICKER_FRAMES = 24
 """consecutive frames over which flicker is measured"""
+
+
+def scored_splits(config: TrainConfig) -> tuple[Split, ...]:
+    """The splits that a trained avatar is scored on: one that held frames out never sees a test split."""
+    return ("validation",) if config.hold_out else HELD_OUT
 
 
 @dataclass
@@ -40,7 +47,8 @@ class SplitScore:
 class Evaluator:
     """Renders a trained avatar for the frames of a capture, each under its light.
 
-    Frames under a training light are lit by the learned probe, others by the capture's light maps.
+    Of an avatar that held frames out, the capture has the split ``validation``. Frames under a training light are lit
+    by the learned probe, others by the capture's light maps.
 
     Args:
         mode: shading of the runtime.
@@ -56,6 +64,7 @@ class Evaluator:
         motion: Motion | None = None,
         cull: float | None = None,
     ) -> None:
+        capture = capture.holding_out() if checkpoint.config.hold_out else capture
         self.checkpoint, self.capture, self.mode, self.cull = checkpoint, capture, mode, cull
         self.motion = capture.motion_for(checkpoint.skeleton) if motion is None else motion
         self._trained = checkpoint.learned_under(capture)

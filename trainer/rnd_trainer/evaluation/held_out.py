@@ -24,7 +24,7 @@ from rnd_runtime.shading.light import Light
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.checkpoint import Checkpoint
 
-from .evaluate import HELD_OUT, Evaluator, albedo_scale, evaluate, flicker
+from .evaluate import Evaluator, albedo_scale, evaluate, flicker, scored_splits
 from .preview import contact_sheet, strip
 
 PLAYED = 40
@@ -56,22 +56,23 @@ def score(
         InputError: the capture has no held-out split.
     """
     evaluator = Evaluator(checkpoint, capture, mode, cull=cull)
+    capture, splits = evaluator.capture, scored_splits(checkpoint.config)
     lit = checkpoint.config.light != "none"  # otherwise there is no albedo
     scale = albedo_scale(evaluator) if lit else None
-    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in HELD_OUT if capture.split(split)]
+    jobs: list[tuple[Split, Tensor | None]] = [(split, None) for split in splits if capture.split(split)]
     if scale is not None and capture.split("relight"):
         jobs.append(("relight", scale))
     if not jobs:
-        raise InputError("held-out splits", expected=" or ".join(HELD_OUT), got="none", file=capture.folder)
+        raise InputError("held-out splits", expected=" or ".join(splits), got="none", file=capture.folder)
     common = {
-        "flicker": flicker(evaluator),
+        "flicker": None if checkpoint.config.hold_out else flicker(evaluator),
         "albedo_scale": None if scale is None else [round(float(x), 4) for x in scale],
         "shade": mode,
         "cull": cull,
         "lpips_weights": None if perceptual is None else perceptual.backbone,
         "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
         **({} if avatar is None else playback(avatar, evaluator)),
-        "size": sizes(capture),
+        "size": sizes(capture, splits),
         "scored_on": capture.folder.resolve().name,
         "capture_sha256": sha256_of(capture.file),
         "motion": Path(evaluator.motion.source).name,
@@ -122,7 +123,9 @@ def playback(avatar: Path, evaluator: Evaluator) -> dict[str, Any]:
 
     Under the learned light, for the first held-out camera, over ``PLAYED`` consecutive frames.
     """
-    frame = next(frame for split in HELD_OUT for frame in evaluator.capture.split(split))
+    frame = next(
+        frame for split in scored_splits(evaluator.checkpoint.config) for frame in evaluator.capture.split(split)
+    )
     renderer = FrameRenderer(
         Avatar.load(avatar),
         Light(evaluator.checkpoint.probe.numpy()),
@@ -139,7 +142,7 @@ def playback(avatar: Path, evaluator: Evaluator) -> dict[str, Any]:
     return {"file_mb": avatar.stat().st_size / 1e6, "fps": 1 / statistics.median(seconds)}
 
 
-def sizes(capture: Capture, splits: Iterable[Split] = HELD_OUT) -> list[tuple[int, int]]:
+def sizes(capture: Capture, splits: Iterable[Split]) -> list[tuple[int, int]]:
     """Unique widths and heights in pixels of the images of ``splits``."""
     cameras = (capture.cameras[frame.camera] for split in splits for frame in capture.split(split))
     return sorted({(camera.width, camera.height) for camera in cameras})
@@ -163,6 +166,7 @@ def _provenance(checkpoint: Any) -> dict[str, Any]:
         "train_perceptual": info.get("perceptual"),
         "consistency_sha256": info.get("consistency_sha256"),
         "refine_poses": config.refine_poses,
+        "hold_out": config.hold_out,
         "threads": numba.get_num_threads(),
         "machine": machine(),
     }

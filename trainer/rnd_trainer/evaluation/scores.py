@@ -26,7 +26,8 @@ def frame_scores(
 ) -> dict[str, float]:
     """Scores of one image by name, as far as the capture and the weights allow.
 
-    - ``psnr, ssim, lpips``: sRGB on black, full frame; ``*_box``: in the mask's bounding box.
+    - ``psnr, ssim, lpips``: sRGB on black, full frame; ``*_box``: in the mask's bounding box; ``psnr_person``: where
+      the mask covers more than half.
     - ``psnr_n, ssim_n``: normal images (n + 1)/2; ``normal_deg``: mean angle in degrees.
     - ``psnr_albedo``: sRGB, after ``scale`` [3], where mask and render both cover more than half.
     - ``lpips_inner``: with the outline from the truth.
@@ -42,6 +43,9 @@ def frame_scores(
         "psnr_box": psnr(image[box], target[box]),
         "ssim_box": ssim(image[box], target[box]),
     }
+    inside = mask > 0.5
+    if inside.any():
+        scores["psnr_person"] = psnr(image, target, inside)
     length = outline_length(mask)
     if length > 0:
         scores["outline_px"] = float((rendered.alpha - mask).abs().sum()) / length
@@ -50,7 +54,7 @@ def frame_scores(
         scores["lpips_inner"] = float(perceptual(torch.where(silhouette(mask), target, image), target))
         if min(image[box].shape[:2]) >= perceptual.smallest:
             scores["lpips_box"] = float(perceptual(image[box], target[box]))
-    inside = (mask > 0.5) & (rendered.alpha > 0.5)
+    inside = inside & (rendered.alpha > 0.5)
     normal = truth.normal_gt if truth.normal_gt is not None else truth.normal
     if normal is not None:
         expected = torch.from_numpy(normal).float()

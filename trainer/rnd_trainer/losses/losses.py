@@ -54,13 +54,17 @@ def geometry_prior(posed: PosedGaussians, weight_offset: float, weight_residual:
     return weight_offset * posed.offset.square().mean() + weight_residual * residual.square().mean()
 
 
-def grey_prior(radiance: Tensor, solid_angles: Tensor) -> Tensor:
-    """Mean absolute chroma of the mean light of a probe [32, 64, 3], relative to its level.
+def chroma_prior(radiance: Tensor, start: Tensor, solid_angles: Tensor) -> Tensor:
+    """Mean absolute log r/g and log b/g of a probe [32, 64, 3] relative to those of ``start``.
 
-    Fixes the factor per channel that light and albedo share.
+    Fixes the colour that light and albedo share, in every direction. Half of the weight goes by solid angle, half by
+    the power of ``start``: a sun is small and decides most.
     """
-    mean = (radiance * (solid_angles / solid_angles.sum())[..., None]).sum((0, 1))
-    return ((mean - mean.mean()).abs() / mean.mean()).mean()
+    power = luminance(start) * solid_angles
+    weight = solid_angles / solid_angles.sum() + power / power.sum()
+    log_ratio = torch.log(radiance / start)
+    chroma = (log_ratio[..., [0, 2]] - log_ratio[..., 1:2]).abs().mean(-1)
+    return 0.5 * (chroma * weight).sum()
 
 
 def sky_prior(radiance: Tensor, directions: Tensor, solid_angles: Tensor) -> Tensor:

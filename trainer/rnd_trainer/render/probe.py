@@ -38,6 +38,7 @@ class LightProbe(nn.Module):
     solid_angles: Tensor
     exposure: Tensor
     level: Tensor
+    start: Tensor
 
     def __init__(self, channels: int = 3) -> None:
         super().__init__()
@@ -46,6 +47,7 @@ class LightProbe(nn.Module):
         self.register_buffer("solid_angles", torch.as_tensor(texel_solid_angles(*PROBE_SHAPE), dtype=torch.float32))
         self.register_buffer("exposure", self.solid_angles / (4 * math.pi))
         self.register_buffer("level", torch.ones(()))
+        self.register_buffer("start", torch.ones(*PROBE_SHAPE, 3))
 
     def radiance(self) -> Tensor:
         """[32, 64, 3] linear."""
@@ -56,6 +58,7 @@ class LightProbe(nn.Module):
     def start_from(self, radiance: Tensor, exposure: Tensor) -> None:
         """Start from ``radiance`` [32, 64, 3] > 0, and fix its luminance under ``exposure`` [32, 64]."""
         grey = self.raw.shape[-1] == 1
+        self.start.copy_(radiance)
         self.raw.copy_(torch.log(luminance(radiance)[..., None] if grey else radiance))
         self.exposure.copy_(exposure)
         self.level.copy_((luminance(radiance) * exposure).sum())
@@ -64,9 +67,9 @@ class LightProbe(nn.Module):
 def natural_sky(height: Tensor | NDArray[np.float64]) -> Any:
     """Prior relative radiance of a direction with ``height`` y in −1…1.
 
-    Light from above and below is five to three on average (after Dror et al. 2004).
+    The ground reflects a fifth to a third of what falls on it: the halves of the sphere differ two- to threefold.
     """
-    return 1 + 0.5 * height
+    return 1 + 0.9 * height
 
 
 def luminance(rgb: Tensor) -> Tensor:

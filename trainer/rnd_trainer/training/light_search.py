@@ -29,6 +29,7 @@ from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.render.shading import traced_visibility
 
 from .data import TrainingView
+from .skin import BODY_LUMINANCE, likely_gain
 
 Floats = NDArray[np.float64]
 
@@ -70,8 +71,6 @@ MIN_OBSERVATIONS = 3
 """observations of a point that is used: with one or two its unknown albedo explains any light"""
 OCCLUSION = 0.03
 """distance behind the first surface up to which a point is visible, m"""
-REFLECTANCE = 0.22
-"""mean reflectance of a person: a grey card's 18 % and 4 % at the surface"""
 
 
 @dataclass
@@ -98,14 +97,18 @@ def initial_light(
     views: Sequence[TrainingView],
     poses: Sequence[PoseInput],
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    skin: NDArray[np.int64] | None = None,
+    tone: float | None = None,
 ) -> InitialLight | None:
     """The light that best explains the images; None if the body is hardly visible, or only from one side.
 
-    The scale is that of a visible body of mean reflectance ``REFLECTANCE``.
+    The factor per channel that light and albedo share is ``skin.likely_gain``'s.
 
     Args:
         model: after the first stage.
         views, poses: of the training images.
+        skin: indices of points that may be skin; None: none.
+        tone: known reflectance of the skin.
         on_progress: called with done and total.
     """
     steps = iter(range(1, 6))
@@ -125,6 +128,9 @@ def initial_light(
     directions, solid_angles = _grid(PROBE_SHAPE)
     coarse_directions, coarse_angles = _grid(SEARCH_SHAPE)
     coarse = _transport(observations, coarse_directions, coarse_angles)
+    exposure = _upsample(coarse.mean(0) / coarse_angles) * solid_angles
+    hidden = np.maximum(1 - coarse.sum(1), 0)
+    coarse = _with_bounce(coarse, hidden)
     sky = coarse @ _lobes(coarse_directions).astype(np.float32)
     quadratic = _quadratic(observations, np.concatenate([sky, coarse], axis=1), weight)
     advance()
@@ -133,7 +139,7 @@ def initial_light(
     coarse_lights = _search(quadratic)
     advance()
     near_texels = _texels_near(directions, coarse_directions[np.array(coarse_lights, int) - SKY_LOBES])
-    fine = _transport(observations, directions[near_texels], solid_angles[near_texels])
+    fine = _with_bounce(_transport(observations, directions[near_texels], solid_angles[near_texels]), hidden)
     columns = np.concatenate([sky, fine], axis=1)
     lights = _search(_quadratic(observations, columns, weight))
     advance()
@@ -142,9 +148,9 @@ def initial_light(
     radiance = _lobes(directions) @ intensity[:SKY_LOBES]
     radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
     radiance[near_texels[np.array(lights, int) - SKY_LOBES]] += intensity[SKY_LOBES:]
-    exposure = _upsample(coarse.mean(0) / coarse_angles) * solid_angles
-    level = (observations.colour @ REC709_LUMINANCE).mean() / REFLECTANCE
-    radiance *= level / ((radiance @ REC709_LUMINANCE) @ exposure)
+    irradiance = columns[:, [*range(SKY_LOBES), *lights]] @ intensity
+    albedo, weight = _albedo(observations, irradiance)
+    radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
     return InitialLight(
         radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(PROBE_SHAPE).astype(np.float32)
     )
@@ -190,6 +196,15 @@ def _transport(observations: Observations, directions: Floats, solid_angles: Flo
         visible = traced_visibility(means, normals, towards, observations.spacing)[point]
         rows.append((visible * (normals[point] @ towards.T).clamp(min=0)).numpy())
     return np.concatenate(rows) * (solid_angles / np.pi).astype(np.float32)
+
+
+def _with_bounce(transport: NDArray[np.float32], hidden: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Transport [n, K] with one reflection: the hidden share [n] of the hemisphere is as bright as the mean body.
+
+    Without it the light from below and behind, where limbs face each other, comes out 1.2 to 1.6 times too strong.
+    """
+    reflected: NDArray[np.float32] = transport + BODY_LUMINANCE * hidden[:, None] * transport.mean(0)
+    return reflected
 
 
 @dataclass
@@ -282,6 +297,16 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
         weight = 1 / np.maximum(error, ERROR_FLOOR)
         _, intensity = _quadratic(observations, columns, weight / light**2).fit(all_columns)
     return intensity
+
+
+def _albedo(observations: Observations, irradiance: Floats) -> tuple[Floats, Floats]:
+    """Least-squares albedo [P, 3] of every point under ``irradiance`` [n, 3], and its number of observations [P]."""
+    point = observations.point
+    albedo = [
+        np.bincount(point, colour * light) / np.maximum(np.bincount(point, light**2), 1e-12)
+        for colour, light in zip(observations.colour.T, irradiance.T, strict=True)
+    ]
+    return np.stack(albedo, axis=1), np.bincount(point).astype(float)
 
 
 def _search(quadratic: Quadratic) -> list[int]:

@@ -13,8 +13,8 @@ from rnd_runtime.core.images import srgb_to_linear
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.consistency import POINTS, consistency_loss, covisible, project, virtual_camera
 from rnd_trainer.losses.losses import (
+    chroma_prior,
     geometry_prior,
-    grey_prior,
     image_loss,
     linear_to_srgb,
     skinning_divergence,
@@ -79,7 +79,7 @@ class Objective:
         texels = None if stage == 1 else self._texels(step)
         if stage == 2 and self.fixed_light is None:
             light, probe = self.light(), self.probe
-            terms["grey"] = config.weight_light_grey * grey_prior(light, probe.solid_angles)
+            terms["chroma"] = config.weight_light_chroma * chroma_prior(light, probe.start, probe.solid_angles)
             terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
         rendered = self._render(model, posed, pose, texels, view.camera)
         device = posed.means.device

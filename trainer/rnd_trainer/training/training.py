@@ -31,9 +31,11 @@ from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
 from .sampled_poses import perturbed_pose
 from .schedule import Schedule
+from .skin import TONES, skin_points
 from .state import learned_sha256
 from .uncertainty import load_uncertainty
 from .unseen import UnseenPoses
+from .unseen_surface import evidence, fill_in
 
 MAX_BAD_STEPS = 10
 """consecutive non-finite steps after which training stops"""
@@ -76,6 +78,7 @@ class Training:
     ) -> None:
         if config.light == "learn":
             training_light_name(capture, "learning a light")
+        capture = capture.holding_out() if config.hold_out else capture
         self.capture, self.config, self.schedule = capture, config, Schedule(config)
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -89,6 +92,7 @@ class Training:
 
         # model, light, pose corrections
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
+        self._skin = skin_points(template, capture.body.skeleton)
         self.model = AvatarModel(config.model, template).to(self.device)
         self.probe = LightProbe(config.probe_channels).to(self.device)
         fixed_light = None
@@ -181,6 +185,10 @@ class Training:
         done = StepResult(self.step_index, stage, dict(zip(terms, values.tolist())), not finite)
         self.step_index += 1
         self._start_second_stage()  # before a state or preview at the end of the first stage
+        if self.step_index == self.config.steps and self.lit:
+            motion = self.motion()
+            poses = [self.pose(view, motion) for view in self.views]
+            fill_in(self.model, evidence(self.model, self.views, poses))
         self.seconds += time.perf_counter() - started
         return done
 
@@ -218,7 +226,9 @@ class Training:
         if self._searches_light:
             motion = self.motion()
             poses = [self.pose(view, motion) for view in self.views]
-            found = light_search.initial_light(self.model, self.views, poses, self.on_light_search)
+            skin, tone = self._skin, self.config.skin
+            known = None if tone is None else TONES[tone - 1]
+            found = light_search.initial_light(self.model, self.views, poses, self.on_light_search, skin, known)
             self.light_found = found is not None
             if found is not None:
                 self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
