@@ -25,13 +25,13 @@ from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
 from rnd_trainer.render.probe import PROBE_SHAPE, LightProbe, as_probe
 
-from . import light_search
 from .data import TrainingView, load_views, pose_input, training_light, training_light_name
+from .lighting import light_search
+from .lighting.skin import TONES, skin_points
 from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
 from .sampled_poses import perturbed_pose
 from .schedule import Schedule
-from .skin import TONES, skin_points
 from .state import learned_sha256
 from .uncertainty import load_uncertainty
 from .unseen import UnseenPoses

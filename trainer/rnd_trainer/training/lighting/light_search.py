@@ -27,8 +27,8 @@ from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.render.in_sight import in_sight
 from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.render.shading import traced_visibility
+from rnd_trainer.training.data import TrainingView
 
-from .data import TrainingView
 from .skin import BODY_LUMINANCE, likely_gain
 
 Floats = NDArray[np.float64]

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from rnd_runtime.shading.light import texel_directions, texel_solid_angles
-from rnd_trainer.training import light_search, skin
-from rnd_trainer.training.light_search import Observations, initial_light
+from rnd_trainer.training.lighting import light_search, skin
+from rnd_trainer.training.lighting.light_search import Observations, initial_light
 
 COUNT, IMAGES = 700, 24
 WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide

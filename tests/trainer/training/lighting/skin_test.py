@@ -8,7 +8,7 @@ import pytest
 from rnd_runtime.capture.capture import load_capture
 from rnd_runtime.shading.light import REC709_LUMINANCE
 from rnd_trainer.model.template import sample_template
-from rnd_trainer.training import skin
+from rnd_trainer.training.lighting import skin
 from support.paths import ASSETS
 
 
