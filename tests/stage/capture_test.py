@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ mi.set_variant("scalar_rgb")
 from rnd_bench.stability.processes import environment  # noqa: E402
 from rnd_runtime.capture.body import Body  # noqa: E402
 from rnd_runtime.capture.capture import load_capture  # noqa: E402
+from rnd_runtime.capture.format import Split  # noqa: E402
 from rnd_runtime.core.errors import InputError, flag  # noqa: E402
 from rnd_runtime.core.files import write_json  # noqa: E402
 from rnd_runtime.core.images import read_image, srgb_to_linear, write_image  # noqa: E402
@@ -256,3 +258,14 @@ def test_bad_shards_are_refused(text: str) -> None:
 def test_unknown_lights_are_refused(recipe) -> None:
     with pytest.raises(InputError, match="--lights"):
         film._chosen(replace(recipe, lights=("mauve",)))
+    with pytest.raises(InputError, match="--train-lights"):
+        film._chosen(replace(recipe, train_lights=("mauve",)))
+
+
+def test_training_lights_take_turns_and_none_of_them_relights(recipe) -> None:
+    two = replace(recipe, train_lights=("red", "white"), lights=("green",))
+    assert {light.name for light in film._chosen(two)} == {"red", "white", "green"}
+    views = plan.plan(two, [0, 1, 2, 3, 4], ["cam00", "cam01"], ["white", "red", "green"])
+    used = {split: [light for view in views for name, light in view.uses if name == split] for split in get_args(Split)}
+    assert used["train"] == used["novel_view"] == ["red", "white", "red", "white"]
+    assert used["novel_pose"] == ["red"] * 2 and used["relight"] == ["green"]

@@ -25,7 +25,7 @@ from . import plan as plans
 from .cameras import VISIBLE_HEIGHT, ring_cameras
 from .dances import dance
 from .estimates import estimated_mask, estimated_normals
-from .lights import WHITE, StageLight, module_directions, stage_lights
+from .lights import StageLight, module_directions, stage_lights
 from .plan import Recipe, View
 
 Floats = NDArray[np.float64]
@@ -154,7 +154,7 @@ def recipe_for(recipe: Recipe, folder: Path) -> dict[str, Any]:
     named = [*motion, *recipe.hdr, *([] if recipe.character is None else [recipe.character])]
     digests = {name: sha256_of(name) for name in named}
     if file.exists():
-        theirs = _recipe_in(file)
+        theirs = json.loads(json.dumps(asdict(Recipe()))) | _recipe_in(file)
         earlier = theirs["sha256"]
         different = sorted(
             key
@@ -210,9 +210,10 @@ def _cast(recipe: Recipe, template: Body | None) -> tuple[Dressed, str]:
 def _chosen(recipe: Recipe) -> list[StageLight]:
     lights = stage_lights(tuple(Path(name) for name in recipe.hdr))
     names = [light.name for light in lights]
-    unknown = [name for name in recipe.lights if name not in names]
-    if unknown:
-        raise InputError("--lights", expected=", ".join(names), got=", ".join(unknown))
+    for what, chosen in (("--lights", recipe.lights), ("--train-lights", recipe.train_lights)):
+        unknown = [name for name in chosen if name not in names]
+        if unknown:
+            raise InputError(what, expected=", ".join(names), got=", ".join(unknown))
     given = {Path(name).stem for name in recipe.hdr}
-    wanted = {WHITE, *given, *(recipe.lights or names)}
+    wanted = {*recipe.train_lights, *given, *(recipe.lights or names)}
     return [light for light in lights if light.name in wanted]

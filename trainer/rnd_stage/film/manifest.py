@@ -118,6 +118,7 @@ def _readme(production: Production, variant: str, seconds: float | None) -> str:
     cost = "" if seconds is None else f" {seconds:.2f} s of processor time an image with its truth, cloth included."
     counts = {s: sum(use[0] == s for view in production.views for use in view.uses) for s in _SPLITS}
     splits = ", ".join(f"{name} {count}" for name, count in counts.items())
+    trained = " and ".join(recipe.train_lights)
     return f"""# {production.title}
 
 Made by `rnd-stage` (RnD-Avatar): all images are rendered. To reproduce:
@@ -129,8 +130,8 @@ self-shadowing and interreflection), distant light only, no ground. {image_count
 {splits}.{cost}
 Machine: {machine()}.
 
-Format `rnd-capture/1`. White light trains: the first four fifths of `cam00`; the same instants from the other cameras
-are the novel views, the last fifth from all cameras the novel poses, those under the other lights are relit.
+Format `rnd-capture/1`. Trained under {trained}: the first four fifths of `cam00`; the same instants from the other
+cameras are the novel views, the last fifth from all cameras the novel poses, those under the other lights are relit.
 
 | path | what |
 |---|---|

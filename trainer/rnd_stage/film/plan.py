@@ -43,6 +43,8 @@ class Recipe:
     """paths a pixel"""
     max_depth: Count = 5
     """of a path; 2 is direct light alone"""
+    train_lights: Annotated[tuple[str, ...], option("NAME ...")] = (WHITE,)
+    """names of the lights trained under; of several, instants take turns"""
     lights: Annotated[tuple[str, ...], option("NAME ...")] = ()
     """names of the relighting lights; by default all eight"""
     hdr: Annotated[tuple[str, ...], option("FILE ...")] = ()
@@ -68,6 +70,7 @@ class Recipe:
         if self.character is not None:
             refuse_changed(self, ["subject", "step"], "--character has its own")
         check_step(self.step)
+        check_option(len(self.train_lights) > 0, "--train-lights", "one name at least", "none")
         check_option(0 <= self.estimate_strength <= 10, "--estimate-strength", "0 to 10", self.estimate_strength)
 
 
@@ -128,26 +131,27 @@ def instants(recipe: Recipe, frame_count: int) -> list[int]:
 def plan(recipe: Recipe, frames: list[int], cameras: list[str], lights: list[str]) -> list[View]:
     """Every view, by instants.
 
-    As in the paper, the first four fifths of one camera's frames under white light train. These instants from all
-    other cameras are the novel views; the last fifth from every camera are the novel poses, and from some cameras
+    As in the paper, the first four fifths of one camera's frames under the training lights train. These instants from
+    all other cameras are the novel views; the last fifth from every camera are the novel poses, and from some cameras
     under the other lights the relit images.
     """
     split_at = max(1, int(TRAIN_SHARE * len(frames)))
     spread = np.linspace(0, len(cameras), min(recipe.relight_cameras, len(cameras)), endpoint=False)
     relit = {cameras[int(k)] for k in spread}
-    others = [light for light in lights if light != WHITE]
+    others = [light for light in lights if light not in recipe.train_lights]
     views = []
     for number, frame in enumerate(frames):
+        own = recipe.train_lights[number % len(recipe.train_lights)]
         training = number < split_at
         held_out = (number if training else number - split_at) % recipe.held_out_every == 0
         for camera in cameras:
             uses: list[tuple[Split, str]] = []
             if training and camera == TRAIN_CAMERA:
-                uses.append(("train", WHITE))
+                uses.append(("train", own))
             elif training and held_out:
-                uses.append(("novel_view", WHITE))
+                uses.append(("novel_view", own))
             elif not training and held_out:
-                uses.append(("novel_pose", WHITE))
+                uses.append(("novel_pose", own))
                 uses += [("relight", light) for light in others if camera in relit]
             if uses:
                 views.append(View(camera, frame, tuple(uses)))
