@@ -198,17 +198,18 @@ def test_every_person_counts_once() -> None:
     assert (ours["method"], ours["split"], ours["subjects"]) == ("ours", "novel_view", 2)
     assert ours["psnr"] == pytest.approx((31 + 21) / 2) and ours["ssim"] == pytest.approx((0.92 + 0.8) / 2)
     assert ours["psnr_spread"] == pytest.approx(2**0.5) and plain["psnr_spread"] is None
+    assert ours["psnr_subjects"] == pytest.approx(50**0.5)
     assert plain["psnr"] == pytest.approx(21) and plain["ssim"] is None
 
 
 @pytest.mark.slow
-def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(people, "METHODS", ("ours",))
+def test_people_are_trained_scored_and_nothing_is_done_twice(tiny_capture, tmp_path) -> None:
+    ours = [row for row in VARIANTS if row.name == "ours"]
     (tmp_path / "subject0").symlink_to(tiny_capture.folder)
     sizes = PeopleSizes(subjects=1, seeds=1, steps=4, gaussians=400)
-    result = people.run_study(sizes, tmp_path, perceptual=None, on_run=lambda *call: None)
+    result = people.run_study(sizes, tmp_path, ours, perceptual=None, on_run=lambda *call: None)
     assert all(row["subject"] == 0 and row["method"] == "ours" for row in result["rows"])
-    again = people.run_study(sizes, tmp_path, perceptual=None, on_run=lambda *call: None)
+    again = people.run_study(sizes, tmp_path, ours, perceptual=None, on_run=lambda *call: None)
     assert again["rows"] == result["rows"]
 
 
@@ -220,7 +221,7 @@ from rnd_bench.studies import people
 from rnd_runtime.cli.command import run_command
 people.prepare = lambda recipe, out: (out.mkdir(parents=True, exist_ok=True), SimpleNamespace(views=[]))[1]
 people.film = lambda production, out, on_image: (print("ready", flush=True), time.sleep(60))
-sizes = SimpleNamespace(subjects=1, recipe=lambda subject: None)
+sizes = SimpleNamespace(subjects=1, seeds_of_people=[0], recipe=lambda subject: None)
 sys.exit(run_command("rnd-bench", lambda: people.film_subjects(sizes, Path(sys.argv[1]), "llvm", print)))
 """
 

@@ -111,9 +111,10 @@ def run_people(options: People) -> None:
     need_extra()
     options.sizes.check()
     variant = use_variant(options.variant)
-    from .people import FIGURES, film_subjects, run_study
+    from .people import FIGURES, film_subjects, looks_before, run_study
 
-    perceptual = load_lpips(options.perceptual_weights)
+    variants = chosen(list({row.name: row for row in (*VARIANTS, *CAUSES)}.values()), options.methods)
+    perceptual, judge = load_lpips(options.perceptual_weights), load_lpips(options.judge_weights)
     output_folder(options.out)
     if options.json is not None:
         output_file(options.json)
@@ -127,9 +128,9 @@ def run_people(options: People) -> None:
         def on_run(what: str, done: float, total: int) -> None:
             progress.update(done, step=f"{what}, {done:.2f}/{total}")
 
-        result = run_study(options.sizes, options.out, perceptual=perceptual, on_run=on_run)
+        result = run_study(options.sizes, options.out, variants, perceptual=perceptual, judge=judge, on_run=on_run)
     if options.json is not None:
-        write_json(options.json, result)
+        write_json(options.json, {"looks": looks_before(options.json) + 1, **result})
     table = Table("method", "split", *FIGURES, title=f"means of {options.sizes.subjects} subjects")
     for line in result["means"]:
         cells = ("" if line[figure] is None else f"{line[figure]:.4g}" for figure in FIGURES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -75,7 +75,11 @@ class PeopleSizes:
     """Sizes of the study: by default two cores take 70 minutes for all of it, two thirds of it trainings."""
 
     subjects: Count = 4
-    """people, by their seeds from 0 on"""
+    """people"""
+    first: Count = 0
+    """seed of the first; 0 to 3 were developed with, those from 100 on are looked at once, for a table"""
+    hdr: Annotated[tuple[str, ...], option("FILE ...")] = ()
+    """lights of places: each person is filmed under the next of them and relit under the others"""
     seeds: Count = 3
     """trainings of the first of them with every method; of the others one"""
     size: Count = 256
@@ -103,13 +107,22 @@ class PeopleSizes:
 
     def recipe(self, subject: int) -> Recipe:
         """What is rendered of one subject."""
-        names = ("frames", "cameras", "size", "samples", "held_out_every", "relight_cameras")
-        return Recipe(subject=subject, visibility=False, **{name: getattr(self, name) for name in names})
+        names = ("frames", "cameras", "size", "samples", "held_out_every", "relight_cameras", "hdr")
+        own: dict[str, Any] = {name: getattr(self, name) for name in names}
+        if self.hdr:
+            places = [Path(file).stem for file in self.hdr]
+            own |= {"train_lights": (places[subject % len(places)],), "lights": tuple(places)}
+        return Recipe(subject=subject, visibility=False, **own)
+
+    @property
+    def seeds_of_people(self) -> range:
+        """Seeds of all people."""
+        return range(self.first, self.first + self.subjects)
 
 
 @dataclass(frozen=True)
 class People:
-    """Render four people on the light stage, train on one camera's white light, score the rest; resumes.
+    """Render people on the light stage, train on one camera's images, score the rest; resumes.
 
     rnd-bench study people out/people --json out/people.json
     """
@@ -118,8 +131,12 @@ class People:
     """folder for captures and trainings"""
     json: OptionalFile = None
     """write summary, cost and rows here"""
+    methods: Annotated[tuple[str, ...], option("NAME ...")] = ("ours", "static skinning", "LBS, plain colour")
+    """variants to train, such as "true light\""""
     perceptual_weights: OptionalFile = None
     """adds LPIPS to the metrics and to the training, as in rnd-train"""
+    judge_weights: OptionalFile = None
+    """another network for the metrics, which no training saw"""
     sizes: Annotated[PeopleSizes, tyro.conf.arg(name="")] = field(default_factory=PeopleSizes)
     variant: Variant = "auto"
     """Mitsuba's back end"""

@@ -23,18 +23,17 @@ from rnd_trainer.losses.perceptual import Perceptual
 from .options import PeopleSizes
 from .summary import summarise
 from .trainings import ablate
-from .variants import VARIANTS
+from .variants import StudyRow
 
-METHODS = ("ours", "static skinning", "LBS, plain colour")
 COST_FILE = "cost.json"
-FIGURES = ("psnr", "ssim", "lpips", "psnr_box", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
+FIGURES = ("psnr", "psnr_person", "ssim", "lpips", "psnr_n", "normal_deg", "psnr_albedo", "flicker")
 """metrics of rnd-eval, averaged over the subjects"""
 
 
 def film_subjects(sizes: PeopleSizes, folder: Path, variant: str, on_image: Callable[[int, int], None]) -> None:
     """Render the missing images of every subject; ``on_image`` is called with the numbers of images done and of all."""
     done, total = 0, None
-    for subject in range(sizes.subjects):
+    for subject in sizes.seeds_of_people:
         out = folder / f"subject{subject}"
         if (out / "capture.json").exists():
             recipe_for(sizes.recipe(subject), out)
@@ -81,22 +80,27 @@ class _Cost:
 
 
 def run_study(
-    sizes: PeopleSizes, folder: Path, *, perceptual: Perceptual | None, on_run: Callable[[str, float, int], None]
+    sizes: PeopleSizes,
+    folder: Path,
+    variants: Sequence[StudyRow],
+    *,
+    perceptual: Perceptual | None,
+    judge: Perceptual | None = None,
+    on_run: Callable[[str, float, int], None],
 ) -> dict[str, Any]:
-    """Train and score every method on every rendered subject: rows, summaries and cost.
+    """Train and score every variant on every rendered subject: rows, summaries and cost.
 
     ``on_run`` is called with the current training's name, the number of trainings done (a fraction) and of all.
     """
     started = time.perf_counter()
     base = resized(preset("quick"), sizes.gaussians, sizes.steps)
-    variants = [variant for variant in VARIANTS if variant.name in METHODS]
     total = (sizes.subjects - 1 + sizes.seeds) * len(variants)
     rows: list[dict[str, Any]] = []
     summaries: dict[str, list[dict[str, Any]]] = {}
     done = 0
-    for subject in range(sizes.subjects):
+    for subject in sizes.seeds_of_people:
         capture = load_capture(folder / f"subject{subject}")
-        seeds = tuple(range(sizes.seeds if subject == 0 else 1))
+        seeds = tuple(range(sizes.seeds if subject == sizes.first else 1))
 
         def on_training(
             name: str, seed: int, of_subject: float, _: int, subject: int = subject, before: int = done
@@ -110,10 +114,12 @@ def run_study(
             variants,
             seeds=seeds,
             perceptual=perceptual,
+            judge=judge,
             on_run=on_training,
         )
         done += len(seeds) * len(variants)
-        rows += [{**row, "subject": subject} for row in own]
+        light = capture.split("train")[0].light
+        rows += [{**row, "subject": subject, "train_light": light} for row in own]
         summaries[f"subject{subject}"] = summarise(own, variants)
     return {
         "options": dataclasses.asdict(sizes),
@@ -124,10 +130,16 @@ def run_study(
     }
 
 
+def looks_before(file: Path) -> int:
+    """How often the results in ``file`` were scored before: a test subject is looked at once."""
+    return int(json.loads(file.read_text(encoding="utf-8")).get("looks", 1)) if file.exists() else 0
+
+
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """A row for every method and split: FIGURES as means over the subjects, of each the mean over its seeds.
 
-    ``psnr_spread`` is the standard deviation over the first subject's seeds; a figure without rows is None.
+    ``psnr_spread`` is the standard deviation over the first subject's seeds, ``psnr_subjects`` over the subjects; a
+    figure without rows is None.
     """
     table = []
     for method, split in dict.fromkeys((row["method"], row["split"]) for row in rows):
@@ -140,6 +152,8 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
             each = [[row[figure] for row in of if row.get(figure) is not None] for of in by_subject.values()]
             each = [values for values in each if values]
             line[figure] = statistics.fmean(map(statistics.fmean, each)) if each else None
+        of_subjects = [statistics.fmean(row["psnr"] for row in of) for of in by_subject.values()]
+        line["psnr_subjects"] = statistics.stdev(of_subjects) if len(of_subjects) > 1 else None
         first = [row["psnr"] for row in by_subject[min(by_subject)]]
         line["psnr_spread"] = statistics.stdev(first) if len(first) > 1 else None
         table.append(line)
@@ -148,7 +162,7 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _cost(folder: Path, sizes: PeopleSizes, rows: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
     """Measured seconds per image, and hours of rendering and training; None where rnd-stage recorded no cost."""
-    files = [folder / f"subject{subject}" / COST_FILE for subject in range(sizes.subjects)]
+    files = [folder / f"subject{subject}" / COST_FILE for subject in sizes.seeds_of_people]
     filmed = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.exists()]
     images, filming, cpu = (sum(f[key] for f in filmed) for key in ("images", "seconds", "cpu_seconds"))
     trainings = {(row["subject"], row["method"], row["seed"]): row["minutes"] for row in rows}

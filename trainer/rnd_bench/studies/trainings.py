@@ -47,15 +47,17 @@ def ablate(
     seeds: Sequence[int],
     perceptual: Perceptual | None,
     consistency: Perceptual | None = None,
+    judge: Perceptual | None = None,
     mode: str = "table+sun",
     on_run: Callable[[str, int, float, int], None],
 ) -> list[dict[str, Any]]:
     """Train and score every variant with every seed; rows of rnd-eval with the encoder's cost.
 
-    The third stage is off by default. Runs with ``rows.json`` in ``folder/NAME-SEED`` are not repeated; those of other
-    studies are refused before any training. ``on_run`` is called with the variant's name, the seed, the number of runs
-    done (a fraction) and of all.
+    ``judge`` is the network of the scores, by default that of the training. The third stage is off by default. Runs
+    with ``rows.json`` in ``folder/NAME-SEED`` are not repeated; those of other studies are refused before any training.
+    ``on_run`` is called with the variant's name, the seed, the number of runs done (a fraction) and of all.
     """
+    judge = perceptual if judge is None else judge
     learned = {MOTION: Path(capture.motion.source).name, CAPTURE: sha256_of(capture.file)}
     rows: list[dict[str, Any]] = []
     jobs: list[tuple[StudyRow, int, TrainConfig, list[dict[str, Any]]]] = []
@@ -68,7 +70,7 @@ def ablate(
                 "gaussians": config.model.gaussians,
                 "image_scale": config.image_scale,
                 "shade": mode,
-                "lpips_weights_sha256": None if perceptual is None else perceptual.sha256,
+                "lpips_weights_sha256": None if judge is None else judge.sha256,
                 FEATURES: networks_sha256(consistency or perceptual),
                 **learned,
             }
@@ -94,7 +96,7 @@ def ablate(
             seen = _noisy(capture) if variant.noisy else capture
             extra = _train(seen, config, run_folder, perceptual, consistency, capture, on_share)
             checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
-            scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=perceptual)
+            scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=judge)
             cost = encoder_cost(checkpoint.model)
             write_json(run_folder / ROWS, [row | cost | extra for row in scored])
             found = _rows(run_folder)
