@@ -5,7 +5,7 @@ Install this file as an add-on (Edit, Preferences, Add-ons, Install from Disk). 
 * Motion: an armature whose bones have the names of the avatar's joints, such as that of ``rnd-convert mesh``; its
   animation is taken exactly. Any other armature is exported as BVH, which rnd-play retargets.
 * Camera: the scene's, in every frame. Light: the world's environment texture with its rotation and strength, or its
-  colour.
+  colour, and the lamps as they shine on the armature in the first frame: suns, and as far ones the others.
 * The frames return as an OpenEXR sequence: over the camera's view, and on request in the compositor, which shows what
   is nearer, the avatar or the scene's own render, by their depths.
 """
@@ -112,29 +112,91 @@ def export_camera(scene, folder):
     return path
 
 
-def export_light(scene, folder):
-    """The world's light as arguments of rnd-play; images that Blender alone has are written into ``folder``."""
+def export_light(scene, armature, folder):
+    """The scene's light as arguments of rnd-play; images that Blender alone has are written into ``folder``."""
     tree = scene.world.node_tree if scene.world else None
     nodes = list(tree.nodes) if tree else []
     background = next((node for node in nodes if node.type == "BACKGROUND"), None)
     strength = background.inputs["Strength"].default_value if background else 1.0
     texture = next((node for node in nodes if node.type == "TEX_ENVIRONMENT" and node.image), None)
-    arguments = ["--exposure", f"{math.log2(max(strength, 1e-6)):.6f}"]
+    arguments, yaw = ["--exposure", f"{math.log2(max(strength, 1e-6)):.6f}"], 0.0
+    mapping = next((node for node in nodes if node.type == "MAPPING"), None)
     if texture is None:
         colour = background.inputs["Color"].default_value[:3] if background else (0.05, 0.05, 0.05)
-        image = bpy.data.images.new("rnd_world", 64, 32, float_buffer=True, is_data=True)
-        image.pixels.foreach_set(np.tile(np.array([*colour, 1.0], np.float32), 64 * 32))
-        path = _saved(image, folder)
-        bpy.data.images.remove(image)
-        return ["--hdr", str(path), *arguments]
-    path = Path(bpy.path.abspath(texture.image.filepath))
-    if not path.is_file() or path.suffix.lower() not in (".exr", ".hdr"):
-        path = _saved(texture.image, folder)
-    mapping = next((node for node in nodes if node.type == "MAPPING"), None)
-    if mapping is not None:
+        pixels = np.tile(np.array(colour, np.float32), (32, 64, 1))
+    elif mapping is not None:
         yaw = mapping.inputs["Rotation"].default_value[2]
         arguments += ["--hdr-yaw", f"{math.degrees(yaw):.6f}"]
+    lamps = list(lamps_of(scene, _middle(armature)))
+    if texture is not None and not lamps:
+        path = Path(bpy.path.abspath(texture.image.filepath))
+        if not path.is_file() or path.suffix.lower() not in (".exr", ".hdr"):
+            path = _saved(texture.image, folder)
+        return ["--hdr", str(path), *arguments]
+    if texture is not None:
+        pixels = np.empty(4 * texture.image.size[0] * texture.image.size[1], np.float32)
+        texture.image.pixels.foreach_get(pixels)
+        pixels = pixels.reshape(texture.image.size[1], texture.image.size[0], 4)[..., :3]
+    if lamps:
+        arguments[1] = "0"
+        pixels = _with_lamps(strength * pixels, lamps, yaw)
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new("rnd_world", width, height, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.concatenate([pixels, np.ones((height, width, 1))], -1).astype(np.float32).ravel())
+    path = _saved(image, folder)
+    bpy.data.images.remove(image)
     return ["--hdr", str(path), *arguments]
+
+
+def _middle(armature):
+    """Where the armature's bones are, on average."""
+    heads = [armature.matrix_world @ bone.head for bone in armature.pose.bones]
+    return sum(heads, Vector()) / len(heads)
+
+
+def lamps_of(scene, place):
+    """Direction, irradiance across it (W/m², RGB) and angular radius (rad) of each lamp as seen from ``place``."""
+    for each in scene.objects:
+        if each.type != "LIGHT" or each.hide_render:
+            continue
+        lamp, matrix = each.data, each.matrix_world
+        power = np.array(lamp.color) * lamp.energy * 2 ** getattr(lamp, "exposure", 0.0)
+        if getattr(lamp, "use_temperature", False):
+            power = power * np.array(lamp.temperature_color)
+        backwards = matrix.to_3x3().normalized() @ Vector((0, 0, 1))  # lamps shine along their −Z
+        if lamp.type == "SUN":
+            yield backwards, power, lamp.angle / 2
+            continue
+        way = matrix.translation - place
+        distance, towards = max(way.length, 1e-3), way.normalized()
+        ahead, radius = towards.dot(backwards), lamp.shadow_soft_size if lamp.type != "AREA" else 0.0
+        share = 1 / (4 * math.pi)
+        if lamp.type == "SPOT":
+            share *= float(ahead > math.cos(lamp.spot_size / 2))
+        elif lamp.type == "AREA":
+            sides = matrix.to_scale()
+            across = lamp.size_y if lamp.shape in ("RECTANGLE", "ELLIPSE") else lamp.size
+            radius = math.sqrt(abs(lamp.size * sides[0] * across * sides[1]) / math.pi)
+            share = max(ahead, 0.0) / math.pi
+        if share > 0:
+            yield towards, share * power / distance**2, math.atan(radius / distance)
+
+
+def _with_lamps(pixels, lamps, yaw):
+    """World ``pixels`` [H, W, 3], from below, at least 512 wide, with discs of the lamps' irradiance."""
+    finer = -(-512 // pixels.shape[1])
+    pixels = np.repeat(np.repeat(pixels, finer, 0), finer, 1)
+    height, width = pixels.shape[:2]
+    up = (np.arange(height) + 0.5) / height * math.pi - math.pi / 2
+    round_ = (np.arange(width) + 0.5) / width * 2 * math.pi - math.pi + yaw
+    flat = np.stack([np.cos(round_), -np.sin(round_), np.zeros(width)], -1)
+    texels = np.cos(up)[:, None, None] * flat + np.sin(up)[:, None, None] * np.array([0, 0, 1.0])
+    solid = np.cos(up)[:, None] * (math.pi / height) * (2 * math.pi / width)
+    for direction, irradiance, radius in lamps:
+        cosine = texels @ np.array(direction)
+        disc = solid * np.clip(cosine, 0, 1) * (cosine >= min(math.cos(max(radius, math.pi / height)), cosine.max()))
+        pixels = pixels + (disc > 0)[..., None] * irradiance / disc.sum()
+    return pixels
 
 
 def _saved(image, folder):
@@ -164,7 +226,8 @@ def render(scene, settings, progress=lambda line: None):
     try:
         motion = export_motion(scene, armature, folder)
         camera = export_camera(scene, folder)
-        light = export_light(scene, folder)
+        scene.frame_set(scene.frame_start)
+        light = export_light(scene, armature, folder)
     finally:
         scene.frame_set(current)
     out = folder / "frames"

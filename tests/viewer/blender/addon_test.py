@@ -17,6 +17,8 @@ import pytest
 
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.motion.motion import load_motion
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import texel_directions, texel_solid_angles
 from rnd_viewer.convert.cameras import read_cameras
 from rnd_viewer.convert.cli import main
 from rnd_viewer.inputs.cameras import file_path
@@ -25,6 +27,7 @@ from support.paths import ROOT
 from support.tiny import ASSETS
 
 ADDON, SCENE = ROOT / "viewer/blender/rnd_avatar.py", ROOT / "tests/support/blender_scene.py"
+LAMPS = ROOT / "tests/support/blender_lamps.py"
 BLENDER = os.environ.get("BLENDER_PYTHON") or (sys.executable if importlib.util.find_spec("bpy") else None)
 needs_blender = pytest.mark.skipif(BLENDER is None, reason="BLENDER_PYTHON names no Python with the module bpy")
 FRAMES, SIZE, YAW, STRENGTH = (18, 20), (160, 200), 1.2, 1.5
@@ -50,16 +53,19 @@ def test_blender_finds_what_it_needs_in_the_file():
     assert imported <= {"bpy", "numpy", "mathutils", *sys.stdlib_module_names}
 
 
+def _run(script: Path, told: dict) -> dict:
+    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    line = [str(BLENDER), str(script), json.dumps(told)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, env=own)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return json.loads(next(row for row in done.stdout.splitlines() if row.startswith("{")))
+
+
 def _blender(out: Path, **told) -> dict:
     program = Path(sys.executable).with_name("rnd-play")
     values = {"glb": "", "hdr": str(ASSETS / "sky.exr"), "yaw": YAW, "strength": STRENGTH, "composite": False}
     values |= {"addon": str(ADDON), "avatar": str(ASSETS / "avatar.onnx"), "program": str(program), "out": str(out)}
-    values |= {"frames": FRAMES, "size": SIZE} | told
-    line = [str(BLENDER), str(SCENE), json.dumps(values)]
-    own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(line, capture_output=True, text=True, check=False, env=own)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    return json.loads(next(row for row in done.stdout.splitlines() if row.startswith("{")))
+    return _run(SCENE, values | {"frames": FRAMES, "size": SIZE} | told)
 
 
 @pytest.fixture(scope="module")
@@ -136,3 +142,24 @@ def test_a_foreign_armature_and_a_plain_world_are_exported_or_refused(tmp_path):
     assert (tmp_path / "motion.bvh").is_file()
     probe = oiio.ImageBuf(str(tmp_path / "world.exr")).get_pixels("float")
     np.testing.assert_allclose(probe[..., :3].reshape(-1, 3).mean(axis=0), [0.2, 0.4, 0.6], atol=1e-3)
+
+
+@needs_blender
+@pytest.mark.slow
+def test_lamps_light_as_cycles_renders_them(tmp_path):
+    """Irradiance of a floor below each kind of lamp; a sun in the exported map has it too, and the sun's direction."""
+    told = _run(LAMPS, {"addon": str(ADDON), "out": str(tmp_path)})
+    for kind, row in told["lamps"].items():
+        np.testing.assert_allclose(row["ours"], row["cycles"], rtol=0.03, err_msg=kind)
+    sun = told["lamps"]["SUN"]
+    assert sun["radius"] == pytest.approx(math.radians(2))
+    assert told["arguments"][0] == "--hdr" and told["arguments"][2:] == ["--exposure", "0"]
+    light = load_light(told["arguments"][1])
+    radiance, shape = light.radiance, light.radiance.shape[:2]
+    texels, solid = texel_directions(*shape), texel_solid_angles(*shape)
+    bright = np.where(radiance[..., :1] > 10, radiance, 0)
+    x, y, z = sun["direction"]
+    cosine = texels @ np.array([x, z, -y])
+    across = (bright * (solid * cosine)[..., None]).sum((0, 1))
+    np.testing.assert_allclose(across, [3, 1.5, 0.75], rtol=0.01)
+    assert np.degrees(np.arccos(cosine[bright[..., 0] > 0].min())) < 2.5
