@@ -44,7 +44,7 @@ VARIANTS = (
     StudyRow("ours", "everything, L_gc too", "+ D_W"),
     StudyRow(
         "LBS, plain colour",
-        "template skinning and colours that no light changes: the core of 3DGS-Avatar and GauHuman",
+        "plain colours on linear blend skinning, the same under every light",
         "ours",
         {"dynamic_skinning": False},
         {"light": "none", **_NO_GC},
