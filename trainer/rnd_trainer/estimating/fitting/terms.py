@@ -95,43 +95,6 @@ class PointTerm:
         return self.weight * cost
 
 
-@dataclass(frozen=True, eq=False)
-class PositionTerm:
-    """The marks against known positions [T, P, 3] m with ``deviation`` [T, P] m, infinite where unknown."""
-
-    positions: Floats
-    deviation: Floats
-    limit: float = 4.0
-
-    def __call__(
-        self,
-        state: State,
-        posed: Posed,
-        figure: Figure,
-        marks: Marks,
-        layout: Layout,
-        equations: NormalEquations | None,
-    ) -> float:
-        points = mark_points(state, posed, marks)
-        inverse = 1 / self.deviation
-        residual = (points - self.positions) * inverse[..., None]
-        cost, kept = robust((residual**2).sum(-1), self.limit)
-        if equations is not None:
-            local = point_derivative(posed, points, marks.joints, layout.active) * inverse[..., None, None]
-            shared = np.zeros((*residual.shape, layout.shared))
-            shared[..., layout.shape] = marks_by_shape(posed, figure, marks) * inverse[..., None, None]
-            by_offset = posed.world[:, marks.joints] @ layout.offset_derivative()
-            shared[..., layout.offsets] = by_offset * inverse[..., None, None]
-            count = len(residual)
-            equations.add(
-                residual.reshape(count, -1),
-                np.repeat(kept, 3, axis=1),
-                local.reshape(count, -1, layout.unknowns),
-                shared.reshape(count, -1, layout.shared),
-            )
-        return cost
-
-
 def mark_points(state: State, posed: Posed, marks: Marks) -> Floats:
     """World positions [T, P, 3] of the marks."""
     places = marks.places + np.tensordot(state.shape, marks.basis, 1) + state.offsets
@@ -190,14 +153,12 @@ class SharedTerm:
     Attributes:
         weight: of the priors; errors of one video's landmarks are alike in all its frames, so it grows with them.
         height: of the body, m; by default the template's, as one camera does not tell the scale.
-        scale_known: whether the data tell the scale; the height is then a parameter like the others.
         tilt: rad, deviation of the ground from the camera's level.
     """
 
     lens: Lens
     weight: float = 1.0
     height: float | None = None
-    scale_known: bool = False
     tilt: float = 0.15
     height_deviation: float = 0.003
 
@@ -214,7 +175,7 @@ class SharedTerm:
         matrix = np.diag(inverse)
         residual = inverse * values
         weight = np.full(len(residual), self.weight)
-        if "height" in figure.names and not self.scale_known:
+        if "height" in figure.names:
             vertices, basis = figure.body.vertices[:, 1], figure.vertex_basis[..., 1]
             high, low = vertices.argmax(), vertices.argmin()
             row = np.zeros(layout.shared)
