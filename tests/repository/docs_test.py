@@ -143,7 +143,8 @@ def test_links_resolve(page):
 def test_sources_that_are_named_exist(page):
     text = _text(page)
     for name in re.findall(r"`(?:\w+/)*(\w+\.py)`", text):
-        assert list(ROOT.glob(f"*/rnd_*/**/{name}")) or list(ROOT.glob(f"assets/make/{name}")), (_name(page), name)
+        folders = ("*/rnd_*/**", "assets/make", "scripts")
+        assert any(list(ROOT.glob(f"{folder}/{name}")) for folder in folders), (_name(page), name)
     for name in re.findall(r"\btests/[\w/]+\w(?:\.py)?", FENCED.sub(lambda block: block["reason"] or "", text)):
         assert (ROOT / name).exists(), (_name(page), name)
 
