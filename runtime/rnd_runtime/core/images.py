@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _SMALL_IMAGE = 1 << 20  # bytes of pixels that need no such check
 _PIXEL_TYPES = ("uint8", "uint16", "half", "float")  # OpenImageIO would divide others by their largest value
 _PIXEL_BYTES = {"uint8": 1, "uint16": 2, "float": 4}  # as read
+_MOST_PARTS = 32  # of a file, that are named
 _STRIP = 256  # rows: OpenEXR's DWAB decodes as many at once
 # Codecs of OpenEXR without such a bound (even pixels in DWAB: 7200 : 1), and the most bytes of pixels in them.
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
@@ -67,12 +68,17 @@ class ImageHeader:
     channels: tuple[str, ...]
     pixel_type: str  # uint8, uint16, half, float, …
     chromaticities: tuple[float, ...] | None = None  # x, y of red, green, blue and white, of an EXR
+    left_out: tuple[str, ...] = ()  # further images of the file, as an EXR's parts, by name
 
 
 def read_header(path: str | Path) -> ImageHeader:
     """The size and channel names of an image file, without decoding it."""
     with _opened(path) as source:
-        return _checked_header(source.spec(), path)
+        header = _checked_header(source.spec(), path)
+        others = list[str]()
+        while len(others) < _MOST_PARTS and source.seek_subimage(len(others) + 1, 0):
+            others.append(source.spec().getattribute("oiio:subimagename") or f"part {len(others) + 2}")
+    return replace(header, left_out=tuple(map(str, others)))
 
 
 def read_image(path: str | Path) -> Image:

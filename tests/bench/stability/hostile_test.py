@@ -16,7 +16,7 @@ from rnd_bench.stability.fuzzing import run as module
 from rnd_bench.stability.fuzzing.damage import Random, damage
 from rnd_bench.stability.fuzzing.honest import write_files
 from rnd_bench.stability.fuzzing.readers import READERS
-from rnd_bench.stability.fuzzing.run import fuzz
+from rnd_bench.stability.fuzzing.run import figures_of, fuzz
 from rnd_bench.stability.kill import incomplete_files
 from rnd_bench.stability.processes import environment
 from rnd_runtime.core.errors import InputError
@@ -37,9 +37,9 @@ def honest(subject):
 
 @pytest.mark.parametrize("reader", ALONE)
 def test_broken_files_are_refused_or_read_by_a_process_that_may_die(reader, honest):
-    figures, record = fuzz(honest, INPUTS, (reader,))
+    record = fuzz(honest, INPUTS, (reader,))
     assert record[reader]["inputs"] == INPUTS and record[reader]["refused"] > 0
-    assert [figure for figure in figures if not figure.passes] == []
+    assert [figure for figure in figures_of(record) if not figure.passes] == []
 
 
 @pytest.mark.parametrize("name", [name for name in READERS if name not in ALONE])
@@ -63,8 +63,8 @@ def test_batches_that_were_fed_are_not_fed_again(honest, monkeypatch):
     monkeypatch.setattr(module, "BATCH", 6)
     fed, batch = [], module._batch
     monkeypatch.setattr(module, "_batch", lambda *words: fed.append(words) or batch(*words))
-    first = fuzz(honest, 12, ("hdr",))[1]
-    again = fuzz(honest, 20, ("hdr",))[1]
+    first = fuzz(honest, 12, ("hdr",))
+    again = fuzz(honest, 20, ("hdr",))
     assert [(seed, size) for _, _, seed, size in fed] == [(0, 6), (1, 6), (2, 6), (3, 2)]
     assert first["hdr"]["inputs"] == 12 and again["hdr"]["inputs"] == 20
     assert again["hdr"]["refused"] >= first["hdr"]["refused"]

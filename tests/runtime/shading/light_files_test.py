@@ -6,6 +6,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from numpy.testing import assert_allclose
 
@@ -142,3 +143,27 @@ def _luminance_chroma(path: Path) -> Path:
 def test_luminance_and_chroma_are_refused_by_name(tmp_path):
     with pytest.raises(InputError, match=r"a\.exr: .*(luminance and chroma|ubsampled)"):
         load_light(_luminance_chroma(tmp_path / "a.exr"))
+
+
+@pytest.mark.parametrize("first", ["RGB", "Z"])
+def test_of_several_parts_the_first_is_read_and_the_others_named(tmp_path, first):
+    """As Nuke writes them: a light is noted, another first part is refused with the reason."""
+    path, size = tmp_path / "a.exr", (8, 4)
+    specs = [oiio.ImageSpec(*size, len(names), "half") for names in (first, "RGB")]
+    for spec, names, part in zip(specs, (first, "RGB"), ("rgba", "specular")):
+        spec.channelnames = tuple(names)
+        spec.attribute("oiio:subimagename", part)
+    target = oiio.ImageOutput.create(str(path))
+    assert target.open(str(path), tuple(specs))
+    for k, spec in enumerate(specs):
+        if k:
+            assert target.open(str(path), spec, "AppendSubimage")
+        assert target.write_image(np.full((4, 8, spec.nchannels), 1.0 + k, np.float32))
+    target.close()
+    told = "of the light's file the first part is read; left out: specular"
+    if first == "RGB":
+        light = load_light(path)
+        assert told in light.notes and (light.radiance == 1).all()
+    else:
+        with pytest.raises(InputError, match=told):
+            load_light(path)

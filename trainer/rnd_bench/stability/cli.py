@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -153,7 +154,7 @@ def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
 
     from .fuzzing.honest import COMPLETE, write_files
     from .fuzzing.readers import READERS
-    from .fuzzing.run import batches, fuzz
+    from .fuzzing.run import batches, figures_of, fuzz
     from .processes import export, run_commands
     from .small import studio, train_small
 
@@ -169,6 +170,9 @@ def _fuzz(options: Stability, subject: Subject) -> Sequence[Figure]:
     done = count()
     with Progress() as progress:
         progress.phase("broken files", len(names) * batches(options.fuzz))
-        figures, record = fuzz(folder / "files", options.fuzz, names, lambda: progress.update(next(done) + 1))
-    write_json(options.json.with_name("stability_fuzz.json"), record)
-    return figures
+        record = fuzz(folder / "files", options.fuzz, names, lambda: progress.update(next(done) + 1))
+    file = options.json.with_name("stability_fuzz.json")
+    if file.exists():  # other readers stay
+        record = json.loads(file.read_text(encoding="utf-8")) | record
+    write_json(file, record)
+    return figures_of(record)

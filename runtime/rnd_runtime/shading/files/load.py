@@ -73,8 +73,11 @@ def _read(path: str | Path, name: str | Path, across: bool = False) -> tuple[Flo
 
     ``across``: the file stores the transposed map, which is refused for large maps.
     """
+    parts = None
     try:
         header = read_header(path)
+        if header.left_out:
+            parts = f"of the light's file the first part is read; left out: {', '.join(header.left_out)}"
         channels, notes = colour_channels(header.channels, name)
         width, height = (header.height, header.width) if across else (header.width, header.height)
         if width != 2 * height:
@@ -84,7 +87,9 @@ def _read(path: str | Path, name: str | Path, across: bool = False) -> tuple[Flo
             raise InputError("large light probe", expected="rows from left to right", got="columns", file=name)
         radiance, repaired, cut = (_read_reduced if large else _read_whole)(path, header, channels)
     except InputError as error:
-        raise InputError(error.what, expected=error.expected, got=error.got, file=name, hint=error.hint) from error
+        hint = error.hint or parts
+        raise InputError(error.what, expected=error.expected, got=error.got, file=name, hint=hint) from error
+    notes += () if parts is None else (parts,)
     return radiance, repaired, notes + colour_notes(header.chromaticities) + _cut_notes(cut)
 
 

@@ -43,6 +43,7 @@ def feed(name: str, count: int, seed: int, valid: Path, own: Path) -> dict[str, 
     limit = pages * resource.getpagesize() + SPARE_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     _watch(own, report["audit"])
+    begun = process_time()
     for _ in range(count):
         content = damage(rng, honest, reader.mutation)
         broken.write_bytes(content)
@@ -61,6 +62,7 @@ def feed(name: str, count: int, seed: int, valid: Path, own: Path) -> dict[str, 
         report["slowest_s"] = max(report["slowest_s"], process_time() - started)
         signal.setitimer(signal.ITIMER_PROF, 0)
         report["inputs"] += 1
+    report["seconds"] = process_time() - begun
     report["grown_bytes"] = _peak_bytes() - before
     return report
 

@@ -6,12 +6,12 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rnd_bench.scenes.avatars import content_key, sources
-from rnd_bench.stability.figures import Figure, at_most, holds
+from rnd_bench.stability.figures import Figure, at_most, holds, reported
 from rnd_bench.stability.processes import environment
 from rnd_runtime.core.files import write_json
 
@@ -26,14 +26,18 @@ SLOW_S = 5.0
 
 def fuzz(
     folder: Path, count: int, names: Sequence[str] = tuple(READERS), on_batch: Callable[[], object] = lambda: None
-) -> tuple[list[Figure], dict[str, Any]]:
-    """Feed ``count`` damaged files to each of the readers ``names``; figures and the record.
+) -> dict[str, Any]:
+    """Feed ``count`` damaged files to each of the readers ``names``; the record by reader.
 
     ``folder`` has the valid files. Results of batches are stored beside it, so that an interrupted run resumes.
     """
-    figures, record = [], {}
-    for name in names:
-        total = record[name] = _all_batches(folder, name, count, on_batch)
+    return {name: _all_batches(folder, name, count, on_batch) for name in names}
+
+
+def figures_of(record: Mapping[str, Any]) -> list[Figure]:
+    """Figures of a ``record`` of ``fuzz``."""
+    figures = []
+    for name, total in record.items():
         faults = [f"{len(total['died'])} processes died"] * bool(total["died"])
         faults += list(total["escaped"]) + total["audit"]
         what = f"{name}: {total['inputs']} inputs, {total['refused']} refused"
@@ -42,7 +46,9 @@ def fuzz(
             at_most(f"{name}: slowest input", total["slowest_s"], SLOW_S, "s of processor time"),
             at_most(f"{name}: peak memory above that of the valid file", total["grown_bytes"] / 2**20, MEMORY_MB, "MB"),
         ]
-    return figures, record
+        if seconds := total.get("seconds"):
+            figures.append(reported(f"{name}: inputs a second of processor time", total["inputs"] / seconds))
+    return figures
 
 
 def batches(count: int) -> int:
@@ -50,7 +56,7 @@ def batches(count: int) -> int:
 
 
 def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], object]) -> dict[str, Any]:
-    counts, largest = ("inputs", "refused", "read"), ("slowest_s", "grown_bytes")
+    counts, largest = ("inputs", "refused", "read", "seconds"), ("slowest_s", "grown_bytes")
     total: dict[str, Any] = {**dict.fromkeys((*counts, *largest), 0), "died": [], "escaped": {}, "audit": []}
     key = content_key(*sources("rnd_runtime"), *sources("rnd_trainer"))
     results = folder.with_name("results")
@@ -66,7 +72,7 @@ def _all_batches(folder: Path, name: str, count: int, on_batch: Callable[[], obj
             total["died"].append(batch["died"])
             continue
         for what in counts:
-            total[what] += batch[what]
+            total[what] += batch.get(what, 0)  # older batches lack the seconds
         for what in largest:
             total[what] = max(total[what], batch[what])
         total["escaped"] |= batch["escaped"]

@@ -24,7 +24,7 @@ from rnd_bench.scenes.lights import sun_and_sky
 from rnd_bench.scenes.subject import Subject
 from rnd_bench.stability.figures import Result, at_most, below, holds, refusal, result
 from rnd_bench.stability.fuzzing.honest import COMPLETE, write_files
-from rnd_bench.stability.fuzzing.run import fuzz
+from rnd_bench.stability.fuzzing.run import figures_of, fuzz
 from rnd_bench.stability.processes import environment
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.errors import InputError
@@ -65,9 +65,9 @@ def valid_files(subject: Subject) -> Path:
 
 def calibration_text(subject: Subject) -> Result:
     """H1: damaged calibration files of OpenCV, in a process that may die."""
-    figures, record = fuzz(valid_files(subject), subject.few(40, 5000), ("calibration",))
+    record = fuzz(valid_files(subject), subject.few(40, 5000), ("calibration",))
     died = len(record["calibration"]["died"])
-    return result(at_most("processes that damaged calibrations end", died, 0), *figures)
+    return result(at_most("processes that damaged calibrations end", died, 0), *figures_of(record))
 
 
 def bombs(subject: Subject) -> Result:
