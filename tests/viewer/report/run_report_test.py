@@ -133,6 +133,9 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     images = _images(page, tmp_path)
     assert {"learned light, 0°", "learned light, 270°", "sky", "albedo", "roughness"} <= set(images)
     assert (images["sky"] != images["learned light, 0°"]).any()
+    for seldom in ("back of the head", "left palm", "right sole"):
+        shown = images[seldom].max(-1) > 0
+        assert shown.mean() > 0.1 and shown[96:128, 96:128].all(), seldom  # the camera looks at it
     strips = [name for name in images if name.startswith("truth, ")]
     assert strips == ["truth, a", "truth, b", "truth, c"]  # three of four, spread
     for what, value in (("truth", 200), ("render", 100), ("normals", 50), ("albedo", 150), ("error", 90)):

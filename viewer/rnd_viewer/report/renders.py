@@ -1,4 +1,4 @@
-"""Images of a report: a turntable clip, one pose under rotated and other lights, and the materials."""
+"""Images of a report: a turntable clip, a pose under rotated and other lights, materials, seldom seen surfaces."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.signals import temporary_folder
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path, orbit_path
+from rnd_runtime.playback.framing import FIELD_OF_VIEW, CameraOptions, frame_motion, front_path, orbit_path
 from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, Up, light_notes
 from rnd_viewer.play.video import clip_writer
@@ -25,6 +26,16 @@ SIDE, FPS, SECONDS = 448, 24, 5.0
 YAWS = (0, 90, 180, 270)  # degrees: the learned light from four sides
 AOVS = ("albedo", "normal", "roughness", "visibility")
 MODE = "table+sun"
+CLOSE_UPS = {
+    "back of the head": ("head", (0, 0.1, 0), (0, 0.1, -1)),
+    "under the chin": ("head", (0, 0.05, 0), (0, -0.8, 1)),
+    "left palm": ("left_wrist", (0.08, 0, 0), (0, -1, 0.3)),
+    "right palm": ("right_wrist", (-0.08, 0, 0), (0, -1, 0.3)),
+    "left sole": ("left_ankle", (0, -0.05, 0.05), (0, -1, 0.3)),
+    "right sole": ("right_ankle", (0, -0.05, 0.05), (0, -1, 0.3)),
+}
+"""surfaces that a video seldom shows: a joint in the rest pose, the offset from it in m, the direction to the camera"""
+CLOSE_UP_SIDE, CLOSE_UP_DISTANCE = 224, 0.65  # pixels, m
 
 
 class AvatarRenders:
@@ -37,11 +48,7 @@ class AvatarRenders:
     def __init__(self, avatar_file: Path, read_motion: Callable[[Skeleton], Motion] | None) -> None:
         self.avatar = Avatar.load(avatar_file)
         skeleton = self.avatar.skeleton
-        self.motion = (
-            Motion(np.tile(np.eye(3), (1, len(skeleton), 1, 1)), np.zeros((1, 3)), FPS, skeleton.names)
-            if read_motion is None
-            else read_motion(skeleton)
-        )
+        self.motion = _rest_pose(skeleton) if read_motion is None else read_motion(skeleton)
         self.notes = list(self.motion.notes)
         view = CameraOptions(SIDE, SIDE)
         framing = frame_motion(skeleton, self.motion)
@@ -89,3 +96,22 @@ class AvatarRenders:
         for name, values in frame.aovs.items():
             image = aov_image(name, values, frame.alpha)
             yield name, np.ascontiguousarray(np.broadcast_to(image, (*image.shape[:2], 3)))
+
+    def close_ups(self) -> Iterator[tuple[str, Bytes]]:
+        """Captions and images of the albedo of ``CLOSE_UPS`` in the rest pose, of the joints that the skeleton has."""
+        skeleton = self.avatar.skeleton
+        at_rest = _rest_pose(skeleton)
+        fov = math.radians(FIELD_OF_VIEW)
+        with self._renderer("ao") as renderer:
+            for caption, (joint, offset, direction) in CLOSE_UPS.items():
+                if joint not in skeleton.names:
+                    continue
+                target = skeleton.rest_joints[skeleton.names.index(joint)] + offset
+                eye = target + CLOSE_UP_DISTANCE * np.array(direction) / np.linalg.norm(direction)
+                camera = Camera.look_at(eye, target, width=CLOSE_UP_SIDE, height=CLOSE_UP_SIDE, fov_y=fov)
+                frame = renderer.render(at_rest, 0.0, camera, aovs=("albedo",))
+                yield caption, np.ascontiguousarray(aov_image("albedo", frame.aovs["albedo"], frame.alpha))
+
+
+def _rest_pose(skeleton: Skeleton) -> Motion:
+    return Motion(np.tile(np.eye(3), (1, len(skeleton), 1, 1)), np.zeros((1, 3)), FPS, skeleton.names)

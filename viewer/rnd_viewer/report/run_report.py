@@ -138,9 +138,11 @@ def _turntable_and_relights(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_
     else:
         cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
     materials = [figure(png(image, caption), caption) for caption, image in renders.materials()]
+    close_ups = [figure(png(image, caption), caption) for caption, image in renders.close_ups()]
     html = (
         f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
         f'<h3>Materials</h3><div class="grid tiles">{"".join(materials)}</div>'
+        f'<h3>What videos seldom show: albedo</h3><div class="grid small">{"".join(close_ups)}</div>'
     )
     return html + "".join(f"<p>Note: {escape(note)}</p>" for note in renders.notes)
 
