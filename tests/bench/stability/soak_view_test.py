@@ -10,6 +10,6 @@ from support.paths import ASSETS
 
 @pytest.mark.slow
 def test_clients_come_and_go():
-    growth, usual, longest, refused, ended = soak_view(SimpleNamespace(avatar_file=ASSETS / "avatar.onnx"), 0.1)
+    growth, usual, longest, refused, ended, to_end = soak_view(SimpleNamespace(avatar_file=ASSETS / "avatar.onnx"), 0.1)
     assert growth.measured is None  # too few
-    assert usual.measured <= longest.measured and refused.passes and ended.passes
+    assert usual.measured <= longest.measured and refused.passes and ended.passes and to_end.passes

@@ -39,8 +39,8 @@ WARM = 1200
 """clients before memory is watched: each thread of the server takes an arena of malloc's"""
 EVERY = 20
 """clients between two readings of memory"""
-PAUSE_S = 0.5
-"""between two clients: an hour of them takes a tenth of a core"""
+PAUSE_S = 0.1
+"""between two clients: they and the server take a tenth of a core"""
 RETRY_S = 0.05
 """until a refused client comes again"""
 TRIES = 20
@@ -67,6 +67,8 @@ def soak_view(subject: Subject, minutes: float) -> list[Figure]:
             clients += 1
             sleep(PAUSE_S)
         ended = process.poll() is not None
+        _close_all(idle)
+        seconds_to_end = _end(process)
     name = f"rnd-view, {clients} clients in {minutes:.3g} minutes"
     growth = f"{name}: memory a client"
     slope = np.polyfit(EVERY * np.arange(len(memory)), memory, 1)[0] if len(memory) > 10 else None
@@ -76,6 +78,7 @@ def soak_view(subject: Subject, minutes: float) -> list[Figure]:
         replace(below(f"{name}: longest answer to a page", max(seconds), ANSWER_S, "s"), timing=True),
         reported(f"{name}: connections refused, then taken", refused),
         at_most(f"{name}: ended early", int(ended), 0),
+        replace(below(f"{name}: time to end after SIGTERM", seconds_to_end, PATIENCE_S, "s"), timing=True),
     ]
 
 
@@ -101,10 +104,18 @@ def _viewer(avatar: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
             if not line.startswith("rnd-view: http://"):
                 raise InputError("rnd-view does not start", got=line.strip() or f"exit {process.wait()}")
             yield line.removeprefix("rnd-view: ").strip(), process
-            process.send_signal(signal.SIGTERM)
-            process.wait(PATIENCE_S)
         finally:
-            process.kill()
+            _end(process)
+
+
+def _end(process: subprocess.Popen[str]) -> float:
+    """Seconds in which ``process`` ends after SIGTERM; it is killed where that takes longer than ``PATIENCE_S``."""
+    started = perf_counter()
+    process.send_signal(signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(PATIENCE_S)
+    process.kill()
+    return perf_counter() - started
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rnd_bench.scenes.subject import Subject
-from rnd_bench.stability.figures import Result, at_most, below, holds, reported, result
+from rnd_bench.stability.figures import Figure, Result, at_most, below, holds, reported, result
 from rnd_bench.stability.processes import EXPORT, PLAY, TRAIN, Command, environment, export, play
 from rnd_bench.stability.small import studio
 from rnd_bench.stability.soak_view import visit_idle
@@ -74,31 +74,35 @@ def no_home(subject: Subject) -> Result:
 
 def signals(subject: Subject) -> Result:
     """H3: SIGINT, SIGTERM and SIGHUP at random moments of each command."""
-    folder, rng = subject.work / "signals", np.random.default_rng(4)
+    names = ["rnd-play", "rnd-convert", "rnd-view", "rnd-export", "rnd-train", "rnd-data"][: subject.few(1, 6)]
+    return result(*(signals_to(subject, name, subject.few(1, 50)) for name in names))
+
+
+def signals_to(subject: Subject, name: str, count: int) -> Figure:
+    """The figure of H3 for the command ``name``, signalled ``count`` times."""
+    folder, rng, wrong, sent = subject.work / "signals" / name, np.random.default_rng(4), list[str](), 0
     folder.mkdir(parents=True, exist_ok=True)
-    out, motion, capture = folder / "out", _motion_file(subject, folder, 4.0), studio(subject).folder
-    commands: dict[str, Command] = {
-        "rnd-play": play(subject.avatar_file, motion, out, "--size", 64, "--format", "png,exr,mp4"),
-        "rnd-convert": (
-            CONVERT,
-            ["splats", str(subject.avatar_file), "--motion", str(motion), "--out", str(out), "--frames", "0:100"],
-        ),
-        "rnd-view": (VIEWER, [str(subject.avatar_file), "--port", "0", "--no-browser", "--size", "64"]),
-        "rnd-export": export(subject.checkpoint, out / "avatar.onnx"),
-        "rnd-train": (TRAIN, [str(capture), "--out", str(out), "--preset", "quick", "--gaussians", "400"]),
-        "rnd-data": (DATA, ["check", str(capture), "--out", str(out)]),
-    }
-    figures = []
-    for name, command in list(commands.items())[: subject.few(1, len(commands))]:
-        wrong, sent = list[str](), 0
-        for k in range(subject.few(1, 50)):
-            shutil.rmtree(out, ignore_errors=True)
-            fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0, MOMENTS_S)))
-            sent += fault is not None
-            wrong += [fault] if fault else []
-            wrong += [f"left {file.name}" for file in out.rglob(".*") if not file.name.startswith(".run-")]
-        figures.append(holds(f"{name}: {sent} signals that did not end it in one line with its code", wrong))
-    return result(*figures)
+    out, motion, avatar = folder / "out", _motion_file(subject, folder, 4.0), str(subject.avatar_file)
+    if name == "rnd-play":
+        command = play(subject.avatar_file, motion, out, "--size", 64, "--format", "png,exr,mp4")
+    elif name == "rnd-convert":
+        command = CONVERT, ["splats", avatar, "--motion", str(motion), "--out", str(out), "--frames", "0:100"]
+    elif name == "rnd-view":
+        command = VIEWER, [avatar, "--port", "0", "--no-browser", "--size", "64"]
+    elif name == "rnd-export":
+        command = export(subject.checkpoint, out / "avatar.onnx")
+    elif name == "rnd-train":
+        words = ["--out", str(out), "--preset", "quick", "--gaussians", "400"]
+        command = TRAIN, [str(studio(subject).folder), *words]
+    else:
+        command = DATA, ["check", str(studio(subject).folder), "--out", str(out)]
+    for k in range(count):
+        shutil.rmtree(out, ignore_errors=True)
+        fault = _interrupted(command, folder, _NUMBERS[k % 3], float(rng.uniform(0, MOMENTS_S)))
+        sent += fault is not None
+        wrong += [fault] if fault else []
+        wrong += [f"left {file.name}" for file in out.rglob(".*") if not file.name.startswith(".run-")]
+    return holds(f"{name}: {sent} signals that did not end it in one line with its code", wrong)
 
 
 def _interrupted(command: Command, folder: Path, number: signal.Signals, after: float) -> str | None:
