@@ -125,6 +125,27 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Scenes:
+    """Levels of detail by height in pixels, with error and time, and the time of 1, 10 and 50 people at 1280 x 720.
+
+    rnd-bench scenes --avatar assets/avatar.onnx --motion assets/walk.npz --hdr assets/sky.exr
+    """
+
+    avatar: File
+    """avatar.onnx of everybody"""
+    motion: File
+    """everybody's motion"""
+    hdr: File
+    """light probe"""
+    json: OptionalFile = None
+    """write the rows here"""
+    repeats: Count = 30
+    """timed frames of each"""
+    threads: OptionalCount = None
+    """by default two, where there are two cores"""
+
+
+@dataclass(frozen=True)
 class Compare:
     """Frames of one avatar by two checkouts of this project, alternating: paired ratios of their times.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import Future
+from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -11,16 +13,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rnd_runtime.core.arrays import shallow_copy
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton, taken_along
+from rnd_runtime.posing.levels import Surface, coarser
 from rnd_runtime.posing.rest import RestPose, Unposed
 from rnd_runtime.posing.window import moment
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
 
 from .file import REST_OUTPUTS
 from .networks import Networks
+
+MIN_GAUSSIANS = 2000
+"""of a level that has a coarser one"""
 
 
 class Encoded(NamedTuple):
@@ -84,6 +91,24 @@ class Avatar:
             return cls(networks)
         except InputError as error:
             raise error.at(file=path) from error
+
+    @cached_property
+    def levels(self) -> tuple[Avatar, ...]:
+        """This avatar and coarser ones, for fewer and fewer pixels; made on first use, in a second."""
+        levels = [self]
+        while self._rest is not None and (count := levels[-1].gaussians) > MIN_GAUSSIANS:
+            finer = levels[-1]
+            assert finer._rest is not None
+            rest, opacities, albedo, roughness = coarser(
+                Surface(finer._rest, finer._opacities, finer._albedo, finer._roughness)
+            )
+            fewer = len(opacities)
+            if fewer == count:
+                break
+            level = shallow_copy(self, gaussians=fewer, spacing=self.spacing * math.sqrt(self.gaussians / fewer))
+            level._rest, level._opacities, level._albedo, level._roughness = rest, opacities, albedo, roughness
+            levels.append(level)
+        return tuple(levels)
 
     def pose(self, motion: Motion, time: float) -> Gaussians:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton), in the world frame."""

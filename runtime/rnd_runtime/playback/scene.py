@@ -23,6 +23,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster.in_view import visible_to
+from rnd_runtime.raster.oracle import NEAR
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.shader import Shader, shadow_radii
 from rnd_runtime.shading.shadow import NO_CASTERS, Casters
@@ -30,9 +31,14 @@ from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 from .aov import aov_layers
 from .far import MARGIN, depth_groups, extent
 from .frame import FrameRenderer, RenderedFrame, features_of, in_root_frame, splat
-from .framing import Framing, frame_motion
+from .framing import CameraPath, Framing, frame_motion
 
 _PART_OF_A_FRAME = 1e-4  # tolerance of rounded times
+LEVEL_SPACING = 0.24
+"""px, spacing of the Gaussians up to which a coarser level is taken: neighbouring levels then differ by 1/255 at most,
+as root mean square over the body's box (``rnd-bench scenes``)"""
+HYSTERESIS = 1.15
+"""factor on the distance between taking a coarser level and giving it back"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +58,11 @@ class Person:
     def frames_at(self, fps: float) -> int:
         """Number of the scene's frames until the motion ends."""
         return max(self.motion.frames_at(fps) + math.ceil(self.start * fps - _PART_OF_A_FRAME), 1)
+
+    def positions(self, times_s: Floats) -> Floats:
+        """Its root [T, 3] m in the scene."""
+        moved = self.motion.at(times_s - self.start).translations + self.avatar.skeleton.rest_joints[0]
+        return np.asarray(moved @ self.place[:3, :3].T + self.place[:3, 3])
 
     def encode(self, time_s: float) -> Encoded:
         """Its pose at ``time_s`` of the scene."""
@@ -77,6 +88,19 @@ def frame_people(people: Sequence[Person]) -> Framing:
     return Framing(joints, (joints.min(axis=0) + joints.max(axis=0)) / 2, padding, facing)
 
 
+def chosen_levels(pixels_per_metre: Floats, spacings: Sequence[float]) -> NDArray[np.intp]:
+    """Level [F] of a body in F consecutive frames, by its size; ``spacings`` are the levels', m.
+
+    The coarsest whose spacing is at most ``LEVEL_SPACING``; a coarser one than before only ``HYSTERESIS`` later.
+    """
+    sizes = np.asarray(spacings)[:, None] * pixels_per_metre / LEVEL_SPACING  # [L, F]
+    coarsest, lagging = ((sizes[1:] * factor <= 1).sum(axis=0) for factor in (1.0, HYSTERESIS))
+    levels: NDArray[np.intp] = lagging.copy()
+    for frame in range(1, len(levels)):
+        levels[frame] = np.clip(levels[frame - 1], lagging[frame], coarsest[frame])
+    return levels
+
+
 class SceneRenderer:
     """Renders N people with the light, the rasteriser and the ground of ``renderer``, which is of the first avatar.
 
@@ -93,6 +117,21 @@ class SceneRenderer:
             raise InputError("avatar of a scene", expected="a file of rnd-export", got="a graph that poses")
         self._arrays: dict[str, NDArray[Any]] = {}
 
+    def levels(self, count: int, fps: float, camera_at: CameraPath) -> NDArray[np.intp]:
+        """Level of detail [F, N] of each person in the first ``count`` frames; a lone person keeps all Gaussians."""
+        levels = np.zeros((count, len(self.people)), np.intp)
+        if len(self.people) == 1:
+            return levels
+        times_s = np.arange(count) / fps
+        cameras = [camera_at(frame, frame / fps) for frame in range(count)]
+        axes = np.array([[*camera.world_to_camera[2], max(camera.K[0, 0], camera.K[1, 1])] for camera in cameras])
+        for number, person in enumerate(self.people):
+            depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
+            sizes = np.divide(axes[:, 4], depths, out=np.full(len(depths), np.inf), where=depths > NEAR)
+            if sizes.min() * person.avatar.spacing < LEVEL_SPACING:
+                levels[:, number] = chosen_levels(sizes, [level.spacing for level in person.avatar.levels])
+        return levels
+
     def encode(self, time_s: float) -> list[Encoded]:
         """Everybody's pose, for ``draw``."""
         return [person.encode(time_s) for person in self.people]
@@ -105,8 +144,14 @@ class SceneRenderer:
         aovs: Sequence[str] = (),
         srgb: bool = True,
         given: Sequence[Mapping[str, Floats32]] | None = None,
+        levels: Sequence[int] | None = None,
     ) -> RenderedFrame:
-        """Render what is encoded; arguments as of ``FrameRenderer.draw``, ``given`` for each person."""
+        """Render what is encoded.
+
+        Args:
+            aovs, srgb: as of ``FrameRenderer.draw``. given: the same of each person, for all of its Gaussians.
+            levels: of detail of each person, of ``levels``, where nothing is ``given``; the finest by default.
+        """
         given = given or [{}] * len(bodies)
         if len(bodies) == 1:
             return self.renderer.draw(bodies[0], camera, aovs=aovs, srgb=srgb, given=given[0])
@@ -114,6 +159,8 @@ class SceneRenderer:
         frame = bodies[0].root
         moved = [body.in_frame(frame) for body in bodies]
         avatars = [person.avatar for person in self.people]
+        if levels is not None and not any(given):
+            avatars = [avatar.levels[level] if level else avatar for avatar, level in zip(avatars, levels)]
         posed = [avatar.posed(body) for avatar, body in zip(avatars, moved)]
         joints = [avatar.joints(body) for avatar, body in zip(avatars, moved)]
         seconds["posing"], started = perf_counter() - started, perf_counter()

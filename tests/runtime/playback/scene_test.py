@@ -12,7 +12,7 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.far import Extent, depth_groups
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.playback.scene import Person, SceneRenderer, frame_people, place_at
+from rnd_runtime.playback.scene import LEVEL_SPACING, Person, SceneRenderer, chosen_levels, frame_people, place_at
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.shading.files.load import load_light
@@ -151,3 +151,34 @@ def test_a_heading_turns_to_the_left_and_the_camera_sees_everybody(avatar, motio
     np.testing.assert_allclose(one.centre - [3, 0, -2], placed[:3, :3] @ frame_people([here]).centre, atol=1e-9)
     assert both.radius > one.radius and len(both.joints) == 2 * len(one.joints)
     assert there.frames_at(10) == here.frames_at(10) + 10
+
+
+def test_levels_follow_the_size_with_hysteresis():
+    spacings = [0.01, 0.02, 0.04]
+    at = [LEVEL_SPACING / spacing for spacing in spacings]  # px per metre up to which each is taken
+    sizes = np.array(
+        [2 * at[1], at[1] / 1.05, at[1] / 1.2, at[1] / 1.05, at[1] * 1.01, at[2] / 2, np.inf, at[2] / 1.05]
+    )
+    assert chosen_levels(sizes, spacings).tolist() == [0, 0, 1, 1, 0, 2, 0, 1]
+
+
+def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motion):
+    """A camera that retreats: levels grow, by the first frame on the same in every part."""
+    people = [Person(avatar, motion), Person(avatar, motion, 0, place_at(0.5, -40, 0))]
+
+    def camera_at(frame: int, time: float) -> Camera:
+        return Camera.look_at([0, 1, 6 + 12 * frame], [0, 1, 0], width=90, height=90, fov_y=0.8)
+
+    with FrameRenderer(avatar, Light(np.ones((16, 32, 3), np.float32)), shade="ao") as renderer:
+        scene = SceneRenderer(people, renderer)
+        levels = scene.levels(8, 30.0, camera_at)
+        assert (
+            (np.diff(levels[:, 0]) >= 0).all() and levels[0, 0] < levels[-1, 0] and (levels[:, 1] >= levels[:, 0]).all()
+        )
+        np.testing.assert_array_equal(scene.levels(5, 30.0, camera_at), levels[:5])
+        assert not SceneRenderer(people[:1], renderer).levels(8, 30.0, camera_at).any()
+        bodies, camera = scene.encode(0.2), camera_at(2, 0.0)
+        full, coarse = (scene.draw(bodies, camera, levels=chosen) for chosen in (None, levels[2].tolist()))
+    difference = np.sqrt(np.mean((full.srgb.astype(float) - coarse.srgb) ** 2))
+    assert 0 < difference < 1
+    np.testing.assert_allclose(coarse.alpha.sum(), full.alpha.sum(), rtol=0.04)

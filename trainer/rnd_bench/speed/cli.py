@@ -1,4 +1,4 @@
-"""``rnd-bench raster, frame, grid, step, compare``: measure, print tables, write rows."""
+"""``rnd-bench raster, frame, grid, step, scenes, compare``: measure, print tables, write rows."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from rnd_bench.options import Compare, Files, Frame, Grid, Raster, Step
+from rnd_bench.options import Compare, Files, Frame, Grid, Raster, Scenes, Step
 from rnd_bench.scenes.scenes import USUAL
 from rnd_runtime.cli.command import show
 from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import check_cull, check_option, flag
 from rnd_runtime.core.files import earlier_rows, existing_file, sha256_of, write_json
-from rnd_runtime.core.threads import check_threads, max_threads
+from rnd_runtime.core.threads import check_threads, max_threads, set_threads
 from rnd_runtime.playback.doctor import machine
 
 
@@ -105,6 +105,28 @@ def run_step(options: Step) -> None:
     for row in rows:
         table.add_row(row["what"], f"{row['ms']:.1f}", f"{row['share']:.0%}")
     Console().print(table)
+
+
+def run_scenes(options: Scenes) -> None:
+    from .scenes import bench_scenes
+
+    _check(options, "repeats")
+    avatar, motion, light = (
+        existing_file(file, what=what)
+        for file, what in ((options.avatar, "avatar"), (options.motion, "motion"), (options.hdr, "light"))
+    )
+    threads = _threads(options.threads)
+    set_threads(threads)
+    about = {"avatar_sha256": sha256_of(options.avatar), "machine": machine(), "threads": threads}
+    rows: list[dict[str, Any]] = []
+
+    def on_row(row: dict[str, Any]) -> None:
+        rows.append(row | about)
+        _write(options.json, rows)
+        numbers = {name: value for name, value in row.items() if isinstance(value, int | float)}
+        show(f"{row['kind']:7}" + "  ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+
+    bench_scenes(avatar, motion, light, options.repeats, on_row)
 
 
 def run_compare(options: Compare) -> None:

@@ -184,6 +184,12 @@ class _Run:
         how = self.fps, self.count, self.camera_at, self.aovs
         return [GivenFeatures(person, *how) for person in self.scene.people]
 
+    @cached_property
+    def _levels(self) -> list[list[int]]:
+        """Of detail, for each frame and person: from the first frame on, so that parts of a run agree."""
+        levels: list[list[int]] = self.scene.levels(self.frames.stop, self.fps, self.camera_at).tolist()
+        return levels
+
     def camera(self, number: int) -> Camera:
         return self.camera_at(number, number / self.fps)
 
@@ -219,7 +225,8 @@ class _Run:
         if lighting.hdr_turn:
             renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * number / self.fps / lighting.hdr_turn)
         given = [of.of(number, encoded, camera) for of, encoded in zip(self._given, pending.encoded)]
-        frame = self.scene.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given)
+        levels = self._levels[number]
+        frame = self.scene.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given, levels=levels)
         for stage, seconds in frame.stage_seconds.items():
             self.times.add(stage, seconds)
         with self.times.stage("background"):

@@ -1,0 +1,36 @@
+"""Rows of the scenes' bench: levels pay, differ little, and a crowd is drawn."""
+
+import json
+
+import numpy as np
+
+from rnd_bench.cli import main
+from rnd_bench.speed import scenes
+from support.paths import ASSETS
+
+
+def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
+    monkeypatch.setattr(scenes, "HEIGHTS", (96, 16))
+    monkeypatch.setattr(scenes, "CROWDS", (1, 3))
+    monkeypatch.setattr(scenes, "VIEWS", scenes.VIEWS[:1])
+    monkeypatch.setattr(scenes, "SIZE", (160, 90))
+    words = ["--avatar", ASSETS / "avatar.onnx", "--motion", ASSETS / "walk.npz", "--hdr", ASSETS / "sky.exr"]
+    assert main(["scenes", *map(str, words), "--json", str(tmp_path / "rows.json"), "--repeats", "2"]) == 0
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in ("switch", "height", "crowd")}
+    counts = [row["gaussians"] for row in by_kind["switch"]]
+    assert counts == sorted(counts, reverse=True) and counts[0] == 9000 and counts[-1] <= 2000
+    large, small = by_kind["height"]
+    assert large["gaussians"] == 12000 and large["rms_to_whole"] == 0
+    assert small["gaussians"] < 3000 and 0 < small["rms_to_whole"] < 4
+    one, three = by_kind["crowd"]
+    assert one["gaussians"] == 12000 and three["people"] == 3 and three["ms_median"] > 0 and three["cpu_ms_median"] > 0
+    assert {"encoders", "posing", "shading", "raster"} <= set(three["stages"])
+
+
+def test_a_camera_shows_a_person_of_so_many_pixels():
+    camera = scenes.camera_of(64, 0.3)
+    ends = np.array([[0, 0.025, 0, 1], [0, 0.025 + scenes.HEIGHT, 0, 1]]) @ camera.world_to_camera.T
+    rows = ends[:, 1] / ends[:, 2] * camera.K[1, 1] + camera.K[1, 2]
+    np.testing.assert_allclose(rows[0] - rows[1], 64, rtol=0.02)
+    assert rows.min() > 0 and rows.max() < camera.height

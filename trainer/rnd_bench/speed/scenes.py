@@ -1,0 +1,151 @@
+"""Scenes: what a coarser level of detail costs and saves by height in pixels, and the time of a crowd by its number."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+
+from rnd_bench.speed.frame import STEP_S, STEP_YAW, WARMUP, summary
+from rnd_runtime.avatar.avatar import Avatar
+from rnd_runtime.core.camera import Camera
+from rnd_runtime.motion.motion import Motion, load_motion
+from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
+from rnd_runtime.playback.framing import CameraOptions, front_path
+from rnd_runtime.playback.scene import LEVEL_SPACING, Person, SceneRenderer, chosen_levels, frame_people, place_at
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import Light
+
+HEIGHT = 1.75  # m, of a person
+FOCAL = 4000.0  # px
+BOX = 1.3  # heights, side of an image around a person
+HEIGHTS = (384, 192, 96, 64, 48, 32, 24, 16, 12)  # px
+VIEWS = ((0.3, 0.3), (1.1, 2.1), (2.0, 4.0))  # time of the motion, s, and azimuth, rad
+SIZE = (1280, 720)
+CROWDS = (1, 10, 50)
+APART = 1.2  # m between neighbours of a crowd
+
+
+def bench_scenes(
+    avatar_file: Path, motion_file: Path, light_file: Path, repeats: int, on_row: Callable[[dict[str, Any]], None]
+) -> list[dict[str, Any]]:
+    """Rows of ``kind`` "switch" (of neighbouring levels), "height" and "crowd", as they are measured."""
+    avatar = Avatar.load(avatar_file)
+    motion, light = load_motion(motion_file, avatar.skeleton), load_light(light_file)
+    rows = []
+
+    def add(row: dict[str, Any]) -> None:
+        rows.append(row)
+        on_row(row)
+
+    for number in range(1, len(avatar.levels)):
+        add(_switch_row(avatar, number, motion, light))
+    for pixels in HEIGHTS:
+        add(_height_row(avatar, pixels, motion, light, repeats))
+    for count in CROWDS:
+        add(_crowd_row(avatar, count, motion, light, repeats))
+    return rows
+
+
+def camera_of(pixels: float, azimuth: float) -> Camera:
+    """Sees a standing person ``pixels`` high, from a little above."""
+    side, distance = round(BOX * pixels) + 2, FOCAL * HEIGHT / pixels
+    eye = [distance * np.sin(azimuth), 0.9 + 0.1 * distance, distance * np.cos(azimuth)]
+    around = Camera.look_at(eye, [0, 0.9, 0], width=side, height=side, fov_y=0.5)
+    K = np.array([[FOCAL, 0, side / 2], [0, FOCAL, side / 2], [0, 0, 1]])
+    return Camera(side, side, K, around.world_to_camera)
+
+
+def _frames(avatar: Avatar, pixels: float, motion: Motion, light: Light) -> list[RenderedFrame]:
+    """In every one of ``VIEWS``."""
+    renderer = FrameRenderer(avatar, light)
+    return [renderer.render(motion, time, camera_of(pixels, azimuth)) for time, azimuth in VIEWS]
+
+
+def _difference(ours: Sequence[RenderedFrame], others: Sequence[RenderedFrame]) -> float:
+    """Root mean square, of sRGB from 0 to 255, over whole images."""
+    squares = [np.mean((a.srgb.astype(float) - b.srgb) ** 2) for a, b in zip(ours, others)]
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _switch_row(avatar: Avatar, number: int, motion: Motion, light: Light) -> dict[str, Any]:
+    """Level ``number`` at the greatest height where it is taken, against the next finer one and the whole avatar."""
+    level, finer = avatar.levels[number], avatar.levels[number - 1]
+    pixels = LEVEL_SPACING / level.spacing * HEIGHT
+    ours, others, whole = (_frames(each, pixels, motion, light) for each in (level, finer, avatar))
+    coverage = sum(float(frame.alpha.sum()) for frame in ours) / sum(float(frame.alpha.sum()) for frame in whole)
+    return {
+        "kind": "switch",
+        "gaussians": level.gaussians,
+        "of": avatar.gaussians,
+        "pixels": pixels,
+        "rms_to_finer": _difference(ours, others),
+        "rms_to_whole": _difference(ours, whole),
+        "coverage": coverage,
+    }
+
+
+def _height_row(avatar: Avatar, pixels: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
+    """The level that a person of ``pixels`` height gets, and the whole avatar."""
+    spacings = [level.spacing for level in avatar.levels]
+    level = avatar.levels[chosen_levels(np.array([pixels / HEIGHT]), spacings)[0]]
+    ours, whole = (_frames(each, pixels, motion, light) for each in (level, avatar))
+    row = {"kind": "height", "pixels": pixels, "gaussians": level.gaussians, "rms_to_whole": _difference(ours, whole)}
+    for name, each in {"": level, "whole_": avatar}.items():
+        renderer = FrameRenderer(each, light)
+
+        def draw(number: int, renderer: FrameRenderer = renderer) -> None:
+            renderer.turn(STEP_YAW * number)
+            renderer.render(motion, STEP_S * number, camera_of(pixels, 0.3))
+
+        row |= {name + key: value for key, value in _timed(draw, repeats).items()}
+    return row
+
+
+def _crowd_row(avatar: Avatar, count: int, motion: Motion, light: Light, repeats: int) -> dict[str, Any]:
+    """``count`` people on a grid, all in view; motion and light change from frame to frame."""
+    columns = int(np.ceil(np.sqrt(2 * count)))
+    spots = [(APART * (k % columns), -APART * (k // columns)) for k in range(count)]
+    people = [Person(avatar, motion, -0.17 * k, place_at(*spot, 0.7 * k)) for k, spot in enumerate(spots)]
+    path = front_path(frame_people(people), CameraOptions(*SIZE))
+    renderer = FrameRenderer(avatar, light)
+    scene = SceneRenderer(people, renderer)
+    levels = scene.levels(WARMUP + repeats, 1 / STEP_S, path)
+    stages: dict[str, list[float]] = {}
+
+    def draw(number: int) -> None:
+        started = perf_counter()
+        bodies = scene.encode(STEP_S * number)
+        renderer.turn(STEP_YAW * number)
+        spent = {"encoders": perf_counter() - started}
+        frame = scene.draw(bodies, path(number, STEP_S * number), levels=levels[number].tolist())
+        for stage, seconds in (spent | dict(frame.stage_seconds)).items():
+            stages.setdefault(stage, []).append(1e3 * seconds)
+
+    taken = _timed(draw, repeats)
+    camera = path(0, 0.0)
+    depths = np.array([(camera.world_to_camera @ [*person.positions(np.zeros(1))[0], 1])[2] for person in people])
+    return {
+        "kind": "crowd",
+        "people": count,
+        "size": list(SIZE),
+        "pixels": float(np.median(camera.K[0, 0] * HEIGHT / depths)),
+        "gaussians": int(sum(avatar.levels[level].gaussians for level in levels[-1])),
+        **taken,
+        "stages": {name: float(np.median(values[WARMUP:])) for name, values in stages.items()},
+    }
+
+
+def _timed(draw: Callable[[int], None], repeats: int) -> dict[str, float]:
+    """Milliseconds of ``repeats`` consecutive frames, after some to warm up: elapsed, and of CPU time of all threads."""
+    taken, spent = [], []
+    for number in range(WARMUP + repeats):
+        started, busy = perf_counter(), process_time()
+        draw(number)
+        taken.append(1e3 * (perf_counter() - started))
+        spent.append(1e3 * (process_time() - busy))
+    return summary(taken[WARMUP:]) | {"cpu_ms_median": float(np.median(spent[WARMUP:])), "load": os.getloadavg()[0]}
