@@ -1,4 +1,4 @@
-"""Rows of the scenes' bench: levels pay, differ little, and a crowd is drawn."""
+"""Rows of ``rnd-bench scenes``: levels are coarser, differ little, and a crowd is drawn."""
 
 import json
 
@@ -22,7 +22,7 @@ def test_rows_of_levels_and_crowds(tmp_path, monkeypatch):
     assert counts == sorted(counts, reverse=True) and counts[0] == 9000 and counts[-1] <= 2000
     large, small = by_kind["height"]
     assert large["gaussians"] == 12000 and large["rms_to_whole"] == 0
-    assert small["gaussians"] < 3000 and 0 < small["rms_to_whole"] < 4
+    assert small["gaussians"] < 4000 and 0 < small["rms_to_whole"] < 4
     one, three = by_kind["crowd"]
     assert one["gaussians"] == 12000 and three["people"] == 3 and three["ms_median"] > 0 and three["cpu_ms_median"] > 0
     assert {"encoders", "posing", "shading", "raster"} <= set(three["stages"])

@@ -141,7 +141,7 @@ def _crowd_row(avatar: Avatar, count: int, motion: Motion, light: Light, repeats
 
 
 def _timed(draw: Callable[[int], None], repeats: int) -> dict[str, float]:
-    """Milliseconds of ``repeats`` consecutive frames, after some to warm up: elapsed, and of CPU time of all threads."""
+    """Milliseconds of ``repeats`` consecutive frames, after some to warm up: elapsed, and of all threads' CPU."""
     taken, spent = [], []
     for number in range(WARMUP + repeats):
         started, busy = perf_counter(), process_time()
