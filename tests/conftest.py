@@ -67,7 +67,9 @@ def tiny_checkpoint(tmp_path_factory) -> Path:
         for parameter in model.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     path = tmp_path_factory.mktemp("checkpoint") / "avatar.ckpt"
-    save_checkpoint(path, model, torch.ones(32, 64, 3), template.skeleton, config, {"body_license": "CC0-1.0"})
+    save_checkpoint(
+        path, model, {"white": torch.ones(32, 64, 3)}, template.skeleton, config, {"body_license": "CC0-1.0"}
+    )
     return path
 
 

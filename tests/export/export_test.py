@@ -93,7 +93,7 @@ def test_a_static_avatar_exports_too(tiny_checkpoint, tmp_path) -> None:
     config = dataclasses.replace(checkpoint.config, model=model_config)
     model = AvatarModel(model_config, sample_template(body(), 800, 200, seed=1))
     path = tmp_path / "static.ckpt"
-    save_checkpoint(path, model, torch.ones(32, 64, 3), checkpoint.skeleton, config, {})
+    save_checkpoint(path, model, {"white": torch.ones(32, 64, 3)}, checkpoint.skeleton, config, {})
     error = export(load_checkpoint(path), tmp_path / "static.onnx", motion(body()))
     assert error.frames == 6 and error.weights < 1e-6
 

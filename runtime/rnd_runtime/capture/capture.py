@@ -137,10 +137,14 @@ class Capture:
     def light_sha256(self, name: str) -> str | None:
         """Of the map of a light, its scale and yaw; None without such a map."""
         entry = self.lights.get(name)
-        if entry is None or not (self.folder / entry.file).is_file():
+        if entry is None or entry.file is None or not (self.folder / entry.file).is_file():
             return None
         content = f"{sha256_of(self.folder / entry.file)} {entry.scale} {entry.yaw}"
         return hashlib.sha256(content.encode()).hexdigest()
+
+    def has_map(self, light: str | None) -> bool:
+        """Whether the map of ``light`` is known."""
+        return light is not None and light in self.lights and self.lights[light].file is not None
 
     def load_light(self, name: str) -> Light:
         """The light called ``name``, with its scale and yaw."""
@@ -148,6 +152,8 @@ class Capture:
             known = " or ".join(self.lights) or "none, as the capture lists none"
             raise InputError("light", expected=known, got=name, file=self.folder)
         entry = self.lights[name]
+        if entry.file is None:
+            raise InputError("light", expected="one with a map", got=name, file=self.file)
         return load_light(self.folder / entry.file, yaw=entry.yaw).scaled(entry.scale)
 
 

@@ -45,9 +45,9 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class CaptureLight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A light of a capture: the file's radiance times ``scale``, rotated by ``yaw`` rad."""
+    """A light of a capture: the file's radiance times ``scale``, rotated by ``yaw`` rad; no file: it is unknown."""
 
-    file: str
+    file: str | None = None
     scale: _Row3 = (1.0, 1.0, 1.0)
     yaw: float = 0.0
 
@@ -93,7 +93,8 @@ def read_record(file: Path) -> CaptureRecord:
     for name in (record.body, record.motion):
         _inside(file, name)
     for name, light in record.lights.items():
-        existing_file(_inside(file, light.file), what=f"light {name}")
+        if light.file is not None:
+            existing_file(_inside(file, light.file), what=f"light {name}")
         if min(light.scale) < 0:
             raise InputError(f"lights.{name}.scale", expected="not negative", got=light.scale, file=file)
     for frame in record.frames:

@@ -212,15 +212,18 @@ def test_masks_are_counted_as_a_training_counts_them(folder) -> None:
     assert "2 of 8" in _wrong(folder)["masks"]
 
 
-def test_captures_that_cannot_be_trained_are_named(folder) -> None:
+def test_lights_without_maps_are_named_and_wrong_captures_too(folder) -> None:
     def relit(record) -> None:
-        record["lights"] = {"noon": {"file": "body.npz"}, "dusk": {"file": "body.npz"}}
+        record["lights"] = {"noon": {"file": "body.npz"}, "dusk": {}}
         for number, frame in enumerate(record["frames"]):
             frame.update(split="train", light=["noon", "dusk"][number % 2])
 
     _edit(folder, relit)
-    wrong = _wrong(folder)
-    assert "2 lights (dusk, noon)" in wrong["training"] and "body.npz" in wrong["lights"]
+    findings = {f.subject: f for f in check_capture(folder).findings}
+    assert findings["training"].level == "ok" and "2 lights (noon, dusk)" in findings["training"].sentence
+    assert findings["lights"].level == "wrong" and "body.npz" in findings["lights"].sentence
+    with pytest.raises(InputError, match="light: expected one with a map, got dusk"):
+        load_capture(folder).load_light("dusk")
     _edit(folder, lambda record: [frame.update(split="relight") for frame in record["frames"]])
     assert _wrong(folder)["training"].startswith("none of 8 images")
 

@@ -332,11 +332,12 @@ def test_the_training_light_is_the_learned_one_and_others_the_captures(tiny_run,
     monkeypatch.setattr(Capture, "load_light", lambda self, name: f"the true {name}")
     monkeypatch.setattr(rnd_trainer.evaluation.evaluate, "Shader", lambda light, mode: light)
     checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
-    checkpoint.info["lights"] = {"noon": None}  # the capture has no map of it
+    checkpoint.info["lights"] = {"noon": None, "evening": None}  # the capture has no maps of them
+    checkpoint.probes = {"noon": checkpoint.probe, "evening": 2 * checkpoint.probe}
     evaluator = Evaluator(checkpoint, capture)
     assert evaluator._shader("dusk") == "the true dusk"
-    for name in ("noon", None):
-        assert np.array_equal(evaluator._shader(name).radiance, Light(checkpoint.probe.numpy()).radiance)
+    for name, factor in (("noon", 1), (None, 1), ("evening", 2)):
+        assert np.array_equal(evaluator._shader(name).radiance, Light(factor * checkpoint.probe.numpy()).radiance)
 
 
 def test_the_training_light_is_identified_by_its_map(tiny_capture, tiny_config, tmp_path) -> None:

@@ -19,7 +19,7 @@ from rnd_trainer.losses.losses import (
     sky_prior,
 )
 from rnd_trainer.losses.metrics import mask_box, mean_ssim, normal_degrees, psnr, ssim, ssim_map
-from rnd_trainer.render.probe import LightProbe, natural_sky
+from rnd_trainer.render.probe import LightProbes, natural_sky
 
 SSIM_AGREEMENT = 1e-6  # float64 on both sides; the border is cut on both sides
 
@@ -126,7 +126,7 @@ def test_chroma_prior_sees_colour_in_every_direction_but_no_brightness() -> None
 
 
 def test_sky_prior_is_zero_for_a_natural_sky_and_a_sun_costs_little() -> None:
-    probe = LightProbe()
+    probe = LightProbes()
     sky = natural_sky(probe.directions[..., 1])[..., None].expand(-1, -1, 3)
     maps = probe.directions, probe.solid_angles
     assert float(sky_prior(3 * sky, *maps)) == pytest.approx(0, abs=1e-6)

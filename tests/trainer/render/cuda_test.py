@@ -61,7 +61,7 @@ def test_every_loss_and_its_gradient_are_the_cpus(tiny_capture, tiny_config, tmp
         found = training.objective(training.model, training.views[0], training.poses[0], 0, 2)
         torch.stack(list(found.values())).sum().backward()
         terms.append({name: float(value.detach()) for name, value in found.items()})
-        named = [*training.model.named_parameters(), *training.probe.named_parameters()]
+        named = [*training.model.named_parameters(), *training.lights.probes.named_parameters()]
         gradients.append({name: p.grad.cpu() for name, p in named if p.grad is not None})
     assert terms[1] == pytest.approx(terms[0], rel=TERMS, abs=1e-6)
     assert gradients[0].keys() == gradients[1].keys()
@@ -83,7 +83,7 @@ def test_a_training_on_the_gpu_runs_all_stages(changes, tiny_capture, tiny_confi
 
     def preview() -> None:
         shown = [(view, resumed.pose(view, resumed.motion())) for view in resumed.views[:2]]
-        save_preview(tmp_path / "preview.png", resumed.model, resumed.light(), shown)
+        save_preview(tmp_path / "preview.png", resumed.model, resumed.lights, shown)
 
     assert not run(resumed, tmp_path, on_step=lambda step: None, on_preview=preview)
     assert (tmp_path / "preview.png").stat().st_size > 0

@@ -21,7 +21,7 @@ from safetensors.torch import save_file
 import rnd_trainer.commands.train
 import rnd_trainer.model.checkpoint
 import rnd_trainer.training.training
-from rnd_runtime.capture.capture import load_capture
+from rnd_runtime.capture.capture import CaptureLight, load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.commands.eval import EvalOptions, evaluate_run
@@ -31,7 +31,7 @@ from rnd_trainer.losses.losses import linear_to_srgb
 from rnd_trainer.losses.perceptual import load_features, load_lpips
 from rnd_trainer.losses.perceptual_nets import BACKBONES
 from rnd_trainer.model.checkpoint import load_checkpoint, read_tensors, write_tensors
-from rnd_trainer.render.probe import LightProbe
+from rnd_trainer.training.lighting.lights import TrainingLights
 from rnd_trainer.training.objective import Objective
 from rnd_trainer.training.run import run
 from rnd_trainer.training.saving import resume_training, save_training
@@ -62,7 +62,7 @@ def test_training_lowers_the_image_loss(tiny_capture, tiny_config) -> None:
 
 
 def test_half_of_the_backgrounds_are_black_and_half_random(tiny_config) -> None:
-    objective = Objective(tiny_config, LightProbe(), None, None, None, torch.Generator().manual_seed(0))
+    objective = Objective(tiny_config, TrainingLights(("white",)), None, None, torch.Generator().manual_seed(0))
     sampled = torch.stack([objective._background() for _ in range(400)])
     black = (sampled == 0).all(dim=1)
     assert 0.4 < black.float().mean() < 0.6
@@ -162,11 +162,11 @@ def test_the_third_stage_changes_the_skinning_only(tiny_capture, tiny_config, li
     while training.stage < 3:
         training.step()
     before = {name: p.detach().clone() for name, p in training.model.named_parameters()}
-    probe = training.probe.raw.detach().clone()
+    probe = training.lights.probes.raw.detach().clone()
     while training.step_index < training.schedule.total:
         training.step()
     changed = {name.split(".")[0] for name, p in training.model.named_parameters() if not torch.equal(p, before[name])}
-    assert changed == {"skinning"} and torch.equal(probe, training.probe.raw)
+    assert changed == {"skinning"} and torch.equal(probe, training.lights.probes.raw)
 
 
 def test_static_skinning_has_no_third_stage(tiny_capture, tiny_config) -> None:
@@ -380,7 +380,37 @@ def test_training_under_the_captures_light_keeps_it(tiny_capture, tiny_config) -
     training = Training(tiny_capture, dataclasses.replace(tiny_config, light="capture"))
     for _ in range(12):
         training.step()
-    assert torch.allclose(training.light(), torch.ones(32, 64, 3), atol=1e-5)
+    assert torch.allclose(training.lights.radiance(), torch.ones(1, 32, 64, 3), atol=1e-5)
+
+
+def test_a_capture_under_two_lights_learns_a_probe_of_each(tiny_capture, tiny_config, tmp_path, one_thread) -> None:
+    """One avatar; the most used light is the default one; both go on after a resume."""
+    frames = tuple(replace(f, light="dusk" if f.frame in (1, 4) else "white") for f in tiny_capture.frames)
+    lights = tiny_capture.lights | {"dusk": CaptureLight("lights/white.exr", (2.0, 1.0, 1.0))}
+    two = dataclasses.replace(tiny_capture, frames=frames, lights=lights)
+    training = Training(two, tiny_config)
+    while training.step_index < 9:
+        training.step()
+    save_training(training, tmp_path)
+    checkpoint = load_checkpoint(tmp_path / "avatar.ckpt")
+    assert list(checkpoint.probes) == ["white", "dusk"] and checkpoint.learned_under(two) == {"white", "dusk"}
+    assert torch.equal(checkpoint.probe, checkpoint.probe_of("white")) and checkpoint.probe_of(None) is checkpoint.probe
+    assert not torch.allclose(checkpoint.probe, checkpoint.probe_of("dusk"), rtol=1e-3)
+    resumed = Training(two, tiny_config)
+    resume_training(resumed, tmp_path / "training.state")
+    assert resumed.step().terms == training.step().terms
+    renamed = dataclasses.replace(two, frames=tuple(replace(f, light="white") for f in frames))
+    with pytest.raises(InputError, match="--resume: expected the images"):
+        resume_training(Training(renamed, tiny_config), tmp_path / "training.state")
+    fixed = Training(two, dataclasses.replace(tiny_config, light="capture")).lights
+    assert torch.allclose(fixed.radiance()[1], torch.tensor([2.0, 1.0, 1.0]))
+
+
+def test_training_under_the_captures_lights_needs_all_of_them(tiny_capture, tiny_config) -> None:
+    frames = tuple(replace(f, light=None if f.frame == 2 else f.light) for f in tiny_capture.frames)
+    without = dataclasses.replace(tiny_capture, frames=frames)
+    with pytest.raises(InputError, match="--light capture: expected a light map of every training image, got unknown"):
+        Training(without, dataclasses.replace(tiny_config, light="capture"))
 
 
 def test_a_missing_device_is_refused() -> None:

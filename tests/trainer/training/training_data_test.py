@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -97,11 +96,3 @@ def test_a_capture_without_training_images_is_refused(tiny_capture) -> None:
     frames = tuple(replace(frame, split="relight") for frame in tiny_capture.frames)
     with pytest.raises(InputError, match="split 'train': expected at least one frame, got none"):
         Training(dataclasses.replace(tiny_capture, frames=frames), TrainConfig())
-
-
-def test_several_training_lights_are_refused(tiny_capture) -> None:
-    lights = itertools.cycle(["noon", "evening"])
-    frames = tuple(replace(frame, light=next(lights)) for frame in tiny_capture.frames)
-    two = dataclasses.replace(tiny_capture, frames=frames)
-    with pytest.raises(InputError, match="expected one light in the train split, got evening, noon"):
-        Training(two, TrainConfig())

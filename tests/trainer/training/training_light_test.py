@@ -10,7 +10,7 @@ import torch
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.reference import shade_reference
-from rnd_trainer.render.probe import LightProbe, all_texels, luminance, sample_texels
+from rnd_trainer.render.probe import LightProbes, all_texels, luminance, sample_texels
 from rnd_trainer.render.shading import light_visibility, shade
 
 FLOAT32_RELATIVE = 2e-4  # a sum of 2 048 float32 terms, GGX peaks among them
@@ -23,17 +23,17 @@ def _sunny() -> torch.Tensor:
 
 
 def test_probe_starts_white_with_mean_luminance_one() -> None:
-    probe = LightProbe()
-    assert torch.allclose(probe.radiance(), torch.ones(32, 64, 3), atol=1e-5)
+    probe = LightProbes()
+    assert torch.allclose(probe.radiance(), torch.ones(1, 32, 64, 3), atol=1e-5)
     with torch.no_grad():
         probe.raw.add_(5 * torch.randn_like(probe.raw))
     mean = (luminance(probe.radiance().detach()) * probe.solid_angles).sum() / (4 * math.pi)
     assert abs(float(mean) - 1) < 1e-5
 
 
-def test_the_exposed_luminance_is_constant() -> None:
-    probe, radiance = LightProbe(), _sunny()
-    exposure = torch.rand(32, 64, generator=torch.Generator().manual_seed(1)) * probe.solid_angles
+def test_the_exposed_luminance_of_all_lights_is_constant() -> None:
+    probe, radiance = LightProbes(lights=2), torch.stack([_sunny(), 3 * _sunny().flip(1)])
+    exposure = torch.rand(2, 32, 64, generator=torch.Generator().manual_seed(1)) * probe.solid_angles
     probe.start_from(radiance, exposure)
     assert torch.allclose(probe.radiance(), radiance, rtol=1e-5)
     with torch.no_grad():
@@ -43,7 +43,7 @@ def test_the_exposed_luminance_is_constant() -> None:
 
 
 def test_sampled_texels_are_unbiased_and_always_include_the_sun() -> None:
-    probe, radiance = LightProbe(), _sunny()
+    probe, radiance = LightProbes(), _sunny()
     generator = torch.Generator().manual_seed(0)
     # any function of direction will do: the average over draws must be its full sum
     weight = torch.rand(32 * 64, generator=generator)
@@ -85,7 +85,7 @@ def test_shading_equals_the_runtimes_oracle() -> None:
     light = _sunny()
     expected = shade_reference(gaussians, Light(light.numpy()), eye)
 
-    probe = LightProbe()
+    probe = LightProbes()
     texels = all_texels(light, probe.directions, probe.solid_angles)
     view = torch.nn.functional.normalize(torch.as_tensor(eye - means), dim=-1).float()
     visibility = light_visibility(

@@ -97,7 +97,7 @@ def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
         return out
     import torch
 
-    from rnd_trainer.model.checkpoint import save_checkpoint
+    from rnd_trainer.model.checkpoint import UNKNOWN_LIGHT, save_checkpoint
     from rnd_trainer.model.model import AvatarModel
     from rnd_trainer.model.template import sample_template
 
@@ -111,7 +111,7 @@ def seeded_checkpoint(count: int, body_file: Path, folder: Path) -> Path:
         model.geometry_residual[:, 0] = OPACITY
     light = torch.ones(32, 64, 3)
     info = {"body_license": body.license, "made": "rnd-bench, untrained"}
-    save_checkpoint(out, model, light, body.skeleton, dataclasses.replace(config, seed=SEED), info)
+    save_checkpoint(out, model, {UNKNOWN_LIGHT: light}, body.skeleton, dataclasses.replace(config, seed=SEED), info)
     return out
 
 

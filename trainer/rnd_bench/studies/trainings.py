@@ -20,7 +20,8 @@ from rnd_trainer.evaluation.held_out import score
 from rnd_trainer.losses.perceptual import Perceptual, networks_by_role, networks_sha256
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.model import AvatarModel
-from rnd_trainer.training.data import check_true_normals, training_light
+from rnd_trainer.training.data import check_true_normals
+from rnd_trainer.training.lighting.lights import capture_lights
 from rnd_trainer.training.pose_refinement import joint_error_degrees
 from rnd_trainer.training.run import run
 from rnd_trainer.training.saving import resume_training
@@ -110,7 +111,7 @@ def check_needs(variants: Iterable[StudyRow], capture: Capture) -> None:
         if variant.noisy:
             _noisy(capture)
         if variant.train.get("light") == "capture":
-            training_light(capture, f"variant {variant.name!r}")
+            capture_lights(capture, f"variant {variant.name!r}")
         if variant.train.get("normals") == "true":
             check_true_normals(capture, capture.split("train"), f"variant {variant.name!r}")
 

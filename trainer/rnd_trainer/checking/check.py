@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from rnd_runtime.capture.capture import Capture, Frame, FrameImages, load_capture
 from rnd_runtime.capture.format import decode_normals, read_unit_range
 from rnd_runtime.core.errors import InputError
-from rnd_trainer.training.data import MAX_BAD_MASKS, light_names, usable
+from rnd_trainer.training.data import MAX_BAD_MASKS, usable
+from rnd_trainer.training.lighting.lights import light_names
 
 from .geometry import Finding, check_geometry, wrong
 from .hypotheses import explain, explain_timing
@@ -107,13 +108,13 @@ def _training(capture: Capture) -> list[Finding]:
         return wrong("training", f'none of {len(capture.frames)} images is of the split "train"')
     names = light_names(frames)
     if len(names) > 1:
-        return wrong("training", f"the training images have {len(names)} lights ({', '.join(names)}); one is learned")
+        return [Finding("ok", "training", f"{len(names)} lights ({', '.join(names)}): a probe for each is learned")]
     return []
 
 
 def _lights(capture: Capture) -> list[Finding]:
     findings = []
-    for name in capture.lights:
+    for name in filter(capture.has_map, capture.lights):
         try:
             capture.load_light(name)
         except InputError as error:

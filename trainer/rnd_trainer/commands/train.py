@@ -295,7 +295,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
         motion = training.motion()  # as refined so far
         posed = [(view, training.pose(view, motion)) for view in shown]
         file = folder / "previews" / f"step_{training.step_index:06d}.png"
-        save_preview(file, training.model, training.light() if lit else None, posed)
+        save_preview(file, training.model, training.lights if lit else None, posed)
 
     with Progress() as progress:
         return run(training, folder, on_step=on_step, on_preview=on_preview, on_phase=on_phase)

@@ -48,7 +48,7 @@ class Evaluator:
     """Renders a trained avatar for the frames of a capture, each under its light.
 
     Of an avatar that held frames out, the capture has the split ``validation``. Frames under a training light are lit
-    by the learned probe, others by the capture's light maps.
+    by the probe learned of it, others by the capture's light maps.
 
     Args:
         mode: shading of the runtime.
@@ -87,7 +87,7 @@ class Evaluator:
     def _shader(self, name: str | None) -> Shader | None:
         if name not in self._shaders:
             known = name is not None and name not in self._trained
-            light = self.capture.load_light(name) if name and known else Light(self.checkpoint.probe.numpy())
+            light = self.capture.load_light(name) if name and known else Light(self.checkpoint.probe_of(name).numpy())
             plain = self.checkpoint.config.light == "none"
             self._shaders[name] = None if plain else Shader(light, self.mode)
         return self._shaders[name]

@@ -14,7 +14,7 @@ from rnd_runtime.motion.motion import Motion
 from rnd_trainer.losses.losses import image_loss, linear_to_srgb
 from rnd_trainer.model.checkpoint import Checkpoint
 from rnd_trainer.model.model import PoseInput
-from rnd_trainer.render.probe import LightProbe, Texels, sample_texels
+from rnd_trainer.render.probe import LightProbes, Texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.training.data import TrainingView, load_views, pose_input
 from rnd_trainer.training.pose_refinement import PoseRefinement
@@ -78,8 +78,8 @@ def _difference(checkpoint: Checkpoint, view: TrainingView, pose: PoseInput, gen
     config = checkpoint.config
     texels = None
     if config.light != "none":
-        maps = LightProbe(config.probe_channels)
-        texels = sample_texels(checkpoint.probe, maps.directions, maps.solid_angles, config.light_texels, generator)
+        maps, probe = LightProbes(), checkpoint.probe_of(view.frame.light)
+        texels = sample_texels(probe, maps.directions, maps.solid_angles, config.light_texels, generator)
     rendered = _rendered(checkpoint, view, pose, texels)
     target, mask = view.target(torch.zeros(3))
     image = image_loss(linear_to_srgb(rendered.image), linear_to_srgb(target), config.weight_dssim, config.dssim_scales)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 
 from rnd_runtime.core.images import linear_to_srgb, to_bytes, write_image
 from rnd_runtime.shading.light import Light
 from rnd_runtime.shading.shader import Shader
 from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.training.data import TrainingView
+from rnd_trainer.training.lighting.lights import TrainingLights, light_name
 
 from .evaluator import Rendered, render_runtime
 
@@ -40,12 +40,14 @@ def strip(rendered: Rendered, target_srgb: np.ndarray) -> np.ndarray:
 
 
 def save_preview(
-    path: Path, model: AvatarModel, probe: torch.Tensor | None, views: list[tuple[TrainingView, PoseInput]]
+    path: Path, model: AvatarModel, lights: TrainingLights | None, views: list[tuple[TrainingView, PoseInput]]
 ) -> None:
-    """Write an image with a strip per view; without ``probe`` [32, 64, 3] of plain colours."""
-    shader = None if probe is None else Shader(Light(probe.detach().cpu().numpy()), "table+sun")
+    """Write an image with a strip per view under its light; without ``lights`` of plain colours."""
+    probes = {} if lights is None else lights.by_name()
+    shaders = {name: Shader(Light(probe.cpu().numpy()), "table+sun") for name, probe in probes.items()}
     rows = []
     for view, pose in views:
+        shader = shaders.get(light_name(view.frame))
         target = view.image.astype(np.float32) / 255
         rows.append(strip(render_runtime(model, pose, view.camera, shader), target))
     _write_sheet(path, rows)

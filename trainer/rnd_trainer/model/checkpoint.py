@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from .template import Template
 from .twist import twist_frames
 
 SCHEMA = "rnd-checkpoint/1"
+UNKNOWN_LIGHT = "unknown"
+"""name of the light of images without one"""
 _KEY = "rnd_checkpoint"
 
 
@@ -33,12 +36,21 @@ class Checkpoint:
     """A trained avatar."""
 
     model: AvatarModel
-    probe: Tensor  # [32, 64, 3] linear radiance
+    probes: dict[str, Tensor]  # [32, 64, 3] linear radiance of each training light, the default one first
     skeleton: Skeleton
     config: TrainConfig
     info: dict[str, Any]  # provenance, see ``Training.info``
     file: Path
     sha256: str  # of ``file``
+
+    @property
+    def probe(self) -> Tensor:
+        """The default light [32, 64, 3], which an export embeds."""
+        return next(iter(self.probes.values()))
+
+    def probe_of(self, name: str | None) -> Tensor:
+        """The training light called ``name`` [32, 64, 3], by default the default one."""
+        return self.probes.get(name or UNKNOWN_LIGHT, self.probe)
 
     def learned_from(self, capture: Path) -> bool:
         """Whether the avatar was trained on this capture.json."""
@@ -58,16 +70,26 @@ class Checkpoint:
 
 
 def save_checkpoint(
-    path: Path, model: AvatarModel, probe: Tensor, skeleton: Skeleton, config: TrainConfig, info: dict[str, Any]
+    path: Path,
+    model: AvatarModel,
+    probes: Mapping[str, Tensor],
+    skeleton: Skeleton,
+    config: TrainConfig,
+    info: dict[str, Any],
 ) -> None:
-    """Write ``avatar.ckpt`` atomically; ``probe`` [32, 64, 3] linear, ``info`` of JSON values."""
+    """Write ``avatar.ckpt`` atomically; ``probes`` [32, 64, 3] linear, the default one first, ``info`` of JSON values.
+
+    The first is the tensor ``probe``, others are ``probe.1``, ``probe.2``, …
+    """
     tensors = {f"model.{k}": v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-    tensors["probe"] = probe.detach().cpu().contiguous()
+    for index, probe in enumerate(probes.values()):
+        tensors[_probe_tensor(index)] = probe.detach().cpu().contiguous()
     tensors["skeleton.rest_joints"] = torch.as_tensor(np.asarray(skeleton.rest_joints), dtype=torch.float64)
     header = {
         "schema": SCHEMA,
         "config": to_dict(config),
         "skeleton": {"names": list(skeleton.names), "parents": [int(p) for p in skeleton.parents]},
+        "lights": list(probes),
         "info": info,
     }
     write_tensors(path, tensors, header)
@@ -87,12 +109,18 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         )
         state = {k.removeprefix("model."): v for k, v in tensors.items() if k.startswith("model.")}
         model = rebuild_model(config, state, skeleton)
-        probe = tensors["probe"]
+        info = header.get("info", {})
+        names = header.get("lights") or [*info.get("lights", {}), UNKNOWN_LIGHT][:1]
+        probes = {str(name): tensors[_probe_tensor(index)] for index, name in enumerate(names)}
     except (KeyError, TypeError, RuntimeError, IndexError, ValueError, AttributeError) as error:
         raise InputError("not an avatar checkpoint", got=str(error).splitlines()[0], file=path) from error
     if not all(bool(torch.isfinite(t).all()) for t in tensors.values() if t.is_floating_point()):
         raise InputError("checkpoint", expected="finite numbers", got="NaN or infinity", file=path)
-    return Checkpoint(model, probe, skeleton, config, header.get("info", {}), Path(path), sha256_of(path))
+    return Checkpoint(model, probes, skeleton, config, info, Path(path), sha256_of(path))
+
+
+def _probe_tensor(index: int) -> str:
+    return f"probe.{index}" if index else "probe"
 
 
 def rebuild_model(config: TrainConfig, state: dict[str, Tensor], skeleton: Skeleton) -> AvatarModel:

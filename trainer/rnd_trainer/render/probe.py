@@ -1,4 +1,4 @@
-"""Learnable light probe, and the texels that a training step sums over."""
+"""Learnable light probes, and the texels that a training step sums over."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Texels:
     power: Tensor  # [K, 3] = L Δω / probability
 
 
-class LightProbe(nn.Module):
-    """L(ω): 32×64 texels of linear RGB, stored as logarithms.
+class LightProbes(nn.Module):
+    """L(ω) of each light: 32×64 texels of linear RGB, stored as logarithms.
 
-    The factor that albedo and light share is fixed by Σ exposure · luminance = level, initially a mean of 1 over the
-    sphere.
+    The one factor that albedo and all lights share is fixed by Σ exposure · luminance = level, summed over lights and
+    texels; initially a mean of 1 over the sphere.
     """
 
     directions: Tensor
@@ -40,23 +40,23 @@ class LightProbe(nn.Module):
     level: Tensor
     start: Tensor
 
-    def __init__(self, channels: int = 3) -> None:
+    def __init__(self, channels: int = 3, lights: int = 1) -> None:
         super().__init__()
-        self.raw = nn.Parameter(torch.zeros(*PROBE_SHAPE, channels))
+        self.raw = nn.Parameter(torch.zeros(lights, *PROBE_SHAPE, channels))
         self.register_buffer("directions", torch.as_tensor(texel_directions(*PROBE_SHAPE), dtype=torch.float32))
         self.register_buffer("solid_angles", torch.as_tensor(texel_solid_angles(*PROBE_SHAPE), dtype=torch.float32))
-        self.register_buffer("exposure", self.solid_angles / (4 * math.pi))
+        self.register_buffer("exposure", (self.solid_angles / (4 * math.pi * lights)).repeat(lights, 1, 1))
         self.register_buffer("level", torch.ones(()))
-        self.register_buffer("start", torch.ones(*PROBE_SHAPE, 3))
+        self.register_buffer("start", torch.ones(lights, *PROBE_SHAPE, 3))
 
     def radiance(self) -> Tensor:
-        """[32, 64, 3] linear."""
-        light = torch.exp(self.raw).expand(*PROBE_SHAPE, 3)
+        """[lights, 32, 64, 3] linear."""
+        light = torch.exp(self.raw).expand(-1, *PROBE_SHAPE, 3)
         return light / (luminance(light) * self.exposure).sum() * self.level
 
     @torch.no_grad()
     def start_from(self, radiance: Tensor, exposure: Tensor) -> None:
-        """Start from ``radiance`` [32, 64, 3] > 0, and fix its luminance under ``exposure`` [32, 64]."""
+        """Start from ``radiance`` [lights, 32, 64, 3] > 0; fix its luminance under ``exposure`` [lights, 32, 64]."""
         grey = self.raw.shape[-1] == 1
         self.start.copy_(radiance)
         self.raw.copy_(torch.log(luminance(radiance)[..., None] if grey else radiance))

@@ -19,7 +19,6 @@ from rnd_runtime.motion.motion import Motion
 from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.posing.forearm import skinning_bones
 from rnd_runtime.posing.window import motion_window
-from rnd_runtime.shading.light import Light
 from rnd_trainer.config import ModelConfig
 from rnd_trainer.losses.metrics import SSIM_WINDOW, mask_box, widened
 from rnd_trainer.model.model import PoseInput
@@ -114,30 +113,6 @@ def check_true_normals(capture: Capture, frames: Iterable[Frame], what: str = "-
         if frame.normal_gt is None:
             expected = "normal_gt of every training image"
             raise InputError(what, expected=expected, got="none", file=capture.folder, frame=frame.frame)
-
-
-def training_light(capture: Capture, what: str = "--light capture") -> tuple[str, Light]:
-    """Name and map of the one light of all training images.
-
-    Raises:
-        InputError: several lights, or none in the capture; the message names the option ``what``.
-    """
-    name = training_light_name(capture, what)
-    return name, capture.load_light(name)
-
-
-def training_light_name(capture: Capture, what: str) -> str:
-    """Name of the one light of all training images, "unknown" if it has none; see ``training_light``."""
-    names = light_names(_frames(capture, "train"))
-    if len(names) != 1:
-        got = ", ".join(names)
-        raise InputError(what, expected="one light in the train split", got=got, file=capture.folder)
-    return names[0]
-
-
-def light_names(frames: Iterable[Frame]) -> list[str]:
-    """Sorted unique names of the lights of ``frames``; "unknown" stands for none."""
-    return sorted({frame.light or "unknown" for frame in frames})
 
 
 def usable(mask: NDArray[np.floating[Any]]) -> bool:

@@ -23,11 +23,12 @@ from rnd_trainer.losses.losses import (
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.losses.repulsion import repulsion
 from rnd_trainer.model.model import AvatarModel, PosedGaussians, PoseInput
-from rnd_trainer.render.probe import LightProbe, Texels, all_texels, sample_texels
+from rnd_trainer.render.probe import Texels, all_texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.render.shading import sh_basis, traced_visibility
 
 from .data import TrainingView
+from .lighting.lights import TrainingLights
 
 MIN_MATCHES = 16
 """points that two views must share for the consistency term"""
@@ -38,8 +39,7 @@ class Objective:
 
     Args:
         config: weights and schedule.
-        probe: the learned light.
-        fixed_light: [32, 64, 3] linear radiance that replaces the probe's, or None.
+        lights: of the training images.
         perceptual: network of the LPIPS term; None: multi-scale DSSIM instead.
         consistency: network whose features L_gc compares; None leaves the term out.
         generator: of all random numbers.
@@ -48,18 +48,13 @@ class Objective:
     def __init__(
         self,
         config: TrainConfig,
-        probe: LightProbe,
-        fixed_light: Tensor | None,
+        lights: TrainingLights,
         perceptual: Perceptual | None,
         consistency: Perceptual | None,
         generator: torch.Generator,
     ) -> None:
-        self.config, self.probe, self.fixed_light = config, probe, fixed_light
+        self.config, self.lights = config, lights
         self.perceptual, self.consistency, self.generator = perceptual, consistency, generator
-
-    def light(self) -> Tensor:
-        """Light [32, 64, 3] of the training images: learned or fixed."""
-        return self.probe.radiance() if self.fixed_light is None else self.fixed_light
 
     def __call__(
         self, model: AvatarModel, view: TrainingView, pose: PoseInput, step: int, stage: int
@@ -76,11 +71,15 @@ class Objective:
             terms["repulsion"] = config.repulsion_every * config.weight_repulsion * self._repulsion(model, posed)
         if config.model.visibility == "pose" and config.light != "none":
             terms["visibility"] = config.weight_visibility * self._visibility_loss(model, posed, pose)
-        texels = None if stage == 1 else self._texels(step)
-        if stage == 2 and self.fixed_light is None:
-            light, probe = self.light(), self.probe
-            terms["chroma"] = config.weight_light_chroma * chroma_prior(light, probe.start, probe.solid_angles)
-            terms["sky"] = config.weight_light_sky * sky_prior(light, probe.directions, probe.solid_angles)
+        texels = None
+        if stage == 2:
+            index, probes = self.lights.index(view.frame), self.lights.probes
+            light = self.lights.radiance()[index]
+            texels = self._texels(light, step)
+            if self.lights.learned:
+                chroma = chroma_prior(light, probes.start[index], probes.solid_angles)
+                terms["chroma"] = config.weight_light_chroma * chroma
+                terms["sky"] = config.weight_light_sky * sky_prior(light, probes.directions, probes.solid_angles)
         rendered = self._render(model, posed, pose, texels, view.camera)
         device = posed.means.device
         background = self._background()
@@ -129,9 +128,9 @@ class Objective:
             terms["lpips"] = config.lpips_every * config.weight_lpips * distance
         return terms
 
-    def _texels(self, step: int) -> Texels:
+    def _texels(self, light: Tensor, step: int) -> Texels:
         config = self.config
-        maps = (self.light(), self.probe.directions, self.probe.solid_angles)
+        maps = (light, self.lights.probes.directions, self.lights.probes.solid_angles)
         if step >= config.steps * (1 - config.full_light_fraction):
             return all_texels(*maps)
         return sample_texels(*maps, config.light_texels, self.generator)

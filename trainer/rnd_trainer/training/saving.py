@@ -27,7 +27,8 @@ REFINED_MOTION = "refined_motion.npz"
 
 def save_training(training: Training, folder: Path) -> None:
     """Write the state, the checkpoint, and the refined motion if there is one."""
-    parts: dict[str, dict[str, Any]] = {"model": training.model.state_dict(), "probe": training.probe.state_dict()}
+    model, probes = training.model, training.lights.probes
+    parts: dict[str, dict[str, Any]] = {"model": model.state_dict(), "probes": probes.state_dict()}
     if training.refinement is not None:
         parts["poses"] = training.refinement.state_dict()
     if training.unseen is not None:
@@ -55,7 +56,8 @@ def save_training(training: Training, folder: Path) -> None:
     }
     write_tensors(folder / STATE_FILE, tensors, header)
     checkpoint = folder / "avatar.ckpt"
-    save_checkpoint(checkpoint, training.model, training.light(), capture.body.skeleton, config, provenance(training))
+    lights, skeleton = training.lights.by_name(), capture.body.skeleton
+    save_checkpoint(checkpoint, model, lights, skeleton, config, provenance(training))
     if training.refinement is not None:
         save_motion(folder / REFINED_MOTION, training.motion())
 
@@ -74,7 +76,7 @@ def resume_training(training: Training, path: Path) -> None:
         raise InputError("--resume", expected="the images and poses it was started with", got="others", file=path)
     try:
         training.model.load_state_dict(saved.part("model"))
-        training.probe.load_state_dict(saved.part("probe"))
+        training.lights.probes.load_state_dict(saved.part("probes"))
         if training.refinement is not None:
             training.refinement.load_state_dict(saved.part("poses"))
         if teacher:
@@ -96,12 +98,12 @@ def resume_training(training: Training, path: Path) -> None:
 def provenance(training: Training) -> dict[str, Any]:
     """Where the checkpoint comes from: data, lights, networks, steps, time and machine."""
     capture, device = training.capture, training.device
-    lights = sorted({view.frame.light for view in training.views if view.frame.light})
+    lights = {view.frame.light for view in training.views if view.frame.light}
     return {
         "capture": capture.folder.resolve().name,
         "capture_sha256": sha256_of(capture.file),
         "motion": Path(capture.motion.source).name,
-        "lights": {name: capture.light_sha256(name) for name in lights},
+        "lights": {name: capture.light_sha256(name) for name in training.lights.names if name in lights},
         "body_license": capture.body.license,
         "step": training.step_index,
         "steps_planned": training.schedule.total,

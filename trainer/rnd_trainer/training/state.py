@@ -19,6 +19,7 @@ from rnd_trainer.config import TrainConfig, from_dict, to_dict
 from rnd_trainer.model.checkpoint import read_tensors
 
 from .data import TrainingView
+from .lighting.lights import light_name
 
 STATE_SCHEMA = "rnd-training/1"
 STATE_FILE = "training.state"
@@ -84,8 +85,8 @@ def read_state(path: Path) -> TrainingState:
     return TrainingState(path, *read_tensors(path, STATE_SCHEMA))
 
 
-def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, light: tuple[str, Light] | None) -> str:
-    """Digest of the training data: images, cameras, frames, poses, body, and ``light`` if given.
+def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, lights: dict[str, Light]) -> str:
+    """Digest of the training data: images, cameras, frames, poses, body, and given ``lights``.
 
     Equal on every CPU: computed values are rounded, and of images with ``scale`` ≠ 1 the files are hashed.
     """
@@ -109,8 +110,10 @@ def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, li
     add(_rounded(motion.rotations), _rounded(motion.translations), _rounded(motion.fps))
     add(_rounded(body.vertices), body.faces, _rounded(body.skinning_weights))
     add(_rounded(body.skeleton.rest_joints))
-    if light is not None:
-        name, radiance = light
+    names = [light_name(view.frame) for view in views]
+    if len(set(names)) > 1:
+        digest.update("\0".join(names).encode())
+    for name, radiance in lights.items():
         digest.update(name.encode())
         add(radiance.radiance, _rounded(radiance.rotation))
     return digest.hexdigest()

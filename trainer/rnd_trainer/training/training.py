@@ -18,15 +18,14 @@ from torch.nn.utils import get_total_norm
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
-from rnd_runtime.shading.light import texel_directions
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.model.template import sample_template
-from rnd_trainer.render.probe import PROBE_SHAPE, LightProbe, as_probe
 
-from .data import TrainingView, load_views, pose_input, training_light, training_light_name
+from .data import TrainingView, load_views, pose_input
 from .lighting import light_search
+from .lighting.lights import TrainingLights, capture_lights, light_names
 from .lighting.skin import TONES, skin_points
 from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
@@ -76,8 +75,6 @@ class Training:
         *,
         consistency: Perceptual | None = None,
     ) -> None:
-        if config.light == "learn":
-            training_light_name(capture, "learning a light")
         capture = capture.holding_out() if config.hold_out else capture
         self.capture, self.config, self.schedule = capture, config, Schedule(config)
         torch.manual_seed(config.seed)
@@ -90,15 +87,13 @@ class Training:
         self.views, self.bad_masks = load_views(capture, "train", config.image_scale, config.normals == "true")
         self.poses = [self.pose(view) for view in self.views]
 
-        # model, light, pose corrections
+        # model, lights, pose corrections
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
         self._skin = skin_points(template, capture.body.skeleton)
         self.model = AvatarModel(config.model, template).to(self.device)
-        self.probe = LightProbe(config.probe_channels).to(self.device)
-        fixed_light = None
-        if config.light == "capture":
-            light = training_light(capture)[1].resized(*PROBE_SHAPE)  # before rotating, which keeps a sun in one texel
-            fixed_light = as_probe(light.sample(texel_directions(*PROBE_SHAPE))).to(self.device)
+        self.fixed_lights = capture_lights(capture) if config.light == "capture" else None
+        names = light_names(view.frame for view in self.views)
+        self.lights = TrainingLights(names, config.probe_channels, self.fixed_lights).to(self.device)
         self.refinement: PoseRefinement | None = None
         if config.refine_poses:
             frames = [view.frame.frame for view in self.views]
@@ -107,7 +102,7 @@ class Training:
             self.refinement = PoseRefinement(motion, skeleton, frames, unsure).to(self.device)
 
         # objectives: of an image, and from the third stage on of unseen poses
-        self.objective = Objective(config, self.probe, fixed_light, self.perceptual, self.consistency, self.generator)
+        self.objective = Objective(config, self.lights, self.perceptual, self.consistency, self.generator)
         self.unseen: UnseenPoses | None = None
 
         # optimizer
@@ -116,7 +111,7 @@ class Training:
         rates = [
             (networks, config.rate_networks),
             (residuals, config.rate_residuals),
-            ([self.probe.raw], config.rate_light),
+            ([self.lights.probes.raw], config.rate_light),
         ]
         if self.refinement is not None:
             rates.append((list(self.refinement.raw), config.rate_poses))
@@ -226,12 +221,14 @@ class Training:
         if self._searches_light:
             motion = self.motion()
             poses = [self.pose(view, motion) for view in self.views]
-            skin, tone = self._skin, self.config.skin
-            known = None if tone is None else TONES[tone - 1]
-            found = light_search.initial_light(self.model, self.views, poses, self.on_light_search, skin, known)
+            lights = [self.lights.index(view.frame) for view in self.views]
+            known = None if self.config.skin is None else TONES[self.config.skin - 1]
+            found = light_search.initial_light(
+                self.model, self.views, poses, lights, self.on_light_search, self._skin, known
+            )
             self.light_found = found is not None
             if found is not None:
-                self.probe.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
+                self.lights.probes.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
         self.lit = True
 
     def _copy_colour_to_albedo(self) -> None:
@@ -257,10 +254,6 @@ class Training:
         """Stage of the next step; see ``Schedule``."""
         return self.schedule.stage(self.step_index)
 
-    def light(self) -> Tensor:
-        """Light [32, 64, 3] of the training images: learned, or the capture's own."""
-        return self.objective.light()
-
     def motion(self) -> Motion:
         """The capture's motion; with ``refine_poses`` its training frames are corrected."""
         return self.capture.motion if self.refinement is None else self.refinement.apply_to(self.capture.motion)
@@ -274,5 +267,4 @@ class Training:
     @cached_property
     def learned_from_sha256(self) -> str:
         """Digest of the training data, of which a training can only be resumed with the same."""
-        light = training_light(self.capture) if self.config.light == "capture" else None
-        return learned_sha256(self.views, self.capture, self.config.image_scale, light)
+        return learned_sha256(self.views, self.capture, self.config.image_scale, self.fixed_lights or {})

@@ -208,7 +208,7 @@ class Scene:
         """The key of the light in use: a probe's file, a light of the capture, or None for the avatar's own."""
         if state.truth is not None:
             light = self._capture_frame(state.truth)[1].light
-            return str(light) if light else None
+            return light if self.capture is not None and self.capture.has_map(light) else None
         if state.light > len(self._files):
             raise InputError("light", expected=f"0 to {len(self._files)}", got=state.light)
         return self._files[state.light - 1] if state.light else None

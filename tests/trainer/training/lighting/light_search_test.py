@@ -10,7 +10,8 @@ import torch
 
 from rnd_runtime.shading.light import texel_directions, texel_solid_angles
 from rnd_trainer.training.lighting import light_search, skin
-from rnd_trainer.training.lighting.light_search import Observations, initial_light
+from rnd_trainer.training.lighting.light_search import initial_light
+from rnd_trainer.training.lighting.observations import FACING, Observations
 
 COUNT, IMAGES = 700, 24
 WITHIN = math.cos(math.radians(6))  # a probe texel is 5.6° wide
@@ -31,7 +32,7 @@ def _rotating_ball(sun: np.ndarray, strength: float) -> Observations:
             [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
         )
         normals = points @ rotation.T
-        seen = (normals[:, 2] > light_search.FACING).nonzero()[:, 0]
+        seen = (normals[:, 2] > FACING).nonzero()[:, 0]
         arriving = 1 + strength / math.pi * (normals[seen] @ torch.as_tensor(sun).float()).clamp(min=0)
         point.append(seen.numpy())
         colour.append((albedo[seen] * arriving[:, None]).double().numpy())
@@ -40,15 +41,21 @@ def _rotating_ball(sun: np.ndarray, strength: float) -> Observations:
     return Observations(*(np.concatenate(x) for x in (point, colour, image)), posed, 0.1)
 
 
+def _arriving(ball: Observations, sun: np.ndarray) -> np.ndarray:
+    """Irradiance over π of each observation [n] under the sky and a sun of strength 6."""
+    normals = np.concatenate([n[ball.point[ball.image == k]] for k, (_, n) in enumerate(ball.posed)])
+    return 1 + 6 / math.pi * np.maximum(normals @ sun, 0)
+
+
 @pytest.mark.parametrize("strength", [0.0, 6.0])
 def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
     sun /= np.linalg.norm(sun)
     ball = _rotating_ball(sun, strength)
-    monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
     found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
     assert found is not None
-    light, exposure = found.radiance, found.exposure
+    light, exposure = found.radiance[0], found.exposure[0]
     assert light.shape == (32, 64, 3) and (light > 0).all() and (exposure >= 0).all()
     solid_angles = texel_solid_angles(32, 64)
     grey = light.mean(-1)
@@ -76,12 +83,36 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
     rng = np.random.default_rng(0)
     ball.colour *= np.exp(0.3 * rng.normal(size=(len(ball.colour), 1)))
     ball.colour[shade[rng.random(len(shade)) < 1 / 4]] *= 2
-    monkeypatch.setattr(light_search, "_observe", lambda *_: ball)
+    monkeypatch.setattr(light_search, "observe", lambda *_: ball)
     found = initial_light(None, [], [])  # type: ignore[arg-type]
     assert found is not None
-    energy = found.radiance.mean(-1) * texel_solid_angles(32, 64)
+    energy = found.radiance[0].mean(-1) * texel_solid_angles(32, 64)
     near = texel_directions(32, 64) @ sun > math.cos(math.radians(12))
     assert energy[near].sum() / energy.sum() == pytest.approx(6 / (6 + 4 * math.pi), rel=ROBUST)
+
+
+def test_two_lights_are_found_with_their_ratio(monkeypatch) -> None:
+    """Noon is twice as bright as evening, which is redder; the albedo tells, as it is the same in both."""
+    noon, evening = (np.array(sun) / np.linalg.norm(sun) for sun in ([0.7, 0.5, 0.51], [-0.6, 0.3, 0.74]))
+    balls = [_rotating_ball(sun, 6.0) for sun in (noon, evening)]
+    factors = np.array([[2.0, 2.0, 2.0], [1.4, 1.0, 0.7]])
+    both = Observations(
+        np.concatenate([ball.point for ball in balls]),
+        np.concatenate([ball.colour * factor for ball, factor in zip(balls, factors, strict=True)]),
+        np.concatenate([balls[0].image, balls[1].image + IMAGES]),
+        [*balls[0].posed, *balls[1].posed],
+        0.1,
+        [0] * IMAGES + [1] * IMAGES,
+    )
+    monkeypatch.setattr(light_search, "observe", lambda *_: both)
+    found = initial_light(None, [], [])  # type: ignore[arg-type]
+    assert found is not None
+    for radiance, sun in zip(found.radiance, (noon, evening), strict=True):
+        brightest = texel_directions(32, 64).reshape(-1, 3)[radiance.mean(-1).argmax()]
+        assert brightest @ sun > WITHIN
+    reached = np.einsum("lhwc,lhw->lc", found.radiance, found.exposure)
+    true = factors * [[_arriving(ball, sun).mean()] for ball, sun in zip(balls, (noon, evening), strict=True)]
+    assert reached[0] / reached[1] == pytest.approx(true[0] / true[1], rel=SHADOWS)
 
 
 def test_equal_images_give_none(monkeypatch) -> None:
@@ -98,14 +129,14 @@ def test_equal_images_give_none(monkeypatch) -> None:
     )
     once = Observations(ball.point[first], ball.colour[first], ball.image[first], ball.posed[:1], ball.spacing)
     for seen in (alike, once):
-        monkeypatch.setattr(light_search, "_observe", lambda *_, seen=seen: seen)
+        monkeypatch.setattr(light_search, "observe", lambda *_, seen=seen: seen)
         assert initial_light(None, [], []) is None  # type: ignore[arg-type]
 
 
 def test_too_few_observations_give_none(monkeypatch) -> None:
     ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 0.0)
     few = Observations(ball.point[:20], ball.colour[:20], ball.image[:20], ball.posed, 0.1)
-    monkeypatch.setattr(light_search, "_observe", lambda *_: few)
+    monkeypatch.setattr(light_search, "observe", lambda *_: few)
     assert initial_light(None, [], []) is None  # type: ignore[arg-type]
 
 
@@ -114,5 +145,5 @@ def test_points_observed_once_or_twice_give_no_sun(monkeypatch) -> None:
     ball = _rotating_ball(np.array([0.7, 0.5, 0.51]), 6.0)
     few = np.isin(ball.image, (0, 8, 16))
     seen = Observations(ball.point[few], ball.colour[few], ball.image[few] // 8, ball.posed[::8], ball.spacing)
-    monkeypatch.setattr(light_search, "_observe", lambda *_: seen)
+    monkeypatch.setattr(light_search, "observe", lambda *_: seen)
     assert initial_light(None, [], []) is None  # type: ignore[arg-type]

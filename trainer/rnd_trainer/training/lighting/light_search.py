@@ -17,19 +17,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from rnd_runtime.core.images import srgb_to_linear
 from rnd_runtime.shading.light import REC709_LUMINANCE, texel_directions, texel_solid_angles
 from rnd_trainer.model.model import AvatarModel, PoseInput
-from rnd_trainer.render.in_sight import in_sight
 from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
-from rnd_trainer.render.shading import traced_visibility
 from rnd_trainer.training.data import TrainingView
 
-from .skin import BODY_LUMINANCE, likely_gain
+from .observations import POINTS, Observations, light_luminance, observe, point_luminance, transport_of, with_bounce
+from .skin import likely_gain
 
 Floats = NDArray[np.float64]
 
@@ -42,9 +39,9 @@ SKY_SHARPNESS = 4.0
 SKY_FLOOR = 0.02
 """smallest radiance relative to the mean: the probe stores logarithms"""
 MAX_LIGHTS = 3
-"""directional lights"""
+"""directional lights of each light of the capture"""
 MIN_GAIN = 0.01
-"""relative decrease of the squared error below which no directional light is added"""
+"""relative decrease of the squared error below which no directional light is added; of several lights their share"""
 NOISE_FLOOR = 2e-3
 """squared error relative to the energy at which the search ends; that of real captures is ten times as large"""
 CANDIDATES = 24
@@ -61,52 +58,37 @@ SKY_PRIOR = 1.0
 """relative weight of the natural sky"""
 PENALTY = 30.0
 """relative weight of the constraint that fixes the scale of the light"""
-POINTS = 3_000
-"""nodes observed"""
-FRAMES = 40
-"""images observed, evenly spaced"""
-FACING = 0.3
-"""smallest cosine between normal and view of an observation"""
 MIN_OBSERVATIONS = 3
 """observations of a point that is used: with one or two its unknown albedo explains any light"""
-OCCLUSION = 0.03
-"""distance behind the first surface up to which a point is visible, m"""
 
 
 @dataclass
 class InitialLight:
     """Initial light."""
 
-    radiance: NDArray[np.float32]  # [32, 64, 3] linear
-    exposure: NDArray[np.float32]  # [32, 64] mean radiance of a visible white body per unit radiance of a texel
-
-
-@dataclass
-class Observations:
-    """n observations of body points."""
-
-    point: NDArray[np.int64]  # [n] index
-    colour: Floats  # [n, 3] linear
-    image: NDArray[np.int64]  # [n] index
-    posed: list[tuple[torch.Tensor, torch.Tensor]]  # means and normals of the points in each image
-    spacing: float  # m
+    radiance: NDArray[np.float32]  # [lights, 32, 64, 3] linear
+    exposure: NDArray[np.float32]
+    """[lights, 32, 64] mean radiance of a visible white body, over all images, per unit radiance of a texel"""
 
 
 def initial_light(
     model: AvatarModel,
     views: Sequence[TrainingView],
     poses: Sequence[PoseInput],
+    lights: Sequence[int] = (),
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     skin: NDArray[np.int64] | None = None,
     tone: float | None = None,
 ) -> InitialLight | None:
-    """The light that best explains the images; None if the body is hardly visible, or only from one side.
+    """The lights that best explain the images; None if the body is hardly visible, or only from one side.
 
-    The factor per channel that light and albedo share is ``skin.likely_gain``'s.
+    Several are searched jointly: points have one albedo under all of them, so their ratios come from the images. The
+    one factor per channel that lights and albedo share is ``skin.likely_gain``'s.
 
     Args:
         model: after the first stage.
         views, poses: of the training images.
+        lights: index of the light of each image; empty: all have one.
         skin: indices of points that may be skin; None: none.
         tone: known reflectance of the skin.
         on_progress: called with done and total.
@@ -117,42 +99,46 @@ def initial_light(
         on_progress(next(steps), 5)
 
     on_progress(0, 5)
-    observations = _observe(model, views, poses)
+    observations = observe(model, views, poses, lights)
     advance()
     if len(observations.point) == 0:
         return None
     reliable = np.bincount(observations.point)[observations.point] >= MIN_OBSERVATIONS
     if np.count_nonzero(reliable) < 10 * SKY_LOBES:
         return None
-    weight = _point_luminance(observations) * reliable
+    weight = point_luminance(observations) * reliable / light_luminance(observations) ** 2
     directions, solid_angles = _grid(PROBE_SHAPE)
     coarse_directions, coarse_angles = _grid(SEARCH_SHAPE)
-    coarse = _transport(observations, coarse_directions, coarse_angles)
-    exposure = _upsample(coarse.mean(0) / coarse_angles) * solid_angles
+    coarse = transport_of(observations, coarse_directions, coarse_angles)
+    exposure = _exposure(observations, coarse) / _upsampled(coarse_angles) * solid_angles
     hidden = np.maximum(1 - coarse.sum(1), 0)
-    coarse = _with_bounce(coarse, hidden)
-    sky = coarse @ _lobes(coarse_directions).astype(np.float32)
-    quadratic = _quadratic(observations, np.concatenate([sky, coarse], axis=1), weight)
+    coarse = with_bounce(coarse, hidden)
+    blocks, skies = observations.blocks, SKY_LOBES * observations.lights
+    sky = blocks(coarse @ _lobes(coarse_directions).astype(np.float32))
+    quadratic = _quadratic(observations, np.concatenate([sky, blocks(coarse)], axis=1), weight)
     advance()
     if quadratic.is_undetermined():
         return None
-    coarse_lights = _search(quadratic)
+    coarse_suns = (np.array(_search(quadratic), int) - skies) % len(coarse_directions)
     advance()
-    near_texels = _texels_near(directions, coarse_directions[np.array(coarse_lights, int) - SKY_LOBES])
-    fine = _with_bounce(_transport(observations, directions[near_texels], solid_angles[near_texels]), hidden)
+    near_texels = _texels_near(directions, coarse_directions[coarse_suns])
+    fine = blocks(with_bounce(transport_of(observations, directions[near_texels], solid_angles[near_texels]), hidden))
     columns = np.concatenate([sky, fine], axis=1)
-    lights = _search(_quadratic(observations, columns, weight))
+    suns = _search(_quadratic(observations, columns, weight))
     advance()
-    intensity = _intensities(observations, columns[:, [*range(SKY_LOBES), *lights]])
+    intensity = _intensities(observations, columns[:, [*range(skies), *suns]])
     advance()
-    radiance = _lobes(directions) @ intensity[:SKY_LOBES]
-    radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean())
-    radiance[near_texels[np.array(lights, int) - SKY_LOBES]] += intensity[SKY_LOBES:]
-    irradiance = columns[:, [*range(SKY_LOBES), *lights]] @ intensity
+    radiance = np.stack([_lobes(directions) @ block for block in np.split(intensity[:skies], observations.lights)])
+    radiance = np.maximum(radiance, SKY_FLOOR * radiance.mean((1, 2), keepdims=True))
+    observed = np.unique(observations.light())
+    radiance[np.setdiff1d(np.arange(len(radiance)), observed)] = radiance[observed].mean(0)
+    light, texel = np.divmod(np.array(suns, int) - skies, max(len(near_texels), 1))
+    radiance[light, near_texels[texel]] += intensity[skies:]
+    irradiance = columns[:, [*range(skies), *suns]] @ intensity
     albedo, weight = _albedo(observations, irradiance)
     radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
     return InitialLight(
-        radiance.reshape(*PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(PROBE_SHAPE).astype(np.float32)
+        radiance.reshape(-1, *PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(-1, *PROBE_SHAPE).astype(np.float32)
     )
 
 
@@ -162,58 +148,25 @@ def warm_up() -> None:
     transport = rng.random((8 * POINTS, SKY_LOBES + math.prod(SEARCH_SHAPE)), dtype=np.float32)
     colour, point = 0.1 + rng.random((len(transport), 3)), np.arange(len(transport)) % POINTS
     observations = Observations(point, colour, np.zeros(len(point), np.int64), [], 0.0)
-    _quadratic(observations, transport, _point_luminance(observations)).fit(range(SKY_LOBES))
-
-
-def _observe(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[PoseInput]) -> Observations:
-    """Colours of the first nodes where they are visible, inside the mask and not clipped."""
-    nodes = min(POINTS, model.config.nodes)
-    spacing = float(model.spacing) * math.sqrt(len(model.points) / nodes)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(FRAMES, len(views))).astype(int))
-    point, colour, image, posed_nodes = [], [], [], []
-    for k, index in enumerate(chosen):
-        view, camera = views[index], views[index].camera
-        with torch.no_grad():
-            posed = model(poses[index])
-        visible, pixel = in_sight(posed, camera, nodes, facing=FACING, occlusion=OCCLUSION)
-        column, row = pixel.astype(int).T
-        pixels = view.image[row, column]
-        unclipped = (view.mask[row, column] == 255) & (pixels.max(1) < 250)
-        usable = np.nonzero(visible & unclipped)[0]
-        point.append(usable)
-        colour.append(srgb_to_linear(pixels[usable] / 255))
-        image.append(np.full(len(usable), k))
-        posed_nodes.append((posed.means[:nodes].cpu(), posed.normals[:nodes].cpu()))
-    return Observations(np.concatenate(point), np.concatenate(colour), np.concatenate(image), posed_nodes, spacing)
-
-
-def _transport(observations: Observations, directions: Floats, solid_angles: Floats) -> NDArray[np.float32]:
-    """[n, K] radiance of white observations per unit radiance from each direction, shadows traced."""
-    towards = torch.as_tensor(directions, dtype=torch.float32)
-    rows = []
-    for k, (means, normals) in enumerate(observations.posed):
-        point = observations.point[observations.image == k]
-        visible = traced_visibility(means, normals, towards, observations.spacing)[point]
-        rows.append((visible * (normals[point] @ towards.T).clamp(min=0)).numpy())
-    return np.concatenate(rows) * (solid_angles / np.pi).astype(np.float32)
-
-
-def _with_bounce(transport: NDArray[np.float32], hidden: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Transport [n, K] with one reflection: the hidden share [n] of the hemisphere is as bright as the mean body.
-
-    Without it the light from below and behind, where limbs face each other, comes out 1.2 to 1.6 times too strong.
-    """
-    reflected: NDArray[np.float32] = transport + BODY_LUMINANCE * hidden[:, None] * transport.mean(0)
-    return reflected
+    _quadratic(observations, transport, point_luminance(observations)).fit(range(SKY_LOBES))
 
 
 @dataclass
 class Quadratic:
-    """Squared error Lᵀ residual_gram L of a light L, per channel, over Q columns of the dictionary."""
+    """Squared error Lᵀ residual_gram L of a light L, per channel, over Q columns of the dictionary.
+
+    The first are the sky lobes of each of the lights.
+    """
 
     residual_gram: Floats  # [3, Q, Q]
     irradiance_gram: Floats  # [Q, Q]; Lᵀ irradiance_gram L is the squared irradiance
     irradiance: Floats  # [Q]; irradiance · L is the total irradiance
+    lights: int = 1
+
+    @property
+    def skies(self) -> int:
+        """Number of sky lobes."""
+        return SKY_LOBES * self.lights
 
     def is_undetermined(self) -> bool:
         """Whether the observations do not constrain the light."""
@@ -228,10 +181,11 @@ class Quadratic:
         for channel in range(3):
             gram = self.residual_gram[channel][np.ix_(selected, selected)]
             gram = gram + np.diag(RIDGE * np.diag(gram) + 1e-12)
-            sky = slice(0, SKY_LOBES)  # always among the columns
-            level = SKY_PRIOR * float(np.diag(gram)[sky].mean())
             expected = natural_sky(_lobe_centres()[:, 1])
-            gram[sky, sky] += level * (np.eye(SKY_LOBES) - np.outer(expected, expected) / (expected @ expected))
+            for first in range(0, self.skies, SKY_LOBES):  # always among the columns
+                sky = slice(first, first + SKY_LOBES)
+                level = SKY_PRIOR * float(np.diag(gram)[sky].mean())
+                gram[sky, sky] += level * (np.eye(SKY_LOBES) - np.outer(expected, expected) / (expected @ expected))
             factor = np.linalg.cholesky(gram).T  # ‖factor L‖² is the error
             equations = np.concatenate([factor, weight * self.irradiance[None, selected]])
             target = np.append(np.zeros(len(selected)), weight)
@@ -254,12 +208,6 @@ class Quadratic:
         return gain
 
 
-def _point_luminance(observations: Observations) -> Floats:
-    """Mean luminance of each observation's point [n], the weight of its error."""
-    count = np.maximum(np.bincount(observations.point), 1)
-    return (np.bincount(observations.point, observations.colour @ REC709_LUMINANCE) / count)[observations.point]
-
-
 def _quadratic(observations: Observations, transport: NDArray[np.float32], weight: Floats) -> Quadratic:
     """Quadratic form of ``transport`` [n, Q] with ``weight`` [n], the albedo eliminated.
 
@@ -279,13 +227,13 @@ def _quadratic(observations: Observations, transport: NDArray[np.float32], weigh
         unit = (colour / np.maximum(length[observations.point], 1e-9)).astype(rows.dtype)
         along = np.add.reduceat((rows * unit[:, None])[order], starts, axis=0).astype(np.float64)
         residual_gram[channel] = irradiance_gram - along.T @ along
-    return Quadratic(residual_gram, irradiance_gram, rows.sum(0, dtype=np.float64))
+    return Quadratic(residual_gram, irradiance_gram, rows.sum(0, dtype=np.float64), observations.lights)
 
 
 def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Floats:
     """Intensities [Q, 3] of all columns that minimise the absolute error of log colours."""
     all_columns = list(range(columns.shape[1]))
-    _, intensity = _quadratic(observations, columns, _point_luminance(observations)).fit(all_columns)
+    _, intensity = _quadratic(observations, columns, point_luminance(observations)).fit(all_columns)
     colour = np.log(np.maximum(observations.colour @ REC709_LUMINANCE, 1e-4))
     count, weight = int(observations.point.max()) + 1, np.ones(len(colour))
     for _ in range(REWEIGHTINGS):
@@ -315,30 +263,39 @@ def _search(quadratic: Quadratic) -> list[int]:
     Without shadows a direction and its opposite have similar gradients: above degree 1 the SH coefficients of a cosine
     lobe are even only (Ramamoorthi & Hanrahan 2001). ``CANDIDATES`` are therefore fitted.
     """
-    columns = list(range(SKY_LOBES))
+    skies, lights = quadratic.skies, quadratic.lights
+    columns = list(range(skies))
     before, intensity = quadratic.fit(columns)
-    sky = slice(0, SKY_LOBES)
-    noise = NOISE_FLOOR * float(np.einsum("qc,qr,rc", intensity, quadratic.irradiance_gram[sky, sky], intensity))
-    while len(columns) < min(SKY_LOBES + MAX_LIGHTS, len(quadratic.irradiance)) and before > noise:
+    sky = slice(0, skies)
+    energy = float(np.einsum("qc,qr,rc", intensity, quadratic.irradiance_gram[sky, sky], intensity))
+    noise = NOISE_FLOOR / lights * energy
+    while len(columns) < min(skies + MAX_LIGHTS * lights, len(quadratic.irradiance)) and before > noise:
         gain = quadratic.gains(columns, intensity)
         gain[columns] = -np.inf
         tried = [(quadratic.fit([*columns, int(k)])[0], int(k)) for k in np.argsort(-gain)[:CANDIDATES]]
         after, best = min(tried)
-        if before - after < MIN_GAIN * before:
+        if before - after < MIN_GAIN / lights * before:
             break
         columns.append(best)
         before, intensity = quadratic.fit(columns)
-    return columns[SKY_LOBES:]
+    return columns[skies:]
 
 
 def _grid(shape: tuple[int, int]) -> tuple[Floats, Floats]:
     return texel_directions(*shape).reshape(-1, 3), texel_solid_angles(*shape).reshape(-1)
 
 
-def _upsample(values: Floats) -> Floats:
-    """A map [K] of the search's texels, repeated to the probe's."""
+def _exposure(observations: Observations, coarse: NDArray[np.float32]) -> Floats:
+    """Mean of ``coarse`` [n, K], over all observations and by lights, at the probe's texels: [lights, 2048]."""
+    own = np.eye(observations.lights)[observations.light()]
+    return _upsampled(own.T @ coarse / len(coarse))
+
+
+def _upsampled(values: Floats) -> Floats:
+    """Maps [..., 512] of the search's texels, repeated to the probe's [..., 2048]."""
     rows, columns = (fine // coarse for fine, coarse in zip(PROBE_SHAPE, SEARCH_SHAPE, strict=True))
-    return values.reshape(SEARCH_SHAPE).repeat(rows, 0).repeat(columns, 1).reshape(-1)
+    maps = values.reshape(*values.shape[:-1], *SEARCH_SHAPE).repeat(rows, -2).repeat(columns, -1)
+    return maps.reshape(*values.shape[:-1], -1)
 
 
 def _lobe_centres() -> Floats:
