@@ -110,6 +110,14 @@ class Avatar:
             levels.append(level)
         return tuple(levels)
 
+    def scale_albedo(self, gain: Sequence[float]) -> None:
+        """Multiply the albedo by ``gain`` [3] of linear R, G and B; it stays below what conserves energy.
+
+        ``levels`` made before stay.
+        """
+        scaled = self._albedo * np.asarray(gain, np.float32)
+        self._albedo = np.clip(scaled, 0, np.float32(LARGEST_ALBEDO))
+
     def pose(self, motion: Motion, time: float) -> Gaussians:
         """The avatar at ``time`` seconds of ``motion`` (mapped to its skeleton), in the world frame."""
         return self.posed(self.encode(motion, time).in_world())

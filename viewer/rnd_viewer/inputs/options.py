@@ -76,6 +76,20 @@ class MotionOptions:
         refuse_outside(self, {"motion_fps": FPS_LIMITS, **EDIT_LIMITS})
 
 
+def parse_gain(text: str) -> tuple[float, float, float]:
+    """Factors of --albedo-gain from ``R,G,B`` or one number; raises ``InputError`` outside 0 to 100."""
+    words = text.split(",")
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        values = []
+    if len(values) not in (1, 3) or not all(0 <= value <= 100 for value in values):
+        raise InputError("--albedo-gain", expected="R,G,B or one number, 0 to 100", got=text)
+    red, green, blue = values * (3 // len(values))
+    return red, green, blue
+
+
+GAIN = "R,G,B"
 MotionGroup = Annotated[MotionOptions, *group("motion")]
 ProbeUp = Annotated[Up, option()]
 
@@ -118,6 +132,8 @@ class _Lighting:
     """Duration of one rotation of the light, from --hdr-yaw on; negative rotates the other way. Default: none."""
     exposure: Number = 0.0
     """Stops by which the light is made brighter."""
+    albedo_gain: Annotated[str, option(GAIN)] = "1"
+    """Factors on the albedo, linear: corrects colours that training put into the light."""
     background: Annotated[str, option("none|hdr|COLOUR")] = "none"
     """none is transparent; hdr is the light itself; a COLOUR is #rgb, #rrggbb or a name such as red (sRGB), or r,g,b
     (linear radiance)."""
@@ -130,6 +146,7 @@ class _Lighting:
             check_option(abs(self.ground_height) <= 1e4, "--ground", "none, auto or metres", self.ground)
         refuse_outside(self, {"hdr_yaw": (-1e6, 1e6), "hdr_turn": (-1e6, 1e6), "exposure": (-30, 30)})
         check_option(self.hdr_turn != 0, "--hdr-turn", "not 0", 0)
+        parse_gain(self.albedo_gain)
 
     @property
     def ground_height(self) -> float:

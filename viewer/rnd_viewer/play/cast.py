@@ -11,7 +11,7 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.scene import Person, place_at
-from rnd_viewer.inputs.options import PlayOptions
+from rnd_viewer.inputs.options import PlayOptions, parse_gain
 from rnd_viewer.inputs.scenes import PersonRecord
 
 
@@ -26,6 +26,7 @@ def load_people(
         file, source = record.avatar.resolve(), record.motion.resolve()
         if file not in avatars:
             avatars[file] = Avatar.load(record.avatar, threads=options.rendering.threads, ahead=ahead)
+            avatars[file].scale_albedo(parse_gain(options.lighting.albedo_gain))
         if (file, source) not in motions:
             motions[file, source] = options.reading.read_motion(record.motion, avatars[file].skeleton)
         place = place_at(*record.position, math.radians(record.heading))

@@ -10,7 +10,7 @@ import tyro
 
 from rnd_runtime.cli.command import OptionalCount, OptionalFile, OptionalFolder, OptionalNumber, Size, option, size_text
 from rnd_runtime.core.errors import InputError, refuse_changed, refuse_outside
-from rnd_viewer.inputs.options import MotionGroup, MotionOptions, ProbeUp
+from rnd_viewer.inputs.options import GAIN, MotionGroup, MotionOptions, ProbeUp, parse_gain
 
 SIZES = 64, 2048  # px: the least and the largest side of a frame
 
@@ -30,6 +30,8 @@ class ViewOptions:
     """Light probes to choose from, .exr or .hdr, or folders of them. The avatar's own light is always there."""
     hdr_up: ProbeUp = "y"
     """Up axis of the probes' files."""
+    albedo_gain: Annotated[str, option(GAIN)] = "1"
+    """Factors on the albedo, linear."""
     capture: OptionalFolder = None
     """A capture: its images can be shown beside the avatar, from their cameras and under their lights."""
 
@@ -57,6 +59,7 @@ class ViewOptions:
             captured = self.capture is not None
             ours = "the capture's own is read by its rules" if captured else "the rest pose does not move"
             self.reading.refuse_unread(f"needs --motion: {ours}", edited=captured)
+        parse_gain(self.albedo_gain)
         refuse_outside(self, {"fps_floor": (1e-3, 1000)})
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)

@@ -30,6 +30,7 @@ from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, downsize, light_notes
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
+from rnd_viewer.inputs.options import parse_gain
 
 from .options import SIZES, ViewOptions
 from .state import ViewState
@@ -67,6 +68,7 @@ class Scene:
 
     def __init__(self, options: ViewOptions, ahead: Future[Networks] | None = None) -> None:
         self.avatar = Avatar.load(options.avatar, threads=options.threads, ahead=ahead)
+        self.avatar.scale_albedo(parse_gain(options.albedo_gain))
         self.capture: Capture | None = load_capture(options.capture) if options.capture else None
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
