@@ -403,6 +403,7 @@ def test_a_capture_under_two_lights_learns_a_probe_of_each(tiny_capture, tiny_co
     with pytest.raises(InputError, match="--resume: expected the images"):
         resume_training(Training(renamed, tiny_config), tmp_path / "training.state")
     fixed = Training(two, dataclasses.replace(tiny_config, light="capture")).lights
+    assert not fixed.learned
     assert torch.allclose(fixed.radiance()[1], torch.tensor([2.0, 1.0, 1.0]))
 
 

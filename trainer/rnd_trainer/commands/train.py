@@ -40,14 +40,12 @@ from .eval import EvalOptions, evaluate_run
 
 if TYPE_CHECKING:
     from rnd_trainer.config import TrainConfig
+    from rnd_trainer.training.lighting.lights import KnownLight
     from rnd_trainer.training.training import StepResult, Training
 
 PREVIEWS = 3
 """rows of a preview: evenly spaced training views"""
-UNKNOWN = {
-    "view": "rnd-view RUN shows a training while it runs",
-    "hdr": "the light is learned; --light capture takes the capture's own, rnd-play relights with --hdr",
-}
+UNKNOWN = {"view": "rnd-view RUN shows a training while it runs"}
 
 
 @dataclass(frozen=True)
@@ -84,6 +82,10 @@ class Learning:
     """Leave every fifth training frame out and score those alone: what choices are made by."""
     skin: OptionalCount = None
     """Tone of the skin, 1 (palest) to 6 (darkest) by Fitzpatrick: how bright albedo is against light."""
+    hdr: OptionalFile = None
+    """Light probe of the place where the images were taken, .exr or .hdr: its yaw and exposure are found."""
+    grey_card: Annotated[str | None, option("FRAME:X,Y")] = None
+    """A pixel of a training image that shows an 18 % grey card: fixes colour and level of the light."""
     refine_poses: Flag = False
     """Correct the capture's body poses while training; writes refined_motion.npz."""
     motion: Annotated[str | None, option("FILE")] = None
@@ -148,9 +150,10 @@ def _train(options: TrainOptions) -> None:
     options = dataclasses.replace(options, capture=_capture_folder(options.capture, folder))
     capture = load_capture(options.capture, motion_file=learning.motion)
     log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
+    known = _known_light(options)
     perceptual, features = load_lpips(learning.perceptual_weights), load_features(learning.consistency_weights)
     with _memory_error_in_one_line():
-        training = Training(capture, config, perceptual, device, consistency=features)
+        training = Training(capture, config, perceptual, device, consistency=features, known=known)
     if options.resume:
         resume_training(training, state)
     with folder_lock(output_folder(folder), "rnd-train"):
@@ -224,6 +227,19 @@ def _config(options: TrainOptions) -> TrainConfig:
     check_sizes(config)
     check_option(config.save_every >= 1, "--save-every", "at least 1", config.save_every)
     return config
+
+
+def _known_light(options: TrainOptions) -> KnownLight:
+    """What the user knows of the light; raises ``InputError`` where none is learned."""
+    from rnd_runtime.shading.files.load import load_light
+    from rnd_trainer.training.lighting.grey_card import GreyCard
+    from rnd_trainer.training.lighting.lights import KnownLight
+
+    learning, light = options.learning, options.ablations.light
+    if light != "learn":
+        refuse_changed(learning, ["hdr", "grey_card"], f"--light {light} learns no light")
+    place = None if learning.hdr is None else load_light(learning.hdr)
+    return KnownLight(place, None if learning.grey_card is None else GreyCard.parse(learning.grey_card))
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from torch.nn.utils import get_total_norm
 from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import Motion
+from rnd_runtime.shading.light import Light
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.perceptual import Perceptual
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
@@ -25,7 +26,9 @@ from rnd_trainer.model.template import sample_template
 
 from .data import TrainingView, load_views, pose_input
 from .lighting import light_search
-from .lighting.lights import TrainingLights, capture_lights, light_names
+from .lighting.grey_card import card_gain
+from .lighting.lights import KnownLight, TrainingLights, capture_lights, light_names
+from .lighting.place import placed_light
 from .lighting.skin import TONES, skin_points
 from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
@@ -60,6 +63,7 @@ class Training:
         config: schedule and weights.
         perceptual: network of the LPIPS loss; None leaves it out.
         consistency: network of the consistency loss, by default ``perceptual``.
+        known: what the user knows of a light that is learned.
         device: of the tensors; random numbers come from the CPU on every device.
 
     Attributes:
@@ -74,6 +78,7 @@ class Training:
         device: torch.device | str = "cpu",
         *,
         consistency: Perceptual | None = None,
+        known: KnownLight | None = None,
     ) -> None:
         capture = capture.holding_out() if config.hold_out else capture
         self.capture, self.config, self.schedule = capture, config, Schedule(config)
@@ -91,9 +96,20 @@ class Training:
         template = sample_template(capture.body, config.model.gaussians, config.model.nodes, config.seed)
         self._skin = skin_points(template, capture.body.skeleton)
         self.model = AvatarModel(config.model, template).to(self.device)
-        self.fixed_lights = capture_lights(capture) if config.light == "capture" else None
         names = light_names(view.frame for view in self.views)
-        self.lights = TrainingLights(names, config.probe_channels, self.fixed_lights).to(self.device)
+        self.lights, self.known = TrainingLights(names, config.probe_channels), known or KnownLight()
+        self.given_lights: dict[str, Light] = {}
+        if config.light == "capture":
+            self.given_lights = capture_lights(capture)
+            self.lights.fix(self.given_lights)
+        if self.known.place is not None:
+            self.known.check(names)
+            self.given_lights = {"--hdr": self.known.place}
+            self.lights.fix()
+        if self.known.card is not None:
+            view = self.known.card.view(self.views)
+            self._card_pixel = self.known.card.pixel(view, capture.cameras[view.frame.camera])
+        self.lights.to(self.device)
         self.refinement: PoseRefinement | None = None
         if config.refine_poses:
             frames = [view.frame.frame for view in self.views]
@@ -219,17 +235,31 @@ class Training:
             return
         self._copy_colour_to_albedo()
         if self._searches_light:
-            motion = self.motion()
-            poses = [self.pose(view, motion) for view in self.views]
+            self._find_lights()
+        self.lit = True
+
+    def _find_lights(self) -> None:
+        motion = self.motion()
+        poses = [self.pose(view, motion) for view in self.views]
+        images = self.model, self.views, poses
+        hints = self._skin, None if self.config.skin is None else TONES[self.config.skin - 1]
+        place, card, probes = self.known.place, self.known.card, self.lights.probes
+        if place is not None:
+            radiance = placed_light(*images, place, self.on_light_search, *hints)
+            self.light_found = radiance is not None
+            if radiance is not None:
+                probes.start_from(torch.from_numpy(radiance)[None], probes.exposure)
+        else:
             lights = [self.lights.index(view.frame) for view in self.views]
-            known = None if self.config.skin is None else TONES[self.config.skin - 1]
-            found = light_search.initial_light(
-                self.model, self.views, poses, lights, self.on_light_search, self._skin, known
-            )
+            found = light_search.initial_light(*images, lights, self.on_light_search, *hints)
             self.light_found = found is not None
             if found is not None:
-                self.lights.probes.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
-        self.lit = True
+                probes.start_from(torch.from_numpy(found.radiance), torch.from_numpy(found.exposure))
+        if card is not None:
+            view = card.view(self.views)
+            radiance_there = self.lights.radiance()[self.lights.index(view.frame)]
+            pose = self.pose(view, motion)
+            self.lights.scale(card_gain(self.model, view, pose, self._card_pixel, radiance_there))
 
     def _copy_colour_to_albedo(self) -> None:
         """Start the albedo, network and residual, from the first stage's colour."""
@@ -267,4 +297,4 @@ class Training:
     @cached_property
     def learned_from_sha256(self) -> str:
         """Digest of the training data, of which a training can only be resumed with the same."""
-        return learned_sha256(self.views, self.capture, self.config.image_scale, self.fixed_lights or {})
+        return learned_sha256(self.views, self.capture, self.config.image_scale, self.given_lights)

@@ -20,7 +20,7 @@ ROBUST = 0.15  # the same where the colours err too
 SHADOWS = 0.07  # the ball's own shadows: those of 700 splats are too wide, and what they hide is taken to reflect
 
 
-def _rotating_ball(sun: np.ndarray, strength: float) -> Observations:
+def rotating_ball(sun: np.ndarray, strength: float) -> Observations:
     """A ball of random albedo rotating about Y under a white sky and one sun, seen from +Z."""
     generator = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=generator), dim=-1)
@@ -51,7 +51,7 @@ def _arriving(ball: Observations, sun: np.ndarray) -> np.ndarray:
 def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
     sun = np.array([0.7, 0.5, 0.51])
     sun /= np.linalg.norm(sun)
-    ball = _rotating_ball(sun, strength)
+    ball = rotating_ball(sun, strength)
     monkeypatch.setattr(light_search, "observe", lambda *_: ball)
     found = initial_light(None, [], [])  # type: ignore[arg-type]  # the observations are given
     assert found is not None
@@ -77,7 +77,7 @@ def test_a_sun_is_found_where_there_is_one(monkeypatch, strength) -> None:
 def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch) -> None:
     """Noise of 30 % on colours, a quarter of the shade twice as bright; least squares alone lose 23 % of the sun."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])
-    ball = _rotating_ball(sun, 6.0)
+    ball = rotating_ball(sun, 6.0)
     normals = np.concatenate([n[ball.point[ball.image == k]] for k, (_, n) in enumerate(ball.posed)])
     shade = np.flatnonzero(normals @ sun < 0)
     rng = np.random.default_rng(0)
@@ -94,7 +94,7 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
 def test_two_lights_are_found_with_their_ratio(monkeypatch) -> None:
     """Noon is twice as bright as evening, which is redder; the albedo tells, as it is the same in both."""
     noon, evening = (np.array(sun) / np.linalg.norm(sun) for sun in ([0.7, 0.5, 0.51], [-0.6, 0.3, 0.74]))
-    balls = [_rotating_ball(sun, 6.0) for sun in (noon, evening)]
+    balls = [rotating_ball(sun, 6.0) for sun in (noon, evening)]
     factors = np.array([[2.0, 2.0, 2.0], [1.4, 1.0, 0.7]])
     both = Observations(
         np.concatenate([ball.point for ball in balls]),
@@ -117,7 +117,7 @@ def test_two_lights_are_found_with_their_ratio(monkeypatch) -> None:
 
 def test_equal_images_give_none(monkeypatch) -> None:
     """Any light explains equal images: each point's irradiance is parallel to its colours."""
-    ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 6.0)
+    ball = rotating_ball(np.array([0.0, 1.0, 0.0]), 6.0)
     first = ball.image == 0
     count = int(first.sum())
     alike = Observations(
@@ -134,7 +134,7 @@ def test_equal_images_give_none(monkeypatch) -> None:
 
 
 def test_too_few_observations_give_none(monkeypatch) -> None:
-    ball = _rotating_ball(np.array([0.0, 1.0, 0.0]), 0.0)
+    ball = rotating_ball(np.array([0.0, 1.0, 0.0]), 0.0)
     few = Observations(ball.point[:20], ball.colour[:20], ball.image[:20], ball.posed, 0.1)
     monkeypatch.setattr(light_search, "observe", lambda *_: few)
     assert initial_light(None, [], []) is None  # type: ignore[arg-type]
@@ -142,7 +142,7 @@ def test_too_few_observations_give_none(monkeypatch) -> None:
 
 def test_points_observed_once_or_twice_give_no_sun(monkeypatch) -> None:
     """In three images from three sides each point is observed once or twice; its albedo explains any sun."""
-    ball = _rotating_ball(np.array([0.7, 0.5, 0.51]), 6.0)
+    ball = rotating_ball(np.array([0.7, 0.5, 0.51]), 6.0)
     few = np.isin(ball.image, (0, 8, 16))
     seen = Observations(ball.point[few], ball.colour[few], ball.image[few] // 8, ball.posed[::8], ball.spacing)
     monkeypatch.setattr(light_search, "observe", lambda *_: seen)

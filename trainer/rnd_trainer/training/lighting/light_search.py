@@ -25,7 +25,16 @@ from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.training.data import TrainingView
 
-from .observations import POINTS, Observations, light_luminance, observe, point_luminance, transport_of, with_bounce
+from .observations import (
+    POINTS,
+    Observations,
+    albedo_under,
+    light_luminance,
+    observe,
+    point_luminance,
+    transport_of,
+    with_bounce,
+)
 from .skin import likely_gain
 
 Floats = NDArray[np.float64]
@@ -135,7 +144,7 @@ def initial_light(
     light, texel = np.divmod(np.array(suns, int) - skies, max(len(near_texels), 1))
     radiance[light, near_texels[texel]] += intensity[skies:]
     irradiance = columns[:, [*range(skies), *suns]] @ intensity
-    albedo, weight = _albedo(observations, irradiance)
+    albedo, weight = albedo_under(observations, irradiance)
     radiance /= likely_gain(albedo, weight * (weight >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
     return InitialLight(
         radiance.reshape(-1, *PROBE_SHAPE, 3).astype(np.float32), exposure.reshape(-1, *PROBE_SHAPE).astype(np.float32)
@@ -245,16 +254,6 @@ def _intensities(observations: Observations, columns: NDArray[np.float32]) -> Fl
         weight = 1 / np.maximum(error, ERROR_FLOOR)
         _, intensity = _quadratic(observations, columns, weight / light**2).fit(all_columns)
     return intensity
-
-
-def _albedo(observations: Observations, irradiance: Floats) -> tuple[Floats, Floats]:
-    """Least-squares albedo [P, 3] of every point under ``irradiance`` [n, 3], and its number of observations [P]."""
-    point = observations.point
-    albedo = [
-        np.bincount(point, colour * light) / np.maximum(np.bincount(point, light**2), 1e-12)
-        for colour, light in zip(observations.colour.T, irradiance.T, strict=True)
-    ]
-    return np.stack(albedo, axis=1), np.bincount(point).astype(float)
 
 
 def _search(quadratic: Quadratic) -> list[int]:

@@ -1,11 +1,14 @@
-"""The lights of the training images, by name: learned probes, or the capture's own maps."""
+"""The lights of the training images, by name: learned, or known to the user."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rnd_runtime.capture.capture import Capture, Frame
@@ -13,6 +16,8 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.shading.light import Light, texel_directions
 from rnd_trainer.model.checkpoint import UNKNOWN_LIGHT
 from rnd_trainer.render.probe import PROBE_SHAPE, LightProbes, as_probe
+
+from .grey_card import GreyCard
 
 
 def light_name(frame: Frame) -> str:
@@ -39,38 +44,64 @@ def capture_lights(capture: Capture, what: str = "--light capture") -> dict[str,
     return {name: capture.load_light(name) for name in light_names(frames)}
 
 
+@dataclass(frozen=True)
+class KnownLight:
+    """What the user knows of the light.
+
+    Attributes:
+        place: a map of the place, whose yaw and scale are found by the search.
+        card: a grey card in an image.
+    """
+
+    place: Light | None = None
+    card: GreyCard | None = None
+
+    def check(self, names: tuple[str, ...]) -> None:
+        """Raise ``InputError`` if a place is given for several lights ``names``."""
+        if self.place is not None and len(names) > 1:
+            raise InputError("--hdr", expected="one light in the training images", got=", ".join(names))
+
+
 class TrainingLights:
-    """One light for each name, of learned radiance unless it is fixed.
+    """One light for each name, learned until it is fixed.
 
     Args:
         names: the default light first.
-        channels: of the learned probes.
-        fixed: maps that replace the learned probes, or None.
+        channels: of the probes.
 
     Attributes:
-        probes: the learned lights, in the order of ``names``.
+        probes: the lights, in the order of ``names``.
     """
 
-    def __init__(self, names: tuple[str, ...], channels: int = 3, fixed: dict[str, Light] | None = None) -> None:
+    def __init__(self, names: tuple[str, ...], channels: int = 3) -> None:
         self.names, self.probes = names, LightProbes(channels, len(names))
-        self._fixed: Tensor | None = None
-        if fixed is not None:  # resized before rotating, which keeps a sun in one texel
-            maps = [fixed[name].resized(*PROBE_SHAPE).sample(texel_directions(*PROBE_SHAPE)) for name in names]
-            self._fixed = torch.stack([as_probe(radiance) for radiance in maps])
 
     def to(self, device: torch.device) -> TrainingLights:
         """Itself, on ``device``."""
         self.probes.to(device)
-        self._fixed = None if self._fixed is None else self._fixed.to(device)
         return self
+
+    def fix(self, lights: dict[str, Light] | None = None) -> None:
+        """Learn no further; with ``lights``, at their maps."""
+        self.probes.raw.requires_grad_(False)
+        if lights is not None:  # resized before rotating, which keeps a sun in one texel
+            grid = texel_directions(*PROBE_SHAPE)
+            maps = [as_probe(lights[name].resized(*PROBE_SHAPE).sample(grid)) for name in self.names]
+            self.probes.start_from(torch.stack(maps), self.probes.exposure)
+
+    def scale(self, gain: NDArray[np.float64]) -> None:
+        """Multiply all lights by ``gain`` [3]."""
+        scaled = self.radiance().detach() * torch.as_tensor(gain).to(self.probes.raw)
+        self.probes.start_from(scaled, self.probes.exposure)
 
     @property
     def learned(self) -> bool:
-        return self._fixed is None
+        return self.probes.raw.requires_grad
 
     def radiance(self) -> Tensor:
         """[lights, 32, 64, 3] linear."""
-        return self.probes.radiance() if self._fixed is None else self._fixed
+        radiance: Tensor = self.probes.radiance()
+        return radiance
 
     def index(self, frame: Frame) -> int:
         """Index of the light of ``frame``."""

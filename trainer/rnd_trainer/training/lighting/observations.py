@@ -118,3 +118,13 @@ def light_luminance(observations: Observations) -> Floats:
     light, luminance = observations.light(), observations.colour @ REC709_LUMINANCE
     means = np.bincount(light, luminance) / np.maximum(np.bincount(light), 1)
     return means[light] / luminance.mean()
+
+
+def albedo_under(observations: Observations, irradiance: Floats) -> tuple[Floats, Floats]:
+    """Least-squares albedo [P, 3] of every point under ``irradiance`` [n, 3], and its number of observations [P]."""
+    point = observations.point
+    albedo = [
+        np.bincount(point, colour * light) / np.maximum(np.bincount(point, light**2), 1e-12)
+        for colour, light in zip(observations.colour.T, irradiance.T, strict=True)
+    ]
+    return np.stack(albedo, axis=1), np.bincount(point).astype(float)
