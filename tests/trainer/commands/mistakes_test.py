@@ -43,6 +43,14 @@ IMPORT = f"rnd-data import {CAPTURE} OUT --body {BODY}"
             "--probe-channels: expected the default, got 1 (--light none learns no light)",
         ),
         (
+            f"rnd-train {CAPTURE} --out OUT --light capture --grey-card 0:1,1",
+            "--grey-card: expected the default, got 0:1,1 (--light capture learns no light)",
+        ),
+        (
+            f"rnd-train {CAPTURE} --out OUT --grey-card chest",
+            "--grey-card: expected FRAME:X,Y, such as 12:340,220, got chest",
+        ),
+        (
             f"rnd-train {CAPTURE} --out OUT --light none --visibility paper",
             "--visibility: expected the default, got paper",
         ),

@@ -297,4 +297,5 @@ class Training:
     @cached_property
     def learned_from_sha256(self) -> str:
         """Digest of the training data, of which a training can only be resumed with the same."""
-        return learned_sha256(self.views, self.capture, self.config.image_scale, self.given_lights)
+        digest = learned_sha256(self.views, self.capture, self.config.image_scale, self.given_lights)
+        return digest if self.known.card is None else f"{digest} {self.known.card}"

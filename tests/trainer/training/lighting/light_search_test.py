@@ -20,14 +20,14 @@ ROBUST = 0.15  # the same where the colours err too
 SHADOWS = 0.07  # the ball's own shadows: those of 700 splats are too wide, and what they hide is taken to reflect
 
 
-def rotating_ball(sun: np.ndarray, strength: float) -> Observations:
+def rotating_ball(sun: np.ndarray, strength: float, count: int = COUNT, images: int = IMAGES) -> Observations:
     """A ball of random albedo rotating about Y under a white sky and one sun, seen from +Z."""
     generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(COUNT, 3, generator=generator), dim=-1)
-    albedo = 0.2 + 0.5 * torch.rand(COUNT, 3, generator=generator)
+    points = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    albedo = 0.2 + 0.5 * torch.rand(count, 3, generator=generator)
     point, colour, image, posed = [], [], [], []
-    for k in range(IMAGES):
-        angle = 2 * math.pi * k / IMAGES
+    for k in range(images):
+        angle = 2 * math.pi * k / images
         rotation = torch.tensor(
             [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
         )
@@ -94,15 +94,15 @@ def test_the_sun_keeps_its_strength_under_texture_and_wrong_shadows(monkeypatch)
 def test_two_lights_are_found_with_their_ratio(monkeypatch) -> None:
     """Noon is twice as bright as evening, which is redder; the albedo tells, as it is the same in both."""
     noon, evening = (np.array(sun) / np.linalg.norm(sun) for sun in ([0.7, 0.5, 0.51], [-0.6, 0.3, 0.74]))
-    balls = [rotating_ball(sun, 6.0) for sun in (noon, evening)]
+    balls = [rotating_ball(sun, 6.0, count=400, images=16) for sun in (noon, evening)]
     factors = np.array([[2.0, 2.0, 2.0], [1.4, 1.0, 0.7]])
     both = Observations(
         np.concatenate([ball.point for ball in balls]),
         np.concatenate([ball.colour * factor for ball, factor in zip(balls, factors, strict=True)]),
-        np.concatenate([balls[0].image, balls[1].image + IMAGES]),
+        np.concatenate([balls[0].image, balls[1].image + 16]),
         [*balls[0].posed, *balls[1].posed],
         0.1,
-        [0] * IMAGES + [1] * IMAGES,
+        [0] * 16 + [1] * 16,
     )
     monkeypatch.setattr(light_search, "observe", lambda *_: both)
     found = initial_light(None, [], [])  # type: ignore[arg-type]

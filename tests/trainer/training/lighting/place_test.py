@@ -17,7 +17,7 @@ WITHIN_DEG = 2.0
 def test_a_place_turned_and_scaled_is_found(monkeypatch) -> None:
     """To 2° of yaw; its level is that of a body of mean reflectance, whatever the file's exposure."""
     sun = np.array([0.7, 0.5, 0.51]) / np.linalg.norm([0.7, 0.5, 0.51])
-    ball = rotating_ball(sun, STRENGTH)
+    ball = rotating_ball(sun, STRENGTH, count=300, images=10)
     ball.colour *= [1.2, 1.0, 0.7]
     monkeypatch.setattr(place, "observe", lambda *_: ball)
     map_ = np.ones((128, 256, 3), np.float32)

@@ -26,6 +26,8 @@ CARD_REFLECTANCE = 0.18
 """of a photographer's grey card"""
 PATCH = 1
 """pixels around the given one that are averaged"""
+COVERED = 250
+"""8-bit value from which a pixel counts as covered"""
 CLIPPED = 250
 """8-bit value from which a pixel counts as clipped"""
 
@@ -66,7 +68,7 @@ class GreyCard:
         inside = PATCH <= row < len(view.mask) - PATCH and PATCH <= column < view.mask.shape[1] - PATCH
         if inside:
             patch = _patch(int(row), int(column))
-            inside = bool((view.mask[patch] == 255).all() and view.image[patch].max() < CLIPPED)
+            inside = bool(view.mask[patch].min() >= COVERED and view.image[patch].max() < CLIPPED)
         if not inside:
             expected, got = "a card inside the mask, not clipped", f"{self.x},{self.y}"
             raise InputError(OPTION, expected=expected, got=got, frame=self.frame)

@@ -23,8 +23,10 @@ from .skin import BODY_LUMINANCE, likely_gain
 
 Floats = NDArray[np.float64]
 
-SHIFTS = 8
-"""yaws per texel of the probe: 0.7° apart"""
+YAWS = 512
+"""yaws tried: 0.7° apart"""
+SEARCH_SHAPE = (16, 32)
+"""texels, 11° wide, of the light while its yaw is searched"""
 MIN_OBSERVATIONS = 3
 """observations of a point that is used: the albedo explains fewer under any light"""
 
@@ -52,13 +54,11 @@ def placed_light(
     on_progress(1, 2)
     if not (np.bincount(observations.point, minlength=1) >= MIN_OBSERVATIONS).any():
         return None
-    maps = _shifted(place)
-    irradiance = _irradiance(observations, maps)
-    yaw = _best_yaw(observations, irradiance)
-    at, between = divmod(yaw, 1)
+    irradiance = _irradiance(observations, _at_all_yaws(place, SEARCH_SHAPE))
+    at, between = divmod(_best_yaw(observations, irradiance), 1)
     radiance, arriving = (
-        (1 - between) * values[..., int(at)] + between * values[..., (int(at) + 1) % values.shape[-1]]
-        for values in (_all_yaws(maps), irradiance)
+        (1 - between) * values[..., int(at)] + between * values[..., (int(at) + 1) % YAWS]
+        for values in (_at_all_yaws(place, PROBE_SHAPE), irradiance)
     )
     albedo, count = albedo_under(observations, arriving)
     gain = likely_gain(albedo, count * (count >= MIN_OBSERVATIONS), [] if skin is None else skin, tone)
@@ -66,36 +66,31 @@ def placed_light(
     return (radiance / (gain @ REC709_LUMINANCE)).astype(np.float32)
 
 
-def _shifted(place: Light) -> Floats:
-    """Maps [32, 64, 3, SHIFTS] of ``place``, each turned by a further 1 / ``SHIFTS`` of a texel.
+def _at_all_yaws(place: Light, shape: tuple[int, int]) -> Floats:
+    """Maps [rows, columns, 3, YAWS] of ``place`` turned about the vertical in even steps.
 
     Between two columns a texel's light is shared in proportion, so that a sun moves evenly.
     """
-    rows, columns = PROBE_SHAPE
-    size = (SHIFTS * columns // 2, SHIFTS * columns)
-    fine = place.resized(*size) if len(place.radiance) > size[0] else place
-    world = downsize(fine.sample(texel_directions(*size)), rows, SHIFTS * columns).astype(np.float64)
-    offsets = np.arange(2 * SHIFTS)
-    tent = 1 - np.abs(offsets - SHIFTS + 0.5) / SHIFTS  # 1 at a texel's centre, 0 at those of its neighbours
-    maps = np.zeros((rows, columns, 3, SHIFTS))
-    for shift in range(SHIFTS):
-        for offset, weight in zip(offsets, tent, strict=True):
-            turned = np.roll(world, shift + SHIFTS // 2 - offset, axis=1)
-            maps[..., shift] += weight / SHIFTS * turned[:, ::SHIFTS]
+    rows, columns = shape
+    fine = place.resized(YAWS // 2, YAWS) if len(place.radiance) > YAWS // 2 else place
+    world = downsize(fine.sample(texel_directions(YAWS // 2, YAWS)), rows, YAWS).astype(np.float64)
+    width = YAWS // columns
+    maps = np.zeros((rows, columns, 3, YAWS))
+    for shift in range(width):
+        for offset in range(2 * width):
+            weight = (1 - abs(offset - width + 0.5) / width) / width  # largest at a texel's centre, 0 at the next ones
+            turned = np.roll(world, shift + width // 2 - offset, axis=1)[:, ::width]
+            maps[..., shift] += weight * turned
+    for texel in range(1, columns):
+        maps[..., texel * width : (texel + 1) * width] = np.roll(maps[..., :width], texel, axis=1)
     return maps
 
 
-def _all_yaws(maps: Floats) -> Floats:
-    """Maps [32, 64, 3, yaws] at all yaws of ``maps`` [32, 64, 3, SHIFTS], in order."""
-    turned = [np.roll(maps, texel, axis=1) for texel in range(PROBE_SHAPE[1])]
-    return np.concatenate(turned, axis=-1)
-
-
 def _irradiance(observations: Observations, maps: Floats) -> NDArray[np.float32]:
-    """Radiance [n, 3, yaws] of white observations, with one reflection by the body."""
-    lights = torch.as_tensor(_all_yaws(maps).reshape(-1, 3, PROBE_SHAPE[1] * SHIFTS), dtype=torch.float32)
-    towards = torch.as_tensor(texel_directions(*PROBE_SHAPE).reshape(-1, 3), dtype=torch.float32)
-    share = torch.as_tensor(texel_solid_angles(*PROBE_SHAPE).reshape(-1) / np.pi, dtype=torch.float32)
+    """Radiance [n, 3, YAWS] of white observations under ``maps`` [16, 32, 3, YAWS], with one reflection by the body."""
+    lights = torch.as_tensor(maps.reshape(-1, 3, YAWS), dtype=torch.float32)
+    towards = torch.as_tensor(texel_directions(*SEARCH_SHAPE).reshape(-1, 3), dtype=torch.float32)
+    share = torch.as_tensor(texel_solid_angles(*SEARCH_SHAPE).reshape(-1) / np.pi, dtype=torch.float32)
     rows, hidden = [], []
     for k, (means, normals) in enumerate(observations.posed):
         point = observations.point[observations.image == k]
