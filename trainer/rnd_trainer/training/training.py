@@ -247,6 +247,7 @@ class Training:
         if place is not None:
             radiance = placed_light(*images, place, self.on_light_search, *hints)
             self.light_found = radiance is not None
+            probes.raw.requires_grad_(radiance is None)  # where it was not found, it is learned from white
             if radiance is not None:
                 probes.start_from(torch.from_numpy(radiance)[None], probes.exposure)
         else:
