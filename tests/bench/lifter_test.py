@@ -1,30 +1,36 @@
-"""``rnd-bench study lifter``: motions, bodies, the errors of landmarks, likelihood, training, figures."""
+"""``rnd-bench study lifter``: motions, people on film, the landmark network in torch, likelihood, training, figures."""
 
 from __future__ import annotations
 
 import copy
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
+from onnx import TensorProto, helper, numpy_helper
 
 from rnd_bench.cli import main
-from rnd_bench.lifter import errors as err
-from rnd_bench.lifter.figures import Lifts, calibration, figures, procrustes, synthetic
+from rnd_bench.lifter import filming, training
+from rnd_bench.lifter.blazepose import LandmarkGraph, Looks
+from rnd_bench.lifter.figures import Lifts, calibration, figures, of_windows, procrustes
+from rnd_bench.lifter.filming import Films, Places, Scene, Studio, Window, filmed, load_films, save_films
 from rnd_bench.lifter.motions import MIRROR, TEST, VALIDATION, Clips, chained, load_clips, relative, sampled, subject_of
 from rnd_bench.lifter.network import export, negative_log_likelihood
+from rnd_bench.lifter.people import Points
 from rnd_bench.lifter.pose2sim import Calibrated, triangulated
-from rnd_bench.lifter.refining import loss_of, refine
-from rnd_bench.lifter.solving import solve
-from rnd_bench.lifter.synthesis import batch, strided, vectors_of
-from rnd_bench.lifter.views import positions, sampled_cameras, sampled_offsets
+from rnd_bench.lifter.training import between, samples_of, train, vectors_of
+from rnd_runtime.avatar.inference import open_session
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.lifted import JOINTS, REST_DIRECTIONS, ROLL_AXES
 from rnd_trainer.estimating.lifter import CHANNELS, REACH, run
-from rnd_trainer.estimating.observations import BLAZEPOSE
+from rnd_trainer.estimating.observing.regions import Region
 from support.paths import SHARED
+from support.tiny import body
 
-VALUES = 33 * 6
+CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -40,18 +46,73 @@ def clips() -> Clips:
 
 
 @pytest.fixture(scope="module")
-def model() -> err.ErrorModel:
-    """Errors of 1 cm in 2D and 3 cm in 3D, independent of the pose, and offsets of 5 cm."""
-    rng = np.random.default_rng(1)
-    rest = np.r_[np.full(66, 0.01), np.full(99, 0.03), np.full(33, 0.5)]
-    predictors = err._predictors(np.ones((1, 33, 3), np.float32)).shape[1]
-    mean = np.zeros((predictors, VALUES))
-    mean[99, 165:] = 6.0  # the constant is a half: logits of 3
-    offsets = rng.normal(0, 0.03, (33, 3))
-    offsets = (offsets + offsets[err.SWAPPED] * [-1, 1, 1]) / 2
-    return err.ErrorModel(
-        offsets, mean, np.zeros((VALUES, err.FACTORS)), rest, np.full(VALUES, 0.3), np.full(VALUES, 0.8), np.zeros(33)
+def person(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A person's file: the tests' body in one colour."""
+    one = body()
+    held = np.argsort(-one.skinning_weights, 1)[:, :4]
+    file = tmp_path_factory.mktemp("people") / "one.npz"
+    np.savez(
+        file,
+        vertices=one.vertices,
+        faces=one.faces,
+        joints=held,
+        weights=np.take_along_axis(one.skinning_weights, held, 1),
+        colour=np.full((len(one.vertices), 3), 0.5),
+        piece=np.zeros(len(one.vertices), np.uint8),
+        rest=one.skeleton.rest_joints,
     )
+    return file
+
+
+class Graph:
+    """Sees every point in the middle of its crop, and the person's circle as it is."""
+
+    def __call__(self, crops: torch.Tensor) -> list[torch.Tensor]:
+        count = len(crops)
+        rows = torch.full((count, 39, 5), 128.0)
+        rows[:, 34, 1] = 128 - 256 / 2.5
+        rows[..., 3:] = 9.0
+        metres = torch.zeros(count, 39, 3)
+        return [rows.flatten(1), torch.ones(count, 1), crops, torch.full((count, 39, 64, 64), -9.0), metres.flatten(1)]
+
+
+@pytest.fixture(scope="module")
+def studio(person: Path) -> Studio:
+    """A studio without network, under even light."""
+    studio = Studio.__new__(Studio)
+    studio.device, studio.graph = CPU, Graph()
+    studio.files, studio.places = [person], Places(torch.full((1, 3, 8, 16), 0.2), torch.ones(1, 3, 4, 8))
+    studio._people = {person: Points.load(person, 4000, CPU)}
+    return studio
+
+
+def _windows(clips: Clips, count: int, seed: int) -> list[Window]:
+    """Windows in which the network's 3D is the truth in the camera's axes and its 2D fits it."""
+    rng = np.random.default_rng(seed)
+    rotations, _ = sampled(clips, count, 20, rng)
+    names = ("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist")
+    joints = np.zeros((count, 20, 22, 3), np.float32)
+    for bone, parent in enumerate(training._UP):
+        joints[:, :, bone + 1] = joints[:, :, parent] + 0.3 * vectors_of(rotations)[:, :, bone]
+    hint = np.repeat(joints[:, :, :1], 33, 2)
+    places = {11: names[0], 12: names[1], 13: names[2], 14: names[3], 15: names[4], 16: names[5]}
+    legs = ("left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
+    for point, name in {**places, **{23 + k: name for k, name in enumerate(legs)}}.items():
+        hint[:, :, point] = joints[:, :, JOINTS.index(name)]
+    seen = hint + np.array([0, 0, 4.0])
+    rays = (seen[..., :2] / seen[..., 2:]).astype(np.float32)
+    sure, step = np.ones((20, 33), np.float32), np.float32(1)
+    return [
+        {
+            "rays": rays[k],
+            "confidence": sure,
+            "hint_m": hint[k],
+            "rotations": rotations[k],
+            "joints": joints[k],
+            "step": step,
+        }
+        for k in range(count)
+    ]
 
 
 def test_rotations_relative_to_parents_chain_back(clips: Clips) -> None:
@@ -82,6 +143,141 @@ def test_vectors_of_the_t_pose_are_the_rest_vectors() -> None:
     np.testing.assert_allclose(vectors, np.concatenate([REST_DIRECTIONS, ROLL_AXES]), atol=1e-6)
 
 
+def test_points_move_as_linear_blend_skinning_says(person: Path) -> None:
+    points = Points.load(person, 300, CPU)
+    rng = np.random.default_rng(1)
+    rotations = axis_angle_to_matrix(rng.normal(size=(2, 1, 24, 3)))
+    roots = rng.normal(size=(2, 1, 3))
+    shape = torch.stack([points.neutral, points.neutral + 0.5])
+    turned = torch.from_numpy(rotations).float()
+    joints = points.joints(shape, turned, torch.from_numpy(roots).float())
+    placed, normals = points.posed(shape, turned[:, 0], joints[:, 0])
+    weights = points.weights.double().numpy()
+    for b in range(2):
+        rest = points.rest.double().numpy() + np.tensordot(shape[b].double(), points.rest_basis.double(), 1)
+        places = points.places.double().numpy() + np.tensordot(shape[b].double(), points.place_basis.double(), 1)
+        local = places[:, None] - rest  # [P, 24, 3]
+        moved = np.einsum("jik,pjk->pji", rotations[b, 0], local) + joints[b, 0].double().numpy()
+        np.testing.assert_allclose(placed[b], (weights[..., None] * moved).sum(1), atol=1e-5)
+    knee, hip = JOINTS.index("left_knee"), JOINTS.index("left_hip")
+    bone = (joints[0, 0, knee] - joints[0, 0, hip]).norm()
+    assert float(bone) == pytest.approx(float((points.rest[knee] - points.rest[hip]).norm()), rel=0.02)
+    assert normals.shape == placed.shape
+
+
+def test_the_nearest_point_is_drawn_and_nothing_beside_the_person(studio: Studio, person: Path) -> None:
+    points = studio._people[person]
+    shape, eye = points.neutral[None], torch.eye(3)[None]
+    turn = eye * torch.tensor([1.0, -1.0, -1.0])
+    scene = Scene(studio, points, shape, turn, torch.tensor([[0.0, 0.9, 4.0]]), np.random.default_rng(0))
+    scene.noise *= 0
+    rotations = torch.eye(3).expand(1, 1, 24, 3, 3)
+    joints = points.joints(shape, rotations, points.rest[:1][None])
+    placed, normals = points.posed(shape, rotations[:, 0], joints[:, 0])
+    ahead = placed @ turn.mT + scene.shift[:, None]
+    image, mask = scene._drawn(ahead, normals, torch.zeros(1, 2), torch.tensor([0.4]))
+    flat = ((ahead[0, :, :2] / ahead[0, :, 2:] / 0.4 + 1) * filming.CANVAS / 2).long()
+    assert (mask[0, 0, flat[:, 1], flat[:, 0]] == 1).float().mean() > 0.99
+    assert mask.mean() < 0.2
+    assert torch.allclose(image[:, :, 0, 0], 0.2 * scene.behind[:, None], atol=1e-5)
+    inside = torch.full((1, 1, 33, 2), 0.0)
+    inside[..., 0] = torch.linspace(-0.3, 0.3, 33)
+    far = filming._outside(mask, inside, torch.zeros(1, 2), torch.tensor([0.4]))[0, 0]
+    rows, columns = np.nonzero(mask[0, 0].numpy())
+    known = np.stack([columns, rows], -1) / filming.CANVAS * 0.8 - 0.4
+    exact = np.linalg.norm(inside[0, 0, :, None].numpy() - known, axis=-1).min(1)
+    np.testing.assert_allclose(far, exact, atol=0.012)
+
+
+def test_regions_are_those_of_the_observer() -> None:
+    centre, top = np.array([0.1, -0.2]), np.array([0.3, -0.6])
+    one = Region.of_body(centre, top)
+    ours = filming._region_of(torch.tensor(centre)[None], torch.tensor(top)[None])[0].numpy()
+    np.testing.assert_allclose(ours, [one.x, one.y, one.size, one.rotation], atol=1e-6)
+    pixels = np.random.default_rng(0).uniform(0, 256, (5, 2))
+    matrix = one.to_image(256)
+    found = filming._to_rays(torch.tensor(pixels)[None], torch.tensor(ours)[None].double())[0]
+    np.testing.assert_allclose(found, pixels @ matrix[:, :2].T + matrix[:, 2], atol=1e-6)
+
+
+def test_films_follow_the_person_and_are_stored(studio: Studio, clips: Clips, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        windows = filmed(studio, clips, 3, 5, pool, batch=2, frames=4)
+    assert len(windows) == 3
+    for window in windows:
+        assert window["rays"].shape == (4, 33, 2) and window["joints"].shape == (4, 22, 3)
+        hips = window["joints"][0, 1:3].mean(0)
+        np.testing.assert_allclose(window["rays"][0, 0], hips[:2] / hips[2], atol=1e-3)
+        assert window["confidence"].min() > 0.4
+    save_films(tmp_path / "films.npz", windows)
+    again = load_films(tmp_path / "films.npz")
+    np.testing.assert_allclose(again[2]["joints"], windows[2]["joints"], atol=4e-3)
+
+
+def test_frames_without_a_person_lose_the_window() -> None:
+    shape = (2, 3, 4, 33)
+    films = Films(
+        *(np.zeros((*shape, n), np.float32) for n in (2, 3)),
+        *(np.ones(shape, np.float32) for _ in range(2)),
+        np.ones((2, 3), np.float32),
+        np.array([[1, 1, 1], [1, 0.2, 1]], np.float32),
+        *(np.zeros((2, 3, 22, *n), np.float32) for n in ((3, 3), (3,))),
+        np.array([1, 2]),
+    )
+    assert [float(w["step"]) for w in films.windows()] == [1.0]
+
+
+def test_the_network_in_torch_is_the_one_in_onnxruntime(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    shapes = {"a": (8, 3, 3, 3), "d": (8, 1, 3, 3), "e": (8, 1, 3, 3), "h": (5, 8, 4, 4), "b": (8,), "c": (5,)}
+    held = {k: rng.normal(0, 0.3, s).astype(np.float32) for k, s in shapes.items()}
+    held |= {"low": np.float32(0), "high": np.float32(6)}
+    held |= {"sizes": np.array([1, 8, 8, 8]), "edge": np.array([0, 0, 1, 1, 0, 0, 1, 1]), "row": np.array([1, 5])}
+
+    def conv(names: list[str], out: str, **given) -> onnx.NodeProto:
+        return helper.make_node("Conv", names, [out], **({"strides": [1, 1], "dilations": [1, 1]} | given))
+
+    nodes = [
+        helper.make_node("Transpose", ["image"], ["t"], perm=[0, 3, 1, 2]),
+        helper.make_node("Pad", ["t", "edge"], ["p"]),
+        conv(["p", "a", "b"], "x", strides=[2, 2]),
+        helper.make_node("Clip", ["x", "low", "high"], ["y"]),
+        conv(["y", "d", "b"], "z", pads=[1, 1, 1, 1], group=8),
+        conv(["z", "e", "b"], "s", pads=[0, 0, 1, 1], strides=[2, 2], group=8),
+        helper.make_node("Resize", ["s", "", "", "sizes"], ["u"], mode="linear"),
+        helper.make_node("MaxPool", ["z"], ["m"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Add", ["m", "s"], ["n"]),
+        conv(["n", "h", "c"], "o", pads=[0, 0, 0, 0]),
+        helper.make_node("Transpose", ["o"], ["o2"], perm=[0, 2, 3, 1]),
+        helper.make_node("Reshape", ["o2", "row"], ["out"]),
+        helper.make_node("Transpose", ["u"], ["up"], perm=[0, 2, 3, 1]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "small",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 16, 16, 3])],
+        [
+            helper.make_tensor_value_info("out", TensorProto.FLOAT, [1, 5]),
+            helper.make_tensor_value_info("up", TensorProto.FLOAT, [1, 8, 8, 8]),
+        ],
+        [numpy_helper.from_array(np.asarray(array), name) for name, array in held.items()],
+    )
+    file = tmp_path / "small.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), str(file))
+    image = rng.random((1, 16, 16, 3), np.float32)
+    expected = open_session(file, 1).run(None, {"image": image})
+    found = LandmarkGraph(file, CPU)(torch.from_numpy(image).permute(0, 3, 1, 2))
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
+    np.testing.assert_allclose(found[1].permute(0, 2, 3, 1), expected[1], atol=1e-4)
+
+
+def test_mirrored_looks_name_the_other_side() -> None:
+    outputs = Graph()(torch.zeros(1, 3, 256, 256))
+    outputs[0][0, 5 * 11] = 100.0  # the left shoulder's x
+    plain, other = Looks(outputs, False), Looks(outputs, True)
+    assert plain.points[0, 11, 0] == 100 and other.points[0, 12, 0] == 156
+
+
 @pytest.mark.parametrize("kappa", [0.5, 3.0, 40.0, 2000.0])
 def test_likelihood_integrates_to_one(kappa: float) -> None:
     cosine = 1 - np.logspace(-9, np.log10(2.0), 20001)
@@ -93,62 +289,46 @@ def test_likelihood_integrates_to_one(kappa: float) -> None:
     assert np.trapezoid(density, 1 - cosine) == pytest.approx(1, abs=2e-3)  # 2π of the ring and of the constant cancel
 
 
-def test_offsets_and_errors_are_found_again(clips: Clips, model: err.ErrorModel) -> None:
-    rng = np.random.default_rng(3)
-    windows = []
-    for _ in range(30):
-        rotations, roots = sampled(clips, 1, 24, rng, augment=False)
-        joints = positions(rotations, roots, sampled_offsets(1, rng))
-        cameras = sampled_cameras(joints, rng)
-        rotations, seen = (cameras.rotations[:, None, None] @ rotations), cameras.seen(joints)
-        rays, confidence, hint = err.seen_with_errors(err.landmarks(rotations, seen, model.offsets), model, rng)
-        names = ("rays", "confidence", "hint_m", "rotations", "joints")
-        windows.append(dict(zip(names, (a[0, ::2] for a in (rays, confidence, hint, rotations, seen)))))
-    found = err.fit_errors(windows)
-    hips = [BLAZEPOSE.index(n) for n in ("left_hip", "right_hip", "left_knee", "left_wrist", "nose")]
-    assert np.abs(found.offsets[hips] - model.offsets[hips]).max() < 0.012
-    deviation = np.sqrt((found.factors**2).sum(1) + found.rest**2)
-    assert 0.006 < np.median(deviation[:66]) < 0.014 and 0.018 < np.median(deviation[66:165]) < 0.04
+def test_values_between_frames_keep_those_of_the_video() -> None:
+    values = np.random.default_rng(4).normal(size=(5, 2)).astype(np.float32)
+    at = between(values, np.arange(13), 3)
+    np.testing.assert_allclose(at[::3], values, atol=1e-6)
+    np.testing.assert_allclose(at[1], values[0] * 2 / 3 + values[1] / 3, atol=1e-6)
 
 
-def test_strided_values_keep_the_frames_of_the_video() -> None:
-    values = np.random.default_rng(4).normal(size=(13, 2)).astype(np.float32)
-    kept = strided(values, 3)
-    np.testing.assert_allclose(kept[::3], values[::3], atol=1e-6)
-    np.testing.assert_allclose(kept[1], values[0] * 2 / 3 + values[3] / 3, atol=1e-6)
+def test_variants_of_a_window_keep_the_angle_between_landmarks_and_truth(clips: Clips) -> None:
+    made = samples_of(_windows(clips, 4, 1), 0, 6)
+    assert made.inputs.shape == (24, training.FRAMES, CHANNELS) and made.targets.shape == (24, training.FRAMES, 42, 3)
+    start = 25 * 2 + 25 + 25 * 3
+    hinted = made.inputs.astype(np.float32)[..., start : start + 36].reshape(24, training.FRAMES, 12, 3)
+    target = made.targets.astype(np.float32)[..., [JOINTS.index("left_elbow") - 1], :]
+    assert (hinted[:, :, :1] * target).sum(-1).min() > 0.97
 
 
 @pytest.fixture(scope="module")
-def solved(clips: Clips, model: err.ErrorModel, tmp_path_factory):
-    """A small network solved on two batches, and its file."""
-    network = solve(clips, model, 2, lambda done: None, hidden=64)
+def trained(clips: Clips, tmp_path_factory: pytest.TempPathFactory):
+    """A small network trained on a few windows, its curve, and its file."""
+    with ThreadPoolExecutor(1) as pool:
+        windows = _windows(clips, 24, 2)
+        found = [train(windows, _windows(clips, 4, 3), 16, CPU, pool, batch=8, width=32, every=8) for _ in range(2)]
     file = tmp_path_factory.mktemp("lifter") / "lifter.onnx"
-    export(network, file)
-    return network, file
+    export(found[0].network, file)
+    return found, file
 
 
-def test_the_solved_network_beats_the_landmarks_and_knows_its_errors(
-    clips: Clips, model: err.ErrorModel, solved
-) -> None:
-    row = figures(synthetic(clips, model, solved[1], batches=1))
-    assert row["frames"] == 24 * 60 and len(row["bones_deg"]) == 21
-    assert row["limbs_deg"] < 0.9 * row["limbs_deg_landmarks"]
-    for decile in row["calibration"][2:-2]:
-        assert 0.5 < decile["actual_deg"] / decile["predicted_deg"] < 2
+def test_training_lowers_the_loss_and_is_reproducible(trained) -> None:
+    first, again = trained[0]
+    assert first.curve[-1]["validation"] < first.curve[0]["validation"]
+    assert all(torch.equal(a, b) for a, b in zip(first.network.parameters(), again.network.parameters()))
 
 
-def test_refining_lowers_the_loss_and_is_reproducible(clips: Clips, model: err.ErrorModel, solved) -> None:
-    made = batch(clips, model, 20, 24 + 2 * REACH, np.random.default_rng(9))
-    with torch.no_grad():
-        before = float(loss_of(solved[0], made))
-    first, again = (refine(copy.deepcopy(solved[0]), clips, model, 6, lambda step, loss: None) for _ in range(2))
-    with torch.no_grad():
-        assert float(loss_of(first, made)) < before
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), again.parameters()))
+def test_figures_of_windows_count_the_frames_seen(clips: Clips, trained) -> None:
+    row = figures(of_windows(_windows(clips, 3, 4), trained[1]))
+    assert row["frames"] == 60 and len(row["bones_deg"]) == 21 and row["limbs_deg_landmarks"] < 6
 
 
-def test_the_file_computes_what_the_network_does(solved) -> None:
-    network, file = copy.deepcopy(solved[0]), solved[1]
+def test_the_file_computes_what_the_network_does(trained) -> None:
+    network, file = copy.deepcopy(trained[0][0].network), trained[1]
     for weight in network.parameters():  # the file holds matrices in half precision
         if weight.ndim == 2:
             weight.data = weight.data.half().float()
@@ -199,8 +379,8 @@ def test_triangulation_finds_points_again() -> None:
     np.testing.assert_allclose(found, points, atol=1e-9)
 
 
-def test_no_batches_are_refused(tmp_path, capsys) -> None:
-    folders = ["--motions", "a", "--capture", "b", "--video", "c"]
-    assert main(["study", "lifter", str(tmp_path / "out"), *folders, "--batches", "0"]) == 2
-    assert "--batches: expected at least 1, got 0" in capsys.readouterr().err
+def test_few_windows_are_refused(tmp_path, capsys) -> None:
+    folders = [word for name in ("motions", "characters", "lights", "capture", "video") for word in (f"--{name}", "a")]
+    assert main(["study", "lifter", str(tmp_path / "out"), *folders, "--windows", "3"]) == 2
+    assert "--windows: expected at least 10, got 3" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -16,10 +16,8 @@ from rnd_trainer.estimating.observations import Observations, load_observations,
 from rnd_trainer.estimating.observing.observe import Networks, observe
 from rnd_trainer.importing.videos.video_file import VideoFile
 
-from .errors import Window
-
-FRAMES = 12
-"""of a window"""
+from .filming import Window
+from .motions import FPS
 
 
 def observed(file: Path, kept: Path, every: int = 1) -> Observations:
@@ -30,12 +28,11 @@ def observed(file: Path, kept: Path, every: int = 1) -> Observations:
     return load_observations(kept)
 
 
-def windows_of_capture(folder: Path, seen: Observations, frames: int | None = FRAMES) -> list[Window]:
-    """Windows of the training frames of the capture in ``folder``.
+def window_of_capture(folder: Path, seen: Observations) -> Window:
+    """The training frames of the capture in ``folder``.
 
     Args:
         seen: observations of a video of these frames, one for one.
-        frames: of a window; all in one where None.
     """
     capture = load_capture(folder)
     chosen = sorted(capture.split("train"), key=lambda frame: frame.frame)
@@ -56,5 +53,5 @@ def windows_of_capture(folder: Path, seen: Observations, frames: int | None = FR
         "rotations": (to_camera[:3, :3] @ bones[..., :3])[:, order],
         "joints": joints[:, order],
     }
-    parts = np.array_split(np.arange(len(index)), max(1, round(len(index) / frames)) if frames else 1)
-    return [{name: np.asarray(array[part], np.float32) for name, array in window.items()} for part in parts]
+    step = round(FPS / seen.fps)
+    return {name: np.asarray(array, np.float32) for name, array in {**window, "step": np.array(step)}.items()}

@@ -14,9 +14,9 @@ from rnd_trainer.estimating.lifted import JOINTS, PARENTS
 from rnd_trainer.estimating.lifter import Features, features, run
 from rnd_trainer.estimating.observations import BLAZEPOSE
 
-from .errors import ErrorModel, Window
-from .motions import FPS, Clips, Floats32
-from .synthesis import batch, strided, vectors_of
+from .filming import Window
+from .motions import FPS, Floats32
+from .training import between, vectors_of
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +29,6 @@ LIMBS = tuple(n for n in JOINTS if n.endswith(("knee", "ankle", "elbow", "wrist"
 _OURS = [JOINTS.index(n) for n in BODY]
 _THEIRS = [BLAZEPOSE.index(n) for n in BODY]
 _BINS = 10  # of predicted deviation
-_SEED = 54
-_WINDOWS, _FRAMES = 24, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,34 +49,23 @@ class Lifts:
     lengths: Floats32
 
 
-def synthetic(clips: Clips, errors: ErrorModel, network: Path, batches: int = 10) -> Lifts:
-    """Lifts of held-out ``clips``, not augmented, with the model's errors."""
-    rng = np.random.default_rng(_SEED)
-    parts = []
-    for _ in range(batches):
-        made = batch(clips, errors, _WINDOWS, _FRAMES, rng, augment=False)
-        unit, kappa = run(made.inputs, network)
-        lengths = np.repeat(made.lengths[:, None], _FRAMES, 1)
-        parts.append([a.reshape(-1, *a.shape[2:]) for a in (unit, kappa, made.targets, made.hint_m, lengths)])
-    return Lifts(*(np.concatenate(arrays) for arrays in zip(*parts)))
-
-
-def of_windows(windows: list[Window], network: Path, step: int) -> Lifts:
-    """Lifts of what the landmark network saw of rendered people, in every ``step``-th frame of 30 a second."""
+def of_windows(windows: list[Window], network: Path) -> Lifts:
+    """Lifts of what the landmark network saw, in the frames seen."""
     parts = []
     for window in windows:
-        unit, kappa, seen = _window(window, network, step)
+        step = int(window["step"])
+        unit, kappa, seen = _lifted(window, network, step)
         target = vectors_of(seen.views[0, ::step, None] @ window["rotations"])
         bones = window["joints"][:, 1:] - window["joints"][:, PARENTS[1:]]
         parts.append([unit, kappa, target, window["hint_m"], np.linalg.norm(bones, axis=-1)])
     return Lifts(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
-def _window(window: Window, network: Path, step: int) -> tuple[Floats32, Floats32, Features]:
+def _lifted(window: Window, network: Path, step: int) -> tuple[Floats32, Floats32, Features]:
     """Unit vectors and concentrations of the frames of a window."""
-    names = ("rays", "confidence", "hint_m")
-    rays, confidence, hint = (strided(np.repeat(window[name], step, 0), step)[None] for name in names)
-    gap = np.minimum(np.arange(rays.shape[1]) % step, -np.arange(rays.shape[1]) % step)[None] / FPS
+    at = np.arange((len(window["rays"]) - 1) * step + 1)
+    rays, confidence, hint = (between(window[name], at, step)[None] for name in ("rays", "confidence", "hint_m"))
+    gap = np.minimum(at % step, -at % step)[None] / FPS
     seen = features(rays, confidence, hint, gap.astype(np.float32))
     unit, kappa = run(seen.inputs, network)
     return unit[0, ::step], kappa[0, ::step], seen

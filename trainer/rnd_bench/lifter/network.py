@@ -1,4 +1,4 @@
-"""The lifter's network: two wide hidden layers over some frames each, and the likelihood of unit vectors."""
+"""The lifter's network: convolutions over time, and the likelihood of unit vectors."""
 
 from __future__ import annotations
 
@@ -9,75 +9,58 @@ import numpy as np
 import onnx
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from rnd_runtime.core.files import atomic_path
 from rnd_trainer.estimating.lifted import JOINTS
 from rnd_trainer.estimating.lifter import CHANNELS, REACH
 
 VECTORS = 2 * (len(JOINTS) - 1)
-STAGES = 2
-HALF = REACH // STAGES
-"""frames that each stage looks ahead and back"""
-SIZES = (4 * CHANNELS, *(STAGES - 1) * (5 * 3 * VECTORS + 2 * CHANNELS,))
-"""inputs of the stages"""
-COMPONENTS, HIDDEN = 256, 1536
+WIDTH, WIDER, KERNEL = 320, 3, 7
+DILATIONS = (1, 1, 2, 2, 1)
+"""of the blocks, which together look ``REACH`` frames ahead and back"""
+DROPPED = 0.1
 OUTPUTS = ("directions", "concentrations")
 _LIMITS = (0.5, 4000.0)  # of κ, rad⁻²
+assert sum(DILATIONS) * (KERNEL // 2) == REACH
 
 
-class Stage(nn.Module):
-    """A hidden layer on main components, beside a linear map: [..., size] to [..., 42, outputs]."""
+class Block(nn.Module):
+    """A convolution over time in each channel, then a hidden layer in each frame: [B, T, W] to [B, T − 2·reach, W].
 
-    def __init__(self, size: int, hidden: int, outputs: int) -> None:
+    Source: Liu et al. 2022, A ConvNet for the 2020s.
+    """
+
+    def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
-        self.main = nn.Linear(size, COMPONENTS)
-        self.first = nn.Linear(COMPONENTS, hidden)
-        self.skip = nn.Linear(size, outputs * VECTORS)
-        self.head = nn.Linear(hidden, outputs * VECTORS, bias=False)
-        self.outputs = outputs
+        self.reach = KERNEL // 2 * dilation
+        self.over_time = nn.Conv1d(width, width, KERNEL, dilation=dilation, groups=width)
+        self.norm = nn.LayerNorm(width)
+        self.first, self.second = nn.Linear(width, WIDER * width), nn.Linear(WIDER * width, width)
+        self.drop = nn.Dropout(DROPPED)
 
-    def hidden(self, inputs: Tensor) -> Tensor:
-        """Hidden units [..., hidden]."""
-        return torch.relu(self.first(self.main(inputs)))
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        out = self.head(self.hidden(inputs)) + self.skip(inputs)
-        return out.unflatten(-1, (VECTORS, self.outputs))
+    def forward(self, frames: Tensor) -> Tensor:
+        seen = self.norm(self.over_time(frames.transpose(1, 2)).transpose(1, 2))
+        return frames[:, self.reach : -self.reach] + self.second(self.drop(F.gelu(self.first(seen))))
 
 
 class LifterNetwork(nn.Module):
-    """Inputs [B, T + 2·REACH, CHANNELS] to unit vectors [B, T, 42, 3] and concentrations [B, T, 42], rad⁻².
+    """Inputs [B, T + 2·REACH, CHANNELS] to unit vectors [B, T, 42, 3] and concentrations [B, T, 42], rad⁻²."""
 
-    The first stage guesses vectors from landmarks, each later one from landmarks and the last one's vectors over time.
-    """
-
-    def __init__(self, hidden: int = HIDDEN) -> None:
+    def __init__(self, width: int = WIDTH) -> None:
         super().__init__()
-        self.stages = nn.ModuleList(
-            Stage(size, hidden, outputs) for size, outputs in zip(SIZES, (*(STAGES - 1) * (3,), 4))
-        )
+        self.enter = nn.Linear(CHANNELS, width)
+        self.drop = nn.Dropout(DROPPED)
+        self.blocks = nn.ModuleList(Block(width, dilation) for dilation in DILATIONS)
+        self.norm, self.leave = nn.LayerNorm(width), nn.Linear(width, 4 * VECTORS)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        out = self.stages[-1](self.inputs_of(STAGES - 1, features))
+        frames = self.enter(self.drop(features))
+        for block in self.blocks:
+            frames = block(frames)
+        out = self.leave(self.norm(frames)).float().unflatten(-1, (VECTORS, 4))
         low, high = _LIMITS
         return unit_of(out[..., :3]), (low + out[..., 3].exp()).clamp(max=high)
-
-    def inputs_of(self, stage: int, features: Tensor) -> Tensor:
-        """What ``stage`` sees [B, T - 2·HALF·(stage + 1), SIZES[stage]] of inputs [B, T, CHANNELS]."""
-        if stage == 0:
-            near = torch.stack([_at(features, k) for k in (-2, 0, 2)]).mean(0)
-            wide = torch.stack([_at(features, k) for k in range(-HALF, HALF + 1, 3)]).mean(0)
-            motion = 2 * (_at(features, 5) - _at(features, -5))
-            return torch.cat([_at(features, 0), near, wide, motion], -1)
-        guess = unit_of(self.stages[stage - 1](self.inputs_of(stage - 1, features))).flatten(-2)
-        inner = features[:, stage * HALF : -stage * HALF]
-        near = (_at(inner, -2) + _at(inner, 2)) / 2
-        return torch.cat([*(_at(guess, k) for k in (-HALF, -2, 0, 2, HALF)), _at(inner, 0), near], -1)
-
-
-def _at(values: Tensor, offset: int) -> Tensor:
-    """``values`` [B, T, n] without HALF frames at each end, moved by ``offset`` frames."""
-    return values[:, HALF + offset : (offset - HALF) or None]
 
 
 def unit_of(vectors: Tensor) -> Tensor:

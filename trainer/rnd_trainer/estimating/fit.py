@@ -52,6 +52,8 @@ class Weights:
     spread: float = 1.0  # of the views of one frame, counted as deviation
     points: float = 2.0
     bones: float = 0.45
+    limbs: float = 0.105  # rad, of the lifter's limbs and rolls from the body's, beside its own deviation
+    trunk: float = 0.21  # likewise; rigs differ
     prior: float = 0.03
     smooth: float = 0.3
     acceleration: float = 4.0  # m/s² of the trunk along each axis; limbs two to three times that
@@ -263,7 +265,8 @@ class Fit:
         figure, marks, layout, lens, w = self.figure, self.marks, self.layout, self.lens, self.weights
         posed = state.posed(figure)
         cost = points(state, posed, figure, marks, layout, lens, equations)
-        cost += BoneTerm(self.lifted, weight=w.bones)(state, posed, figure, layout, equations)
+        bones = BoneTerm(self.lifted, weight=w.bones, limbs=w.limbs, trunk=w.trunk)
+        cost += bones(state, posed, figure, layout, equations)
         cost += PriorTerm(pose_prior(), w.prior)(posed, layout, equations)
         cost += self._smooth(posed, layout, equations)
         cost += GroundTerm(self.times, w.ground)(state, posed, figure, marks, layout, equations)

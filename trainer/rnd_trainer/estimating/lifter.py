@@ -20,7 +20,7 @@ Floats32 = NDArray[np.float32]
 NETWORK = Path(__file__).with_name("lifter.onnx")
 FPS = 30.0
 """rate of the network's frames"""
-REACH = 12
+REACH = 21
 """frames before and after one frame that its result depends on, beside the smoothing of centre and size"""
 POINTS = np.array([0, 7, 8, *range(11, 33)])
 """landmarks that the network sees: nose, ears, and all below"""

@@ -109,11 +109,18 @@ def marks_by_shape(posed: Posed, figure: Figure, marks: Marks) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class BoneTerm:
-    """Directions and rolls of bones against ``Lifted``."""
+    """Directions and rolls of bones against ``Lifted``.
+
+    Attributes:
+        limbs, trunk: rad, deviation of the lifter's idea of a bone from the body's, beside the lifter's own; rigs
+            differ in the trunk, neck and collars.
+    """
 
     lifted: Lifted
     limit: float = 3.0
     weight: float = 1.0
+    limbs: float = 0.0
+    trunk: float = 0.0
 
     def __call__(
         self, state: State, posed: Posed, figure: Figure, layout: Layout, equations: NormalEquations | None
@@ -125,12 +132,13 @@ class BoneTerm:
         own /= np.linalg.norm(own, axis=1, keepdims=True)
         limbs = np.array([name in LIMBS for name in JOINTS[1:]])
         axes = np.where(limbs[:, None], own, REST_DIRECTIONS)
+        beside = np.where(limbs, self.limbs, self.trunk)
         cost = 0.0
-        for joints, axis, target, kappa in (
-            (parents, axes, self.lifted.directions, self.lifted.concentration),
-            (index[1:], ROLL_AXES, self.lifted.roll, self.lifted.roll_concentration),
+        for joints, axis, target, kappa, other in (
+            (parents, axes, self.lifted.directions, self.lifted.concentration, beside),
+            (index[1:], ROLL_AXES, self.lifted.roll, self.lifted.roll_concentration, self.limbs),
         ):
-            root = np.sqrt(kappa.astype(np.float64))[..., None]
+            root = np.sqrt(1 / (1 / kappa.astype(np.float64) + other**2))[..., None]
             now = np.einsum("tpij,pj->tpi", posed.world[:, joints], axis)
             residual = (now - target.astype(np.float64) @ TO_CAMERA) * root
             part, kept = robust((residual**2).sum(-1), self.limit)
