@@ -1,4 +1,4 @@
-"""Figures of the study of videos."""
+"""Figures of ``rnd-bench study video``."""
 
 from __future__ import annotations
 
