@@ -221,14 +221,19 @@ class FrameRenderer:
 
     def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
         """Share [H, W, 3] of the ground's light that the body leaves."""
+        plane, rotation = ground.in_frame(body.root), body.root[:3, :3]
+        grids = self.ground_light(ground).shadow(body.gaussians, shadow_radii(body.gaussians), plane, rotation)
+        return remaining_light(grids, plane, camera.in_frame(body.root))
+
+    def ground_light(self, ground: Plane) -> GroundLight:
+        """The light's irradiance on the ground."""
         known, light = self._ground_light, self.light
         if known is None or known.light.radiance is not light.radiance:
             known = GroundLight(light, ground.normal)
         elif known.light is not light:
             known = known.with_yaw(light)
-        self._ground_light, plane = known, ground.in_frame(body.root)
-        grids = known.shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3])
-        return remaining_light(grids, plane, camera.in_frame(body.root))
+        self._ground_light = known
+        return known
 
     def close(self) -> None:
         """Release the rasteriser."""

@@ -21,6 +21,7 @@ from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
+from rnd_runtime.ground.shadow import Plane, remaining_light
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster.in_view import visible_to
 from rnd_runtime.raster.oracle import NEAR
@@ -174,7 +175,12 @@ class SceneRenderer:
         radiance, started = raster.image[..., :3], perf_counter()
         image_srgb = tone_map(radiance, raster.alpha) if srgb else None
         seconds["tone map"] = perf_counter() - started
-        return RenderedFrame(radiance, raster.alpha, layers, seconds, srgb_on_black=image_srgb)
+        ground = None
+        if self.renderer.ground is not None:
+            started = perf_counter()
+            ground = self._lit_ground(posed, frame, view, self.renderer.ground)
+            seconds["ground"] = perf_counter() - started
+        return RenderedFrame(radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
 
     def _shaded(
         self,
@@ -238,6 +244,26 @@ class SceneRenderer:
             seconds["compositing"] = seconds.get("compositing", 0.0) + perf_counter() - started
         assert result is not None
         return replace(result, seconds=seconds, srgb=None)
+
+    def _lit_ground(self, posed: Sequence[Gaussians], frame: Floats, camera: Camera, ground: Plane) -> Floats32:
+        """Share [H, W, 3] of the ground's light that everybody leaves.
+
+        Bodies hide different parts of the sky, as if by chance, and the same directional light: shares of the first
+        multiply, of the second the least counts.
+        """
+        light, plane = self.renderer.ground_light(ground), ground.in_frame(frame)
+        of_sky = np.maximum(light.sky.sum(axis=0) / np.maximum(light.irradiance, 1e-30), 1e-30).astype(np.float32)
+        shape = camera.height, camera.width, 3
+        sky, suns = np.ones(shape, np.float32), [np.ones(shape, np.float32) for _ in light.suns]
+        for gaussians in posed:
+            grids = light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3])
+            left = [remaining_light([grid], plane, camera) for grid in grids]
+            if left:
+                sky *= np.maximum(1 - (1 - left[0]) / of_sky, 0)
+            for sun, here in zip(suns, left[1:]):
+                np.minimum(sun, here, out=sun)
+        whole: Floats32 = 1 - of_sky * (1 - sky) - sum((1 - sun for sun in suns), np.zeros(shape, np.float32))
+        return np.maximum(whole, 0, out=whole)
 
     def _together(self, name: str, parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """``parts`` one after another, in an array that is kept from frame to frame."""

@@ -9,6 +9,7 @@ import pytest
 
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
+from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.far import Extent, depth_groups
 from rnd_runtime.playback.frame import FrameRenderer
@@ -182,3 +183,21 @@ def test_far_people_get_coarser_levels_and_parts_of_a_run_the_same(avatar, motio
     difference = np.sqrt(np.mean((full.srgb.astype(float) - coarse.srgb) ** 2))
     assert 0 < difference < 1
     np.testing.assert_allclose(coarse.alpha.sum(), full.alpha.sum(), rtol=0.04)
+
+
+def test_everybody_shades_the_ground_and_no_sun_is_hidden_twice(avatar, motion):
+    view = Camera.look_at([0, 2.5, 6.0], [0, 0.2, 0], width=160, height=120, fov_y=0.6)
+    here, there = (Person(avatar, motion, 0, place_at(x, 0, 0)) for x in (-0.8, 0.8))
+    with FrameRenderer(avatar, _sun(0.2, 1, 0.3)) as renderer:
+        renderer.ground = Plane(np.array([0.0, 1, 0]), -0.02)
+
+        def ground(people):
+            scene = SceneRenderer(people, renderer)
+            return scene.draw(scene.encode(TIME), view).ground
+
+        alone, other, both, twice = (ground(people) for people in ([here], [there], [here, there], [here, here]))
+    assert alone.min() < 0.3 and other.min() < 0.3
+    np.testing.assert_allclose(both, np.minimum(alone, other), atol=0.06)  # the sky's shadows overlap a little
+    deep = alone.min()
+    assert twice.min() == pytest.approx(deep, abs=0.03)  # not as dark as the product
+    assert (both <= np.minimum(alone, other) + 2e-3).all()

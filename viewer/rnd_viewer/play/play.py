@@ -150,7 +150,8 @@ class _Run:
             renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
             scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
-                renderer.ground = ground_of(avatar, motions[0])
+                stands = {(person.avatar, person.motion) for person in people}
+                renderer.ground = min((ground_of(*pair) for pair in stands), key=lambda plane: plane.offset)
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
         return cls(
@@ -308,8 +309,6 @@ def _required(options: PlayOptions) -> tuple[list[PersonRecord], Path]:
         raise InputError(f"missing {', '.join(missing)}", hint="rnd-play AVATAR.onnx --motion FILE --out FOLDER")
     assert options.avatar and options.out
     cast = [PersonRecord(options.avatar, options.motion)] if options.motion else read_scene(options.avatar)
-    if len(cast) > 1 and options.lighting.ground != "none":
-        raise InputError("--ground", expected="none for several people", got=options.lighting.ground)
     for motion in {person.motion for person in cast}:
         if is_folder(motion) and options.out.resolve() == motion.resolve():
             raise InputError("--out", expected="another folder than the motion's", got=options.out)
