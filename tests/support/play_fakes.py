@@ -63,6 +63,9 @@ class FakeAvatar:
         now = encoded.motion.at([encoded.time])
         return self.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]
 
+    def scale_albedo(self, gain: tuple[float, float, float]) -> None:
+        """Its albedo stays."""
+
     def unposed(self, encoded: Encoded) -> None:
         """It has no networks."""
 
