@@ -13,7 +13,7 @@ from rnd_runtime.cli.command import parse_subcommand, run_command
 from rnd_runtime.core.errors import InputError
 
 from .lifter.options import Lifter
-from .options import Compare, Frame, Grid, Raster, Scenes, Step
+from .options import Compare, Frame, Grid, Ground, Raster, Scenes, Step
 from .stability.cli import Stability
 from .studies.options import Ablations, Agreement, Causes, Lengths, People
 from .studies.video_options import Video
@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[Any, str, str]] = {
     "step": (Step, SPEED, "run_step"),
     "scenes": (Scenes, SPEED, "run_scenes"),
     "compare": (Compare, SPEED, "run_compare"),
+    "ground": (Ground, "rnd_bench.ground.cli", "run"),
     "stability": (Stability, "rnd_bench.stability.cli", "run"),
     "study": (Study, "", ""),
 }

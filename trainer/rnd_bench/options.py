@@ -172,3 +172,24 @@ class Compare:
     """of onnxruntime and of the kernels; by default two, where there are two cores"""
     json: OptionalFile = None
     """write the rows here"""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a shadow on the ground costs a frame, and its error against Mitsuba's path tracing.
+
+    rnd-bench ground assets
+    """
+
+    assets: Annotated[Path, tyro.conf.Positional, option("ASSETS")]
+    """folder with avatar.onnx, body.npz, walk.npz and sky.exr, such as a clone's assets"""
+    json: OptionalFile = None
+    """write the rows here"""
+    size: Count = 512
+    """image side in pixels of the timed frames"""
+    pairs: Count = 200
+    """frames with and without the ground"""
+    samples: Count = 256
+    """per pixel, of Mitsuba"""
+    threads: OptionalCount = None
+    """of onnxruntime and of the kernels; by default two, where there are two cores"""

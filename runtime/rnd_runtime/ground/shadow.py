@@ -1,14 +1,14 @@
 """Shadows that a body casts on the ground, as the share of the ground's irradiance that is left.
 
-On a plane a shadow is an oblique projection: the body, as spheres, is projected along directions of the light. The sky
-is sampled in ``SKY_DIRECTIONS`` of equal cosine-weighted solid angle, each with the blur of its cell; every directional
-light has a finer grid and the blur of its spread. Nothing is occluded twice, so energy is right for any light.
+On a plane a shadow is an oblique projection of the body. The sky is sampled in ``SKY_DIRECTIONS`` of equal
+cosine-weighted solid angle, summed into one map; every directional light has a finer map and the blur of its spread.
+Nothing is occluded twice, so energy is right for any light.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,29 +20,24 @@ from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.shading.directional import extract_directional
 from rnd_runtime.shading.light import Light
 
-from .kernels import look_up, project
+from . import sky
+from .lookup import GROUP, sky_light, subtract_sun
+from .stand_in import StandIn, stand_in
+from .sun import bounds, sun_map
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 
-SKY_DIRECTIONS = 64
+SKY_DIRECTIONS = 128
 """of the sky's shadow"""
-SKY_CELL, SKY_REACH = 0.05, 3.0
-"""m, cell and half side of the sky's grid around the body"""
-SUN_CELLS, SUN_CELL, SUN_REACH = 384, 0.006, 8.0
-"""most cells along a side of a directional light's grid, their least size m, and the grid's largest side m"""
-NEAR_GROUND = 0.25
-"""m, height below which the sky's shadow is sharp and needs small spheres"""
-LOW_SPHERES, HIGH_SPHERES, SUN_SPHERES = 512, 640, 8192
-"""largest numbers that stand for the body: near the ground and above it for the sky, and for a directional light"""
-BANDS = (0.12, 0.3, 0.6, 1.0, 1.5)
-"""m, heights between which spheres are blurred alike"""
-GROWN, LARGEST = 1.2, 0.045
-"""factor on the discs' radii that closes the gaps of a thinned body; their bound, m, about that of a forearm"""
+SUN_CELLS, SUN_CELL, SUN_REACH = 512, (0.004, 0.05), 8.0
+"""most cells along a side of a directional light's map, bounds of their size m, and the map's largest side m"""
 MIN_ELEVATION = math.radians(3)
 """below which a directional light casts no shadow on the ground: it would be longer than 30 m"""
-SINK = 0.8
-"""of a sphere's radius, by which its centre lies below the surface"""
+BOX = math.sqrt(1.5)
+"""half width of a box over the root mean square radius of a disc of the same variance along either axis"""
+MAX_STEP = 15
+"""pixels between look-ups of the sky's map"""
 
 
 class Plane(NamedTuple):
@@ -56,15 +51,57 @@ class Plane(NamedTuple):
         normal = frame_to_world[:3, :3].T @ self.normal
         return Plane(normal, float(self.offset - self.normal @ frame_to_world[:3, 3]))
 
+    @property
+    def axes(self) -> Floats:
+        """[3, 3] by rows: two unit vectors in the plane, and the normal."""
+        x, y, z = self.normal.tolist()
+        if abs(x) <= min(abs(y), abs(z)):
+            a, b, c = 0.0, -z, y  # across X and the normal
+        elif abs(y) <= abs(z):
+            a, b, c = z, 0.0, -x
+        else:
+            a, b, c = -y, x, 0.0
+        length = math.sqrt(a * a + b * b + c * c)
+        a, b, c = a / length, b / length, c / length
+        return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a], [x, y, z]])
+
+
+class Map(NamedTuple):
+    """Blocked shares on a part of the plane."""
+
+    values: Floats32  # [I, J, 4] RGB and 0; [I, J] of one light
+    to_cells: Floats  # [2, 3], (x, y, 1) in the plane's axes, m → row and column, cell centres at integers
+
 
 @dataclass(frozen=True, eq=False)
-class Grid:
-    """Values on a part of the ground: cell (i, j) lies at origin + (i + ½) · along + (j + ½) · across."""
+class Shadow:
+    """A body's shadow on a plane.
 
-    values: Floats32  # [I, J, C], blocked share
-    origin: Floats  # [3] m
-    along: Floats  # [3] m, a cell
-    across: Floats  # [3] m, a cell
+    Attributes:
+        sky: shares of the irradiance.
+        suns: shares of each sun's light, and its own share [3] of the irradiance.
+        pixel: m, the finest detail that is wanted.
+    """
+
+    plane: Plane
+    sky: Map
+    suns: tuple[tuple[Map, Floats32], ...]
+    pixel: float
+
+    def remaining(self, camera: Camera, image: Floats32) -> Floats32:
+        """Fill ``image`` [H, W, 3] with the share of the ground's irradiance at pixels that see the ground, else 1."""
+        to_plane = _image_to_plane(camera, self.plane)
+        step = int(min(float(sky.CELL) / self.pixel / 2, MAX_STEP)) // GROUP * GROUP or 1
+        sky_light(_compose(self.sky.to_cells, to_plane), self.sky.values, step, image)
+        for sun, share in self.suns:
+            subtract_sun(_compose(sun.to_cells, to_plane), sun.values, share, image)
+        return image
+
+    @property
+    def parts(self) -> list[Shadow]:
+        """That of the sky alone, then that of each sun alone."""
+        none = self.sky._replace(values=np.zeros_like(self.sky.values[:2, :2]))
+        return [replace(self, suns=()), *(replace(self, sky=none, suns=(sun,)) for sun in self.suns)]
 
 
 class GroundLight:
@@ -76,18 +113,14 @@ class GroundLight:
     """
 
     def __init__(self, light: Light, normal: ArrayLike = (0.0, 1.0, 0.0)) -> None:
-        normal = np.asarray(normal, np.float64)
-        self.light, self._normal = light, normal
-        sky, self._suns_of_probe = extract_directional(light)
-        self._sky_of_probe = sky.resized(16, 32)
+        axes = Plane(np.asarray(normal, np.float64), 0.0).axes
+        self.light, self._normal = light, axes[2]
+        rest, self._suns_of_probe = extract_directional(light)
+        self._sky_of_probe = rest.resized(16, 32)
         count = np.arange(SKY_DIRECTIONS) + 0.5
         radius, azimuth = np.sqrt(count / SKY_DIRECTIONS), count * math.pi * (3 - math.sqrt(5))  # Malley's method
-        tangent, bitangent = _tangents(normal)
-        self.directions: Floats = (
-            (radius * np.cos(azimuth))[:, None] * tangent
-            + (radius * np.sin(azimuth))[:, None] * bitangent
-            + np.sqrt(1 - radius**2)[:, None] * normal
-        )
+        height = np.sqrt(1 - radius**2)
+        self.directions: Floats = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1) @ axes
         self._light_up(light)
 
     def with_yaw(self, light: Light) -> GroundLight:
@@ -97,8 +130,8 @@ class GroundLight:
         return turned
 
     def _light_up(self, light: Light) -> None:
-        sky = self._sky_of_probe.with_yaw(light.yaw).sample(self.directions)
-        self.sky: Floats = sky.astype(np.float64) * math.pi / SKY_DIRECTIONS
+        radiance = self._sky_of_probe.with_yaw(light.yaw).sample(self.directions)
+        self.sky: Floats = radiance.astype(np.float64) * math.pi / SKY_DIRECTIONS
         self.suns: list[tuple[Floats, Floats, float]] = []  # direction, irradiance on the ground, spread
         for sun in self._suns_of_probe:
             direction = light.rotation @ sun.direction
@@ -107,124 +140,90 @@ class GroundLight:
                 self.suns.append((direction, sun.irradiance * cosine, sun.spread))
         self.irradiance: Floats = self.sky.sum(0) + sum((e for _, e, _ in self.suns), np.zeros(3))
 
-    def shadow(self, gaussians: Gaussians, radii: Floats32, plane: Plane, frame_to_world: Floats) -> list[Grid]:
-        """Blocked shares of the irradiance: grids that add up.
+    def shadow(
+        self, gaussians: Gaussians, radii: Floats32, plane: Plane, frame_to_world: Floats, *, pixel: float = 0.005
+    ) -> Shadow | None:
+        """The shadow of a body; None where there is no light or no body.
 
         Args:
             gaussians: in a frame of their own.
             radii: [N] m of discs around them, 0 for those that cast no shadow.
             plane: in that frame.
             frame_to_world: [3, 3].
+            pixel: m, finest detail that is wanted, see ``footprint``.
         """
-        if not self.irradiance.max() > 0 or not radii.any():
-            return []
-        grids = []
+        if not self.irradiance.max() > 0:
+            return None
+        axes = plane.axes
+        body = stand_in(gaussians, radii, axes, plane.offset)
+        if not len(body.discs):
+            return None
         total = np.maximum(self.irradiance, 1e-12 * self.irradiance.max())
-        low = gaussians.means @ plane.normal.astype(np.float32) < plane.offset + NEAR_GROUND
-        strata = _spheres(gaussians, radii, LOW_SPHERES, low), _spheres(gaussians, radii, HIGH_SPHERES, ~low)
-        few = _sorted(Spheres(*(np.concatenate(parts) for parts in zip(*strata))), plane)
-        directions = floats(self.directions @ frame_to_world)
-        grid = _grid_below(few, plane)
-        blur = math.sqrt(1 / SKY_DIRECTIONS)  # radius of a cell of the hemisphere, seen from the ground
-        shares = floats(self.sky / total)
-        project(*few, *_frame(grid, plane), directions, shares, np.float32(blur), _bands(few, plane), grid.values)
-        grids.append(grid)
-        if self.suns:
-            many = _sorted(_spheres(gaussians, radii, SUN_SPHERES), plane)
-            for direction, irradiance, angle in self.suns:
-                towards = direction @ frame_to_world
-                grid = _grid_towards(many, plane, towards)
-                share = floats((irradiance / total)[None])
-                along_sun, penumbra = floats(towards[None]), np.float32(math.tan(angle))
-                project(*many, *_frame(grid, plane), along_sun, share, penumbra, _bands(many, plane), grid.values)
-                grids.append(grid)
-        return grids
+        to_axes = frame_to_world @ axes.T
+        centre = np.median(body.discs[:: len(body.discs) // 64 + 1, :2], axis=0)
+        values = sky.sky_map(body.discs, centre, floats(self.directions @ to_axes), floats(self.sky / total))
+        corner = centre.astype(np.float64) - sky.REACH
+        below = Map(values, _to_cells(np.eye(2), corner, np.full(2, sky.CELL, np.float64)))
+        suns = []
+        for direction, irradiance, spread in self.suns:
+            cast = _cast(body, direction @ to_axes, spread, pixel)
+            suns.append((cast, floats(irradiance / total)))
+        return Shadow(plane, below, tuple(suns), pixel)
 
 
-def remaining_light(grids: list[Grid], plane: Plane, camera: Camera) -> Floats32:
-    """Share [H, W, 3] of the ground's irradiance at every pixel that sees the ground; 1 elsewhere."""
-    rays = camera.rays
-    remaining = np.ones((camera.height, camera.width, 3), np.float32)
-    for grid in grids:
-        inverse = np.linalg.pinv(np.stack([grid.along, grid.across], axis=1))  # [2, 3], cells of a metre
-        look_up(
-            rays,
-            camera.position,
-            plane.normal,
-            plane.offset,
-            inverse,
-            inverse @ grid.origin + 0.5,
-            grid.values,
-            remaining,
-        )
-    return np.maximum(remaining, 0, out=remaining)
+def _cast(body: StandIn, towards: Floats, spread: float, pixel: float) -> Map:
+    """The map of a directional light; ``towards`` [3] is in the plane's axes."""
+    rise, flat = float(towards[2]), math.hypot(towards[0], towards[1])
+    cosine, sine = (towards[0] / flat, towards[1] / flat) if flat > 1e-6 else (1.0, 0.0)
+    turned = tuple(np.float32(value) for value in (cosine, sine, rise, flat / rise))
+    low_u, high_u, low_v, high_v, radius, height = bounds(body.discs, turned[0], turned[1], turned[3])
+    blur = BOX * math.tan(spread)
+    margin = (float(radius) + blur * float(height) / rise) * np.array([1 / rise, 1.0]) + 0.03
+    low, high = np.array([low_u, low_v]) - margin, np.array([high_u, high_v]) + margin
+    low = np.maximum(low, high - SUN_REACH)  # the feet's end of a long shadow is kept
+    cell = np.maximum((high - low) / SUN_CELLS, min(max(pixel, SUN_CELL[0]), SUN_CELL[1]))
+    columns, rows = (int(n) for n in np.ceil((high - low) / cell))
+    values = sun_map(*body, turned, (*floats(low),), (*floats(cell),), (rows, columns), np.float32(blur))
+    axes = np.array([[-sine, cosine], [cosine, sine]])
+    return Map(values, _to_cells(axes, low[::-1], cell[::-1]))
 
 
-class Spheres(NamedTuple):
-    """Spheres that stand for the body, from low to high."""
-
-    centres: Floats32  # [n, 3] m
-    radii: Floats32  # [n] m
-
-
-def _spheres(gaussians: Gaussians, radii: Floats32, count: int, among: NDArray[np.bool_] | bool = True) -> Spheres:
-    """At most ``count`` spheres of the same surface ``among`` [N] the Gaussians."""
-    casting = np.nonzero((radii > 0) & among)[0]
-    step = max(1, math.ceil(len(casting) / count))
-    chosen = casting[::step]
-    size = np.minimum(radii[chosen] * np.float32(GROWN * math.sqrt(step)), np.float32(LARGEST))
-    centres = gaussians.means[chosen] - np.float32(SINK) * size[:, None] * gaussians.normals[chosen]
-    return Spheres(floats(centres), floats(size))
+def remaining_light(shadow: Shadow | None, camera: Camera, image: Floats32 | None = None) -> Floats32:
+    """Share [H, W, 3] of the ground's irradiance at every pixel, in ``image`` if given; 1 without a shadow."""
+    if image is None:
+        image = np.empty((camera.height, camera.width, 3), np.float32)
+    if shadow is None:
+        image.fill(1)
+        return image
+    return shadow.remaining(camera, image)
 
 
-def _sorted(spheres: Spheres, plane: Plane) -> Spheres:
-    order = np.argsort(spheres.centres @ plane.normal.astype(np.float32), kind="stable")
-    return Spheres(spheres.centres[order], spheres.radii[order])
+def footprint(camera: Camera, plane: Plane, at: Floats) -> float:
+    """Metres that a pixel spans at the point of ``plane`` at [2] m in its axes."""
+    axes = plane.axes
+    point = at @ axes[:2] + plane.offset * plane.normal
+    depth = float((camera.world_to_camera @ [*point, 1.0])[2])
+    return max(depth, 0.1) / float(camera.K[1, 1])
 
 
-def _bands(spheres: Spheres, plane: Plane) -> NDArray[np.int64]:
-    """First sphere of each band of heights, and the number of spheres."""
-    heights = spheres.centres.astype(np.float64) @ plane.normal - plane.offset
-    return np.concatenate([[0], np.searchsorted(heights, BANDS), [len(heights)]]).astype(np.int64)
+def _to_cells(axes: Floats, low: Floats, cell: Floats) -> Floats:
+    """``Map.to_cells``; rows and columns advance along ``axes`` [2, 2] by ``cell`` from ``low`` [2] m."""
+    return np.column_stack([axes / cell[:, None], -low / cell - 0.5])
 
 
-def _tangents(normal: Floats) -> tuple[Floats, Floats]:
-    axis = np.eye(3)[np.argmin(np.abs(normal))]
-    tangent = np.cross(axis, normal)
-    tangent /= np.linalg.norm(tangent)
-    return tangent, np.cross(normal, tangent)
+def _image_to_plane(camera: Camera, plane: Plane) -> Floats:
+    """[3, 3], (column, row, 1) → (x, y, 1) in the plane's axes, m, times a depth, positive where the plane is seen."""
+    axes, position = plane.axes, camera.position
+    rays = axes @ camera.rays.T  # (column, row, 1) → a direction in the plane's axes
+    above = float(plane.normal @ position) - plane.offset
+    if above > 0:
+        rays[2] *= -1
+    else:
+        above = -above
+    rays[:2] *= above
+    rays[:2] += (axes[:2] @ position)[:, None] * rays[2]
+    return rays
 
 
-def _grid_below(spheres: Spheres, plane: Plane) -> Grid:
-    """The sky's grid around the body's foot."""
-    tangent, bitangent = _tangents(plane.normal)
-    centre = spheres.centres.mean(axis=0, dtype=np.float64)
-    centre = centre - (plane.normal @ centre - plane.offset) * plane.normal
-    cells = round(2 * SKY_REACH / SKY_CELL)
-    origin = centre - SKY_REACH * (tangent + bitangent)
-    return Grid(np.zeros((cells, cells, 3), np.float32), origin, SKY_CELL * tangent, SKY_CELL * bitangent)
-
-
-def _grid_towards(spheres: Spheres, plane: Plane, towards: Floats) -> Grid:
-    """A grid around the shadow along one direction, its sides along and across the direction's azimuth."""
-    sine = float(towards @ plane.normal)
-    along = towards - sine * plane.normal
-    length = np.linalg.norm(along)
-    along = along / length if length > 1e-6 else _tangents(plane.normal)[0]
-    across = np.cross(plane.normal, along)
-    height = np.maximum(spheres.centres @ plane.normal - plane.offset, 0)
-    hits = spheres.centres - height[:, None] / sine * towards
-    places = hits @ np.stack([along, across], axis=1)  # [n, 2] m
-    margin = float(spheres.radii.max()) * np.array([1 / sine, 1.0]) + 0.03
-    low, high = places.min(axis=0) - margin, places.max(axis=0) + margin
-    low[0] = max(low[0], float(places[:, 0].max()) - SUN_REACH)  # the feet's end of a long shadow is kept
-    cell = np.maximum((high - low) / SUN_CELLS, SUN_CELL)
-    cells = np.ceil((high - low) / cell).astype(int)
-    origin = low[0] * along + low[1] * across + plane.offset * plane.normal
-    return Grid(np.zeros((*cells, 3), np.float32), origin, cell[0] * along, cell[1] * across)
-
-
-def _frame(grid: Grid, plane: Plane) -> tuple[Floats32, Floats32, np.float32, Floats32, Floats32]:
-    """Normal, origin, offset and the cells' vectors, as the kernel takes them."""
-    along, across = (v / (v @ v) for v in (grid.along, grid.across))
-    return floats(plane.normal), floats(grid.origin), np.float32(plane.offset), floats(along), floats(across)
+def _compose(to_cells: Floats, to_plane: Floats) -> Floats:
+    return np.concatenate([to_cells @ to_plane, to_plane[2:]])

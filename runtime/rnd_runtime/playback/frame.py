@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rnd_runtime.avatar.avatar import Avatar, Encoded
-from rnd_runtime.core.arrays import Floats32
+from rnd_runtime.core.arrays import Buffers, Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
-from rnd_runtime.ground.shadow import GroundLight, Plane, remaining_light
+from rnd_runtime.ground.shadow import GroundLight, Plane, footprint, remaining_light
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
 from rnd_runtime.raster.enlarge import enlarged
@@ -35,6 +35,8 @@ from rnd_runtime.shading.shadow import NO_CASTERS, Casters
 from .aov import Lit, aov_layers, splat_features
 from .far import fine_view
 from .rasterizer import ChosenRasterizer, Kind, make_rasterizer
+
+_MEAN = np.full(3, 1 / 3, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ class RenderedFrame:
         """8-bit sRGB [H, W, 3] over the background, or black."""
         if self.background is None and self.srgb_on_black is not None:
             return self.srgb_on_black
-        return tone_map(self.radiance, self.alpha, self.shadowed_background)
+        return tone_map(self.radiance, self.alpha, self.background, None if self.background is None else self.ground)
 
     @cached_property
     def srgb_alpha(self) -> NDArray[np.uint8]:
@@ -87,7 +89,7 @@ class RenderedFrame:
         """Alpha [H, W] of the body and of its shadow, taken as black."""
         if self.ground is None:
             return self.alpha
-        covering: Floats32 = self.alpha + (1 - self.alpha) * (1 - self.ground.mean(axis=-1))
+        covering: Floats32 = self.alpha + (1 - self.alpha) * (1 - self.ground @ _MEAN)
         return covering
 
     def linear(self) -> Floats32:
@@ -141,6 +143,7 @@ class FrameRenderer:
         self.rasterizer: Rasterizer = make_rasterizer(raster) if isinstance(raster, str) else raster
         self.ground: Plane | None = None
         self._ground_light: GroundLight | None = None
+        self._images = Buffers()
 
     @property
     def light(self) -> Light:
@@ -221,9 +224,10 @@ class FrameRenderer:
 
     def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
         """Share [H, W, 3] of the ground's light that the body leaves."""
-        plane, rotation = ground.in_frame(body.root), body.root[:3, :3]
-        grids = self.ground_light(ground).shadow(body.gaussians, shadow_radii(body.gaussians), plane, rotation)
-        return remaining_light(grids, plane, camera.in_frame(body.root))
+        camera, plane = camera.in_frame(body.root), ground.in_frame(body.root)
+        pixel, light = footprint(camera, plane, plane.axes[:2] @ body.joints[0]), self.ground_light(ground)
+        shadow = light.shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3], pixel=pixel)
+        return remaining_light(shadow, camera, self._images.empty((camera.height, camera.width, 3)))
 
     def ground_light(self, ground: Plane) -> GroundLight:
         """The light's irradiance on the ground."""

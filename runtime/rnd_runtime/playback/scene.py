@@ -21,7 +21,7 @@ from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
-from rnd_runtime.ground.shadow import Plane, remaining_light
+from rnd_runtime.ground.shadow import Plane, footprint
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster.in_view import visible_to
 from rnd_runtime.raster.oracle import NEAR
@@ -256,10 +256,12 @@ class SceneRenderer:
         shape = camera.height, camera.width, 3
         sky, suns = np.ones(shape, np.float32), [np.ones(shape, np.float32) for _ in light.suns]
         for gaussians in posed:
-            grids = light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3])
-            left = [remaining_light([grid], plane, camera) for grid in grids]
-            if left:
-                sky *= np.maximum(1 - (1 - left[0]) / of_sky, 0)
+            pixel = footprint(camera, plane, plane.axes[:2] @ gaussians.means[0])
+            shadow = light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3], pixel=pixel)
+            if shadow is None:
+                continue
+            left = [part.remaining(camera, np.empty(shape, np.float32)) for part in shadow.parts]
+            sky *= np.maximum(1 - (1 - left[0]) / of_sky, 0)
             for sun, here in zip(suns, left[1:]):
                 np.minimum(sun, here, out=sun)
         whole: Floats32 = 1 - of_sky * (1 - sky) - sum((1 - sun for sun in suns), np.zeros(shape, np.float32))

@@ -25,18 +25,24 @@ _LOWEST = np.float32(2.0**-14)  # the code is 0 below; the first step is at 1.5e
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
-def tone_map(radiance: ArrayLike, alpha: ArrayLike, background: ArrayLike | None = None) -> Bytes:
+def tone_map(
+    radiance: ArrayLike, alpha: ArrayLike, background: ArrayLike | None = None, share: ArrayLike | None = None
+) -> Bytes:
     """8-bit sRGB [H, W, 3] of premultiplied ``radiance`` [H, W, 3] and ``alpha`` [H, W].
 
     Args:
         background: linear radiance [3] or [H, W, 3]; black by default.
+        share: [H, W, 3] of the background that is seen; all by default.
     """
     radiance, alpha = _checked(radiance, alpha)
     backdrop = floats(np.zeros(3) if background is None else background)
     if backdrop.shape not in ((3,), radiance.shape):
         raise InputError("background", expected=f"[3] or {radiance.shape}", got=backdrop.shape)
     image = np.empty(radiance.shape, np.uint8)
-    _tone_map(radiance, alpha, backdrop.reshape(-1, 3), *tone_tables(), image)
+    seen = floats(np.ones((1, 3)) if share is None else share)
+    if share is not None and seen.shape != radiance.shape:
+        raise InputError("share of the background", expected=radiance.shape, got=seen.shape)
+    _tone_map(radiance, alpha, backdrop.reshape(-1, 3), seen.reshape(-1, 3), *tone_tables(), image)
     return image
 
 
@@ -94,9 +100,9 @@ _START = int(_LOWEST.view(np.int32)) >> _SHIFT
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _tone_map(radiance, alpha, background, steps, first, image):  # type: ignore[no-untyped-def]
+def _tone_map(radiance, alpha, background, share, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape
-    one_colour = len(background) == 1
+    one_colour, whole = len(background) == 1, len(share) == 1
     empty = np.empty(3 * width, np.uint8)  # a row of the background colour
     for c in range(3):
         empty[c::3] = _code(background[0, c], steps, first)
@@ -107,11 +113,12 @@ def _tone_map(radiance, alpha, background, steps, first, image):  # type: ignore
                 rows[y, k] = empty[k]
         for x in range(width):
             left = _ONE - alpha[y, x]
-            at = 0 if one_colour else y * width + x
-            if one_colour and left == _ONE:
+            at, seen = 0 if one_colour else y * width + x, 0 if whole else y * width + x
+            if one_colour and left == _ONE and min(share[seen, 0], share[seen, 1], share[seen, 2]) == _ONE:
                 continue
             for c in range(3):
-                image[y, x, c] = _code(radiance[y, x, c] + left * background[at, c], steps, first)
+                behind = background[at, c] * share[seen, c]
+                image[y, x, c] = _code(radiance[y, x, c] + left * behind, steps, first)
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")

@@ -95,18 +95,12 @@ class Light:
 
         Bilinear between texel centres; wraps around horizontally, clamps at the poles.
         """
+        from .sample import sample_latlong  # compiled: options name this module before there is a need
+
         local = np.asarray(directions, np.float64) @ self.rotation  # Rᵀ d
-        x, y, z = local[..., 0], local[..., 1], local[..., 2]
-        height, width = self.radiance.shape[:2]
-        column = (0.5 + np.arctan2(z, x) / (2 * np.pi)) * width - 0.5
-        row = np.clip(np.arctan2(np.hypot(x, z), y) / np.pi * height - 0.5, 0, height - 1)
-        left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
-        s, t = (column - left)[..., None], (row - top)[..., None]
-        right, bottom = (left + 1) % width, np.minimum(top + 1, height - 1)
-        left = left % width
-        upper = (1 - s) * self.radiance[top, left] + s * self.radiance[top, right]
-        lower = (1 - s) * self.radiance[bottom, left] + s * self.radiance[bottom, right]
-        return np.asarray((1 - t) * upper + t * lower, np.float32)
+        sampled = np.empty((local.size // 3, 3), np.float32)
+        sample_latlong(self.radiance, np.ascontiguousarray(local.reshape(-1, 3)), sampled)
+        return sampled.reshape(local.shape)
 
 
 def _rotation(yaw: float, up: Up) -> Floats:

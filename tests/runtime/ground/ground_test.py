@@ -7,84 +7,139 @@ import math
 import numpy as np
 import pytest
 
-from rnd_runtime.capture.body import skin
+from rnd_bench.ground.judge import (
+    GROUND,
+    TURNS,
+    Traced,
+    body_surface,
+    edge_pixels,
+    lights,
+    played,
+    posed_body,
+    shadow_db,
+    surface,
+    traced,
+    view,
+)
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.core.gaussians import Gaussians
-from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_runtime.ground.kernels import project
-from rnd_runtime.ground.shadow import GroundLight, Plane, Spheres, _frame, _grid_towards, remaining_light
-from rnd_runtime.motion.skeleton import bone_transforms
+from rnd_runtime.ground import sky
+from rnd_runtime.ground.lookup import sky_light
+from rnd_runtime.ground.shadow import GroundLight, Map, Shadow, _cast, remaining_light
+from rnd_runtime.ground.stand_in import BANDS, StandIn
 from rnd_runtime.shading.light import Light
 from support.shading_scenes import probe, rotation
 from support.tiny import body
 
-UP = Plane(np.array([0.0, 1.0, 0.0]), 0.0)
 MITSUBA_DB = 30.0
+EDGE_PIXELS = 1.0
 SUN_EDGE = 0.05  # share of a shadow's area that its one-cell edge may cover differently
+SKY_ERROR = 0.12  # mean over the ground, of the mean share
+RADIUS = 0.045
 
 
-def surface(points, normals, radii) -> tuple[Gaussians, np.ndarray]:
-    """Opaque Gaussians with discs of ``radii`` around them."""
-    count = len(points)
-    covariances = np.zeros((count, 6))
-    covariances[:, [0, 3, 5]] = (0.6 * radii[:, None]) ** 2
-    visibility, rest = np.zeros((count, 16)), np.full((count, 3), 0.5)
-    arrays = points, covariances, np.ones(count), normals, rest, np.full(count, 0.9), visibility, np.eye(3)
-    return Gaussians(*(np.asarray(a, np.float32) for a in arrays)), np.asarray(radii, np.float32)
+def spheres(count, low, high) -> StandIn:
+    """In the plane's axes, from low to high."""
+    places = np.random.default_rng(3).uniform(low, high, (count, 3))
+    places = places[np.argsort(places[:, 2])]
+    starts = np.concatenate([[0], np.searchsorted(places[:, 2], BANDS), [count]])
+    return StandIn(np.float32(np.column_stack([places, np.full(count, RADIUS)])), starts)
 
 
-def posed_body(turn: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and faces of the embedded body, an arm raised, its feet on the ground."""
-    template = body()
-    angles = np.zeros((len(template.skeleton), 3))
-    angles[0, 1] = turn
-    angles[template.skeleton.names.index("left_shoulder"), 2] = 0.9
-    bones = bone_transforms(template.skeleton, axis_angle_to_matrix(angles), np.zeros(3)).astype(np.float64)
-    vertices = skin(template.vertices, template.skinning_weights, bones)
-    return vertices - [0, vertices[:, 1].min(), 0], template.faces
+def blocked(points, discs, towards) -> np.ndarray:
+    """Whether a sphere is met from ``points`` [..., 2] of the plane ``towards`` [3]."""
+    offset = (
+        discs[:, :3].astype(np.float64) - np.concatenate([points, np.zeros((*points.shape[:-1], 1))], -1)[..., None, :]
+    )
+    nearest = offset - (offset @ towards)[..., None] * towards
+    return (np.linalg.norm(nearest, axis=-1) < discs[:, 3]).any(-1)
 
 
-def body_surface(vertices, faces) -> tuple[Gaussians, np.ndarray]:
-    corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    areas = np.linalg.norm(crosses, axis=1) / 2
-    normals = crosses / np.maximum(2 * areas, 1e-12)[:, None]
-    return surface(corners.mean(1), normals, 0.8 * np.sqrt(areas))
+def centres(map_: Map) -> np.ndarray:
+    """[I, J, 2] m in the plane's axes."""
+    rows, columns = np.meshgrid(*(np.arange(n) for n in map_.values.shape[:2]), indexing="ij")
+    return (np.stack([rows, columns], -1) - map_.to_cells[:, 2]) @ np.linalg.inv(map_.to_cells[:, :2]).T
 
 
 @pytest.mark.parametrize("elevation", [20, 50, 90])
 @pytest.mark.parametrize("azimuth", [0.4, 2.5])
-def test_projected_spheres_block_the_rays_that_hit_them(elevation, azimuth):
-    rng = np.random.default_rng(3)
-    spheres = Spheres(np.float32(rng.uniform([-0.3, 0.1, -0.3], [0.3, 1.2, 0.3], (12, 3))), np.float32([0.11] * 12))
+def test_projected_spheres_block_the_suns_rays_that_hit_them(elevation, azimuth):
+    discs = spheres(12, [-0.3, -0.3, 0.1], [0.3, 0.3, 1.6])
     sine, cosine = math.sin(math.radians(elevation)), math.cos(math.radians(elevation))
-    towards = np.array([cosine * math.cos(azimuth), sine, cosine * math.sin(azimuth)])
-    grid = _grid_towards(spheres, UP, towards)
-    share = np.array([[0.2, 0.5, 1.0]], np.float32)
-    kept = np.float32(towards[None]), share, np.float32(0), np.array([0, 12])
-    project(*spheres, *_frame(grid, UP), *kept, grid.values)
+    towards = np.array([cosine * math.cos(azimuth), cosine * math.sin(azimuth), sine])
+    cast = _cast(discs, towards, 0.0, 0.004)
+    hit = blocked(centres(cast), discs.discs, towards)
+    assert hit.any() and not hit[[0, -1]].any() and not hit[:, [0, -1]].any()  # the map holds all of it
+    assert np.abs(cast.values - hit).mean() < SUN_EDGE * hit.mean()
 
-    cells = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in grid.values.shape[:2]), indexing="ij"), -1)
-    ground = grid.origin + cells @ np.stack([grid.along, grid.across])
-    offset = spheres.centres[:, None, None].astype(np.float64) - ground
-    nearest = offset - (offset @ towards)[..., None] * towards
-    blocked = (np.linalg.norm(nearest, axis=-1) < 0.11).any(0)
-    assert blocked.any() and not blocked[[0, -1]].any() and not blocked[:, [0, -1]].any()  # the grid holds all of it
-    assert np.abs(grid.values[..., 2] - blocked).mean() < SUN_EDGE * blocked.mean()
-    np.testing.assert_allclose(grid.values[..., 0], 0.2 * grid.values[..., 2], atol=1e-6)
+
+def test_a_wide_sun_blurs_and_conserves_its_shadow():
+    discs = spheres(6, [-0.3, -0.3, 1.1], [0.3, 0.3, 1.4])
+    sharp, soft = (_cast(discs, np.array([0.3, 0.4, 0.866]), spread, 0.01) for spread in (0.0, 0.04))
+    area = [np.abs(np.linalg.det(np.linalg.inv(m.to_cells[:, :2]))) * m.values.sum() for m in (sharp, soft)]
+    np.testing.assert_allclose(area[1], area[0], rtol=0.02)
+    assert soft.values.max() < 0.8 < sharp.values.max()
+
+
+def test_the_sky_is_blocked_where_its_rays_hit_spheres():
+    heights = np.arange(0, 1.6, 0.02)
+    legs = [np.column_stack([0 * heights + i, j + 0.1 * heights, heights]) for i in (-0.05, 0.0) for j in (-0.2, 0.15)]
+    discs = np.float32(np.pad(np.concatenate(legs), ((0, 0), (0, 1)), constant_values=RADIUS))
+    count = np.arange(64) + 0.5
+    radius, azimuth = 0.94 * np.sqrt(count / 64), count * 2.4  # lower, discs of spheres are too short
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.sqrt(1 - radius**2)], 1)
+    shares = np.float32(np.random.default_rng(1).uniform(0, 2 / 64, (64, 3)))
+    centre = np.float32([0.1, -0.2])
+    values = sky.sky_map(discs, centre, np.float32(directions), shares)
+    cells = (np.arange(sky.CELLS) + 0.5) * sky.CELL - sky.REACH
+    points = np.stack(np.meshgrid(cells + centre[0], cells + centre[1], indexing="ij"), -1)[40:80, 40:80]
+    hit = np.stack([blocked(points, discs, direction) for direction in directions], -1).astype(float)
+    expected = hit @ shares.astype(np.float64)
+    error = (values[40:80, 40:80, :3] - expected).reshape(10, 4, 10, 4, 3).mean((1, 3))  # a cell is a mean, no sample
+    assert expected.max() > 0.3 and (values[..., 3] == 0).all()
+    assert np.abs(error).mean() < SKY_ERROR * expected.mean() and abs(error.mean()) < 0.09 * expected.mean()
+
+
+@pytest.mark.parametrize("step", [1, 5])
+@pytest.mark.parametrize("eye", [[0.5, 1.8, 2.5], [0.0, 0.4, -3.0], [0.2, 4.0, 0.1]])
+def test_pixels_read_the_map_where_they_see_the_ground(eye, step):
+    camera = Camera.look_at(eye, [0.1, 0.2, 0.0], width=57, height=43, fov_y=1.0)
+    rows, columns = np.meshgrid(np.arange(8.0), np.arange(6.0), indexing="ij")
+    values = np.float32(np.stack([0.05 * rows, 0.03 * columns, 0.01 * (rows + columns), 0 * rows], -1))
+    to_cells = np.array([[2.1, 0.4, 3.5], [-0.3, 1.9, 2.5]])
+    image = Shadow(GROUND, Map(values, to_cells), (), 1e-6 if step > 1 else 1.0).remaining(
+        camera, np.empty((43, 57, 3), np.float32)
+    )
+    u, v = np.meshgrid(np.arange(57) + 0.5, np.arange(43) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ camera.rays
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -camera.position[1] / rays[..., 1]
+        point = (camera.position + depth[..., None] * rays) @ GROUND.axes[:2].T
+        i, j = np.moveaxis(point @ to_cells[:, :2].T + to_cells[:, 2], -1, 0)
+    inside = (depth > 0) & (i >= 0) & (i <= 7) & (j >= 0) & (j <= 5)
+    expected = 1 - np.where(inside[..., None], np.stack([0.05 * i, 0.03 * j, 0.01 * (i + j)], -1), 0)
+    assert 0.1 < inside.mean() < 1
+    np.testing.assert_allclose(image, expected, atol=1e-5 if step == 1 else 0.02)
+
+
+def test_rows_that_see_nothing_of_a_map_stay_their_own():
+    to_map = np.array([[-6.8e-3, 0.18, -60.0], [0.025, 0.11, -39.0], [6e-21, 1.4e-3, -0.36]])  # almost level
+    values = np.full((120, 120, 4), 0.5, np.float32)
+    image = np.full((512, 512, 3), np.nan, np.float32)
+    sky_light(to_map, values, 5, image)
+    assert (image[:250] == 1).all() and np.isin(np.round(image, 6), [0.5, 1]).all()
 
 
 def test_a_shadow_turns_and_moves_with_its_frame():
-    gaussians, radii = body_surface(*posed_body())
+    gaussians, radii = body_surface(*posed_body(body(), 0.0))
     root = np.eye(4)
     root[:3, :3], root[:3, 3] = rotation(5), [0.3, -0.2, 0.5]
     local = (gaussians.means - root[:3, 3]) @ root[:3, :3], gaussians.normals @ root[:3, :3]
     turned = surface(*local, radii)[0]
     light = GroundLight(probe(sun=400.0))
     camera = Camera.look_at([1.5, 1.8, 2.5], [0, 0.3, 0], width=64, height=48, fov_y=0.9)
-    here = remaining_light(light.shadow(gaussians, radii, UP, np.eye(3)), UP, camera)
-    plane = UP.in_frame(root)
-    there = remaining_light(light.shadow(turned, radii, plane, root[:3, :3]), plane, camera.in_frame(root))
+    here = remaining_light(light.shadow(gaussians, radii, GROUND, np.eye(3)), camera)
+    there = light.shadow(turned, radii, GROUND.in_frame(root), root[:3, :3])
+    there = remaining_light(there, camera.in_frame(root))
     assert here.min() < 0.5 and here.max() == 1
     assert np.abs(here - there).mean() < 0.01  # the sky's cells lie elsewhere
 
@@ -99,67 +154,32 @@ def test_a_turned_light_is_split_once():
 
 
 def test_without_light_or_body_nothing_is_shadowed():
-    gaussians, radii = body_surface(*posed_body())
+    gaussians, radii = body_surface(*posed_body(body(), 0.0))
     camera = Camera.look_at([1.5, 1.8, 2.5], [0, 0.3, 0], width=16, height=16, fov_y=0.9)
-    assert GroundLight(Light(np.zeros((16, 32, 3), np.float32))).shadow(gaussians, radii, UP, np.eye(3)) == []
-    grids = GroundLight(probe(sun=400.0)).shadow(gaussians, 0 * radii, UP, np.eye(3))
-    assert (remaining_light(grids, UP, camera) == 1).all()
+    dark = GroundLight(Light(np.zeros((16, 32, 3), np.float32)))
+    assert dark.shadow(gaussians, radii, GROUND, np.eye(3)) is None
+    shadow = GroundLight(probe(sun=400.0)).shadow(gaussians, 0 * radii, GROUND, np.eye(3))
+    assert (remaining_light(shadow, camera) == 1).all()
+
+
+def test_edges_are_told_apart_by_pixels():
+    visible = np.ones((40, 40), bool)
+    shades = [np.ones((40, 40, 3), np.float32) for _ in range(3)]
+    for shade, edge in zip(shades, (20, 20, 23)):
+        shade[10:30, 10:edge] = 0
+    assert edge_pixels(shades[0], Traced(shades[1], visible)) == (0, 0)
+    mean, largest = edge_pixels(shades[2], Traced(shades[1], visible))
+    assert largest == 2.5 and 0 < mean < largest
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("turn", [0.0, 1.2])
-@pytest.mark.parametrize("kind", ["sky", "window", "sun"])
-def test_a_bodys_shadow_agrees_with_mitsuba(kind, turn):
-    mi = pytest.importorskip("mitsuba")
-    mi.set_variant("scalar_rgb")
-    light = {"sky": probe(), "window": Light(probe().radiance ** 2), "sun": probe(height=256, sun=8e4)}[kind]
-    vertices, faces = posed_body(turn)
-    eye, target, size, fov = [1.6, 2.2, 2.6], [0, 0.4, 0], 96, 50.0
-    camera = Camera.look_at(eye, target, width=size, height=size, fov_y=math.radians(fov))
-    gaussians, radii = body_surface(vertices, faces)
-    ours = remaining_light(GroundLight(light).shadow(gaussians, radii, UP, np.eye(3)), UP, camera)
-
-    mesh = mi.Mesh("body", len(vertices), len(faces))
-    params = mi.traverse(mesh)
-    params["vertex_positions"], params["faces"] = np.float32(vertices).ravel(), np.uint32(faces).ravel()
-    params.update()
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "direct", "hide_emitters": True},
-        "light": {
-            "type": "envmap",
-            "bitmap": mi.Bitmap(nodes_of(light)),
-            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 90),
-        },
-        "sensor": {
-            "type": "perspective",
-            "fov": fov,
-            "to_world": mi.ScalarTransform4f().look_at(eye, target, [0, 1, 0]),
-            "film": {
-                "type": "hdrfilm",
-                "width": size,
-                "height": size,
-                "rfilter": {"type": "box"},
-                "pixel_format": "rgba",
-            },
-            "sampler": {"type": "independent", "sample_count": 256},
-        },
-    }
-    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale([50, 50, 1])}
-    objects = {"both": {"floor": floor, "body": mesh}, "floor": {"floor": floor}, "body": {"body": mesh}}
-    image = {name: np.array(mi.render(mi.load_dict({**scene, **parts}))) for name, parts in objects.items()}
-    ground = (image["body"][..., 3] == 0) & (image["floor"][..., :3].min(-1) > 0)
-    theirs = image["both"][..., :3] / np.maximum(image["floor"][..., :3], 1e-9)
-    error = (np.clip(theirs, 0, 1) - ours)[ground]
-    assert theirs[ground].min() < 0.8
-    assert -10 * math.log10(float(np.mean(error**2))) > MITSUBA_DB
-
-
-def nodes_of(light: Light) -> np.ndarray:
-    """The map as Mitsuba samples it: a node on either pole, columns from its −Z towards +X."""
-    height, width = 1024, 2048
-    azimuth = np.arange(width) / width * 2 * np.pi - np.pi
-    polar = np.linspace(0, np.pi, height)[:, None]
-    ring = np.sin(polar)
-    directions = [ring * np.cos(azimuth), np.broadcast_to(np.cos(polar), (height, width)), ring * np.sin(azimuth)]
-    return light.sample(np.stack(directions, -1))
+@pytest.mark.parametrize("pose", TURNS)
+@pytest.mark.parametrize("kind", ["sky", "window", "sun and sky", "sun"])
+def test_a_bodys_shadow_agrees_with_mitsuba(kind, pose):
+    pytest.importorskip("mitsuba")
+    light, bare = lights()[kind], posed_body(body(), TURNS[pose])
+    theirs = traced(light, *bare, view(96), 128)
+    ours = played(light, *bare, view(96))
+    assert theirs.remaining[theirs.visible].min() < 0.8
+    assert shadow_db(ours, theirs) > MITSUBA_DB
+    assert edge_pixels(ours, theirs)[0] < EDGE_PIXELS

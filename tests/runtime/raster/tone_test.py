@@ -59,3 +59,15 @@ def test_wrong_shapes_are_refused():
         tone_map(np.zeros((4, 5, 3)), np.zeros((5, 4)))
     with pytest.raises(InputError, match="background"):
         tone_map(np.zeros((4, 5, 3)), np.zeros((4, 5)), np.zeros((5, 4, 3)))
+
+
+def test_a_share_of_the_background_is_seen():
+    rng = np.random.default_rng(2)
+    alpha = np.round(rng.random((9, 7)))
+    radiance = 0.3 * alpha[..., None] * rng.random((9, 7, 3))
+    share = np.where(rng.random((9, 7, 1)) < 0.5, 1, rng.random((9, 7, 3))).astype(np.float32)
+    for behind in (np.float32([0.2, 0.5, 0.9]), rng.random((9, 7, 3)).astype(np.float32)):
+        expected = tone_map(radiance, alpha, np.broadcast_to(behind, share.shape) * share)
+        np.testing.assert_array_equal(tone_map(radiance, alpha, behind, share), expected)
+    with pytest.raises(InputError, match="share of the background"):
+        tone_map(radiance, alpha, behind, share[:3])
