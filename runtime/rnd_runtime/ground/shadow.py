@@ -30,7 +30,7 @@ Floats32 = NDArray[np.float32]
 
 SKY_DIRECTIONS = 128
 """of the sky's shadow"""
-SUN_CELLS, SUN_CELL, SUN_REACH = 512, (0.004, 0.05), 8.0
+SUN_CELLS, SUN_CELL, SUN_REACH = 512, (0.006, 0.05), 8.0
 """most cells along a side of a directional light's map, bounds of their size m, and the map's largest side m"""
 MIN_ELEVATION = math.radians(3)
 """below which a directional light casts no shadow on the ground: it would be longer than 30 m"""
@@ -103,6 +103,13 @@ class Shadow:
         none = self.sky._replace(values=np.zeros_like(self.sky.values[:2, :2]))
         return [replace(self, suns=()), *(replace(self, sky=none, suns=(sun,)) for sun in self.suns)]
 
+    def share_at(self, points: Floats) -> Floats:
+        """Share [..., 3] of the irradiance at ``points`` [..., 2] m of the plane, in its axes; of the nearest cells."""
+        left = 1 - _nearest(self.sky, points)[..., :3].astype(np.float64)
+        for sun, share in self.suns:
+            left -= _nearest(sun, points)[..., None] * share
+        return np.maximum(left, 0)
+
 
 class GroundLight:
     """A light's irradiance on the ground, split into sky directions and directional lights.
@@ -160,7 +167,7 @@ class GroundLight:
             return None
         total = np.maximum(self.irradiance, 1e-12 * self.irradiance.max())
         to_axes = frame_to_world @ axes.T
-        centre = np.median(body.discs[:: len(body.discs) // 64 + 1, :2], axis=0)
+        centre = body.discs[:, :2].mean(axis=0)
         values = sky.sky_map(body.discs, centre, floats(self.directions @ to_axes), floats(self.sky / total))
         corner = centre.astype(np.float64) - sky.REACH
         below = Map(values, _to_cells(np.eye(2), corner, np.full(2, sky.CELL, np.float64)))
@@ -204,6 +211,16 @@ def footprint(camera: Camera, plane: Plane, at: Floats) -> float:
     point = at @ axes[:2] + plane.offset * plane.normal
     depth = float((camera.world_to_camera @ [*point, 1.0])[2])
     return max(depth, 0.1) / float(camera.K[1, 1])
+
+
+def _nearest(map_: Map, points: Floats) -> Floats32:
+    """Values of the cells at ``points`` [..., 2], 0 outside of the map."""
+    cells = np.rint(points @ map_.to_cells[:, :2].T + map_.to_cells[:, 2])
+    inside = ((cells >= 0) & (cells < map_.values.shape[:2])).all(-1)
+    i, j = np.moveaxis(np.where(inside[..., None], cells, 0).astype(int), -1, 0)
+    found = map_.values[i, j]
+    found[~inside] = 0
+    return found
 
 
 def _to_cells(axes: Floats, low: Floats, cell: Floats) -> Floats:

@@ -13,7 +13,7 @@ from rnd_runtime.core.simd.arithmetic import lanes, maximum
 from rnd_runtime.core.simd.memory import load, store
 from rnd_runtime.core.simd.vectors import WIDTH
 
-CELL, REACH = np.float32(0.05), 3.0
+CELL, REACH = np.float32(0.05), 2.4
 """m, cell and half side of the map around the body"""
 CELLS = round(2 * REACH / float(CELL))
 _SLICE = np.float32(0.05)  # m

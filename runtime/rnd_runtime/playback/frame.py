@@ -15,12 +15,13 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.core.arrays import Buffers, Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
+from rnd_runtime.ground.bounce import light_over
 from rnd_runtime.ground.shadow import GroundLight, Plane, footprint, remaining_light
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster import cpu as raster_cpu
@@ -140,6 +141,7 @@ class FrameRenderer:
         self.avatar, self.camera = avatar, camera
         self.cull = avatar.advice.cull if cull is None else cull
         self.shader = Shader(light, shade) if isinstance(light, Light) else light
+        self._probe: Light | None = None  # where the shader's has the ground's light in it
         self.rasterizer: Rasterizer = make_rasterizer(raster) if isinstance(raster, str) else raster
         self.ground: Plane | None = None
         self._ground_light: GroundLight | None = None
@@ -147,7 +149,8 @@ class FrameRenderer:
 
     @property
     def light(self) -> Light:
-        return self.shader.light
+        """The probe, without what the ground reflects."""
+        return self.shader.light if self._probe is None else self._probe
 
     @property
     def draws_with(self) -> str:
@@ -158,10 +161,17 @@ class FrameRenderer:
         """Turn the light to ``yaw`` radians (as ``shading.light.Light``); builds no table."""
         if yaw != self.light.yaw:
             self.shader = self.shader.with_yaw(yaw)
+            self._probe = self._probe and self._probe.with_yaw(yaw)
 
     def relight(self, light: Light) -> None:
         """Use another light; builds its tables."""
-        self.shader = Shader(light, self.shader.mode)
+        self.shader, self._probe = Shader(light, self.shader.mode), None
+
+    def reflect(self, share: ArrayLike) -> None:
+        """Light the body from below by ``share`` [3] of the ground's irradiance, until ``relight``; builds tables."""
+        assert self.ground is not None
+        self._probe = self.light
+        self.shader = Shader(light_over(self._probe, self.ground.normal, share), self.shader.mode)
 
     def render(
         self, motion: Motion, time: float, camera: Camera | None = None, *, aovs: Sequence[str] = ()

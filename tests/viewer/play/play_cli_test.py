@@ -262,6 +262,17 @@ def test_a_ground_catches_the_shadow(files, tmp_path):
     assert np.abs(alpha - (1 - left.mean(-1)))[plate].max() < 0.005
 
 
+def test_the_ground_lights_the_body(files, tmp_path):
+    images = []
+    for albedo in ("0", "0.8,0.4,0"):
+        how = {"ground": "auto", "ground_albedo": albedo, "format": "exr", "frames": ":1"}
+        assert main(_arguments(files, tmp_path / albedo, **how)) == 0
+        images.append(read_image(tmp_path / albedo / "frames_exr/000000.exr"))
+    np.testing.assert_array_equal(images[0][..., 3:], images[1][..., 3:])  # outline and shadow stay
+    red, green, blue = (images[1] - images[0])[..., :3].mean((0, 1))
+    assert red > 1.5 * green > 0.001 and abs(blue) < 1e-6
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -283,6 +294,8 @@ def test_a_ground_catches_the_shadow(files, tmp_path):
         ({"motion_fps": "inf"}, "--motion-fps: expected 0.001 to 10000, got inf"),
         ({"background": "bluish"}, "--background"),
         ({"ground": "low"}, "--ground: expected none, auto or metres, got low"),
+        ({"ground_albedo": "0.5"}, "--ground-albedo: expected --ground, got none"),
+        ({"ground": "auto", "ground_albedo": "0.5,2,1"}, "--ground-albedo: expected r,g,b or one number, 0 to 1"),
         ({"aov": "albedo,beauty"}, "--aov"),
         ({"format": "gif"}, "--format"),
         ({"camera": "above"}, "--camera"),

@@ -6,6 +6,8 @@ import importlib.util
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from rnd_bench.options import Ground
 from rnd_runtime import __version__
 from rnd_runtime.capture.body import Body
@@ -15,6 +17,8 @@ from rnd_runtime.core.files import existing_file, write_json
 from rnd_runtime.core.threads import check_threads, max_threads
 from rnd_runtime.playback.doctor import machine
 
+ALBEDO = 0.5
+"""of the ground that lights the body"""
 EDGE_SIZE = 192
 """pixels of the image in which a sun's shadow is compared edge by edge"""
 
@@ -40,8 +44,25 @@ def run(options: Ground) -> None:
             rows.append(row)
             edge = f", edge {row['edge_px']:.2f} pixels (largest {row['edge_px_max']:.1f})" if "edge_px" in row else ""
             show(f"{row['light']}, {row['pose']}: {row['psnr_db']:.1f} dB{edge}")
+        for row in _bounces(Body.load(options.assets / "body.npz"), options.samples):
+            rows.append(row)
+            show(f"{row['light']}: the ground's light on the body is {row['ratio']:.3f} of Mitsuba's")
     if options.json is not None:
         write_json(options.json, [row | {"machine": machine(), "version": __version__} for row in rows])
+
+
+def _bounces(template: Body, samples: int) -> Iterator[dict[str, Any]]:
+    """A row for each of two lights: ratio of the mean radiances, and the RMS of their difference over the mean."""
+    from .judge import lights, played_bounce, posed_body, traced_bounce
+
+    body = posed_body(template, 0.0)
+    for name in ("sky", "sun and sky"):
+        theirs = traced_bounce(lights()[name], *body, ALBEDO, samples)
+        inside = theirs[..., 3] > 0.99
+        ours, truth = played_bounce(lights()[name], *body, ALBEDO)[inside], theirs[inside][:, :3]
+        row = {"what": "bounce", "light": name, "albedo": ALBEDO, "samples": samples}
+        rms = float(np.sqrt(np.mean((ours - truth) ** 2)))
+        yield row | {"ratio": float(ours.mean() / truth.mean()), "rms": rms / float(truth.mean())}
 
 
 def _judged(template: Body, samples: int) -> Iterator[dict[str, Any]]:

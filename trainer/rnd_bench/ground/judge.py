@@ -16,10 +16,13 @@ from rnd_runtime.capture.body import Body, skin
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Gaussians
 from rnd_runtime.core.rotations import axis_angle_to_matrix
+from rnd_runtime.ground.bounce import light_over, mean_share
 from rnd_runtime.ground.shadow import GroundLight, Plane, footprint, remaining_light
 from rnd_runtime.ground.standing import UP
 from rnd_runtime.motion.skeleton import bone_transforms
+from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.shading.light import Light, texel_directions
+from rnd_runtime.shading.shader import Shader
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -103,9 +106,39 @@ def traced(light: Light, vertices: Floats, faces: NDArray[np.integer], camera: C
 
 
 FLOOR = "floor"
+GREY = 0.5
+"""albedo of the lit body"""
 
 
-def mitsuba_image(light: Light, objects: dict[str, Any], camera: Camera, samples: int, *, depth: int = 2) -> Floats:
+def traced_bounce(light: Light, vertices: Floats, faces: NDArray[np.integer], albedo: float, samples: int) -> Floats:
+    """Linear RGBA [H, W, 4] of the body: with a ground of ``albedo`` less with a black one; its alpha."""
+    camera, body = view(BOUNCE_SIZE), (vertices, faces, GREY)
+    bright, black = (
+        mitsuba_image(light, {"floor": FLOOR, "body": body}, camera, samples, depth=3, floor=a) for a in (albedo, 0.0)
+    )
+    alone = mitsuba_image(light, {"body": body}, camera, 16)
+    return np.dstack([(bright - black)[..., :3], alone[..., 3]])
+
+
+BOUNCE_SIZE = 96
+
+
+def played_bounce(light: Light, vertices: Floats, faces: NDArray[np.integer], albedo: float) -> Floats32:
+    """The same radiance [H, W, 3] by the player."""
+    gaussians, radii = body_surface(vertices, faces)
+    camera = view(BOUNCE_SIZE)
+    shadow = GroundLight(light).shadow(gaussians, radii, GROUND, np.eye(3))
+    share = albedo * mean_share(gaussians, shadow)
+    bright, black = (
+        Shader(light_over(light, UP, a), "table+sun").shade(gaussians, camera.position) for a in (share, 0 * share)
+    )
+    raster = rasterize(gaussians.means, gaussians.covariances, gaussians.opacities, bright - black, camera)
+    return raster.image
+
+
+def mitsuba_image(
+    light: Light, objects: dict[str, Any], camera: Camera, samples: int, *, depth: int = 2, floor: float = 0.5
+) -> Floats:
     """Linear RGBA [H, W, 4]; objects are ``FLOOR`` or (vertices, faces, diffuse albedo)."""
     import mitsuba as mi  # type: ignore[import-not-found,import-untyped,unused-ignore]
 
@@ -135,7 +168,8 @@ def mitsuba_image(light: Light, objects: dict[str, Any], camera: Camera, samples
     for name, item in objects.items():
         if item == FLOOR:
             turned = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale([50, 50, 1])
-            scene[name] = {"type": "rectangle", "to_world": turned}
+            plain = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 3 * [floor]}}
+            scene[name] = {"type": "rectangle", "to_world": turned, "bsdf": plain}
             continue
         vertices, faces, albedo = item
         properties = mi.Properties()

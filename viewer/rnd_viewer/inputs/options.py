@@ -141,12 +141,33 @@ class _Lighting:
     """Height of a ground that catches the shadow; auto finds it under the feet. On a background the shadow darkens
     it; without one it is black in the alpha."""
 
+    ground_albedo: Annotated[str | None, option("R,G,B")] = None
+    """Linear albedo of the ground, 0 to 1, or one number: what the ground reflects lights the body, in place of the
+    probe's lower half."""
+
     def __post_init__(self) -> None:
         if self.ground not in ("none", "auto"):
             check_option(abs(self.ground_height) <= 1e4, "--ground", "none, auto or metres", self.ground)
+        if self.ground_albedo is not None:
+            check_option(self.ground != "none", "--ground-albedo", "--ground", "none")
+            _ = self.albedo
         refuse_outside(self, {"hdr_yaw": (-1e6, 1e6), "hdr_turn": (-1e6, 1e6), "exposure": (-30, 30)})
         check_option(self.hdr_turn != 0, "--hdr-turn", "not 0", 0)
         parse_gain(self.albedo_gain)
+
+    @property
+    def albedo(self) -> tuple[float, float, float] | None:
+        """The ground's, where given."""
+        if self.ground_albedo is None:
+            return None
+        try:
+            values = [float(word) for word in self.ground_albedo.split(",")]
+        except ValueError:
+            values = []
+        known = len(values) in (1, 3) and all(0 <= value <= 1 for value in values)
+        check_option(known, "--ground-albedo", "r,g,b or one number, 0 to 1", self.ground_albedo)
+        red, green, blue = values if len(values) == 3 else 3 * values
+        return red, green, blue
 
     @property
     def ground_height(self) -> float:

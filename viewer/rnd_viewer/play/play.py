@@ -27,6 +27,7 @@ from rnd_runtime.core.errors import InputError, refuse_changed
 from rnd_runtime.core.files import is_folder, output_folder, write_json
 from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
+from rnd_runtime.ground.bounce import reflected_share
 from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.ground.standing import UP, ground_of
 from rnd_runtime.motion.motion import Motion, motion_inputs
@@ -154,6 +155,9 @@ class _Run:
                 renderer.ground = min((ground_of(*pair) for pair in stands), key=lambda plane: plane.offset)
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
+            if renderer.ground and lighting.albedo:
+                how = avatar, motions[0], light, renderer.ground
+                renderer.reflect(reflected_share(*how, lighting.albedo))
         return cls(
             options=options,
             mark=mark,
