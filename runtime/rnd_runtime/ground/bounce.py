@@ -68,8 +68,8 @@ def mean_share(gaussians: Gaussians, shadow: Shadow | None) -> Floats:
     heights = np.maximum(points @ shadow.plane.normal - shadow.plane.offset, 0)
     met = points[:, None] + (heights[:, None] / fall)[..., None] * sphere
     left = shadow.share_at(met @ shadow.plane.axes[:2].T)
-    total = seen.sum()
-    return np.einsum("nd,ndc->c", seen, left) / total if total > 0 else np.ones(3)
+    total = float(seen.sum())
+    return np.array(np.einsum("nd,ndc->c", seen, left) / total, np.float64) if total > 0 else np.ones(3)
 
 
 def reflected_share(avatar: Avatar, motion: Motion, light: Light, plane: Plane, albedo: ArrayLike) -> Floats:
@@ -82,4 +82,4 @@ def reflected_share(avatar: Avatar, motion: Motion, light: Light, plane: Plane, 
         here = plane.in_frame(encoded.root)
         shadow = ground.shadow(gaussians, shadow_radii(gaussians), here, encoded.root[:3, :3])
         shares.append(mean_share(gaussians, shadow))
-    return np.asarray(albedo, np.float64) * np.mean(shares, axis=0)
+    return np.array(np.asarray(albedo, np.float64) * np.mean(shares, axis=0), np.float64)

@@ -216,9 +216,9 @@ def footprint(camera: Camera, plane: Plane, at: Floats) -> float:
 def _nearest(map_: Map, points: Floats) -> Floats32:
     """Values of the cells at ``points`` [..., 2], 0 outside of the map."""
     cells = np.rint(points @ map_.to_cells[:, :2].T + map_.to_cells[:, 2])
-    inside = ((cells >= 0) & (cells < map_.values.shape[:2])).all(-1)
+    inside = np.asarray(((cells >= 0) & (cells < map_.values.shape[:2])).all(-1))
     i, j = np.moveaxis(np.where(inside[..., None], cells, 0).astype(int), -1, 0)
-    found = map_.values[i, j]
+    found: Floats32 = map_.values[i, j]
     found[~inside] = 0
     return found
 

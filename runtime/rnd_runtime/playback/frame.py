@@ -234,10 +234,7 @@ class FrameRenderer:
 
     def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
         """Share [H, W, 3] of the ground's light that the body leaves."""
-        camera, plane = camera.in_frame(body.root), ground.in_frame(body.root)
-        pixel, light = footprint(camera, plane, plane.axes[:2] @ body.joints[0]), self.ground_light(ground)
-        shadow = light.shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3], pixel=pixel)
-        return remaining_light(shadow, camera, self._images.empty((camera.height, camera.width, 3)))
+        return ground_share(ground, self.ground_light(ground), body, camera, self._images)
 
     def ground_light(self, ground: Plane) -> GroundLight:
         """The light's irradiance on the ground."""
@@ -301,6 +298,16 @@ class FrameRenderer:
         posing = perf_counter() - started
         raster = draw_gaussians(gaussians, shader, camera, self.rasterizer, **how)
         return replace(raster, seconds={"posing": posing, **raster.seconds})
+
+
+def ground_share(
+    ground: Plane, light: GroundLight, body: PosedAvatar, camera: Camera, images: Buffers | None = None
+) -> Floats32:
+    """Share [H, W, 3] of the ground's light that a body leaves where ``camera`` sees it; in one of ``images``."""
+    plane, camera = ground.in_frame(body.root), camera.in_frame(body.root)
+    pixel = footprint(camera, plane, plane.axes[:2] @ body.joints[0])
+    shadow = light.shadow(body.gaussians, shadow_radii(body.gaussians), plane, body.root[:3, :3], pixel=pixel)
+    return remaining_light(shadow, camera, (images or Buffers()).empty((camera.height, camera.width, 3)))
 
 
 def in_root_frame(root: Floats, shader: Shader, camera: Camera) -> tuple[Shader, Camera]:

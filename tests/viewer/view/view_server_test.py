@@ -33,6 +33,7 @@ import rnd_viewer.view.scene
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_runtime.core.kernels import COMPILING
+from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.edit import MotionEdits, edit_motion
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_runtime.playback.frame import FrameRenderer
@@ -148,7 +149,9 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     shade = changes.pop("shade", "table+sun")
     view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
-    frame = FrameRenderer(avatar, light, shade=shade).render(motion, time, camera)
+    renderer = FrameRenderer(avatar, light, shade=shade)
+    renderer.ground = ground_of(avatar, motion) if changes.pop("ground", False) else None
+    frame = renderer.render(motion, time, camera)
     background = changes.pop("background", None)
     return (frame if background is None else replace(frame, background=background.radiance(camera, light))).srgb
 
@@ -164,6 +167,16 @@ def test_the_first_view_is_rnd_plays_to_the_bit(options):
         # the light is scaled before or after shading: float32 rounds differently
         assert np.abs(bright.astype(int) - _played(options, 0.0, exposure=1.3)).max() <= 1
         assert np.abs(bright.astype(int) - visitor.frame()).max() > 20
+
+
+def test_the_ground_has_rnd_plays_shadow(options):
+    with _serving(options) as (port, _), _visiting(port) as visitor:
+        assert visitor.scene["ground"]
+        look = {"background": "hdr", "yaw": 0.7, "shade": "table"}
+        clear, shadowed = (visitor.frame(**look, ground=ground) for ground in (False, True))
+        expected = _played(options, 0.0, ground=True, yaw=0.7, shade="table", background=Background("hdr"))
+        assert (shadowed == expected).all() and (shadowed <= clear).all() and (shadowed < clear).mean() > 0.02
+        assert (visitor.frame(ground=True) == visitor.frame()).all()  # on black
 
 
 def test_a_probe_made_for_a_z_up_world_lights_as_rnd_play_has_it(options):

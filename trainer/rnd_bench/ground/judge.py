@@ -59,8 +59,8 @@ def posed_body(template: Body, turn: float) -> tuple[Floats, NDArray[np.integer]
     angles[0, 1] = turn
     angles[template.skeleton.names.index("left_shoulder"), 2] = 0.9
     bones = bone_transforms(template.skeleton, axis_angle_to_matrix(angles), np.zeros(3)).astype(np.float64)
-    vertices = skin(template.vertices, template.skinning_weights, bones)
-    return vertices - [0, vertices[:, 1].min(), 0], template.faces
+    vertices = skin(template.vertices.astype(np.float64), template.skinning_weights.astype(np.float64), bones)
+    return vertices - np.array([0, vertices[:, 1].min(), 0]), template.faces
 
 
 def surface(points: Floats, normals: Floats, radii: Floats) -> tuple[Gaussians, Floats32]:

@@ -54,6 +54,8 @@ class MotionOptions:
     """Keep the root above its first position."""
     loop: Flag = False
     """Blend the motion's end into its beginning, for a clip that repeats."""
+    plant_feet: Flag = False
+    """Keep feet on the ground from sliding, by up to 8 cm; legs follow."""
 
     @property
     def edits(self) -> MotionEdits:
@@ -63,9 +65,11 @@ class MotionOptions:
     def read_motion(self, path: Path, skeleton: Skeleton) -> Motion:
         """Read and edit the motion in ``path`` for ``skeleton``."""
         from rnd_runtime.motion.motion import load_motion  # loads numba, which run_command prepares for
+        from rnd_runtime.motion.planting import plant_feet
 
         motion = load_motion(path, skeleton, up=self.motion_up, fps=self.motion_fps, joint_map=self.joint_map)
-        return edit_motion(motion, self.edits)
+        edited = edit_motion(motion, self.edits)
+        return plant_feet(edited, skeleton) if self.plant_feet else edited
 
     def refuse_unread(self, why: str, *, edited: bool = False) -> None:
         """Refuse options of a motion's file if there is none, and edits unless a motion is edited."""

@@ -31,6 +31,7 @@ from rnd_runtime.ground.bounce import reflected_share
 from rnd_runtime.ground.shadow import Plane
 from rnd_runtime.ground.standing import UP, ground_of
 from rnd_runtime.motion.motion import Motion, motion_inputs
+from rnd_runtime.motion.planting import feet_slide
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, front_path, orbit_path
@@ -155,6 +156,8 @@ class _Run:
                 renderer.ground = min((ground_of(*pair) for pair in stands), key=lambda plane: plane.offset)
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
+            if renderer.ground and (slide := feet_slide(motions[0], avatar.skeleton)) is not None:
+                log(f"feet on the ground slide by {1e3 * slide:.0f} mm/s on average")
             if renderer.ground and lighting.albedo:
                 how = avatar, motions[0], light, renderer.ground
                 renderer.reflect(reflected_share(*how, lighting.albedo))

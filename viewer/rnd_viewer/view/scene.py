@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,10 +20,12 @@ from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.gaussians import Gaussians
+from rnd_runtime.ground.shadow import GroundLight
+from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.edit import edit_motion
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.aov import aov_image
-from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar
+from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, ground_share
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.files.load import load_light
@@ -79,6 +81,8 @@ class Scene:
         self._light_notes: dict[str | Path | None, list[str]] = {}
         self._background: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, PosedAvatar] | None = None
+        self._ground_light = lru_cache(MAX_SHADERS)(self._build_ground_light)
+        self._ground = lru_cache(2)(partial(ground_of, self.avatar))
         first = self._shader(self._files[0] if self._files else None, "table+sun")
         self.renderer = FrameRenderer(self.avatar, first, raster=options.raster)
 
@@ -105,6 +109,7 @@ class Scene:
                 "fov": view.fov_y,
             },
             "truths": self._truths(),
+            "ground": True,
             "notes": list(self.motion.notes),
         }
 
@@ -131,7 +136,13 @@ class Scene:
         started = perf_counter()
         if lit or state.output == "albedo":
             radiance = frame.radiance * np.float32(2.0**state.exposure) if lit else frame.aovs["albedo"]
-            srgb = tone_map(radiance, frame.alpha, self._background_radiance(state, camera))
+            background = self._background_radiance(state, camera)
+            seconds |= frame.stage_seconds
+            share = None
+            if lit and state.ground and state.truth is None and background.any():
+                share = self._ground_share(state, motion, body, camera)
+                seconds["ground"], started = perf_counter() - started, perf_counter()
+            srgb = tone_map(radiance, frame.alpha, background, share)
         else:
             shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
             srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))
@@ -221,6 +232,17 @@ class Scene:
         shader.light = replace(shader.light, radiance=np.zeros((1, 2, 3), np.float32))
         self._light.cache_clear()
         return shader
+
+    def _build_ground_light(self, name: str | Path | None) -> GroundLight:
+        light = self._light(name)
+        self._light.cache_clear()
+        return GroundLight(light).with_yaw(replace(light, radiance=np.zeros((1, 2, 3), np.float32)))
+
+    def _ground_share(self, state: ViewState, motion: Motion, body: PosedAvatar, camera: Camera) -> Floats32:
+        """Share [H, W, 3] of the ground's light that the body leaves."""
+        light = self._ground_light(self._light_name(state))
+        turned = light.with_yaw(light.light.with_yaw(light.light.yaw + state.yaw))
+        return ground_share(self._ground(motion), turned, body, camera)
 
     def _load_light(self, name: str | Path | None) -> Light:
         light = self._read_light(name)

@@ -12,7 +12,7 @@ const $ = (id) => document.getElementById(id);
 
 const state = {
   time: 0, width: 512, height: 512, azimuth: 0, elevation: 0, distance: 3, target: [0, 1, 0], fov: 0.6,
-  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", gaussians: null, truth: null,
+  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", ground: true, gaussians: null, truth: null,
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
@@ -173,6 +173,7 @@ function setScene(description) {
   options($("shade"), SHADES.map((name) => [name, name]));
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
+  $("ground").parentElement.hidden = !scene.ground;
   $("time").step = 1 / scene.motion.fps;
   $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // the end of a slider must be on one of its steps
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
@@ -292,6 +293,7 @@ function bind() {
     redraw();
   });
   $("skeleton").addEventListener("change", redraw);
+  $("ground").addEventListener("change", () => { state.ground = $("ground").checked; redraw(); });
   $("truth-on").addEventListener("change", setTruth);
   $("truth-index").addEventListener("change", setTruth);
   $("play").addEventListener("click", () => play(!playing));
