@@ -95,7 +95,7 @@ class Light:
 
         Bilinear between texel centres; wraps around horizontally, clamps at the poles.
         """
-        from .sample import sample_latlong  # compiled: options name this module before there is a need
+        from rnd_runtime.core.latlong import sample_latlong  # compiled: options name this module before there is a need
 
         local = np.asarray(directions, np.float64) @ self.rotation  # Rᵀ d
         sampled = np.empty((local.size // 3, 3), np.float32)
