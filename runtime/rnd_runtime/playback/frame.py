@@ -228,13 +228,9 @@ class FrameRenderer:
         ground = None
         if self.ground is not None and isinstance(body, PosedAvatar):
             started = perf_counter()
-            ground = self._shadow(body, camera, self.ground)
+            ground = ground_share(self.ground, self.ground_light(self.ground), body, camera, self._images)
             seconds["ground"] = perf_counter() - started
         return RenderedFrame(radiance, alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
-
-    def _shadow(self, body: PosedAvatar, camera: Camera, ground: Plane) -> Floats32:
-        """Share [H, W, 3] of the ground's light that the body leaves."""
-        return ground_share(ground, self.ground_light(ground), body, camera, self._images)
 
     def ground_light(self, ground: Plane) -> GroundLight:
         """The light's irradiance on the ground."""

@@ -178,7 +178,7 @@ class SceneRenderer:
         ground = None
         if self.renderer.ground is not None:
             started = perf_counter()
-            ground = self._lit_ground(posed, frame, view, self.renderer.ground)
+            ground = self._lit_ground(posed, joints, frame, view, self.renderer.ground)
             seconds["ground"] = perf_counter() - started
         return RenderedFrame(radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
 
@@ -245,7 +245,9 @@ class SceneRenderer:
         assert result is not None
         return replace(result, seconds=seconds, srgb=None)
 
-    def _lit_ground(self, posed: Sequence[Gaussians], frame: Floats, camera: Camera, ground: Plane) -> Floats32:
+    def _lit_ground(
+        self, posed: Sequence[Gaussians], joints: Sequence[Floats], frame: Floats, camera: Camera, ground: Plane
+    ) -> Floats32:
         """Share [H, W, 3] of the ground's light that everybody leaves.
 
         Bodies hide different parts of the sky, as if by chance, and the same directional light: shares of the first
@@ -255,8 +257,8 @@ class SceneRenderer:
         of_sky = np.maximum(light.sky.sum(axis=0) / np.maximum(light.irradiance, 1e-30), 1e-30).astype(np.float32)
         shape = camera.height, camera.width, 3
         sky, suns = np.ones(shape, np.float32), [np.ones(shape, np.float32) for _ in light.suns]
-        for gaussians in posed:
-            pixel = footprint(camera, plane, plane.axes[:2] @ gaussians.means[0])
+        for gaussians, points in zip(posed, joints):
+            pixel = footprint(camera, plane, plane.axes[:2] @ points[0])
             shadow = light.shadow(gaussians, shadow_radii(gaussians), plane, frame[:3, :3], pixel=pixel)
             if shadow is None:
                 continue

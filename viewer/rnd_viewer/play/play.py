@@ -152,8 +152,8 @@ class _Run:
             renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
             scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
-                stands = {(person.avatar, person.motion) for person in people}
-                renderer.ground = min((ground_of(*pair) for pair in stands), key=lambda plane: plane.offset)
+                stands = {(id(each.avatar), id(each.motion)): (each.avatar, each.motion) for each in people}
+                renderer.ground = min((ground_of(*pair) for pair in stands.values()), key=lambda plane: plane.offset)
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
             if renderer.ground and (slide := feet_slide(motions[0], avatar.skeleton)) is not None:
