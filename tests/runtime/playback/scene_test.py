@@ -198,9 +198,7 @@ def test_everybody_shades_the_ground_and_no_sun_is_hidden_twice(avatar, motion):
         alone, other, both, twice = (ground(people) for people in ([here], [there], [here, there], [here, here]))
     assert alone.min() < 0.3 and other.min() < 0.3
     apart = np.abs(both - np.minimum(alone, other))
-    assert (
-        apart.mean() < 2e-3 and (apart > 0.06).mean() < 5e-3
-    )  # skies overlap, cells lie elsewhere
+    assert apart.mean() < 2e-3 and (apart > 0.06).mean() < 5e-3  # skies overlap, cells lie elsewhere
     deep = alone.min()
     assert twice.min() == pytest.approx(deep, abs=0.03)  # not as dark as the product
     assert (both <= np.minimum(alone, other) + 2e-3).mean() > 0.99
