@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -50,9 +49,6 @@ class FakeAvatar:
     trained_light: np.ndarray = field(default_factory=lambda: np.full((32, 64, 3), 0.5, np.float32))
     spacing: float = 0.02
     advice: PlayerAdvice = field(default_factory=PlayerAdvice)
-
-    def scale_albedo(self, gain: Sequence[float]) -> None:
-        assert tuple(gain) == (1, 1, 1)
 
     def encode(self, motion: Motion, time: float) -> Encoded:
         now = motion.at([time])

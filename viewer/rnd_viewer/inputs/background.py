@@ -16,7 +16,6 @@ from rnd_runtime.shading.light import Light
 
 Floats32 = NDArray[np.float32]
 MAX_RADIANCE = float(np.finfo(np.float32).max)
-STRIP = 8  # rows sampled at once, within the cache: 67 ms instead of 103 at 512²
 _NAMES = {  # of CSS, sRGB
     "black": "000",
     "white": "fff",
@@ -80,10 +79,7 @@ class Background:
         x, y, z = camera.rays
         columns = (np.arange(camera.width) + 0.5)[:, None] * x
         rows = (np.arange(camera.height) + 0.5)[:, None, None] * y + z
-        image = np.empty((camera.height, camera.width, 3), np.float32)
-        for top in range(0, camera.height, STRIP):
-            image[top : top + STRIP] = light.sample(rows[top : top + STRIP] + columns)
-        return image
+        return light.sample(rows + columns)
 
 
 class Backdrop:
