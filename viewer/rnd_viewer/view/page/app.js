@@ -174,6 +174,7 @@ function setScene(description) {
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
   $("ground").parentElement.hidden = !scene.ground;
+  state.ground = Boolean(scene.ground) && $("ground").checked;
   $("time").step = 1 / scene.motion.fps;
   $("time").max = scene.motion.duration + 0.5 / scene.motion.fps;  // the end of a slider must be on one of its steps
   for (const part of document.querySelectorAll("fieldset, #screenshot")) part.disabled = false;
