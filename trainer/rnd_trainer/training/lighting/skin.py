@@ -20,12 +20,14 @@ Floats = NDArray[np.float64]
 
 SKIN_CHROMA = np.array([0.50, -0.28])
 """log r/g and log b/g of skin in linear sRGB: means of the two patches, with 3 % of white reflected at the surface"""
-SKIN_DEVIATION = np.array([0.10, 0.07])
-"""standard deviation of ``SKIN_CHROMA`` over people"""
-LIGHT_DEVIATION = np.array([0.12, 0.20])
-"""standard deviation of log r/g and log b/g of the mean light: from candles to overcast sky"""
-PLAUSIBLE = 0.45
-"""largest distance of a point's log chroma from ``SKIN_CHROMA`` that may be skin, not a glove or a beard"""
+SKIN_DEVIATION = 0.1
+"""standard deviation of either over people"""
+LIGHT_AXES = np.array([[0.595, -0.803], [0.803, 0.595]])
+"""unit axes of log r/g and log b/g: from blue to orange, as black bodies of 10 000 to 3 000 K lie, and to magenta"""
+LIGHT_DEVIATION = np.array([0.5, 0.08])
+"""standard deviation of the mean light along ``LIGHT_AXES``: from overcast sky to candles; lamps are hardly magenta"""
+PLAUSIBLE = np.array([[-0.6, 1.5], [-0.35, 0.35]])
+"""least and greatest distance from ``SKIN_CHROMA`` along ``LIGHT_AXES`` that may be skin, not a glove or a beard"""
 SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION = 0.28, 0.5
 """median reflectance of skin over people, and the deviation of its logarithm"""
 BODY_LUMINANCE, BODY_DEVIATION = 0.28, 0.35
@@ -80,19 +82,20 @@ def likely_gain(albedo: Floats, weight: Floats, skin: Sequence[int] | NDArray[np
         skin: indices of points that may be skin.
         tone: known reflectance of the skin, or None.
     """
-    mean = np.log(np.average(albedo @ REC709_LUMINANCE, weights=weight))
-    level = [(np.log(BODY_LUMINANCE) - mean, BODY_DEVIATION)]
-    logs = np.log(np.maximum(albedo[[p for p in skin if p < len(weight) and weight[p] > 0]], 1e-4))
-    chroma = logs[:, [0, 2]] - logs[:, 1:2]
-    plausible = np.linalg.norm(chroma - SKIN_CHROMA, axis=1) < PLAUSIBLE
-    red, blue = 0.0, 0.0
-    if np.count_nonzero(plausible) >= MIN_POINTS:
+    of_skin = albedo[[p for p in skin if p < len(weight) and weight[p] > 0]]
+    logs = np.log(np.maximum(of_skin, 1e-4))
+    shifted = (logs[:, [0, 2]] - logs[:, 1:2] - SKIN_CHROMA) @ LIGHT_AXES.T
+    plausible = ((shifted > PLAUSIBLE[:, 0]) & (shifted < PLAUSIBLE[:, 1])).all(1)
+    known = np.count_nonzero(plausible) >= MIN_POINTS
+    colour = np.ones(3)
+    if known:
         share = LIGHT_DEVIATION**2 / (LIGHT_DEVIATION**2 + SKIN_DEVIATION**2)
-        red, blue = share * (SKIN_CHROMA - np.median(chroma[plausible], axis=0))
-        seen = np.median(np.log(np.exp(logs[plausible]) @ REC709_LUMINANCE))
-        expected = (SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION) if tone is None else (tone, TONE_DEVIATION)
-        level.append((np.log(expected[0]) - seen, expected[1]))
+        red, blue = (share * np.median(shifted[plausible], axis=0)) @ LIGHT_AXES
+        colour = np.exp([-red, 0, -blue])
+    to_luminance = colour * REC709_LUMINANCE
+    level = [(np.log(BODY_LUMINANCE / np.average(albedo @ to_luminance, weights=weight)), BODY_DEVIATION)]
+    if known:
+        expected, deviation = (SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION) if tone is None else (tone, TONE_DEVIATION)
+        level.append((np.log(expected) - np.median(np.log(of_skin[plausible] @ to_luminance)), deviation))
     shifts, deviations = np.array(level).T
-    colour = np.exp([red, 0, blue])
-    colour /= colour @ REC709_LUMINANCE
     return np.exp(np.average(shifts, weights=1 / deviations**2)) * colour
