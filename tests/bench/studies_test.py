@@ -151,7 +151,7 @@ def test_what_a_study_needs_is_checked_before_it_begins(tiny_capture) -> None:
     noisy, true_light = (next(v for v in CAUSES if v.name == name) for name in ("noisy poses", "true light"))
     with pytest.raises(InputError, match="motion_noisy"):
         check_needs([noisy], tiny_capture)
-    with pytest.raises(InputError, match="light: expected"):
+    with pytest.raises(InputError, match="expected a light map"):
         check_needs([true_light], dataclasses.replace(tiny_capture, lights={}))
 
 
