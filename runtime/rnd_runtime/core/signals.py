@@ -38,6 +38,7 @@ class _State:
         self.cleanups: dict[object, Callable[[], object]] = {}
         self.lock = threading.RLock()  # who ends keeps it, so that no temporary is added
         self.ending = threading.Lock()
+        self.ender = 0  # the thread that holds ``ending``
         self.installed = False
         self.wakeup: socket.socket | None = None  # of the watcher; open as long as the handlers are there
 
@@ -174,9 +175,12 @@ def _watch(reading: socket.socket) -> None:
 
 
 def _end(number: int) -> None:
-    """Clean up, print the line, end the process. Once: further signals and threads find it ending."""
+    """Clean up, print the line, end the process. Once: further signals find it ending, other threads wait for it."""
     if not _state.ending.acquire(blocking=False):
+        if _state.ender != threading.get_ident():
+            time.sleep(PATIENCE_S)  # children are gone: the command would end as if it were done
         return
+    _state.ender = threading.get_ident()
     _state.lock.acquire(timeout=1.0)
     _clean_up()
     for child in _children():
