@@ -222,11 +222,10 @@ def _random_moments(command: list[object], out: Path, times: int, longest: float
 
 
 @_SHOWS_HANDLERS
-@pytest.mark.parametrize("times", [10, pytest.param(50, marks=pytest.mark.slow)])
-def test_rnd_play_at_random_moments(tmp_path, times):
+def test_rnd_play_at_random_moments(tmp_path):  # ten; fifty of each command are row H3 of the stability suite
     out = tmp_path / "out"
     files = [ASSETS / "avatar.onnx", "--motion", ASSETS / "walk.npz", "--out", out]
-    _random_moments([BIN / "rnd-play", *files, "--size", 64, "--format", "png,exr,mp4"], out, times, 4.0)
+    _random_moments([BIN / "rnd-play", *files, "--size", 64, "--format", "png,exr,mp4"], out, 10, 4.0)
 
 
 @_SHOWS_HANDLERS
