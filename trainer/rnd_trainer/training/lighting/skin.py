@@ -26,7 +26,7 @@ LIGHT_AXES = np.array([[0.595, -0.803], [0.803, 0.595]])
 """unit axes of log r/g and log b/g: from blue to orange, as black bodies of 10 000 to 3 000 K lie, and to magenta"""
 LIGHT_DEVIATION = np.array([0.5, 0.08])
 """standard deviation of the mean light along ``LIGHT_AXES``: from overcast sky to candles; lamps are hardly magenta"""
-PLAUSIBLE = np.array([[-0.6, 1.5], [-0.35, 0.35]])
+PLAUSIBLE = np.array([[-1.3, 1.5], [-0.35, 0.35]])
 """least and greatest distance from ``SKIN_CHROMA`` along ``LIGHT_AXES`` that may be skin, not a glove or a beard"""
 SKIN_LUMINANCE, SKIN_LUMINANCE_DEVIATION = 0.28, 0.5
 """median reflectance of skin over people, and the deviation of its logarithm"""
