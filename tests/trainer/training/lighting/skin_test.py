@@ -25,7 +25,9 @@ def _albedo(rng: np.random.Generator, tone: float) -> tuple[np.ndarray, np.ndarr
     return np.concatenate([clothes, of_skin]), np.arange(180, 200)
 
 
-@pytest.mark.parametrize("light", [(1.2, 1.0, 0.7), (0.9, 1.0, 1.3), (1.0, 1.0, 1.0), (2.2, 1.2, 0.5), (0.45, 0.8, 1.6)])
+@pytest.mark.parametrize(
+    "light", [(1.2, 1.0, 0.7), (0.9, 1.0, 1.3), (1.0, 1.0, 1.0), (2.2, 1.2, 0.5), (0.45, 0.8, 1.6)]
+)
 def test_skin_of_a_known_tone_gives_level_and_colour(light) -> None:
     true, indices = _albedo(np.random.default_rng(0), 0.3)
     learned = 0.6 * true * np.array(light)  # a light that was taken for grey and too bright
