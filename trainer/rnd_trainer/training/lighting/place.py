@@ -9,17 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from rnd_runtime.shading.light import REC709_LUMINANCE, Light, downsize, texel_directions, texel_solid_angles
 from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.render.probe import PROBE_SHAPE
-from rnd_trainer.render.shading import traced_visibility
 from rnd_trainer.training.data import TrainingView
 
-from .observations import Observations, albedo_under, observe, point_luminance
-from .skin import BODY_LUMINANCE, likely_gain
+from .observations import Observations, albedo_under, observe, point_luminance, transport_of, with_bounce
+from .skin import likely_gain
 
 Floats = NDArray[np.float64]
 
@@ -88,19 +86,10 @@ def _at_all_yaws(place: Light, shape: tuple[int, int]) -> Floats:
 
 def _irradiance(observations: Observations, maps: Floats) -> NDArray[np.float32]:
     """Radiance [n, 3, YAWS] of white observations under ``maps`` [16, 32, 3, YAWS], with one reflection by the body."""
-    lights = torch.as_tensor(maps.reshape(-1, 3, YAWS), dtype=torch.float32)
-    towards = torch.as_tensor(texel_directions(*SEARCH_SHAPE).reshape(-1, 3), dtype=torch.float32)
-    share = torch.as_tensor(texel_solid_angles(*SEARCH_SHAPE).reshape(-1) / np.pi, dtype=torch.float32)
-    rows, hidden = [], []
-    for k, (means, normals) in enumerate(observations.posed):
-        point = observations.point[observations.image == k]
-        visible = traced_visibility(means, normals, towards, observations.spacing)[point]
-        transport = visible * (normals[point] @ towards.T).clamp(min=0) * share
-        rows.append((transport @ lights.flatten(1)).unflatten(1, lights.shape[1:]).numpy())
-        hidden.append((1 - transport.sum(1)).clamp(min=0).numpy())
-    direct = np.concatenate(rows)
-    reflected: NDArray[np.float32] = direct + BODY_LUMINANCE * np.concatenate(hidden)[:, None, None] * direct.mean(0)
-    return reflected
+    directions = texel_directions(*SEARCH_SHAPE).reshape(-1, 3)
+    transport = transport_of(observations, directions, texel_solid_angles(*SEARCH_SHAPE).reshape(-1))
+    direct = transport @ maps.reshape(len(directions), -1).astype(np.float32)
+    return with_bounce(direct, np.maximum(1 - transport.sum(1), 0)).reshape(-1, 3, YAWS)
 
 
 def _best_yaw(observations: Observations, irradiance: NDArray[np.float32]) -> float:
