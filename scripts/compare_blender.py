@@ -106,5 +106,6 @@ def _render(told: dict[str, object]) -> None:
 if __name__ == "__main__":
     if sys.argv[1][:1] == "{":
         _render(json.loads(sys.argv[1]))
+        os._exit(0)  # bpy 4.5 waits for its own threads for ever at an ordinary exit, on some machines
     else:
         main()

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import os
 import sys
 
 import bpy
@@ -108,3 +109,5 @@ def _cube(location, scale):
 
 
 main(json.loads(sys.argv[1]))
+sys.stdout.flush()
+os._exit(0)  # bpy 4.5 waits for its own threads for ever at an ordinary exit, on some machines
