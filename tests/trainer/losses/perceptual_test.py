@@ -24,6 +24,7 @@ needs_shared = pytest.mark.skipif(
 
 PUBLISHED = 5e-4  # LPIPS' README prints three digits
 SAME_KERNELS = 1e-12  # float64, both sides call torch's convolution
+BFLOAT16 = 0.02  # eight bits of a product, averaged over a map
 SLOPE = 1e-6  # central differences over 1e-6 in float64, no unit within that of its kink at this seed
 
 NAMES = ("alexnet", "squeezenet1_1", "vgg16")
@@ -212,6 +213,26 @@ def test_gradient_is_the_slope(name, distances) -> None:
             ahead, behind = (distance(image + s * step * direction, target) for s in (1, -1))
         slope = float(ahead - behind) / (2 * step)
         assert float((gradient * direction).sum()) == pytest.approx(slope, rel=SLOPE, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_bfloat16_is_near_float64(name, distances, monkeypatch) -> None:
+    """Also on a processor that only emulates it."""
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    exact, coarse = distances[name].to(dtype=torch.float64), distances[name].in_bfloat16()
+    image, target = _image(96, 80).requires_grad_(), _image(96, 80, seed=1)
+    seen = image.detach().float().requires_grad_()
+    far, ours = exact(image, target), coarse(seen, target.float())
+    assert float(ours.detach()) == pytest.approx(float(far.detach()), rel=BFLOAT16)
+    far.backward()
+    ours.backward()
+    along = torch.nn.functional.cosine_similarity(seen.grad.double().flatten(), image.grad.flatten(), dim=0)
+    assert float(along) > 0.95
+
+
+def test_a_processor_without_bfloat16_keeps_its_weights(distances, monkeypatch) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    assert distances["alexnet"].in_bfloat16() is distances["alexnet"]
 
 
 def test_dead_features_give_no_nan(nets, tmp_path) -> None:

@@ -85,8 +85,8 @@ class Training:
         torch.manual_seed(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.device = torch.device(device)
-        self.perceptual = None if perceptual is None else perceptual.to(device=self.device)
-        self.consistency = self.perceptual if consistency is None else consistency.to(device=self.device)
+        self.perceptual = None if perceptual is None else self._placed(perceptual)
+        self.consistency = self.perceptual if consistency is None else self._placed(consistency)
 
         # data
         self.views, self.bad_masks = load_views(capture, "train", config.image_scale, config.normals == "true")
@@ -141,6 +141,9 @@ class Training:
         self.light_found: bool | None = None  # result of the light search, once done
         self.seconds = 0.0
         self.on_light_search: Callable[[int, int], None] = lambda done, total: None
+
+    def _placed(self, network: Perceptual) -> Perceptual:
+        return network.in_bfloat16() if self.device.type == "cpu" else network.to(device=self.device)
 
     # -- one step ------------------------------------------------------------------------------------------
 
