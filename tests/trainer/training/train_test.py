@@ -221,7 +221,7 @@ def test_crops_too_small_for_the_network_skip_its_losses(tiny_capture, tiny_conf
     class Demanding:
         smallest = 10**4
 
-        def to(self, device):
+        def in_bfloat16(self):
             return self
 
     training = Training(tiny_capture, tiny_config, Demanding())
