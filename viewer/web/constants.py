@@ -18,6 +18,7 @@ from rnd_runtime.shading.specular_lobe import lobe_table
 FILE = Path(__file__).parent / "src/constants.js"
 # Names by module; private ones lose their underscore in JavaScript.
 SHARED = {
+    "rnd_runtime.core.images": "NEUTRAL_OFFSET NEUTRAL_START NEUTRAL_DESATURATION",
     "rnd_runtime.avatar.file": (
         "SCHEMA METADATA_KEY ADVICE_KEY PROBE_SHAPE POSED_OUTPUTS CONSTANT_OUTPUTS"
         " NODE_OUTPUTS NODE_LOGITS REST_OUTPUTS"

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import OpenImageIO as oiio
@@ -18,6 +18,7 @@ from .files import atomic_path, existing_file
 
 Floats = NDArray[np.floating[Any]]  # float32 or float64, as given
 Attribute = str | tuple[str, tuple[float, ...]]
+Tone = Literal["srgb", "neutral"]  # what comes before sRGB's transfer function: nothing, or ``neutral``
 Image = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 
 
@@ -33,6 +34,11 @@ _STRIP = 256  # rows: OpenEXR's DWAB decodes as many at once
 _UNBOUNDED_CODECS = ("dwaa", "dwab", "piz")
 _MAX_UNBOUNDED = 1 << 31
 _MAX_HALF = np.float32(65504)
+NEUTRAL_OFFSET = 0.04  # reflectance of a dielectric at normal incidence
+NEUTRAL_START = 0.8 - NEUTRAL_OFFSET
+"""peak from which radiance is compressed"""
+NEUTRAL_DESATURATION = 0.15
+MAX_RADIANCE = float(np.finfo(np.float32).max)
 
 
 def linear_to_srgb(linear: ArrayLike) -> Floats:
@@ -43,6 +49,23 @@ def linear_to_srgb(linear: ArrayLike) -> Floats:
     x = np.maximum(_floats(linear), 0)
     srgb: Floats = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
     return srgb
+
+
+def neutral(linear: ArrayLike) -> Floats:
+    """Khronos PBR Neutral of linear radiance [..., 3]: in [0, 1], base colours nearly kept, highlights compressed.
+
+    Negative numbers and NaN count as 0. float32 stays float32.
+    Source: https://github.com/KhronosGroup/ToneMapping, PBR_Neutral.
+    """
+    x = np.clip(np.nan_to_num(_floats(linear), nan=0.0), 0, MAX_RADIANCE)
+    low = x.min(axis=-1, keepdims=True)
+    toe = low - low * low / (4 * NEUTRAL_OFFSET)
+    x = x - np.where(low < 2 * NEUTRAL_OFFSET, toe, NEUTRAL_OFFSET)
+    peak, room = np.maximum(x.max(axis=-1, keepdims=True), NEUTRAL_START), 1 - NEUTRAL_START
+    compressed = 1 - room * room / (peak - NEUTRAL_START + room)
+    saturation = 1 / (NEUTRAL_DESATURATION * (peak - compressed) + 1)
+    toned: Floats = compressed + saturation * (x / peak * compressed - compressed)
+    return np.where(peak > NEUTRAL_START, toned, x)
 
 
 def srgb_to_linear(srgb: ArrayLike) -> Floats:

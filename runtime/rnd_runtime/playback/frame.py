@@ -21,6 +21,7 @@ from rnd_runtime.avatar.avatar import Avatar, Encoded
 from rnd_runtime.core.arrays import Buffers, Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.gaussians import Gaussians, Raster, Rasterizer
+from rnd_runtime.core.images import Tone
 from rnd_runtime.ground.bounce import light_over
 from rnd_runtime.ground.shadow import GroundLight, Plane, footprint, remaining_light
 from rnd_runtime.motion.motion import Motion
@@ -52,6 +53,7 @@ class RenderedFrame:
         background: linear radiance, [H, W, 3] or [3]; None for a transparent frame.
         ground: [H, W, 3] share of the background's light that the body's shadow on the ground leaves; None without one.
         srgb_on_black: [H, W, 3] 8-bit sRGB without the background, where already made.
+        tone: curve of the 8-bit images; linear ones have none.
     """
 
     radiance: Floats32
@@ -61,13 +63,15 @@ class RenderedFrame:
     background: Floats32 | None = None
     ground: Floats32 | None = None
     srgb_on_black: NDArray[np.uint8] | None = None
+    tone: Tone = "srgb"
 
     @cached_property
     def srgb(self) -> NDArray[np.uint8]:
         """8-bit sRGB [H, W, 3] over the background, or black."""
         if self.background is None and self.srgb_on_black is not None:
             return self.srgb_on_black
-        return tone_map(self.radiance, self.alpha, self.background, None if self.background is None else self.ground)
+        share = None if self.background is None else self.ground
+        return tone_map(self.radiance, self.alpha, self.background, share, tone=self.tone)
 
     @cached_property
     def srgb_alpha(self) -> NDArray[np.uint8]:
@@ -75,7 +79,7 @@ class RenderedFrame:
 
         A shadow on the ground is black of its mean opacity.
         """
-        return tone_map_straight(self.radiance, self._covering)
+        return tone_map_straight(self.radiance, self._covering, tone=self.tone)
 
     @property
     def shadowed_background(self) -> Floats32 | None:
@@ -123,6 +127,7 @@ class FrameRenderer:
         raster: "cpu", "gl", "gl-egl", "gl-osmesa" or "auto", see ``make_rasterizer``; or a rasteriser.
         cull: leaves out Gaussians whose n·v is below this cosine, such as −0.5; −1 draws all. By default as the
             avatar's file advises. See ``raster.in_view.in_view``.
+        tone: of the 8-bit images: sRGB's curve alone, or ``core.images.neutral`` before it, on the CPU.
 
     Attributes:
         ground: the plane that the body casts its shadow on, in the world; None for none.
@@ -137,8 +142,9 @@ class FrameRenderer:
         shade: str = "table+sun",
         raster: Kind | Rasterizer = "cpu",
         cull: float | None = None,
+        tone: Tone = "srgb",
     ) -> None:
-        self.avatar, self.camera = avatar, camera
+        self.avatar, self.camera, self.tone = avatar, camera, tone
         self.cull = avatar.advice.cull if cull is None else cull
         self.shader = Shader(light, shade) if isinstance(light, Light) else light
         self._probe: Light | None = None  # where the shader's has the ground's light in it
@@ -215,7 +221,7 @@ class FrameRenderer:
         seconds |= raster.seconds
         layers = aov_layers(aovs, raster, 3 if lit else 0, given or {})
         radiance = raster.image[..., :3] if lit else np.zeros((*raster.alpha.shape, 3), np.float32)
-        alpha, image_srgb = raster.alpha, raster.srgb
+        alpha, image_srgb = raster.alpha, raster.srgb if self.tone == "srgb" else None
         started = perf_counter()
         if rendered is not camera:
             image = enlarged(np.dstack([radiance, alpha]), camera.height, camera.width)
@@ -223,14 +229,14 @@ class FrameRenderer:
             seconds["enlarging"] = perf_counter() - started
             started = perf_counter()
         if srgb and image_srgb is None:
-            image_srgb = tone_map(radiance, alpha)
+            image_srgb = tone_map(radiance, alpha, tone=self.tone)
             seconds["tone map"] = perf_counter() - started
         ground = None
         if self.ground is not None and isinstance(body, PosedAvatar):
             started = perf_counter()
             ground = ground_share(self.ground, self.ground_light(self.ground), body, camera, self._images)
             seconds["ground"] = perf_counter() - started
-        return RenderedFrame(radiance, alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
+        return RenderedFrame(radiance, alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb, tone=self.tone)
 
     def ground_light(self, ground: Plane) -> GroundLight:
         """The light's irradiance on the ground."""

@@ -173,14 +173,16 @@ class SceneRenderer:
             seconds[stage] = seconds.get(stage, 0.0) + spent
         layers = aov_layers(aovs, raster, 3, given[0])
         radiance, started = raster.image[..., :3], perf_counter()
-        image_srgb = tone_map(radiance, raster.alpha) if srgb else None
+        image_srgb = tone_map(radiance, raster.alpha, tone=self.renderer.tone) if srgb else None
         seconds["tone map"] = perf_counter() - started
         ground = None
         if self.renderer.ground is not None:
             started = perf_counter()
             ground = self._lit_ground(posed, joints, frame, view, self.renderer.ground)
             seconds["ground"] = perf_counter() - started
-        return RenderedFrame(radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb)
+        return RenderedFrame(
+            radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb, tone=self.renderer.tone
+        )
 
     def _shaded(
         self,

@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from rnd_runtime.core.arrays import floats
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import linear_to_srgb, to_bytes
+from rnd_runtime.core.images import (
+    MAX_RADIANCE,
+    NEUTRAL_DESATURATION,
+    NEUTRAL_OFFSET,
+    NEUTRAL_START,
+    Tone,
+    linear_to_srgb,
+    to_bytes,
+)
 
 Bytes = NDArray[np.uint8]
 Floats32 = NDArray[np.float32]
@@ -23,16 +31,26 @@ _CELL_BITS = 7  # of the mantissa: 128 cells an octave, where sRGB makes at most
 _SHIFT = 23 - _CELL_BITS
 _LOWEST = np.float32(2.0**-14)  # the code is 0 below; the first step is at 1.5e-4
 _ZERO, _ONE = np.float32(0), np.float32(1)
+_MAX, _OFFSET, _START_PEAK, _ROOM, _DESATURATION = map(
+    np.float32, (MAX_RADIANCE, NEUTRAL_OFFSET, NEUTRAL_START, 1 - NEUTRAL_START, NEUTRAL_DESATURATION)
+)
+_FOUR_OFFSETS = np.float32(4 * NEUTRAL_OFFSET)
 
 
 def tone_map(
-    radiance: ArrayLike, alpha: ArrayLike, background: ArrayLike | None = None, share: ArrayLike | None = None
+    radiance: ArrayLike,
+    alpha: ArrayLike,
+    background: ArrayLike | None = None,
+    share: ArrayLike | None = None,
+    *,
+    tone: Tone = "srgb",
 ) -> Bytes:
     """8-bit sRGB [H, W, 3] of premultiplied ``radiance`` [H, W, 3] and ``alpha`` [H, W].
 
     Args:
         background: linear radiance [3] or [H, W, 3]; black by default.
         share: [H, W, 3] of the background that is seen; all by default.
+        tone: "neutral" applies ``core.images.neutral`` first.
     """
     radiance, alpha = _checked(radiance, alpha)
     backdrop = floats(np.zeros(3) if background is None else background)
@@ -42,15 +60,16 @@ def tone_map(
     seen = floats(np.ones((1, 3)) if share is None else share)
     if share is not None and seen.shape != radiance.shape:
         raise InputError("share of the background", expected=radiance.shape, got=seen.shape)
-    _tone_map(radiance, alpha, backdrop.reshape(-1, 3), seen.reshape(-1, 3), *tone_tables(), image)
+    curved = tone == "neutral"
+    _tone_map(radiance, alpha, backdrop.reshape(-1, 3), seen.reshape(-1, 3), curved, *tone_tables(), image)
     return image
 
 
-def tone_map_straight(radiance: ArrayLike, alpha: ArrayLike) -> Bytes:
-    """8-bit sRGB and alpha [H, W, 4], not premultiplied (as in PNG)."""
+def tone_map_straight(radiance: ArrayLike, alpha: ArrayLike, *, tone: Tone = "srgb") -> Bytes:
+    """8-bit sRGB and alpha [H, W, 4], not premultiplied (as in PNG); ``tone`` as of ``tone_map``."""
     radiance, alpha = _checked(radiance, alpha)
     image = np.empty((*alpha.shape, 4), np.uint8)
-    _tone_map_straight(radiance, alpha, *tone_tables(), image)
+    _tone_map_straight(radiance, alpha, tone == "neutral", *tone_tables(), image)
     return image
 
 
@@ -99,13 +118,40 @@ def _code(x, steps, first):  # type: ignore[no-untyped-def]
 _START = int(_LOWEST.view(np.int32)) >> _SHIFT
 
 
+@njit(inline="always")
+def _neutral(red, green, blue):  # type: ignore[no-untyped-def]
+    """``core.images.neutral`` of one pixel."""
+    red, green, blue = _radiance(red), _radiance(green), _radiance(blue)
+    low = min(red, min(green, blue))
+    offset = low - low * low / _FOUR_OFFSETS if low < _OFFSET + _OFFSET else _OFFSET
+    red, green, blue = red - offset, green - offset, blue - offset
+    peak = max(red, max(green, blue))
+    if peak <= _START_PEAK:
+        return red, green, blue
+    compressed = _ONE - _ROOM * _ROOM / (peak - _START_PEAK + _ROOM)
+    saturation = _ONE / (_DESATURATION * (peak - compressed) + _ONE)
+    return (
+        compressed + saturation * (red / peak * compressed - compressed),
+        compressed + saturation * (green / peak * compressed - compressed),
+        compressed + saturation * (blue / peak * compressed - compressed),
+    )
+
+
+@njit(inline="always")
+def _radiance(x):  # type: ignore[no-untyped-def]
+    return min(x, _MAX) if x > _ZERO else _ZERO
+
+
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _tone_map(radiance, alpha, background, share, steps, first, image):  # type: ignore[no-untyped-def]
+def _tone_map(radiance, alpha, background, share, curved, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape
     one_colour, whole = len(background) == 1, len(share) == 1
     empty = np.empty(3 * width, np.uint8)  # a row of the background colour
+    colour = background[0, 0], background[0, 1], background[0, 2]
+    if curved:
+        colour = _neutral(colour[0], colour[1], colour[2])
     for c in range(3):
-        empty[c::3] = _code(background[0, c], steps, first)
+        empty[c::3] = _code(colour[c], steps, first)
     rows = image.reshape(height, 3 * width)
     for y in prange(height):
         if one_colour:
@@ -116,19 +162,33 @@ def _tone_map(radiance, alpha, background, share, steps, first, image):  # type:
             at, seen = 0 if one_colour else y * width + x, 0 if whole else y * width + x
             if one_colour and left == _ONE and min(share[seen, 0], share[seen, 1], share[seen, 2]) == _ONE:
                 continue
+            if curved:
+                toned = _neutral(
+                    radiance[y, x, 0] + left * background[at, 0] * share[seen, 0],
+                    radiance[y, x, 1] + left * background[at, 1] * share[seen, 1],
+                    radiance[y, x, 2] + left * background[at, 2] * share[seen, 2],
+                )
+                for c in range(3):
+                    image[y, x, c] = _code(toned[c], steps, first)
+                continue
             for c in range(3):
                 behind = background[at, c] * share[seen, c]
                 image[y, x, c] = _code(radiance[y, x, c] + left * behind, steps, first)
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _tone_map_straight(radiance, alpha, steps, first, image):  # type: ignore[no-untyped-def]
+def _tone_map_straight(radiance, alpha, curved, steps, first, image):  # type: ignore[no-untyped-def]
     height, width = alpha.shape
     for y in prange(height):
         for x in range(width):
             a = alpha[y, x]
             if not a > _ZERO:
                 a = _ONE
-            for c in range(3):
-                image[y, x, c] = _code(radiance[y, x, c] / a, steps, first)
+            if curved:
+                toned = _neutral(radiance[y, x, 0] / a, radiance[y, x, 1] / a, radiance[y, x, 2] / a)
+                for c in range(3):
+                    image[y, x, c] = _code(toned[c], steps, first)
+            else:
+                for c in range(3):
+                    image[y, x, c] = _code(radiance[y, x, c] / a, steps, first)
             image[y, x, 3] = np.uint8(np.floor(min(max(alpha[y, x], _ZERO), _ONE) * np.float32(255) + np.float32(0.5)))

@@ -15,7 +15,7 @@ from PIL import Image
 import rnd_viewer.play.play
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.cli.lock import folder_lock
-from rnd_runtime.core.images import read_image, write_image
+from rnd_runtime.core.images import linear_to_srgb, neutral, read_image, to_bytes, write_image
 from rnd_runtime.core.kernels import COMPILING
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.doctor import Finding
@@ -230,6 +230,19 @@ def test_light_options_reach_the_light(files, tmp_path):
     columns = {name: picture.sum(axis=0) @ np.arange(48) / picture.sum() for name, picture in pictures.items()}
     assert columns["hdr_yaw180"] < columns["exposure0"] - 0.1  # lit from the picture's right, then from its left
     assert (pictures["hdr_upz"] != pictures["exposure0"]).any()
+
+
+def test_the_neutral_tone_clips_nothing_and_leaves_an_exr_as_it_is(files, tmp_path):
+    shown, linear = {}, {}
+    for tone in ("srgb", "neutral"):
+        look = {"tone": tone, "exposure": 2, "background": "0,0,0", "frames": ":1", "format": "png,exr"}
+        assert main(_arguments(files, tmp_path / tone, **look)) == 0
+        shown[tone] = read_image(tmp_path / tone / "frames/000000.png")
+        linear[tone] = read_image(tmp_path / tone / "frames_exr/000000.exr")
+    assert (linear["srgb"] == linear["neutral"]).all()
+    assert (shown["srgb"] == 255).any() and shown["neutral"].max() < 255
+    expected = to_bytes(linear_to_srgb(neutral(linear["neutral"][..., :3].astype(np.float64))))
+    assert np.abs(shown["neutral"].astype(int) - expected).max() <= 1
 
 
 def test_background_colour_fills_the_corner(files, tmp_path):

@@ -149,7 +149,7 @@ def _played(options: ViewOptions, time: float, **changes: Any) -> np.ndarray:
     shade = changes.pop("shade", "table+sun")
     view = CameraOptions(SIZE, SIZE, np.radians(35), np.radians(5))
     camera = front_path(frame_motion(avatar.skeleton, motion), view)(0, time)
-    renderer = FrameRenderer(avatar, light, shade=shade)
+    renderer = FrameRenderer(avatar, light, shade=shade, tone=changes.pop("tone", "srgb"))
     renderer.ground = ground_of(avatar, motion) if changes.pop("ground", False) else None
     frame = renderer.render(motion, time, camera)
     background = changes.pop("background", None)
@@ -167,6 +167,7 @@ def test_the_first_view_is_rnd_plays_to_the_bit(options):
         # the light is scaled before or after shading: float32 rounds differently
         assert np.abs(bright.astype(int) - _played(options, 0.0, exposure=1.3)).max() <= 1
         assert np.abs(bright.astype(int) - visitor.frame()).max() > 20
+        assert (visitor.frame(tone="neutral") == _played(options, 0.0, tone="neutral")).all()
 
 
 def test_the_ground_has_rnd_plays_shadow(options):

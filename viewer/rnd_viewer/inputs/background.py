@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import srgb_to_linear
+from rnd_runtime.core.images import MAX_RADIANCE, srgb_to_linear
 from rnd_runtime.playback.frame import RenderedFrame
 from rnd_runtime.shading.light import Light
 
 Floats32 = NDArray[np.float32]
-MAX_RADIANCE = float(np.finfo(np.float32).max)
 _NAMES = {  # of CSS, sRGB
     "black": "000",
     "white": "fff",

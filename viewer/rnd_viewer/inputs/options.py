@@ -22,6 +22,7 @@ from rnd_runtime.cli.command import (
     option,
 )
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed, refuse_outside
+from rnd_runtime.core.images import Tone
 from rnd_runtime.motion.edit import EDIT_LIMITS, MotionEdits, edit_motion
 from rnd_runtime.motion.readers.arrays import FPS_LIMITS
 from rnd_runtime.playback.framing import ELEVATION, FIELD_OF_VIEW
@@ -138,6 +139,9 @@ class _Lighting:
     """Stops by which the light is made brighter."""
     albedo_gain: Annotated[str, option(GAIN)] = "1"
     """Factors on the albedo, linear: corrects colours that training put into the light."""
+    tone: Annotated[Tone, option("srgb|neutral")] = "srgb"
+    """Tone curve of 8-bit frames: sRGB's alone, which clips above 1, or Khronos PBR Neutral, which compresses
+    highlights. An .exr stays linear."""
     background: Annotated[str, option("none|hdr|COLOUR")] = "none"
     """none is transparent; hdr is the light itself; a COLOUR is #rgb, #rrggbb or a name such as red (sRGB), or r,g,b
     (linear radiance)."""

@@ -149,7 +149,8 @@ class _Run:
                 pass  # before what takes long
             if kernels_are_cold():
                 log(COMPILING)
-            renderer = FrameRenderer(avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull)
+            how = {"shade": rendering.shade, "raster": rendering.raster, "cull": rendering.cull}
+            renderer = FrameRenderer(avatar, light, **how, tone=lighting.tone)
             scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
                 stands = {(id(each.avatar), id(each.motion)): (each.avatar, each.motion) for each in people}

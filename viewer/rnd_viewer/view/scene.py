@@ -142,7 +142,7 @@ class Scene:
             if lit and state.ground and state.truth is None and background.any():
                 share = self._ground_share(state, motion, body, camera)
                 seconds["ground"], started = perf_counter() - started, perf_counter()
-            srgb = tone_map(radiance, frame.alpha, background, share)
+            srgb = tone_map(radiance, frame.alpha, background, share, tone=state.tone if lit else "srgb")
         else:
             shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
             srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))

@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.images import Tone
 
 from .options import SIZES
 
@@ -33,6 +34,7 @@ class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         light: index among the scene's lights. yaw: rad. exposure: stops.
         output: the lit frame, the light alone (on a body of one colour), or one of its materials.
         background: as ``rnd-play --background``, ``none`` being black.
+        tone: as ``rnd-play --tone``, of the lit frame and of the light.
         ground: draw the body's shadow on the ground under its feet, over a background that is not black.
         gaussians: how many to render; fewer are enlarged.
         encoding: of the pixels in the answer.
@@ -52,6 +54,7 @@ class ViewState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shade: str = "table+sun"
     output: Output = "lit"
     background: str = "none"
+    tone: Tone = "srgb"
     ground: bool = False
     gaussians: Annotated[int, Meta(ge=1)] | None = None
     truth: Annotated[int, Meta(ge=0)] | None = None

@@ -1,5 +1,9 @@
 // Written by viewer/web/constants.py from Python's constants; not to be edited.
 
+// rnd_runtime.core.images
+export const NEUTRAL_OFFSET = 0.04;
+export const NEUTRAL_START = 0.76;
+export const NEUTRAL_DESATURATION = 0.15;
 // rnd_runtime.avatar.file
 export const SCHEMA = "rnd-avatar/1";
 export const METADATA_KEY = "rnd_avatar";

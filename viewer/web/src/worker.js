@@ -147,9 +147,10 @@ function material(output, { albedo, normals, roughness, visibility }, count, { r
 /** Uniforms of blend.frag. */
 function look(state, { rotation: r, focal, width, height }) {
   const show = { normal: 1, roughness: 2, visibility: 2 }[state.output] ?? 0, gain = 2 ** state.exposure;
+  const curved = Number(state.tone === "neutral" && state.output !== "albedo");
   if (state.background !== "hdr") {
     const hex = /^#([0-9a-f]{2})([0-9a-f]{2})([0-9a-f]{2})$/i.exec(state.background);
-    return { show, background: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
+    return { show, curved, background: 0, colour: hex ? hex.slice(1).map((text) => linear(parseInt(text, 16) / 255)) : [0, 0, 0] };
   }
   if (shownSky !== scene.lights[state.light]) {
     shownSky = scene.lights[state.light];
@@ -161,7 +162,7 @@ function look(state, { rotation: r, focal, width, height }) {
     const [x, y, z] = [0, 1, 2].map((axis) => rotation[row] * r[3 * axis] + rotation[3 + row] * r[3 * axis + 1] + rotation[6 + row] * r[3 * axis + 2]);
     pixelToLight.push(x / focal, y / focal, z - (x * width + y * height) / 2 / focal);
   }
-  return { show, background: 1, gain, pixel_to_light: pixelToLight };
+  return { show, curved, background: 1, gain, pixel_to_light: pixelToLight };
 }
 
 const linear = (srgb) => (srgb <= 0.04045 ? srgb / 12.92 : ((srgb + 0.055) / 1.055) ** 2.4);

@@ -12,7 +12,7 @@ const $ = (id) => document.getElementById(id);
 
 const state = {
   time: 0, width: 512, height: 512, azimuth: 0, elevation: 0, distance: 3, target: [0, 1, 0], fov: 0.6,
-  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", ground: true, gaussians: null, truth: null,
+  light: 0, yaw: 0, exposure: 0, shade: "table+sun", output: "lit", background: "none", tone: "srgb", ground: true, gaussians: null, truth: null,
 };
 let scene = null, engine = null, playing = false, playedSince = 0;
 let number = 0, shown = 0, wanted = false, flying = new Map();
@@ -130,7 +130,7 @@ function showState() {
   $("size").value = state.height;
   $("size").nextElementSibling.textContent = String(state.height);
   $("gaussians").nextElementSibling.textContent = String(state.gaussians ?? scene.gaussians);
-  for (const name of ["light", "shade", "background"]) $(name).value = String(state[name]);
+  for (const name of ["light", "shade", "background", "tone"]) $(name).value = String(state[name]);
   for (const button of $("output").children) button.ariaPressed = String(button.dataset.value === state.output);
   $("play").textContent = playing ? "❚❚" : "▶";
 }
@@ -285,7 +285,7 @@ function bind() {
   });
   slider("gaussians", setGaussians);
   slider("time", (seconds) => { state.time = Math.min(seconds, scene.motion.duration); play(false); });
-  for (const name of ["shade", "background"])
+  for (const name of ["shade", "background", "tone"])
     $(name).addEventListener("change", () => { state[name] = $(name).value; redraw(); });
   $("light").addEventListener("change", () => { state.light = Number($("light").value); redraw(); });
   $("output").addEventListener("click", (event) => {

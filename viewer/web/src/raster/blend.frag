@@ -14,6 +14,7 @@ uniform int background;      // 0 one colour, 1 the sky
 uniform vec3 colour;         // linear
 uniform mat3 pixel_to_light; // (column, row, 1) → direction in the light's frame
 uniform float gain;
+uniform int curved;          // 1: tone curve "neutral"
 out vec4 image;
 
 const float PI = 3.14159265358979;
@@ -72,13 +73,25 @@ vec3 srgb(vec3 linear) {
     return mix(1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
 }
 
+/** neutral of rnd_runtime/core/images.py. */
+vec3 neutral(vec3 linear) {
+    vec3 x = clamp(linear, 0.0, 1e30);
+    float low = min(x.r, min(x.g, x.b));
+    x -= low < 2.0 * NEUTRAL_OFFSET ? low - low * low / (4.0 * NEUTRAL_OFFSET) : NEUTRAL_OFFSET;
+    float peak = max(x.r, max(x.g, x.b)), room = 1.0 - NEUTRAL_START;
+    if (peak <= NEUTRAL_START) return x;
+    float compressed = 1.0 - room * room / (peak - NEUTRAL_START + room);
+    return mix(vec3(compressed), x / peak * compressed, 1.0 / (NEUTRAL_DESATURATION * (peak - compressed) + 1.0));
+}
+
 void main() {
     ivec2 at = ivec2(int(gl_FragCoord.x), size.y - 1 - int(gl_FragCoord.y));
     vec4 value = mean_of(at);
     vec3 result;
     if (show == 0) {
         vec3 far = background == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
-        result = srgb(value.rgb + (1.0 - value.a) * far);
+        vec3 light = value.rgb + (1.0 - value.a) * far;
+        result = srgb(curved == 1 ? neutral(light) : light);
     } else if (value.a < MIN_COVERAGE) {
         result = vec3(0.0);
     } else {

@@ -1,12 +1,15 @@
 // WebGL2 rasteriser: each pixel blends the Gaussians of its tile.
 
-import { ALPHA_MAX, LOG2_ALPHA_MIN, MIN_COVERAGE, TRANSMITTANCE_MIN } from "../constants.js";
+import {
+  ALPHA_MAX, LOG2_ALPHA_MIN, MIN_COVERAGE, NEUTRAL_DESATURATION, NEUTRAL_OFFSET, NEUTRAL_START, TRANSMITTANCE_MIN,
+} from "../constants.js";
 import blendFragment from "./blend.frag";
 import { ROW_GAUSSIANS, ROW_PAIRS, TEXELS, TILE } from "./project.js";
 
 const HEAD = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler2D;\nprecision highp usampler2D;\n";
 const MACROS = Object.entries({
   TEXELS, ROW_GAUSSIANS, ROW_PAIRS: `${ROW_PAIRS}u`, TILE, ALPHA_MAX, LOG2_ALPHA_MIN, TRANSMITTANCE_MIN, MIN_COVERAGE,
+  NEUTRAL_OFFSET, NEUTRAL_START, NEUTRAL_DESATURATION,
 }).map(([name, value]) => `#define ${name} ${value}\n`).join("");
 const FULLSCREEN = "void main() { gl_Position = vec4(vec2(gl_VertexID % 2, gl_VertexID / 2) * 4.0 - 1.0, 0.0, 1.0); }";
 const TEXTURES = ["records", "pairs", "tiles", "sky"];  // by unit
