@@ -103,6 +103,28 @@ def test_webp_moves_forever_in_its_colours_and_is_transparent(tmp_path):
             assert np.abs(decoded[middle][..., :3] - image[middle][..., :3]).max() <= DECODED_WEBP
 
 
+def test_webm_is_transparent_in_its_colours(tmp_path):
+    """By libvpx, as browsers do: ffmpeg's own VP9 decoder leaves the alpha out."""
+    rng = np.random.default_rng(4)
+    colours, alphas = rng.integers(0, 256, (5, 5, 3), np.uint8), rng.integers(64, 256, (5, 5, 1), np.uint8)
+    image = np.concatenate([colours, alphas], -1).repeat(PATCH, axis=0).repeat(PATCH, axis=1)[:-1]
+    contents = set()
+    for name in "ab":
+        with clip_writer(tmp_path / f"{name}.webm", fps=30) as append:
+            for _ in range(3):
+                append(image)
+        contents.add((tmp_path / f"{name}.webm").read_bytes())
+    assert len(contents) == 1
+    with av.open(str(tmp_path / "a.webm")) as container:
+        decoder = av.CodecContext.create("libvpx-vp9", "r")
+        frames = [frame for packet in container.demux(video=0) for frame in decoder.decode(packet)]
+    assert len(frames) == 3 and frames[0].format.name == "yuva420p"
+    for frame in frames:
+        frame.colorspace = 1  # libvpx does not tell
+        decoded = frame.to_ndarray(format="rgba")[8::PATCH, 8::PATCH].astype(int)
+        assert np.abs(decoded - image[8::PATCH, 8::PATCH]).max() <= DECODED_WEBP
+
+
 @pytest.mark.parametrize(("fps", "every"), [(30, 1), (90, 1), (100, 2), (120, 2), (240, 3), (1200, 14)])
 def test_webp_has_no_frame_that_browsers_hold_for_ten_times_as_long(tmp_path, fps, every):
     """Chromium, Firefox and Safari show one of 10 ms or less for 100."""
@@ -167,7 +189,7 @@ def test_formats():
     assert parse_formats(None) == ("png", "mp4")
     assert parse_formats("webp,png") == ("png", "webp")
     for text in ("gif", "png,tiff", ""):
-        with pytest.raises(InputError, match="png,exr,mp4,mov,webp"):
+        with pytest.raises(InputError, match="png,exr,mp4,mov,webm,webp"):
             parse_formats(text)
 
 

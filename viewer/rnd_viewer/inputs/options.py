@@ -200,9 +200,19 @@ class _Rendering:
     """Rasteriser: auto takes OpenGL on a graphics card and the CPU otherwise."""
     threads: OptionalCount = None
     """CPU threads. Default: all."""
+    supersample: Annotated[int, option("N")] = 1
+    """Samples along a pixel's side, 1 to 4, averaged in linear light: 2 takes four times as long."""
+    shutter: Annotated[float, option("DEGREES")] = 0.0
+    """Motion blur by a shutter that is open for so much of a frame, 360 for all of it; film has 180. A camera from a
+    file stands still meanwhile."""
+    shutter_samples: Annotated[int, option("N")] = 8
+    """Moments at which an open shutter is sampled, 2 to 64."""
 
     def __post_init__(self) -> None:
         check_cull(self.cull)
+        refuse_outside(self, {"supersample": (1, 4), "shutter": (0, 360), "shutter_samples": (2, 64)})
+        if not self.shutter:
+            refuse_changed(self, ["shutter_samples"], "needs --shutter")
 
 
 @dataclass(frozen=True)
@@ -231,8 +241,8 @@ class PlayOptions:
     """Frames to render, END excluded, either may be missing. Pixels are those of the whole run; processes with
     different parts may share a folder. Default: all."""
     format: Annotated[str | None, option("LIST")] = None
-    """Some of png,exr,mp4,webp,mov. webp and mov (ProRes 4444) are clips too, transparent where a png is. Default: png,
-    and mp4 where PyAV is installed."""
+    """Some of png,exr,mp4,webp,webm,mov. webp, webm (VP9) and mov (ProRes 4444) are clips too, transparent where a png
+    is. Default: png, and mp4 where PyAV is installed."""
     aov: Annotated[str, option("LIST")] = ""
     """Also write some of albedo,normal,roughness,visibility,depth, of the split light diffuse,specular,shadow, of
     motion (pixels to the next frame), and of parts (Cryptomatte by joint). Normals are in the camera's OpenCV axes."""
@@ -251,6 +261,8 @@ class PlayOptions:
         refuse_outside(self, {"fps": (1e-3, 1000)})
         if "exr" not in (self.format or ""):
             refuse_changed(self, ["half", "colorspace"], "only of --format exr")
+        sampled = self.rendering.supersample > 1 or self.rendering.shutter > 0
+        check_option(not (self.aov and sampled), "--aov", "no --supersample and no --shutter", self.aov)
         if self.hdr is None:
             refuse_changed(self.lighting, ["hdr_up"], "needs --hdr")
 

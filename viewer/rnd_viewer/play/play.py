@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
@@ -48,6 +48,7 @@ from .exr import ExrWriter
 from .given import GivenFeatures
 from .pipeline import run
 from .run_folder import is_of_a_run, mark_of, part_name, refuse_others
+from .sampling import Sampling
 from .timing import StageTimes
 from .video import clip_notes
 from .writers import frame_writer, parse_formats, tone_map_for
@@ -81,10 +82,10 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
 
 
 class _Pending(NamedTuple):
-    """Everybody's poses of a frame; ``asked`` is when their encoding began, in seconds."""
+    """Everybody's poses at each moment of a frame; ``asked`` is when their encoding began, in seconds."""
 
     asked: float
-    encoded: list[Encoded]
+    moments: list[list[Encoded]]
 
 
 @dataclass(eq=False)
@@ -149,8 +150,9 @@ class _Run:
                 pass  # before what takes long
             if kernels_are_cold():
                 log(COMPILING)
-            how = {"shade": rendering.shade, "raster": rendering.raster, "cull": rendering.cull}
-            renderer = FrameRenderer(avatar, light, **how, tone=lighting.tone)
+            renderer = FrameRenderer(
+                avatar, light, shade=rendering.shade, raster=rendering.raster, cull=rendering.cull, tone=lighting.tone
+            )
             scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
                 stands = {(id(each.avatar), id(each.motion)): (each.avatar, each.motion) for each in people}
@@ -187,6 +189,11 @@ class _Run:
     def name(self) -> str:
         """Of the clips and the report."""
         return part_name("play", self.frames, self.count)
+
+    @cached_property
+    def sampling(self) -> Sampling:
+        rendering = self.options.rendering
+        return Sampling(rendering.supersample, rendering.shutter, rendering.shutter_samples)
 
     @cached_property
     def _given(self) -> list[GivenFeatures]:
@@ -227,19 +234,14 @@ class _Run:
     def _encode(self, number: int) -> _Pending:
         asked = perf_counter()
         with self.times.stage("encoders"):
-            return _Pending(asked, self.scene.encode(number / self.fps))
+            moments = [self.scene.encode((number + offset) / self.fps) for offset in self.sampling.offsets]
+            return _Pending(asked, moments)
 
     def _draw(self, number: int, pending: _Pending) -> tuple[RenderedFrame, Camera]:
-        renderer, camera, lighting = self.renderer, self.camera(number), self.options.lighting
-        if lighting.hdr_turn:
-            renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * number / self.fps / lighting.hdr_turn)
-        given = [of.of(number, encoded, camera) for of, encoded in zip(self._given, pending.encoded)]
-        levels = self._levels[number]
-        frame = self.scene.draw(pending.encoded, camera, aovs=self.aovs, srgb=False, given=given, levels=levels)
+        camera, moments = self.camera(number), zip(self.sampling.offsets, pending.moments)
+        frame = self.sampling.mean(self._sample(number, offset, encoded) for offset, encoded in moments)
         for stage, seconds in frame.stage_seconds.items():
             self.times.add(stage, seconds)
-        with self.times.stage("background"):
-            frame = self.backdrop.behind(frame, camera, renderer.light)
         self.in_view = self.in_view or bool(frame.alpha.any())
         if number == 0 and not self.in_view:
             raise _out_of_view(self.framing, camera, number)
@@ -247,6 +249,18 @@ class _Run:
             tone_map_for(self.formats, frame)
         self.times.add(LATENCY, perf_counter() - pending.asked)
         return frame, camera
+
+    def _sample(self, number: int, offset: float, encoded: list[Encoded]) -> RenderedFrame:
+        """Frame ``number``, ``offset`` frames later, before its samples are averaged."""
+        lighting, time_s = self.options.lighting, (number + offset) / self.fps
+        camera = self.sampling.fine(self.camera_at(number, time_s))
+        if lighting.hdr_turn:
+            self.renderer.turn(math.radians(lighting.hdr_yaw) + math.tau * time_s / lighting.hdr_turn)
+        given = [of.of(number, body, camera) for of, body in zip(self._given, encoded)]
+        frame = self.scene.draw(encoded, camera, aovs=self.aovs, srgb=False, given=given, levels=self._levels[number])
+        started = perf_counter()
+        frame = self.backdrop.behind(frame, camera, self.renderer.light)
+        return replace(frame, stage_seconds={**frame.stage_seconds, "background": perf_counter() - started})
 
     def report(self, seconds: float) -> None:
         """Write play.json and print the summary of a run of so many seconds."""

@@ -16,7 +16,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import sha256_of
 
 _FOLDERS = ("frames/[!.]*", "frames_exr/[!.]*", "aov/*/[!.]*")
-_CLIP = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp|mov)")
+_CLIP = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp|webm|mov)")
 _OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/\d{{6,}}\.(png|exr)|{_CLIP.pattern}")
 
 

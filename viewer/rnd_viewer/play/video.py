@@ -1,4 +1,4 @@
-"""Clips: mp4 whose colours survive, and WebP and ProRes 4444, which keep transparency.
+"""Clips: mp4 whose colours survive, and WebP, WebM and ProRes 4444, which keep transparency.
 
 A player that finds no tags guesses BT.601 for small frames, and ffmpeg's converter assumes BT.601 by
 default; either one alone costs 16 dB. So mp4's conversion to BT.709 is written out here, said in the file and tested
@@ -8,7 +8,7 @@ through a decoder. WebP has one way to keep colours (BT.601, full chroma range h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from itertools import count
@@ -47,11 +47,13 @@ BT709 = {
 # CRF 18 then costs 0.1 dB against 16 at 512², where the halved chroma alone holds everything below 46 dB.
 X264 = {"preset": "veryfast", "crf": "18", "threads": "1", "x264-params": "mbtree=0"}
 PRORES = {"profile": "4444", "vendor": "apl0", "alpha_bits": "16", "threads": "1"}
+VP9 = {"crf": "18", "b": "0", "threads": "1", "auto-alt-ref": "0", "deadline": "good", "cpu-used": "4"}  # ref: no alpha
 WEBP = {"quality": "85", "compression_level": "4"}
 
 WEBP_MIN_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
 
 INSTALL = "pip install 'rnd-avatar[video]'"
+_CLIPS = "PyAV (clips)"
 
 
 def load_pyav(otherwise: str = "") -> ModuleType:
@@ -59,16 +61,18 @@ def load_pyav(otherwise: str = "") -> ModuleType:
     try:
         import av
     except ImportError as error:
-        raise InputError("mp4, webp and mov need PyAV, which is not installed", hint=INSTALL + otherwise) from error
+        raise InputError(
+            "mp4, webp, webm and mov need PyAV, which is not installed", hint=INSTALL + otherwise
+        ) from error
     return av
 
 
 def finding() -> Finding:
     """The doctor's line on clips."""
     try:
-        return Finding("PyAV (mp4, webp, mov)", str(load_pyav().__version__), None)
+        return Finding(_CLIPS, str(load_pyav().__version__), None)
     except InputError:
-        return Finding("PyAV (mp4, webp, mov)", "missing", INSTALL)
+        return Finding(_CLIPS, "missing", INSTALL)
 
 
 def rgb_to_yuv420(image_srgb: Bytes) -> Bytes:
@@ -119,22 +123,31 @@ def rgb_to_yuva444(image_srgb: Bytes) -> list[NDArray[np.uint16]]:
     return [np.rint(plane).astype(np.uint16) for plane in planes]
 
 
-def _frame_of_planes(av: ModuleType, image_srgb: Bytes, pixels: str) -> Any:
+def rgb_to_yuva420(image_srgb: Bytes) -> list[Bytes]:
+    """8-bit R'G'B' or R'G'B'A [H, W, 3 or 4] → the planes of ``rgb_to_yuv420``, and A in full."""
+    flat = rgb_to_yuv420(image_srgb)
+    height, width = len(flat) * 2 // 3, flat.shape[1]
+    alpha = image_srgb[..., 3] if image_srgb.shape[-1] == 4 else np.full(image_srgb.shape[:2], 255, np.uint8)
+    padding = ((0, height - len(alpha)), (0, width - alpha.shape[1]))
+    return [flat[:height], *flat[height:].reshape(2, height // 2, width // 2), np.pad(alpha, padding, mode="edge")]
+
+
+def _frame_of_planes(av: ModuleType, planes: Sequence[NDArray[Any]], pixels: str) -> Any:
     """A frame whose planes PyAV cannot take from an array."""
-    frame = av.VideoFrame(image_srgb.shape[1], image_srgb.shape[0], pixels)
-    for plane, values in zip(frame.planes, rgb_to_yuva444(image_srgb)):
-        rows = np.zeros((plane.buffer_size // plane.line_size, plane.line_size // 2), "<u2")
+    frame = av.VideoFrame(*planes[0].shape[::-1], pixels)
+    for plane, values in zip(frame.planes, planes):
+        rows = np.zeros((plane.buffer_size // plane.line_size, plane.line_size // values.itemsize), values.dtype)
         rows[: len(values), : values.shape[1]] = values
         plane.update(rows.tobytes())
     return frame
 
 
 class _Kind(NamedTuple):
-    """How a clip is made: ``options`` are the encoder's, ``container`` the file's; None for planes of 10 bits."""
+    """How a clip is made: ``options`` are the encoder's, ``container`` the file's."""
 
     codec: str
     pixels: str
-    planes: Callable[[Bytes], Bytes] | None
+    planes: Callable[[Bytes], Bytes] | Callable[[Bytes], list[NDArray[Any]]]
     options: dict[str, str]
     container: dict[str, str]
     tags: dict[str, int]
@@ -142,7 +155,8 @@ class _Kind(NamedTuple):
 
 _KINDS = {
     "mp4": _Kind("libx264", "yuv420p", rgb_to_yuv420, X264, {"movflags": "+faststart"}, BT709),
-    "mov": _Kind("prores_ks", "yuva444p10le", None, PRORES, {}, BT709),
+    "mov": _Kind("prores_ks", "yuva444p10le", rgb_to_yuva444, PRORES, {}, BT709),
+    "webm": _Kind("libvpx-vp9", "yuva420p", rgb_to_yuva420, VP9, {"fflags": "+bitexact"}, BT709),
     "webp": _Kind("libwebp_anim", "bgra", rgb_to_bgra, WEBP, {"loop": "0"}, {}),
 }
 CLIPS = tuple(_KINDS)
@@ -166,11 +180,11 @@ def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], N
     """Yield a function that appends one sRGB frame uint8; the file appears when the block ends.
 
     Args:
-        path: a name in .mp4, which takes frames [H, W, 3], or in .webp or .mov, which also take [H, W, 4], their alpha
-            straight. A .webp plays again and again.
+        path: a name in .mp4, which takes frames [H, W, 3], or in .webp, .webm or .mov, which also take [H, W, 4],
+            their alpha straight. A .webp plays again and again.
         fps: frames per second; of more than 90 a WebP keeps every second, third, …
 
-    The size is that of the first frame (mp4: rounded up to even). The same frames give the same bytes. Raises
+    The size is that of the first frame (mp4 and webm: rounded up to even). The same frames give the same bytes. Raises
     InputError when PyAV is missing or the encoder refuses the size.
     """
     av, name = load_pyav(), Path(path).suffix[1:]
@@ -184,10 +198,11 @@ def clip_writer(path: str | Path, *, fps: float) -> Iterator[Callable[[Bytes], N
         def write(image_srgb: Bytes) -> None:
             if next(numbers) % every:
                 return
-            if kind.planes is None:
-                frame = _frame_of_planes(av, image_srgb, kind.pixels)
+            planes = kind.planes(image_srgb)
+            if isinstance(planes, list):
+                frame = _frame_of_planes(av, planes, kind.pixels)
             else:
-                frame = av.VideoFrame.from_ndarray(kind.planes(image_srgb), format=kind.pixels)
+                frame = av.VideoFrame.from_ndarray(planes, format=kind.pixels)
             size = f"{frame.width}x{frame.height}"
             if not stream.codec_context.is_open:
                 stream.width, stream.height, stream.pix_fmt = frame.width, frame.height, kind.pixels

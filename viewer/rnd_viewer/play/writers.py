@@ -5,7 +5,7 @@
     out/frames/000010.png        the frame: 8-bit sRGB, with straight alpha when there is no background
     out/frames_exr/000010.exr    linear R, G, B, A (premultiplied) and one layer for each AOV, see ``play.exr``
     out/aov/normal/000010.png    AOVs as images
-    out/play.mp4, .webp, .mov    clips; WebP and MOV (ProRes 4444) are transparent where the PNG is
+    out/play.mp4, .webm, …       clips; WebP, WebM (VP9) and MOV (ProRes 4444) are transparent where the PNG is
     out/play.json                settings, notes, stage times
     out/play_000010-000050.*     the same of a part of a run, see ``play.run_folder``
 """
@@ -32,7 +32,7 @@ from .timing import StageTimes
 from .video import CLIPS, clip_writer, load_pyav
 
 FORMATS = ("png", "exr", *CLIPS)
-TRANSPARENT = {"png", "webp", "mov"}  # without a background
+TRANSPARENT = {"png", "webp", "webm", "mov"}  # without a background
 FrameWriter = Callable[[int, RenderedFrame, tuple[float, float], Camera], None]
 
 
