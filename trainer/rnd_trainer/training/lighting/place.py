@@ -25,6 +25,9 @@ YAWS = 512
 """yaws tried: 0.7° apart"""
 SEARCH_SHAPE = (16, 32)
 """texels, 11° wide, of the light while its yaw is searched"""
+FILL = 0.2
+"""light from all sides, of the mean, by which reflections brighten the unlit side; without it the yaw of three captures
+is found 5° to 8° nearer the camera than it is, with it 1° to 5°"""
 MIN_OBSERVATIONS = 3
 """observations of a point that is used: the albedo explains fewer under any light"""
 
@@ -53,7 +56,8 @@ def placed_light(
     if not (np.bincount(observations.point, minlength=1) >= MIN_OBSERVATIONS).any():
         return None
     irradiance = _irradiance(observations, _at_all_yaws(place, SEARCH_SHAPE))
-    at, between = divmod(_best_yaw(observations, irradiance), 1)
+    filled = irradiance + FILL * irradiance.mean(0)
+    at, between = divmod(_best_yaw(observations, filled), 1)
     radiance, arriving = (
         (1 - between) * values[..., int(at)] + between * values[..., (int(at) + 1) % YAWS]
         for values in (_at_all_yaws(place, PROBE_SHAPE), irradiance)
