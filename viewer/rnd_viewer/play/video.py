@@ -53,7 +53,7 @@ WEBP = {"quality": "85", "compression_level": "4"}
 WEBP_MIN_MS = 11  # of a frame: browsers show one of 10 ms or less for 100
 
 INSTALL = "pip install 'rnd-avatar[video]'"
-_CLIPS = "PyAV (clips)"
+_CLIPS = "PyAV (mp4, webp, webm, mov)"
 
 
 def load_pyav(otherwise: str = "") -> ModuleType:

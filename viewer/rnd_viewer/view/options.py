@@ -8,7 +8,15 @@ from typing import Annotated, Literal
 
 import tyro
 
-from rnd_runtime.cli.command import OptionalCount, OptionalFile, OptionalFolder, OptionalNumber, Size, option, size_text
+from rnd_runtime.cli.command import (
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalNumber,
+    OptionalSize,
+    option,
+    size_text,
+)
 from rnd_runtime.core.errors import InputError, refuse_changed, refuse_outside
 from rnd_viewer.inputs.options import GAIN, MotionGroup, MotionOptions, ProbeUp, parse_gain
 
@@ -42,8 +50,8 @@ class ViewOptions:
     browser: bool = True
     """Open the page in this machine's browser, whose command line then shows the token."""
 
-    size: Size = (512, None)
-    """Size of a frame in pixels to begin with."""
+    size: OptionalSize = None
+    """Size of a frame in pixels to begin with. Default: the window's."""
     fps_floor: OptionalNumber = None
     """Frames per second to hold, at a lower resolution where needed. Screenshots and clips keep the full one."""
     raster: Literal["auto", "gl", "cpu"] = "auto"
@@ -64,11 +72,11 @@ class ViewOptions:
         if not 0 <= self.port <= 65535:
             raise InputError("--port", expected="0 to 65535", got=self.port)
         low, high = SIZES
-        if not all(low <= side <= high for side in self.width_height):
+        if self.size and not all(low <= side <= high for side in self.width_height):
             raise InputError("--size", expected=f"{low} to {high}", got=size_text(self.size))
 
     @property
     def width_height(self) -> tuple[int, int]:
         """Of a frame, px."""
-        width, height = self.size
+        width, height = self.size or (512, None)
         return width, height or width

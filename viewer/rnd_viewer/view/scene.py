@@ -75,6 +75,7 @@ class Scene:
         self.motion = self._motion(options)
         self._files, self._up = _probes(options.hdr), options.hdr_up
         self.name, self.size, self.threads = options.avatar.name, options.width_height, options.threads
+        self._fit = options.size is None
         self._shader = lru_cache(MAX_SHADERS)(self._build_shader)
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
         self._sky = lru_cache(MAX_SHADERS // 2)(self._smaller_light)
@@ -98,6 +99,8 @@ class Scene:
             "motion": {"name": Path(self.motion.source).name, "duration": self.motion.duration, "fps": self.motion.fps},
             "lights": ["the avatar's own", *(file.name for file in self._files)],
             "light": 1 if self._files else 0,
+            "head": self.avatar.skeleton.names.index("head") if "head" in self.avatar.skeleton.names else -1,
+            "fit": self._fit,
             "size": self.size,
             "sizes": SIZES,
             "raster": self.renderer.draws_with,

@@ -1,28 +1,11 @@
 // Pinhole cameras in OpenCV's axes, and the view of a whole motion (rnd_runtime/core/camera.py, playback/framing.py).
 
+import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
 import { ELEVATION, FIELD_OF_VIEW, PADDING } from "./constants.js";
 import { jointsAt } from "./posing/avatar.js";
 import { multiply, rotate, transposed } from "./rotations.js";
 
 const RADIANS = Math.PI / 180;
-
-/** The camera of a state: {width, height, focal, centre [2], rotation [9], translation [3], position [3]}. */
-export function cameraOf({ azimuth, elevation, distance, target, fov, width, height }) {
-  const flat = Math.cos(elevation);
-  const back = [flat * Math.sin(azimuth), Math.sin(elevation), flat * Math.cos(azimuth)];
-  const position = target.map((x, k) => x + distance * back[k]), forward = back.map((x) => -x);
-  const length = Math.hypot(forward[2], forward[0]);  // right = forward × (0, 1, 0)
-  const right = [-forward[2] / length, 0, forward[0] / length];
-  const down = [
-    forward[1] * right[2] - forward[2] * right[1],
-    forward[2] * right[0] - forward[0] * right[2],
-    forward[0] * right[1] - forward[1] * right[0],
-  ];
-  const rotation = [...right, ...down, ...forward];
-  const translation = [0, 1, 2].map((row) =>
-    -(rotation[3 * row] * position[0] + rotation[3 * row + 1] * position[1] + rotation[3 * row + 2] * position[2]));
-  return { width, height, focal: 0.5 * height / Math.tan(0.5 * fov), centre: [width / 2, height / 2], rotation, translation, position };
-}
 
 /** The camera for points in a frame {rotation [9], translation [3]} → world. */
 export function inFrame(camera, frame) {

@@ -87,12 +87,16 @@ function shownName(address) {
   }
 }
 
-function fetchFiles(names) {
-  return Promise.all(names.map(async (name) => {
-    const address = addressOf(name), answer = await fetch(address);
+/** All of them, or an error that names each that is missing. */
+async function fetchFiles(names) {
+  const results = await Promise.allSettled(names.map(async (name) => {
+    const address = addressOf(name), answer = await fetch(address).catch((error) => { throw new Error(`${name}: ${error.message}`); });
     if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
     return new File([await answer.blob()], shownName(address));
   }));
+  const missing = results.filter(({ reason }) => reason).map(({ reason }) => reason.message);
+  if (missing.length) throw new Error(missing.join(" · "));
+  return results.map(({ value }) => value);
 }
 
 /** Render all frames, then play them to a recorder in real time: it uses the time of day as timestamps. */

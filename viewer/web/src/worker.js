@@ -2,7 +2,8 @@
 
 import { CLAY, COSINE_LOBE, LARGEST_SKY, PROBE_SHAPE } from "./constants.js";
 import { Avatar } from "./posing/avatar.js";
-import { cameraOf, homeView, inFrame, projectJoints } from "./camera.js";
+import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
+import { homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
 import { downsize, lightNotes, readLight } from "./shading/light.js";
 import { fitMotion, restMotion } from "./motion/motion.js";
@@ -66,7 +67,7 @@ function description({ avatar, motion, lights }, light) {
     avatar: avatar.name, gaussians: avatar.gaussians, parents: avatar.skeleton.parents,
     motion: { name: motion.name, duration: motion.duration, fps: motion.fps },
     lights: lights.map(({ name }) => name), light,
-    size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
+    head: avatar.skeleton.names.indexOf("head"), fit: true, size: SIZE, sizes: SIZES, raster: splatter.name, view: homeView(avatar.skeleton, motion),
     truths: [], notes: motion.notes,
   };
 }

@@ -1,12 +1,17 @@
 // The page: controls define a state, an engine renders it.
 
+import { fitted } from "./camera.js";
 import { connect } from "./engine.js";
+import { Fit } from "./fit.js";
 import { orbit, wrapped } from "./orbit.js";
+import { drawSkeleton } from "./skeleton.js";
+import { bindViews } from "./views.js";
 
 const IN_FLIGHT = 2;  // one frame is shown while the next is rendered
 const LONG_MS = 1000;  // time after which a pending frame is announced
 const MAX_CLIP_FPS = 60;
 const RADIANS = Math.PI / 180;
+const PICTURE_QUALITY = 0.95;
 const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
 const $ = (id) => document.getElementById(id);
 
@@ -20,14 +25,22 @@ let waiting = [];  // {number, done, failed} of awaited frames
 let clipMade = null;  // while a clip is made: {promise, resolve} of its end
 let times = {}, rates = [], shownAt = 0;
 let passing = true;  // the next frame clears the message
+let joints = [];  // of the last frame, px of the state's size
+const fit = new Fit($("stage").firstElementChild, state, redraw);
 
-function redraw() { wanted = true; }
+const views = bindViews(state, { scene: () => scene, joints: () => joints, redraw, say, download });
+
+function redraw() {
+  wanted = true;
+  fit.moved = performance.now();
+}
 
 function step(now) {
   if (playing && scene.motion.duration > 0) {
     state.time = ((now - playedSince) / 1000) % scene.motion.duration;
     wanted = true;
   }
+  if (scene && !playing && flying.size === 0 && fit.isCoarse(now)) wanted = true;
   if (wanted && scene && flying.size < IN_FLIGHT) {
     wanted = false;
     ask(false);
@@ -39,7 +52,8 @@ function step(now) {
 function ask(exact) {
   number += 1;
   flying.set(number, performance.now());
-  engine.render(number, { ...state }, exact);
+  const moves = playing || performance.now() - fit.moved < 100;
+  engine.render(number, exact ? { ...state } : fit.asked(state, moves), exact);
   return number;
 }
 
@@ -56,9 +70,11 @@ function show(frame) {
   if (frame.image instanceof ImageData) context.putImageData(frame.image, 0, 0);
   else context.drawImage(frame.image, 0, 0);
   frame.image.close?.();
-  drawSkeleton(frame);
+  drawSkeleton($("overlay"), frame, scene.parents, $("skeleton").checked);
   showNotes(frame.notes);
+  joints = frame.joints.map(([x, y, z]) => [x * state.width / frame.width, y * state.height / frame.height, z]);
   const now = performance.now();
+  if (flying.size) fit.observe(now - Math.max(shownAt, sent));
   shownAt = now;
   rates = [...rates.filter((at) => now - at < 1000), now];
   times = frame.times;
@@ -78,32 +94,6 @@ function announceSlowFrame() {
 function showNotes(ofLight = []) {
   const text = [...scene.notes, ...ofLight].join(" · ");
   if ($("notes").textContent !== text) $("notes").textContent = text;
-}
-
-function drawSkeleton(frame) {
-  const canvas = $("overlay"), context = canvas.getContext("2d");
-  const scale = Math.max(1, Math.round(1024 / frame.height));
-  canvas.width = frame.width * scale;
-  canvas.height = frame.height * scale;
-  if (!$("skeleton").checked) return;
-  context.scale(scale, scale);
-  context.lineWidth = frame.height / 300;
-  context.strokeStyle = "#f2b25c";
-  context.fillStyle = "#fff";
-  frame.joints.forEach(([x, y, z], joint) => {
-    const parent = scene.parents[joint];
-    if (parent < 0 || z <= 0 || frame.joints[parent][2] <= 0) return;
-    context.beginPath();
-    context.moveTo(x, y);
-    context.lineTo(frame.joints[parent][0], frame.joints[parent][1]);
-    context.stroke();
-  });
-  for (const [x, y, z] of frame.joints) {
-    if (z <= 0) continue;
-    context.beginPath();
-    context.arc(x, y, frame.height / 200, 0, 2 * Math.PI);
-    context.fill();
-  }
 }
 
 function showTimes() {
@@ -153,12 +143,13 @@ function options(select, entries) {
 }
 
 function home() {
-  Object.assign(state, structuredClone(scene.view));
+  Object.assign(state, fitted(scene.view, state));
   redraw();
 }
 
 /** Reset camera, light rotation and exposure. */
 function reset() {
+  views.remember();
   Object.assign(state, { yaw: 0, exposure: 0 });
   home();
 }
@@ -184,10 +175,21 @@ function setScene(description) {
   setGaussians();
   [$("size").min, $("size").max] = scene.sizes;
   if (first) [state.width, state.height] = scene.size;
+  if (first) $("fit").checked = Boolean(scene.fit);
+  fit.start($("fit").checked, scene.sizes);
   if (moved) home();
+  if (moved) views.forget();
+  if (first) restore();
   showNotes();
   say(first ? "loading …" : "", { untilFrame: true });
   redraw();
+}
+
+/** Take the state that the page's address holds. */
+function restore() {
+  views.restore();
+  $("ground").checked = state.ground;
+  $("gaussians").value = 100 * (state.gaussians ?? scene.gaussians) / scene.gaussians;
 }
 
 /** The slider's share of this avatar's Gaussians. */
@@ -237,13 +239,18 @@ function frame(exact = true) {
 
 async function screenshot() {
   const truth = state.truth === null ? null : scene.truths[state.truth].label.replaceAll(/[^\p{L}\p{N}._-]+/gu, "_");
-  const name = `avatar_${truth ?? `${state.time.toFixed(2)}s`}.png`;
-  if (!await frame().catch(() => null)) return;  // the page says why
+  const [kind, times] = $("picture").value.split(" "), [least, most] = scene.sizes, { width, height } = state;
+  const name = `avatar_${truth ?? `${state.time.toFixed(2)}s`}.${kind}`, grown = Math.min(times, most / Math.max(width, height));
+  Object.assign(state, { width: Math.max(Math.round(grown * width), least), height: Math.max(Math.round(grown * height), least) });
+  const drawn = frame().catch(() => null);
+  Object.assign(state, { width, height });
+  if (!await drawn) return;  // the page says why
   const canvas = document.createElement("canvas");
   Object.assign(canvas, { width: $("frame").width, height: $("frame").height });
   canvas.getContext("2d").drawImage($("frame"), 0, 0);
   canvas.getContext("2d").drawImage($("overlay"), 0, 0, canvas.width, canvas.height);
-  canvas.toBlob((blob) => download(blob, name));
+  canvas.toBlob((blob) => download(blob, name), `image/${kind}`, PICTURE_QUALITY);
+  if (times > 1) redraw();
 }
 
 function clip() {
@@ -280,6 +287,7 @@ function bind() {
   slider("yaw", (degrees) => { state.yaw = wrapped(degrees * RADIANS); });
   slider("exposure", (stops) => { state.exposure = stops; });
   slider("size", (pixels) => {
+    fit.start($("fit").checked = false, scene.sizes);
     const [width, height] = scene.size, [least, most] = scene.sizes;
     Object.assign(state, { width: Math.min(Math.max(Math.round(pixels * width / height), least), most), height: pixels });
   });
@@ -293,6 +301,7 @@ function bind() {
     state.output = event.target.dataset.value;
     redraw();
   });
+  $("fit").addEventListener("change", () => fit.start($("fit").checked, scene.sizes));
   $("skeleton").addEventListener("change", redraw);
   $("ground").addEventListener("change", () => { state.ground = $("ground").checked; redraw(); });
   $("truth-on").addEventListener("change", setTruth);
@@ -369,4 +378,4 @@ setInterval(() => {
   if (scene) showTimes();
   announceSlowFrame();
 }, 250);
-window.rnd = { state, redraw, frame, play, scene: () => scene, times: () => times, rate: () => rates.length };
+window.rnd = { state, fit, redraw, frame, play, scene: () => scene, times: () => times, rate: () => rates.length };

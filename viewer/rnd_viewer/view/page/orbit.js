@@ -22,7 +22,10 @@ export function orbit(element, state, changed) {
     if (!last || state.truth !== null) return;
     const apart = spread(fingers), dx = event.clientX - last[0], dy = event.clientY - last[1];
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    if (fingers.size > 1) approach(state, apart / Math.max(spread(fingers), 1));
+    if (fingers.size > 1) {  // the other finger moves by itself: half of this one's way is the pair's
+      approach(state, apart / Math.max(spread(fingers), 1));
+      pan(state, dx / 2, dy / 2, element.clientHeight);
+    }
     else if (event.shiftKey) state.yaw = wrapped(state.yaw + dx * PER_PIXEL);
     else if (event.buttons & 2 || event.ctrlKey) pan(state, dx, dy, element.clientHeight);
     else {

@@ -1,0 +1,190 @@
+"""The controls of rnd-view's page in Chromium, by mouse and by touch: size, views, paths, links, pictures."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import msgspec
+import numpy as np
+import pytest
+
+from rnd_viewer.inputs.cameras import file_path
+from rnd_viewer.view.options import ViewOptions
+from rnd_viewer.view.scene import Scene
+from rnd_viewer.view.server import serve
+from rnd_viewer.view.state import ViewState
+from support.browser import CHROMIUM, Page, chromium
+from support.paths import ASSETS
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
+
+DRAWN = "rnd.frame().then(() => 1)"
+PANE = "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.querySelector('.pane'))"
+FINGER = 44  # px
+TARGETS = """[...document.querySelectorAll("button, select, input:not([type=file]):not([type=checkbox]), label.check")]
+    .map((part) => [part.id, part.getBoundingClientRect()]).filter(([, { width }]) => width > 0)
+    .map(([name, { width, height }]) => [name, Math.min(width, height)])"""
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory):
+    """The page, which may choose its size, and its address."""
+    scene = Scene(ViewOptions(ASSETS / "avatar.onnx", ASSETS / "walk.npz", (ASSETS / "sky.exr",), raster="cpu"))
+    with serve(scene, "127.0.0.1", 0, "s3cret") as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        with chromium(tmp_path_factory.mktemp("profile")) as browser:
+            browser.open(url)
+            browser.wait("window.rnd && rnd.scene()")
+            yield browser, url
+            assert browser.messages == []
+        server.shutdown()
+        thread.join()
+    scene.close()
+
+
+@pytest.fixture
+def page(opened) -> Page:
+    """The page on a desk, in its first view."""
+    browser, url = opened
+    _screen(browser, 700, 500)
+    browser.open(url.split("?")[0] + "?desk")
+    browser.wait("location.search === '?desk' && window.rnd && rnd.scene()")
+    browser.run(DRAWN)
+    return browser
+
+
+def _screen(page: Page, width: int, height: int, ratio: float = 1, *, touch: bool = False) -> None:
+    screen = {"width": width, "height": height, "deviceScaleFactor": ratio, "mobile": touch}
+    page.call("Emulation.setDeviceMetricsOverride", **screen)
+    page.call("Emulation.setTouchEmulationEnabled", enabled=touch, maxTouchPoints=5)
+
+
+def _click(page: Page, selector: str) -> None:
+    page.run(f"document.querySelector('{selector}').click(); {DRAWN}")
+
+
+def _touch(page: Page, kind: str, *points: tuple[float, float]) -> None:
+    fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+    page.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
+
+
+def test_the_frame_fills_its_pane_and_is_coarse_only_while_it_moves(page):
+    assert page.run("[rnd.state.width, rnd.state.height]") == page.run(PANE)
+    _screen(page, 560, 420, 2)
+    page.wait(f"rnd.state.width === 2 * {PANE}[0] && rnd.state.height === 2 * {PANE}[1]")
+    width = page.run("rnd.state.width")
+    assert page.run(f"{DRAWN}.then(() => document.getElementById('frame').width)") == width
+    page.run("rnd.fit.scale = 0.5; rnd.fit.observe = () => {}")
+    page.run("setInterval(() => { if (window.moving) rnd.redraw(); }, 10); window.moving = true")
+    page.wait(f"document.getElementById('frame').width === {round(width / 2)}")
+    page.run("window.moving = false")
+    page.wait(f"document.getElementById('frame').width === {width}")
+    page.run(
+        "document.getElementById('size').value = 128; document.getElementById('size').dispatchEvent(new Event('input'))"
+    )
+    assert page.run("[rnd.state.height, document.getElementById('fit').checked]") == [128, False]
+
+
+def test_slow_frames_take_fewer_pixels_and_fast_ones_more(page):
+    scales = page.run("""[100, 100, 100, 5, 5, 5, 5, 5, 5].map((ms) => {
+        rnd.fit.observe(ms);
+        return rnd.fit.scale;
+    })""")
+    assert scales[0] < 1 and min(scales) == 0.5 and scales[-1] > scales[2]
+
+
+def test_presets_and_undo(page):
+    home = page.run("({ ...rnd.state })")
+    _click(page, "[data-preset=back]")
+    assert abs(page.run("rnd.state.azimuth") - home["azimuth"]) == pytest.approx(np.pi)
+    _click(page, "[data-preset=face]")
+    face = page.run("({ ...rnd.state })")
+    head = page.run("rnd.frame().then(({ joints }) => joints[rnd.scene().head])")
+    assert abs(head[0] - face["width"] / 2) < 2 and face["height"] / 2 < head[1] < 0.8 * face["height"]
+    page.drag((200, 200), (60, 0))
+    assert page.run("rnd.state.azimuth") != face["azimuth"]
+    for expected in (face["azimuth"], home["azimuth"] + np.pi, home["azimuth"], home["azimuth"]):
+        _click(page, "#undo")
+        assert page.run("rnd.state.azimuth") == pytest.approx(expected)
+    assert page.run("rnd.state.distance") == home["distance"]
+
+
+def test_a_link_holds_what_is_seen(page):
+    look = {"yaw": 1, "exposure": -0.5, "tone": "neutral", "background": "hdr", "time": 0.4, "azimuth": 2}
+    page.run(f"Object.assign(rnd.state, {json.dumps(look)})")
+    _click(page, "#share")
+    state, address = page.run("({ ...rnd.state })"), page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
+    page.wait("window.rnd && rnd.scene()")
+    assert page.run("({ ...rnd.state })") == state
+    page.open("about:blank")
+    page.open(address.split("#")[0] + "#%7B%22yaw%22%3A%22x%22%2C%22target%22%3A%5B1%5D%7D")  # of other types
+    page.wait("window.rnd && rnd.scene()")
+    assert page.run("[rnd.state.yaw, rnd.state.target.length]") == [0, 3]
+
+
+def test_a_path_through_keys_is_rnd_plays_camera(page, tmp_path):
+    """At the keys it is the page's camera; between them it is near, also where the azimuth passes ±π."""
+    states = []
+    for time, azimuth, distance in ((0.0, 3.0, 3.0), (0.5, -3.0, 2.0), (1.0, -2.5, 2.5)):
+        page.run(f"Object.assign(rnd.state, {{ time: {time}, azimuth: {azimuth}, distance: {distance} }})")
+        states.append(msgspec.convert(page.run("({ ...rnd.state })"), ViewState))
+        _click(page, "#key")
+    page.run("URL.createObjectURL = (blob) => { window.saved = blob; return 'data:,'; }")
+    _click(page, "#path")
+    file = tmp_path / "camera.json"
+    file.write_text(page.run("saved.text()"))
+    fps, duration = page.run("[rnd.scene().motion.fps, rnd.scene().motion.duration]")
+    path = file_path(str(file), None, range(round(duration * fps) + 1))
+    for state in states:
+        camera, expected = path(round(state.time * fps), state.time), state.camera()
+        np.testing.assert_allclose(camera.K, expected.K)
+        np.testing.assert_allclose(camera.world_to_camera, expected.world_to_camera, atol=1e-9)
+    positions = np.array([path(number, 0).position for number in range(round(fps) + 1)])
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() < 0.15  # the long way round would be 0.6
+
+
+def test_pictures_have_the_kind_and_size_that_are_chosen(page):
+    page.run("""(() => {
+        window.saved = null;
+        URL.createObjectURL = (blob) => { window.saved = blob; return "data:,"; };
+        HTMLAnchorElement.prototype.click = function () { window.name = this.download; };
+    })()""")
+    for kind, times in (("png", 1), ("jpeg", 2), ("webp", 2)):
+        page.run(f"document.getElementById('picture').value = '{kind} {times}'; window.saved = null")
+        page.run("document.getElementById('screenshot').click()")
+        page.wait("saved")
+        size = page.run("createImageBitmap(saved).then(({ width, height }) => [width, height])")
+        assert page.run("[saved.type, name.split('.').pop()]") == [f"image/{kind}", kind]
+        assert size == page.run(f"[{times} * rnd.state.width, {times} * rnd.state.height]")
+
+
+def test_a_phone_is_worked_by_thumb_and_finger(page, tmp_path):
+    _screen(page, 390, 844, 2, touch=True)
+    page.run(DRAWN)
+    small = {name: side for name, side in page.run(TARGETS) if side < FINGER}
+    assert not small, small
+    assert page.run("document.getElementById('time').getBoundingClientRect().width") > 0.85 * 390
+    before = page.run("({ ...rnd.state })")
+    _touch(page, "touchStart", (150, 200), (250, 200))
+    _touch(page, "touchMove", (100, 220), (300, 220))
+    _touch(page, "touchEnd")
+    page.run(DRAWN)
+    after = page.run("({ ...rnd.state })")
+    assert after["distance"] == pytest.approx(before["distance"] / 2, rel=0.05)
+    assert after["target"][1] > before["target"][1] and after["azimuth"] == before["azimuth"]
+    _touch(page, "touchStart", (150, 200))
+    _touch(page, "touchMove", (200, 200))
+    _touch(page, "touchEnd")
+    assert page.run("rnd.state.azimuth") == pytest.approx(before["azimuth"] - 0.5)
+
+
+def test_every_control_has_a_name(page):
+    nameless = """[...document.querySelectorAll("button, select, input")]
+        .filter((part) => !(part.matches("button") && part.textContent.trim()))
+        .filter((part) => !part.ariaLabel && !part.labels?.length)
+        .map(({ id }) => id)"""
+    assert page.run(nameless) == []
