@@ -38,7 +38,7 @@ SHARED = {
     "rnd_runtime.shading.sh": "SH_COUNT SH_DEGREES COSINE_LOBE _C0 _C1 _C2_SIDE _C2_ZONAL _C3_3 _C3_2 _C3_1 _C3_0",
     "rnd_runtime.shading.files.channels": "REC709 _SAME_COLOUR",
     "rnd_runtime.shading.files.radiance": "_MAX_EXPOSURE",
-    "rnd_runtime.shading.light": "REC709_LUMINANCE _DIM",
+    "rnd_runtime.shading.light": "REC709_LUMINANCE _DIM _COARSE",
     "rnd_runtime.shading.brdf": "F0 ROUGHNESS_RANGE COSINE_FLOOR LARGEST_ALBEDO",
     "rnd_runtime.shading.specular_lobe": "LOBE_WIDTHS ROUGHNESS_COUNT COSINE_COUNT",
     "rnd_runtime.shading.lookup": "DIFFUSE_SIZE SPECULAR_SIZE",

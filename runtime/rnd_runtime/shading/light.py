@@ -124,6 +124,17 @@ def light_notes(light: Light) -> list[str]:
     return notes
 
 
+_COARSE = 32, 64  # texels in which bright parts are told apart
+
+
+def brightest_direction(light: Light) -> Floats:
+    """Unit vector [3] towards the mean of a light's bright parts, in the world: weighted by squared luminance."""
+    luminance = downsize(light.radiance, *_COARSE).astype(np.float64) @ REC709_LUMINANCE
+    weights = (luminance / max(luminance.max(), 1e-30)) ** 2 * texel_solid_angles(*_COARSE)
+    mean = light.rotation @ np.einsum("hw,hwc->c", weights, texel_directions(*_COARSE))
+    return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-30))
+
+
 def texel_directions(height: int, width: int) -> Floats:
     """[H, W, 3], the unit direction of every texel's centre in the light's frame."""
     azimuth = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi

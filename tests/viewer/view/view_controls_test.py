@@ -9,6 +9,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import brightest_direction
 from rnd_viewer.inputs.cameras import file_path
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
@@ -22,6 +24,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="nee
 DRAWN = "rnd.frame().then(() => 1)"
 PANE = "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.querySelector('.pane'))"
 FINGER = 44  # px
+# mean column of what is as yellow as the sun of the small sphere, also seen through it
+SUN_COLUMN = """(() => {
+    const { width, height } = gizmo, { data } = gizmo.getContext("2d").getImageData(0, 0, width, height);
+    let count = 0, sum = 0;
+    for (let k = 0; k < width * height; k++)
+        if (data[4 * k] > data[4 * k + 2] + 15) { count += 1; sum += k % width; }
+    return sum / count;
+})()"""
 TARGETS = """[...document.querySelectorAll("button, select, input:not([type=file]):not([type=checkbox]), label.check")]
     .map((part) => [part.id, part.getBoundingClientRect()]).filter(([, { width }]) => width > 0)
     .map(([name, { width, height }]) => [name, Math.min(width, height)])"""
@@ -180,6 +190,23 @@ def test_a_phone_is_worked_by_thumb_and_finger(page, tmp_path):
     _touch(page, "touchMove", (200, 200))
     _touch(page, "touchEnd")
     assert page.run("rnd.state.azimuth") == pytest.approx(before["azimuth"] - 0.5)
+
+
+def test_the_sun_of_the_small_sphere_is_dragged(page):
+    """It is where the light is brightest, follows the pointer on both sides of the sphere, and moves no camera."""
+    sun = page.run("rnd.frame().then(({ sun }) => sun)")
+    np.testing.assert_allclose(sun, brightest_direction(load_light(ASSETS / "sky.exr")), atol=1e-6)
+    left, top, side = page.run("(({ left, top, width }) => [left, top, width])(gizmo.getBoundingClientRect())")
+    for preset, sign in (("front", -1), ("back", 1)):  # the sun of the sky is in front of the body
+        _click(page, f"[data-preset={preset}]")
+        page.run(f"rnd.state.yaw = 0; {DRAWN}")
+        before, view = page.run(SUN_COLUMN), page.run("[rnd.state.azimuth, rnd.state.distance]")
+        page.drag((left + side / 2, top + side / 2), (10, 0))
+        page.run(DRAWN)
+        assert page.run("rnd.state.yaw") == pytest.approx(sign * 10 / (0.72 * side / 2))
+        assert page.run(SUN_COLUMN) > before + 5 and page.run("[rnd.state.azimuth, rnd.state.distance]") == view
+    _click(page, "#undo")
+    assert page.run("rnd.state.yaw") == 0
 
 
 def test_every_control_has_a_name(page):

@@ -29,6 +29,7 @@ from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_runtime.motion.motion import load_motion, save_motion
 from rnd_runtime.shading.files.load import load_light
+from rnd_runtime.shading.light import brightest_direction
 from rnd_viewer.play.cli import main as play
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
@@ -460,6 +461,23 @@ def test_addresses_name_files_of_any_name(address, tmp_path):
         assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
         assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
         assert browser.run("rnd.state.light") == 1  # the first that is named, as in rnd-view
+
+
+def test_an_address_with_missing_files_names_each_and_the_example_opens(address, tmp_path):
+    with chromium(tmp_path, webgl=True) as browser:
+        browser.open(f"{address}?avatar=nobody.onnx&motion=walk.npz&hdr=sky.exr,night.hdr")
+        browser.wait("document.querySelector('#message.wrong')")
+        said = browser.run("document.getElementById('message').textContent")
+        assert [part.split(":")[0] for part in said.split(" · ")] == ["nobody.onnx", "night.hdr"] and "404" in said
+        browser.messages.clear()  # Chromium logs the missing files too
+        browser.run("document.querySelector('#files a').click()")
+        browser.wait("window.rnd && rnd.scene()")
+        sun = browser.run("rnd.frame().then(({ sun }) => sun)")
+        np.testing.assert_allclose(sun, brightest_direction(load_light(ASSETS / "sky.exr")), atol=1e-5)
+        assert browser.run("[rnd.state.width, rnd.state.height]") == browser.run(
+            "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.querySelector('.pane'))"
+        )
+        assert browser.messages == []
 
 
 def test_without_webgl_the_reason_stays(address, site, tmp_path):

@@ -29,7 +29,7 @@ from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, ground_share
 from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.files.load import load_light
-from rnd_runtime.shading.light import Light, downsize, light_notes
+from rnd_runtime.shading.light import Light, brightest_direction, downsize, light_notes
 from rnd_runtime.shading.shader import Shader
 from rnd_viewer.inputs.background import Background
 from rnd_viewer.inputs.options import parse_gain
@@ -80,6 +80,7 @@ class Scene:
         self._light = lru_cache(1)(self._load_light)  # in full: only until its shaders are built
         self._sky = lru_cache(MAX_SHADERS // 2)(self._smaller_light)
         self._light_notes: dict[str | Path | None, list[str]] = {}
+        self._suns: dict[str | Path | None, list[float]] = {}
         self._background: tuple[tuple[Any, ...], Floats32] | None = None
         self._posed: tuple[Motion, float, PosedAvatar] | None = None
         self._ground_light = lru_cache(MAX_SHADERS)(self._build_ground_light)
@@ -155,6 +156,10 @@ class Scene:
     def notes_of_light(self, state: ViewState) -> list[str]:
         """Notes on the light of a rendered ``state``."""
         return self._light_notes[self._light_name(state)]
+
+    def sun_of_light(self, state: ViewState) -> list[float]:
+        """Where the light of a rendered ``state`` is brightest, a unit vector at yaw 0."""
+        return self._suns[self._light_name(state)]
 
     def truth_file(self, index: int) -> Path:
         """The capture's image ``index``."""
@@ -249,7 +254,7 @@ class Scene:
 
     def _load_light(self, name: str | Path | None) -> Light:
         light = self._read_light(name)
-        self._light_notes[name] = light_notes(light)
+        self._light_notes[name], self._suns[name] = light_notes(light), brightest_direction(light).tolist()
         return light
 
     def _read_light(self, name: str | Path | None) -> Light:

@@ -224,7 +224,7 @@ class _Visitor:
             state = replace(state, width=width, height=height)
         with self._rendering:
             view = scene.render(state)
-            notes = scene.notes_of_light(state)
+            notes, sun = scene.notes_of_light(state), scene.sun_of_light(state)
         pixels, encoding_ms = encode(view.srgb, state.encoding)
         header = {
             "kind": "frame",
@@ -234,6 +234,7 @@ class _Visitor:
             "encoding": state.encoding,
             "joints": view.joints.astype(np.float64).round(2).tolist(),
             "notes": notes,
+            "sun": sun,
             "times": {name: 1e3 * seconds for name, seconds in view.seconds.items()} | {"encoding": encoding_ms},
         }
         self._send(socket, header, pixels)

@@ -73,6 +73,7 @@ export const MAX_EXPOSURE = 1e+30;
 // rnd_runtime.shading.light
 export const REC709_LUMINANCE = [0.2126, 0.7152, 0.0722];
 export const DIM = 0.001;
+export const COARSE = [32, 64];
 // rnd_runtime.shading.brdf
 export const F0 = 0.04;
 export const ROUGHNESS_RANGE = [0.09, 0.99];

@@ -5,7 +5,7 @@ import { Avatar } from "./posing/avatar.js";
 import { cameraOf } from "../../rnd_viewer/view/page/camera.js";
 import { homeView, inFrame, projectJoints } from "./camera.js";
 import { inFile, refusal } from "./errors.js";
-import { downsize, lightNotes, readLight } from "./shading/light.js";
+import { brightestDirection, downsize, lightNotes, readLight } from "./shading/light.js";
 import { fitMotion, restMotion } from "./motion/motion.js";
 import { readMotionFile } from "./files/motion_files.js";
 import { fineView } from "./raster/far.js";
@@ -59,7 +59,7 @@ async function take({ name, bytes }, next, opened) {
   } else throw refusal("kind of file", { expected: ".onnx, .npz, .hdr or .exr", got: `.${kind}`, file: name });
 }
 
-const lightEntry = (name, light) => ({ name, light, notes: lightNotes(light), shaders: new Map() });
+const lightEntry = (name, light) => ({ name, light, notes: lightNotes(light), sun: brightestDirection(light), shaders: new Map() });
 
 /** The scene for the page; `light` is the index of the new light, undefined if unchanged. */
 function description({ avatar, motion, lights }, light) {
@@ -96,8 +96,8 @@ async function render({ number, state }) {
   const image = splatter.canvas.transferToImageBitmap();
   clock("splatting");
   const joints = projectJoints(gaussians.joints, camera);
-  const { notes } = scene.lights[state.light];
-  const answer = { kind: "frame", number, width: state.width, height: state.height, image, joints, notes, times: clock.times };
+  const { notes, sun } = scene.lights[state.light];
+  const answer = { kind: "frame", number, width: state.width, height: state.height, image, joints, notes, sun, times: clock.times };
   postMessage(answer, [image]);
 }
 

@@ -3,6 +3,7 @@
 import { fitted } from "./camera.js";
 import { connect } from "./engine.js";
 import { Fit } from "./fit.js";
+import { lightGizmo } from "./gizmo.js";
 import { orbit, wrapped } from "./orbit.js";
 import { drawSkeleton } from "./skeleton.js";
 import { bindViews } from "./views.js";
@@ -29,6 +30,7 @@ let joints = [];  // of the last frame, px of the state's size
 const fit = new Fit($("stage").firstElementChild, state, redraw);
 
 const views = bindViews(state, { scene: () => scene, joints: () => joints, redraw, say, download });
+const drawLight = lightGizmo($("gizmo"), state, views.remember, redraw);
 
 function redraw() {
   wanted = true;
@@ -72,6 +74,8 @@ function show(frame) {
   frame.image.close?.();
   drawSkeleton($("overlay"), frame, scene.parents, $("skeleton").checked);
   showNotes(frame.notes);
+  $("gizmo").hidden = state.truth !== null || !frame.sun;
+  if (frame.sun) drawLight(frame.sun);
   joints = frame.joints.map(([x, y, z]) => [x * state.width / frame.width, y * state.height / frame.height, z]);
   const now = performance.now();
   if (flying.size) fit.observe(now - Math.max(shownAt, sent));

@@ -1,6 +1,6 @@
 // Lat-long, linear light probes: read, repair, downsize (rnd_runtime/shading/light.py, shading/files/load.py).
 
-import { DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
+import { COARSE, DIM, MAX_EXPOSURE, REC709, REC709_LUMINANCE, SAME_COLOUR } from "../constants.js";
 import { refusal, short } from "../errors.js";
 import { readExr } from "../files/exr.js";
 
@@ -122,6 +122,18 @@ function repair(light) {
     holes = holes.filter((k) => !done.has(k));
   }
   return light;
+}
+
+/** The mean of the bright parts, texels weighted by squared luminance: a unit vector in the light's frame. */
+export function brightestDirection(light) {
+  const { height, width, radiance } = downsize(light, ...COARSE);
+  const directions = texelDirections(height, width), angles = texelSolidAngles(height, width), mean = [0, 0, 0];
+  for (let k = 0; k < height * width; k++) {
+    const luminance = REC709_LUMINANCE.reduce((sum, share, c) => sum + share * radiance[3 * k + c], 0);
+    for (let c = 0; c < 3; c++) mean[c] += luminance ** 2 * angles[Math.floor(k / width)] * directions[3 * k + c];
+  }
+  const length = Math.max(Math.hypot(...mean), 1e-300);
+  return mean.map((x) => x / length);
 }
 
 /** Unit directions [H·W·3] of all texels' centres in the light's frame. */
