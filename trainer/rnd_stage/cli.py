@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from rnd_runtime.cli.command import finish, log, option, parse, run_command
+from rnd_runtime.cli.jobs import On, run_jobs, workers
 from rnd_runtime.cli.progress import Progress
-from rnd_runtime.core.errors import InputError
+from rnd_runtime.core.errors import InputError, refuse_changed
 
 from .film.plan import Recipe
 from .variants import Variant, need_extra, use_variant
@@ -32,15 +33,37 @@ class StageOptions:
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]
     """folder for the capture; existing images stay"""
     recipe: Annotated[Recipe, tyro.conf.arg(name="")] = field(default_factory=Recipe)
+    subjects: Annotated[tuple[int, ...], option("N ...")] = ()
+    """several people instead of --subject, each into OUT/subjectN"""
     shard: str = "0/1"
     """K/N: render only the instants K, K+N, K+2N …; the last shard to end writes capture.json"""
     variant: Variant = "auto"
     """Mitsuba's back end; auto takes LLVM where it works"""
+    on: On = None
+    """render people on N processes of this machine, or on the workers of a Dask scheduler (extra [dask])"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``rnd-stage``."""
-    return run_command("rnd-stage", lambda: stage(parse(StageOptions, "rnd-stage", arguments)))
+    return run_command("rnd-stage", lambda: _stage_all(parse(StageOptions, "rnd-stage", arguments)))
+
+
+def _stage_all(options: StageOptions) -> None:
+    """Render each person, here or on workers."""
+    each = [options]
+    if options.subjects:
+        refuse_changed(options.recipe, ["subject", "character"], "--subjects has the people")
+        recipes = {f"subject{seed}": replace(options.recipe, subject=seed) for seed in dict.fromkeys(options.subjects)}
+        each = [replace(options, out=options.out / name, recipe=recipe) for name, recipe in recipes.items()]
+    if options.on is None:
+        for one in each:
+            stage(one)
+        return
+    need_extra()
+    with workers(options.on) as client:
+        run_jobs(client, stage, [(one,) for one in each], name="people")
+    for one in each:
+        finish(one.out)
 
 
 def stage(options: StageOptions) -> None:

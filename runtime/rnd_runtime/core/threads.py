@@ -8,8 +8,9 @@ from .errors import InputError
 
 
 def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that this process may use, at most NUMBA_NUM_THREADS."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(count, int(os.environ.get("NUMBA_NUM_THREADS") or count))
 
 
 def max_threads() -> int:

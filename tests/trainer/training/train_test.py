@@ -25,7 +25,7 @@ from rnd_runtime.capture.capture import CaptureLight, load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.commands.eval import EvalOptions, evaluate_run
-from rnd_trainer.commands.train import Learning
+from rnd_trainer.commands.train_options import Learning, TrainOptions
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.losses import linear_to_srgb
 from rnd_trainer.losses.perceptual import load_features, load_lpips
@@ -297,7 +297,7 @@ def _half_of(folder: Path) -> Path:
 def test_a_training_is_scored_in_its_refined_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
     scored: list[EvalOptions] = []
     monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
-    options = rnd_trainer.commands.train.TrainOptions(Path("capture"), learning=Learning(**changes))
+    options = TrainOptions(Path("capture"), learning=Learning(**changes))
     rnd_trainer.commands.train._score_after_training(
         SimpleNamespace(capture=tiny_capture, config=TrainConfig()), tmp_path, options
     )

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from rnd_runtime.capture.capture import capture_file, load_capture
 from rnd_runtime.cli.command import log, warn
+from rnd_runtime.cli.jobs import run_jobs, workers
 from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError, check_option
 from rnd_runtime.core.files import output_file, output_folder, refuse_input, write_json
@@ -48,14 +49,21 @@ def run_trainings(options: Trainings) -> None:
     config = resized(preset(options.preset), options.gaussians, options.steps)
     config = dataclasses.replace(config, image_scale=options.image_scale)
     check_sizes(config)
-    rows = time_encoders(_trained(options, config, variants), options.run, variants, seed=0)
+    seeds = range(options.seeds)
+    if options.on is not None:
+        jobs = [(options, config, [variant], [seed]) for seed in seeds for variant in variants]
+        with workers(options.on) as client:
+            run_jobs(client, train_variants, jobs, name="trainings")
+    rows = time_encoders(train_variants(options, config, variants, seeds), options.run, variants, seed=0)
     summary = summarise(rows, variants)
     if options.json is not None:
         write_json(options.json, {"summary": summary, "rows": rows})
     _show(summary, type(options).__name__.lower())
 
 
-def _trained(options: Trainings, config: TrainConfig, variants: Sequence[StudyRow]) -> list[dict[str, Any]]:
+def train_variants(
+    options: Trainings, config: TrainConfig, variants: Sequence[StudyRow], seeds: Sequence[int]
+) -> list[dict[str, Any]]:
     """Scores of every variant and seed; missing ones are trained."""
     capture = load_capture(options.capture, motion_file=options.motion)
     check_needs(variants, capture)
@@ -65,7 +73,7 @@ def _trained(options: Trainings, config: TrainConfig, variants: Sequence[StudyRo
     if perceptual is None:
         warn("no --perceptual-weights: no LPIPS, and without --consistency-weights no L_gc")
     with Progress() as progress:
-        progress.phase("trainings", len(variants) * options.seeds)
+        progress.phase("trainings", len(variants) * len(seeds))
 
         def on_run(name: str, seed: int, done: float, total: int) -> None:
             progress.update(done, step=f"{name}, seed {seed}, {done:.2f}/{total}")
@@ -75,7 +83,7 @@ def _trained(options: Trainings, config: TrainConfig, variants: Sequence[StudyRo
             config,
             options.run,
             variants,
-            seeds=range(options.seeds),
+            seeds=seeds,
             perceptual=perceptual,
             consistency=load_features(options.consistency_weights),
             mode=options.shade,

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from rnd_runtime.cli.command import Count, Number, OptionalCount, OptionalFile, option
+from rnd_runtime.cli.jobs import On
 from rnd_runtime.core.errors import check_option, flag
 from rnd_stage.film.plan import Recipe
 from rnd_stage.variants import Variant
@@ -44,6 +45,8 @@ class Trainings:
     """as of rnd-train; adds the LPIPS column"""
     consistency_weights: OptionalFile = None
     """as of rnd-train"""
+    on: On = None
+    """train on N processes of this machine, or on the workers of a Dask scheduler (extra [dask])"""
 
 
 @dataclass(frozen=True)

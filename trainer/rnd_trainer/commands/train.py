@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
-import tyro
-
-from rnd_runtime.cli.command import (
-    Count,
-    Flag,
-    Folder,
-    OptionalCount,
-    OptionalFile,
-    OptionalNumber,
-    finish,
-    group,
-    log,
-    option,
-    parse,
-    run_command,
-    show,
-    warn,
-)
+from rnd_runtime.cli.command import finish, log, parse, run_command, show, warn
+from rnd_runtime.cli.jobs import run_jobs, workers
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.cli.progress import Progress
 from rnd_runtime.core.errors import InputError, check_option, refuse_changed
@@ -37,6 +21,7 @@ from rnd_runtime.core.files import existing_file, output_folder, write_json
 
 from .console import log_all, need_extra
 from .eval import EvalOptions, evaluate_run
+from .train_options import TrainOptions
 
 if TYPE_CHECKING:
     from rnd_trainer.config import TrainConfig
@@ -48,89 +33,73 @@ PREVIEWS = 3
 UNKNOWN = {"view": "rnd-view RUN shows a training while it runs"}
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Schedule and device."""
-
-    preset: Literal["quick", "standard", "full"] = "standard"
-    """Some seven minutes, half an hour, or hours on two cores."""
-    steps: OptionalCount = None
-    """Steps with an image. Default: 6000 (quick: 2000). The third stage adds 3/8 as many short steps (quick: 1/2)."""
-    gaussians: OptionalCount = None
-    """Number of Gaussians. Default: 30000 (quick: 12000)."""
-    image_scale: OptionalNumber = None
-    """Shrink the training images by this factor."""
-    save_every: OptionalCount = None
-    """Steps between saved states, from which --resume continues. Default: the preset's."""
-    seed: Count = 0
-    """Seed of all random numbers."""
-    device: Annotated[str, option("cpu|cuda[:N]")] = "cpu"
-    """cuda trains on a GPU with gsplat as the rasteriser (extra [cuda])."""
-
-
-@dataclass(frozen=True)
-class Learning:
-    """Losses, poses and motion."""
-
-    perceptual_weights: OptionalFile = None
-    """AlexNet, SqueezeNet or VGG16 (.safetensors or .pth): adds the LPIPS and consistency losses."""
-    consistency_weights: OptionalFile = None
-    """Another of them, or its first blocks, for the consistency loss."""
-    unseen_poses: bool = True
-    """Teach the skinning out-of-distribution poses after the images."""
-    hold_out: Flag = False
-    """Leave every fifth training frame out and score those alone: what choices are made by."""
-    skin: OptionalCount = None
-    """Tone of the skin, 1 (palest) to 6 (darkest) by Fitzpatrick: how bright albedo is against light."""
-    hdr: OptionalFile = None
-    """Light probe of the place where the images were taken, .exr or .hdr: its yaw and exposure are found."""
-    grey_card: Annotated[str | None, option("FRAME:X,Y")] = None
-    """A pixel of a training image that shows an 18 % grey card: fixes colour and level of the light."""
-    refine_poses: Flag = False
-    """Correct the capture's body poses while training; writes refined_motion.npz."""
-    motion: Annotated[str | None, option("FILE")] = None
-    """Another motion file of the capture."""
-
-
-@dataclass(frozen=True)
-class Ablations:
-    """Oracles and ablations, for studies."""
-
-    light: Literal["learn", "capture", "none"] = "learn"
-    """capture: under the capture's own light map; none: plain colours, an avatar that cannot be relit."""
-    normals: Literal["estimated", "true"] = "estimated"
-    """true: the capture's exact normals."""
-    probe_channels: Literal[1, 3] = 3
-    """1: a grey light."""
-    visibility: Literal["pose", "paper", "none"] = "pose"
-    """paper: visibility towards the camera, as printed; none: no shadows. Not exported."""
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """Learn an avatar from one monocular capture, or from a video of one person.
-
-    rnd-train me.mp4 --out runs/me
-    """
-
-    capture: Annotated[tyro.conf.Positional[Path], option("CAPTURE|VIDEO")]
-    """Folder with capture.json; a video is first imported into OUT/capture."""
-    out: Folder = Path("runs/avatar")
-    """Folder for avatar.ckpt, previews/, metrics.jsonl, status.json and config.json."""
-    resume: Flag = False
-    """Continue a stopped training in OUT."""
-    schedule: Annotated[Schedule, *group("schedule")] = field(default_factory=Schedule)
-    learning: Annotated[Learning, *group("learning")] = field(default_factory=Learning)
-    ablations: Annotated[Ablations, *group("oracles and ablations")] = field(default_factory=Ablations)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of ``rnd-train``."""
-    return run_command("rnd-train", lambda: _train(parse(TrainOptions, "rnd-train", arguments, unknown=UNKNOWN)))
+    return run_command("rnd-train", lambda: _train_all(parse(TrainOptions, "rnd-train", arguments, unknown=UNKNOWN)))
+
+
+def _train_all(options: TrainOptions) -> None:
+    """Train on each capture, here or on workers."""
+    need_extra()
+    every = list(_each(options)) if options.more else [options]
+    left = [one for one in every if not (options.skip_existing and _has_finished(one.out))]
+    for one in left:
+        _refuse_begun(one)
+    if options.on is None:
+        for one in left:
+            _train(one)
+        return
+    with workers(options.on) as client:
+        run_jobs(client, train_job, [(one,) for one in left], name="trainings")
+    for one in left:
+        finish(one.out / "avatar.ckpt")
+
+
+def _each(options: TrainOptions) -> Iterator[TrainOptions]:
+    """The options of each of several trainings."""
+    captures = [options.capture, *options.more]
+    names = [(path.parent if path.name == "capture.json" else path).resolve().stem for path in captures]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        expected = "captures of different names, each trained into OUT/NAME"
+        raise InputError("CAPTURE", expected=expected, got=f"two of {', '.join(twice)}")
+    for capture, name in zip(captures, names):
+        out = options.out / name
+        resume = options.resume and _has_begun(out)
+        yield dataclasses.replace(options, capture=capture, more=(), out=out, resume=resume)
+
+
+def train_job(options: TrainOptions) -> None:
+    """Train in a worker; what was lost with its worker goes on from its last state."""
+    _train(dataclasses.replace(options, resume=_has_begun(options.out)))
+
+
+def _has_begun(folder: Path) -> bool:
+    """Whether there is a state to resume from."""
+    from rnd_trainer.training.state import STATE_FILE
+
+    return (folder / STATE_FILE).exists()
+
+
+def _has_finished(folder: Path) -> bool:
+    from rnd_trainer.training.run import STATUS_FILE
+
+    file = folder / STATUS_FILE
+    return file.is_file() and json.loads(file.read_text(encoding="utf-8")).get("ended") == "finished"
+
+
+def _refuse_begun(options: TrainOptions) -> None:
+    """Raise ``InputError`` for a folder with a training unless it is resumed, and for one that cannot be."""
+    from rnd_trainer.training.state import STATE_FILE
+
+    folder, begun = options.out, _has_begun(options.out)
+    if options.resume:
+        existing_file(folder / STATE_FILE, what="state of a training to resume")
+    elif begun or (folder / "avatar.ckpt").exists():
+        hint = ("--resume continues it; or " if begun else "") + "choose another --out"
+        raise InputError("holds a training already", file=folder, hint=hint)
 
 
 def _train(options: TrainOptions) -> None:
-    need_extra()
     from rnd_runtime.capture.capture import load_capture
     from rnd_trainer.config import to_dict
     from rnd_trainer.losses.perceptual import load_features, load_lpips
@@ -141,12 +110,6 @@ def _train(options: TrainOptions) -> None:
 
     config, device, learning = _config(options), _device(options.schedule.device), options.learning
     folder = options.out
-    state = folder / STATE_FILE
-    if not options.resume and (state.exists() or (folder / "avatar.ckpt").exists()):
-        hint = ("--resume continues it; or " if state.exists() else "") + "choose another --out"
-        raise InputError("holds a training already", file=folder, hint=hint)
-    if options.resume:
-        existing_file(state, what="state of a training to resume")
     options = dataclasses.replace(options, capture=_capture_folder(options.capture, folder))
     capture = load_capture(options.capture, motion_file=learning.motion)
     log_all(capture_notes(capture, ["train"] if config.light == "capture" else []))
@@ -155,7 +118,7 @@ def _train(options: TrainOptions) -> None:
     with _memory_error_in_one_line():
         training = Training(capture, config, perceptual, device, consistency=features, known=known)
     if options.resume:
-        resume_training(training, state)
+        resume_training(training, folder / STATE_FILE)
     with folder_lock(output_folder(folder), "rnd-train"):
         write_json(folder / "config.json", to_dict(config))
         if perceptual is None:

@@ -21,6 +21,7 @@ from rnd_runtime.cli.command import (
     group,
     option,
 )
+from rnd_runtime.cli.jobs import On
 from rnd_runtime.core.errors import InputError, check_cull, check_option, flag, refuse_changed, refuse_outside
 from rnd_runtime.core.images import Tone
 from rnd_runtime.motion.edit import EDIT_LIMITS, MotionEdits, edit_motion
@@ -250,6 +251,10 @@ class PlayOptions:
     """Store colours of an .exr as half floats."""
     colorspace: Annotated[Literal["rec709", "acescg"], option()] = "rec709"
     """Primaries of the colours of an .exr, all linear."""
+    on: On = None
+    """Render parts of the run on N processes of this machine, or on the workers of a Dask scheduler (extra [dask])."""
+    skip_existing: Flag = False
+    """Leave frames that are there already; of a clip, those of a stopped run with --on."""
     doctor: Flag = False
     """Print renderer, providers, threads and versions, and what to install for what is missing."""
     reading: MotionGroup = field(default_factory=MotionOptions)

@@ -6,20 +6,18 @@ import math
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from rnd_runtime import __version__
 from rnd_runtime.avatar.avatar import Encoded
 from rnd_runtime.avatar.networks import Networks
-from rnd_runtime.cli.command import finish, is_quiet, log, size_text, warn
+from rnd_runtime.cli.command import finish, log, warn
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.cli.progress import track
 from rnd_runtime.core.camera import Camera
@@ -46,18 +44,17 @@ from rnd_viewer.inputs.scenes import PersonRecord, is_scene, read_scene
 from .cast import load_people
 from .exr import ExrWriter
 from .given import GivenFeatures
+from .parts import in_parts
 from .pipeline import run
-from .run_folder import is_of_a_run, mark_of, part_name, refuse_others
+from .run_folder import common_settings, is_of_a_run, mark_of, part_name, refuse_others, settings_of
 from .sampling import Sampling
-from .timing import StageTimes
-from .video import clip_notes
-from .writers import frame_writer, parse_formats, tone_map_for
+from .timing import StageTimes, show_times
+from .video import CLIPS, clip_notes
+from .writers import frame_writer, is_written, join_clips, parse_formats, tone_map_for
 
 FRAME = "frame to frame"
 LATENCY = "pose to pixels"
 _DEFAULT_SIZE = 512, None
-_OWN_TO_A_PROCESS = {"frames", "threads", "format", "raster"}  # options that may differ between parts of a run
-_FILES = {"avatar", "motion", "hdr", "joint_map"}  # a run is identified by their content
 
 
 def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
@@ -73,12 +70,20 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
     for note in playing.notes:
         warn(note)
     with _claimed(playing.mark):
-        seconds = playing.render()
+        seconds = playing.render() if options.on is None else playing.render_on_workers()
         if not playing.in_view:
             playing.notes.append("nothing of the avatar is in view in any of these frames")
             warn(playing.notes[-1])
         playing.report(seconds)
     return 0
+
+
+def render_part(options: PlayOptions) -> tuple[bool, dict[str, list[float]]]:
+    """Render the frames of a part of a run with ``--on``: whether anything is in view, and the stages' times."""
+    part = _Run.of(options, None)
+    with _claimed(part.mark):
+        part.render()
+    return part.in_view, part.times.seconds
 
 
 class _Pending(NamedTuple):
@@ -126,6 +131,9 @@ class _Run:
             parse_aovs(options.aov),
             parse_formats(options.format),
         )
+        if options.skip_existing and options.on is None and {*formats} & {*CLIPS}:
+            hint = "a clip is made from its first frame on; with --on its frames are kept"
+            raise InputError("--skip-existing", expected="--format png,exr", got=",".join(formats), hint=hint)
         set_threads(rendering.threads)
         times = StageTimes()
         with times.stage("load"):
@@ -145,7 +153,7 @@ class _Run:
             for path in inputs:
                 if is_of_a_run(path, out):
                     raise InputError("cannot be an input: runs write such files into --out", file=path)
-            mark = mark_of(out, _common(options), inputs)
+            mark = mark_of(out, common_settings(options), inputs)
             with _claimed(mark):
                 pass  # before what takes long
             if kernels_are_cold():
@@ -210,26 +218,52 @@ class _Run:
         return self.camera_at(number, number / self.fps)
 
     def render(self) -> float:
-        """Write every frame into the folder; seconds that it took."""
+        """Write every frame into the folder, with ``--on`` clips ``to_join``; seconds that it took."""
 
         def begin(number: int) -> None:
             self.mark.touch()  # not before: a run that fails at once leaves the folder as it was
 
         exr = ExrWriter(self.fps, self.options.half, self.options.colorspace, parts=self.renderer.avatar.skeleton.names)
         clips = frame_writer(
-            self.out, self.formats, name=self.name, fps=self.fps, times=self.times, begin=begin, exr=exr
+            self.out,
+            self.formats,
+            name=self.name,
+            fps=self.fps,
+            times=self.times,
+            begin=begin,
+            exr=exr,
+            to_join=self.options.on is not None,
         )
+        frames = self._missing(self.frames)
+        self.in_view = len(frames) < len(self.frames)
         with self.renderer, clips as write:
             started = before = perf_counter()
 
             def put(number: int, rendered: tuple[RenderedFrame, Camera]) -> None:
                 write(number, rendered[0], _reach(self.framing, rendered[1]), rendered[1])
 
-            for _ in track("rendering", run(self.frames, self._encode, self._draw, put), len(self.frames)):
+            for _ in track("rendering", run(frames, self._encode, self._draw, put), len(frames)):
                 now = perf_counter()
                 self.times.add(FRAME, now - before)
                 before = now
         return perf_counter() - started
+
+    def render_on_workers(self) -> float:
+        """As ``render``, in parts on the workers of ``--on``."""
+        self.renderer.close()
+        started = perf_counter()
+        done = in_parts(render_part, self.options, self.formats, self.frames, self._missing)
+        self.in_view = not done or any(in_view for in_view, _ in done)
+        for _, times in done:
+            self.times.extend(times)
+        join_clips(self.out, self.formats, self.frames, name=self.name, fps=self.fps)
+        return perf_counter() - started
+
+    def _missing(self, frames: range) -> Sequence[int]:
+        """Those of ``frames`` to render: all, or with ``--skip-existing`` those without files."""
+        if not self.options.skip_existing:
+            return frames
+        return [number for number in frames if not is_written(self.out, self.formats, self.aovs, number)]
 
     def _encode(self, number: int) -> _Pending:
         asked = perf_counter()
@@ -268,7 +302,7 @@ class _Run:
         summary = self.times.summary()
         report = {
             "version": __version__,
-            "settings": _settings(self.options),
+            "settings": settings_of(self.options),
             "frames": [self.frames.start, self.frames.stop],
             "fps": self.fps,
             "size": [camera.width, camera.height],
@@ -279,7 +313,7 @@ class _Run:
             "times": summary,
         }
         write_json(self.out / f"{self.name}.json", report)
-        _print_times(summary)
+        show_times(summary)
         rate = len(self.frames) / seconds
         made = f"{len(self.frames)} frames of {camera.width}x{camera.height}, {rate:.1f} frames/s"
         finish(self.out, f"{made} ({raster}, {self.options.rendering.shade})")
@@ -291,30 +325,6 @@ def _claimed(mark: Path) -> Iterator[None]:
     with folder_lock(mark.parent, "rnd-play", shared_by=mark.name):
         refuse_others(mark)
         yield
-
-
-def _print_times(summary: dict[str, dict[str, float]]) -> None:
-    table = Table("stage", box=None, pad_edge=False)
-    for heading in ("median ms", "p95 ms", "total s"):
-        table.add_column(heading, justify="right")
-    for name, row in summary.items():
-        table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
-    Console(quiet=is_quiet()).print(table)
-
-
-def _common(options: PlayOptions) -> dict[str, object]:
-    """The settings that all processes of one run share, beside its ``_inputs``."""
-    settings = _settings(options)
-    if options.view.camera not in OWN_CAMERAS:
-        settings["camera"] = split_camera(options.view.camera)[1]
-    return {key: value for key, value in settings.items() if key not in _OWN_TO_A_PROCESS | _FILES}
-
-
-def _settings(options: PlayOptions) -> dict[str, object]:
-    """The options as JSON has them, without the folder: two runs into two folders give the same report."""
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in options.settings().items()}
-    values["size"] = None if options.size is None else size_text(options.size)
-    return {name: value for name, value in values.items() if name not in ("out", "doctor")}
 
 
 def _motion_notes(motions: Sequence[Motion], fps: float) -> list[str]:

@@ -12,12 +12,32 @@ import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from rnd_runtime.cli.command import size_text
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import sha256_of
+from rnd_viewer.inputs.cameras import split_camera
+from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions
 
 _FOLDERS = ("frames/[!.]*", "frames_exr/[!.]*", "aov/*/[!.]*")
 _CLIP = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp|webm|mov)")
 _OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/\d{{6,}}\.(png|exr)|{_CLIP.pattern}")
+_OWN_TO_A_PROCESS = {"frames", "threads", "format", "raster"}  # options that may differ between parts of a run
+_FILES = {"avatar", "motion", "hdr", "joint_map"}  # a run is identified by their content
+
+
+def common_settings(options: PlayOptions) -> dict[str, object]:
+    """The settings that all processes of one run share, beside its ``_inputs``."""
+    settings = settings_of(options)
+    if options.view.camera not in OWN_CAMERAS:
+        settings["camera"] = split_camera(options.view.camera)[1]
+    return {key: value for key, value in settings.items() if key not in _OWN_TO_A_PROCESS | _FILES}
+
+
+def settings_of(options: PlayOptions) -> dict[str, object]:
+    """The options as JSON has them, without the folder: two runs into two folders give the same report."""
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in options.settings().items()}
+    values["size"] = None if options.size is None else size_text(options.size)
+    return {name: value for name, value in values.items() if name not in ("out", "doctor", "on", "skip_existing")}
 
 
 def mark_of(folder: Path, settings: Mapping[str, object], inputs: Iterable[Path]) -> Path:

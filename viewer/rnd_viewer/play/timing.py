@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from rnd_runtime.cli.command import is_quiet
 
 
 class StageTimes:
@@ -26,6 +30,11 @@ class StageTimes:
         """Record one run of stage ``name`` that was timed elsewhere."""
         self.seconds.setdefault(name, []).append(seconds)
 
+    def extend(self, seconds: Mapping[str, Sequence[float]]) -> None:
+        """Record the runs of stages that another process timed."""
+        for name, runs in seconds.items():
+            self.seconds.setdefault(name, []).extend(runs)
+
     def summary(self) -> dict[str, dict[str, float]]:
         """``{stage: {"runs", "median_ms", "p95_ms", "total_s"}}``."""
         return {
@@ -37,3 +46,13 @@ class StageTimes:
             }
             for name, runs in self.seconds.items()
         }
+
+
+def show_times(summary: Mapping[str, Mapping[str, float]]) -> None:
+    """Print a table of ``StageTimes.summary``; nothing under ``--quiet``."""
+    table = Table("stage", box=None, pad_edge=False)
+    for heading in ("median ms", "p95 ms", "total s"):
+        table.add_column(heading, justify="right")
+    for name, row in summary.items():
+        table.add_row(name, f"{row['median_ms']:.1f}", f"{row['p95_ms']:.1f}", f"{row['total_s']:.2f}")
+    Console(quiet=is_quiet()).print(table)

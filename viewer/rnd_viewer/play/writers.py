@@ -8,12 +8,14 @@
     out/play.mp4, .webm, …       clips; WebP, WebM (VP9) and MOV (ProRes 4444) are transparent where the PNG is
     out/play.json                settings, notes, stage times
     out/play_000010-000050.*     the same of a part of a run, see ``play.run_folder``
+    out/.mp4/000010.png          a frame of a clip that is joined when all parts are done
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterator
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
-from rnd_runtime.core.images import write_image
+from rnd_runtime.core.images import read_image, write_image
 from rnd_runtime.playback.aov import aov_image
 from rnd_runtime.playback.frame import RenderedFrame
 
@@ -70,20 +72,21 @@ def frame_writer(
     times: StageTimes,
     begin: Callable[[int], None] = lambda number: None,
     exr: ExrWriter | None = None,
+    to_join: bool = False,
 ) -> Iterator[FrameWriter]:
     """Yield ``write(number, frame, reach, camera)``, which puts one frame into ``folder`` in all of ``formats``.
 
     ``reach`` is the range of depths in metres that the depth image spans, ``camera`` that of the frame. AOVs go into
     the EXR if there is one, and into images of their own if PNG is asked for or there is no EXR. Clips, called
-    ``name``, appear at the end. ``begin(number)`` is called when the clips have taken a frame, which they may refuse,
-    and before any file of it is written.
+    ``name``, appear at the end, or by ``join_clips`` if they are ``to_join``. ``begin(number)`` is called when the
+    clips have taken a frame, which they may refuse, and before any file of it is written.
     """
     output_folder(folder)
     with ExitStack() as clips:
         append = {
             kind: clips.enter_context(clip_writer(folder / f"{name}.{kind}", fps=fps))
             for kind in formats
-            if kind in CLIPS
+            if kind in CLIPS and not to_join
         }
 
         exr_writer = exr or ExrWriter(fps)
@@ -97,6 +100,8 @@ def frame_writer(
                 begin(number)
                 if "png" in formats:
                     files[folder / f"frames/{number_name}.png"] = _pixels("png", frame)
+                for kind in {*CLIPS} & {*formats} - append.keys():
+                    files[folder / f".{kind}/{number_name}.png"] = _pixels(kind, frame)
                 if "png" in formats or "exr" not in formats:
                     for aov, values in frame.aovs.items():
                         image = aov_image(aov, values, frame.alpha, reach)
@@ -107,3 +112,21 @@ def frame_writer(
                     exr_writer.write(folder / f"frames_exr/{number_name}.exr", frame, camera)
 
         yield write
+
+
+def join_clips(folder: Path, formats: Sequence[str], frames: Iterable[int], *, name: str, fps: float) -> None:
+    """Make the clips of ``frames`` that parts of a run have written ``to_join``."""
+    for kind in (kind for kind in formats if kind in CLIPS):
+        with clip_writer(folder / f"{name}.{kind}", fps=fps) as add:
+            for number in frames:
+                add(read_image(folder / f".{kind}/{number:06d}.png"))
+        shutil.rmtree(folder / f".{kind}")
+
+
+def is_written(folder: Path, formats: Sequence[str], aovs: Sequence[str], number: int) -> bool:
+    """Whether all files of the frame are there, and of clips those ``to_join``."""
+    folders = {"png": "frames", "exr": "frames_exr"} | {kind: f".{kind}" for kind in CLIPS}
+    files = [f"{folders[kind]}/{number:06d}.{'exr' if kind == 'exr' else 'png'}" for kind in formats]
+    if "png" in formats or "exr" not in formats:
+        files += [f"aov/{aov}/{number:06d}.png" for aov in aovs]
+    return all((folder / file).is_file() for file in files)

@@ -1,0 +1,66 @@
+"""Jobs for tests of ``rnd_runtime.cli.jobs``, and a Dask cluster of processes of which one is killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rnd_runtime.cli.command import warn
+from rnd_runtime.core.errors import InputError
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}  # a training then gives the same bits
+
+
+def squared(folder: Path, number: int) -> int:
+    """Square ``number``; 1 takes its process with it the first time, and 13 is refused."""
+    if number == 1 and not (folder / "died").exists():
+        (folder / "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == 13:
+        raise InputError("number", expected="a lucky one", got=number, file=folder / "list.txt")
+    warn("squares only")
+    return number * number
+
+
+def dies(number: int) -> None:
+    """Take the process with it, always."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@contextmanager
+def two_workers() -> Iterator[tuple[Any, str]]:
+    """A Dask cluster of two processes, and what ``--on`` calls it; skips the test where the extra is missing."""
+    distributed = pytest.importorskip("distributed", reason="extra [dask]: distributed is not installed")
+    how = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": ONE_THREAD}
+    with distributed.LocalCluster(**how, dashboard_address=None) as cluster:
+        yield cluster, cluster.scheduler_address.replace("tcp://", "dask://")
+
+
+@contextmanager
+def worker_killed_when(cluster: Any, ready: Callable[[], bool]) -> Iterator[list[int]]:
+    """Kill one of the cluster's processes as soon as ``ready()`` during the block; yields the list of the killed."""
+    killed: list[int] = []
+    over = threading.Event()
+
+    def kill() -> None:
+        while not ready() and not over.is_set():
+            time.sleep(0.01)
+        if not over.is_set():
+            killed.append(cluster.workers[0].pid)
+            os.kill(killed[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        yield killed
+    finally:
+        over.set()
+        killer.join()
