@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -35,12 +37,22 @@ def dies(number: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+def in_a_process(module: str, *words: object) -> None:
+    """Run the command of ``module`` alone, with one thread.
+
+    A first run compiles kernels, and its results may differ in the last digit: one comes before what is compared.
+    """
+    program = f"import sys; from {module} import main; sys.exit(main())"
+    environment = os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", program, *map(str, words)], env=environment, check=True)
+
+
 @contextmanager
 def two_workers() -> Iterator[tuple[Any, str]]:
     """A Dask cluster of two processes, and what ``--on`` calls it; skips the test where the extra is missing."""
     distributed = pytest.importorskip("distributed", reason="extra [dask]: distributed is not installed")
     how = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": ONE_THREAD}
-    with distributed.LocalCluster(**how, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(**how, dashboard_address="127.0.0.1:0") as cluster:
         yield cluster, cluster.scheduler_address.replace("tcp://", "dask://")
 
 

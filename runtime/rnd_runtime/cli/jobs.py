@@ -62,7 +62,8 @@ def workers(where: str) -> Iterator[Client]:
     env = dict.fromkeys(_THREADS, str(max(cores() // count, 1)))
     processes = {"n_workers": count, "threads_per_worker": 1, "memory_limit": 0, "env": env}
     # TLS, as any user of this machine may connect, and a worker does what it is told
-    cluster = LocalCluster(**processes, security=True, dashboard_address=None)
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")  # of what Ctrl-C leaves to it
+    cluster = LocalCluster(**processes, security=True, dashboard_address="127.0.0.1:0")
     try:
         with Client(cluster) as client:
             yield client
@@ -103,7 +104,7 @@ def run_jobs(
     numbers = {future.key: number for number, future in enumerate(futures)}
     finished = as_completed(futures)
     del futures  # a result that is here already is not made again when its worker is lost
-    results: dict[int, Result] = {}
+    results: dict[int, Any] = {}
     warnings: set[str] = set()
     with Progress() as progress:
         progress.phase(name, sum(sizes))
@@ -114,6 +115,8 @@ def run_jobs(
             except KilledWorker as error:
                 hint = "out of memory? fewer workers, or more memory for each"
                 raise InputError("a job was lost with its worker, again and again", hint=hint) from error
+            if isinstance(results[number], InputError):
+                raise results[number]
             for line in said:
                 if line not in warnings:
                     warnings.add(line)
@@ -123,15 +126,18 @@ def run_jobs(
 
 
 def _call(target: str, arguments: tuple[Any, ...], folder: str) -> tuple[Any, list[str]]:
-    """In a worker: the result of the function ``target``, and the warnings that it logged."""
+    """In a worker: the result of the function ``target`` or its ``InputError``, and the warnings that it logged."""
     with _alone:
         prepare_process()  # before the import, which may load numba
         try:
             os.chdir(folder)
         except OSError as error:
             where = f"the folder of the command on {socket.gethostname()}"
-            raise InputError(f"{where} cannot be entered", got=error.strerror, file=folder) from error
+            return InputError(f"{where} cannot be entered", got=error.strerror, file=folder), []
         module, name = target.split(":")
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as log:
-            result = getattr(importlib.import_module(module), name)(*arguments)
+            try:
+                result = getattr(importlib.import_module(module), name)(*arguments)
+            except InputError as error:  # raised, Dask would log it as a failure
+                result = InputError(str(error))
         return result, [line.split(_WARNING, 1)[1] for line in log.getvalue().splitlines() if _WARNING in line]

@@ -187,8 +187,9 @@ def _end(number: int) -> None:
         with suppress(OSError):
             os.kill(child, signal.SIGTERM)
     line = f"{_state.name}: interrupted\n"
-    with suppress(OSError, ValueError):
-        os.write(2, ((_SHOW_CURSOR if os.isatty(2) else "") + line).encode())
+    if "__mp_main__" not in sys.modules:  # as in a process that the command has started: the command says it
+        with suppress(OSError, ValueError):
+            os.write(2, ((_SHOW_CURSOR if os.isatty(2) else "") + line).encode())
     _clean_up()  # what other threads have put back meanwhile
     os._exit(128 + number)
 

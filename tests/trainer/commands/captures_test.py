@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 import torch
 
 from rnd_trainer.commands.train import main
 from rnd_trainer.model.checkpoint import load_checkpoint
-from support.dask_jobs import ONE_THREAD, two_workers, worker_killed_when
+from support.dask_jobs import in_a_process, two_workers, worker_killed_when
 
 SIZES = ["--steps", "12", "--gaussians", "300", "--preset", "quick", "--save-every", "4"]
 
@@ -26,16 +23,12 @@ def test_captures_of_one_name_are_refused(tmp_path, capsys):
 def test_a_training_goes_on_where_its_worker_was_killed(tiny_capture, tmp_path, capsys):
     captures = [str(shutil.copytree(tiny_capture.folder, tmp_path / name)) for name in ("ann", "ben")]
     alone, spread = tmp_path / "alone", tmp_path / "spread"
-    program = "import sys; from rnd_trainer.commands.train import main; sys.exit(main())"
+    in_a_process("rnd_trainer.commands.train", captures[0], *SIZES, "--out", tmp_path / "first")
     with two_workers() as (cluster, where):
         with worker_killed_when(cluster, lambda: any(spread.glob("*/training.state"))) as killed:
             assert main([*captures, *SIZES, "--out", str(spread), "--on", where]) == 0
         assert killed
-    subprocess.run(
-        [sys.executable, "-c", program, *captures, *SIZES, "--out", str(alone)],
-        env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        check=True,
-    )
+    in_a_process("rnd_trainer.commands.train", *captures, *SIZES, "--out", alone)
     for name in ("ann", "ben"):
         made, expected = (
             load_checkpoint(folder / name / "avatar.ckpt").model.state_dict() for folder in (spread, alone)

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from rnd_viewer.play.cli import main
-from support.dask_jobs import two_workers, worker_killed_when
+from support.dask_jobs import in_a_process, two_workers, worker_killed_when
 from support.paths import ASSETS
 
 FRAMES = 48
@@ -23,8 +23,9 @@ def _files(folder):
 def test_a_killed_worker_changes_no_byte(tmp_path):
     alone, parted = tmp_path / "alone", tmp_path / "parted"
     words = [*WORDS, "--format", "png,exr,mp4,webp", "--aov", "normal"]
+    for folder in (tmp_path / "first", alone):
+        in_a_process("rnd_viewer.play.cli", *words, "--out", folder)
     with two_workers() as (cluster, where):
-        assert main([*words, "--out", str(alone)]) == 0
         made = []
 
         def begun() -> bool:

@@ -18,7 +18,9 @@ from rnd_runtime.core.files import sha256_of
 from rnd_viewer.inputs.cameras import split_camera
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions
 
-_FOLDERS = ("frames/[!.]*", "frames_exr/[!.]*", "aov/*/[!.]*")
+from .video import CLIPS
+
+_FOLDERS = ("frames/[!.]*", "frames_exr/[!.]*", "aov/*/[!.]*", *(f".{kind}/[!.]*" for kind in CLIPS))
 _CLIP = re.compile(r"play(_\d{6,}-\d{6,})?\.(json|mp4|webp|webm|mov)")
 _OF_A_RUN = re.compile(rf"(frames|frames_exr|aov/[^/]+)/\d{{6,}}\.(png|exr)|{_CLIP.pattern}")
 _OWN_TO_A_PROCESS = {"frames", "threads", "format", "raster"}  # options that may differ between parts of a run

@@ -119,7 +119,7 @@ def join_clips(folder: Path, formats: Sequence[str], frames: Iterable[int], *, n
     for kind in (kind for kind in formats if kind in CLIPS):
         with clip_writer(folder / f"{name}.{kind}", fps=fps) as add:
             for number in frames:
-                add(read_image(folder / f".{kind}/{number:06d}.png"))
+                add(np.asarray(read_image(folder / f".{kind}/{number:06d}.png"), np.uint8))
         shutil.rmtree(folder / f".{kind}")
 
 
