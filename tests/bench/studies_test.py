@@ -12,6 +12,7 @@ import pytest
 import torch
 from msgspec import structs
 
+from rnd_bench.cli import main
 from rnd_bench.studies import people, trainings
 from rnd_bench.studies.options import PeopleSizes
 from rnd_bench.studies.summary import summarise
@@ -23,6 +24,7 @@ from rnd_trainer.config import ModelConfig, to_dict
 from rnd_trainer.model.checkpoint import write_tensors
 from rnd_trainer.training.state import STATE_FILE, STATE_SCHEMA
 from rnd_trainer.training.training import Training
+from support.dask_jobs import two_workers
 
 
 @pytest.mark.parametrize(
@@ -80,6 +82,20 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(tiny_capture, tiny
     ]
     assert static["novel_view"]["gain"] == pytest.approx((both[0] - both[1] + both[2] - both[3]) / 2)
     assert static["encoder_gflop"] == 0 < ours["encoder_gflop"] and static["minutes"] > 0
+
+
+@pytest.mark.slow
+def test_workers_train_each_variant_once(tiny_capture, tmp_path) -> None:
+    sizes = ["--variants", "ours", "static skinning", "--seeds", "1", "--steps", "4", "--gaussians", "300"]
+    words = ["study", "ablations", str(tmp_path / "run"), str(tiny_capture.folder), *sizes]
+    with two_workers() as (_, where):
+        assert main([*words, "--json", str(tmp_path / "spread.json"), "--on", where]) == 0
+    trained = {file.parent.name: file.stat().st_mtime_ns for file in (tmp_path / "run").glob("*/avatar.ckpt")}
+    assert trained.keys() == {"ours-0", "static_skinning-0"}
+    assert main([*words, "--json", str(tmp_path / "again.json")]) == 0
+    spread, again = (json.loads((tmp_path / name).read_text())["rows"] for name in ("spread.json", "again.json"))
+    assert [row["psnr"] for row in spread] == [row["psnr"] for row in again] and len(spread) == 2
+    assert trained == {name: (tmp_path / "run" / name / "avatar.ckpt").stat().st_mtime_ns for name in trained}
 
 
 @pytest.fixture

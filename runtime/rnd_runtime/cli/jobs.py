@@ -36,6 +36,18 @@ _WARNING = "warning: "
 _alone = threading.Lock()
 
 
+def check_on(where: str) -> re.Match[str]:
+    """The number of processes or the address in ``where``; for checks before long work, see ``workers``."""
+    match = re.fullmatch(r"local:([1-9]\d{0,2})|dask://([^\s/]+:\d+)", where)
+    if match is None:
+        raise InputError("--on", expected="local:N or dask://HOST:PORT", got=where)
+    try:
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise InputError("--on needs Dask distributed, which is not installed", hint=INSTALL) from error
+    return match
+
+
 @contextmanager
 def workers(where: str) -> Iterator[Client]:
     """A client of N processes of this machine, which share its cores (``local:N``), or of a Dask scheduler.
@@ -43,13 +55,9 @@ def workers(where: str) -> Iterator[Client]:
     Raises:
         InputError: another word, no scheduler there, or Dask distributed is not installed.
     """
-    match = re.fullmatch(r"local:([1-9]\d{0,2})|dask://([^\s/]+:\d+)", where)
-    if match is None:
-        raise InputError("--on", expected="local:N or dask://HOST:PORT", got=where)
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise InputError("--on needs Dask distributed, which is not installed", hint=INSTALL) from error
+    match = check_on(where)
+    from distributed import Client, LocalCluster
+
     if match[2]:
         try:
             client = Client(f"tcp://{match[2]}")

@@ -18,6 +18,7 @@ from rnd_runtime import __version__
 from rnd_runtime.avatar.avatar import Encoded
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.cli.command import finish, log, warn
+from rnd_runtime.cli.jobs import check_on
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.cli.progress import track
 from rnd_runtime.core.camera import Camera
@@ -66,6 +67,8 @@ def play(options: PlayOptions, ahead: Future[Networks] | None = None) -> int:
     Raises:
         InputError: for whatever cannot be used; what was finished before stays.
     """
+    if options.on is not None:
+        check_on(options.on)
     playing = _Run.of(options, ahead)
     for note in playing.notes:
         warn(note)
