@@ -187,7 +187,7 @@ def _end(number: int) -> None:
         with suppress(OSError):
             os.kill(child, signal.SIGTERM)
     line = f"{_state.name}: interrupted\n"
-    if "__mp_main__" not in sys.modules:  # as in a process that the command has started: the command says it
+    if sys.modules["__main__"].__name__ != "__mp_main__":  # as in a process that the command has started
         with suppress(OSError, ValueError):
             os.write(2, ((_SHOW_CURSOR if os.isatty(2) else "") + line).encode())
     _clean_up()  # what other threads have put back meanwhile
