@@ -48,12 +48,14 @@ def views_around(motion: Motion, size: tuple[int, int], pose: Callable[[float], 
     return SearchViews(views(0, 1), views(0, FIT_COUNT // COUNT), views(1, 1))
 
 
-def views_of(capture: Capture, size: int) -> SearchViews:
+def views_of(capture: Capture, size: int, hold_out: bool = False) -> SearchViews:
     """Training views of ``capture``, ``size`` pixels on the longer side.
 
-    Its novel poses, or else every other training view, are held out.
+    Held out are its novel poses, or else every other training view; with ``hold_out`` what the training held out.
     """
-    train, others = capture.split("train"), capture.split("novel_pose")
+    if hold_out:
+        capture = capture.holding_out()
+    train, others = capture.split("train"), capture.split("validation" if hold_out else "novel_pose")
     if len(train) < 2:
         raise InputError("training views of the capture", expected="at least 2", got=len(train), file=capture.file)
     if not others:

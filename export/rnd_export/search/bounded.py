@@ -122,4 +122,4 @@ def _scene(checkpoint: Checkpoint, what: BoundedSearch, warn: Callable[[Iterable
     capture = load_capture(what.capture)
     motion = capture.motion_for(checkpoint.skeleton)
     warn(motion.notes)
-    return SearchScene(motion, light, size, views=views_of(capture, max(size)))
+    return SearchScene(motion, light, size, views=views_of(capture, max(size), checkpoint.config.hold_out))
