@@ -56,6 +56,11 @@ def shallow_copy(original: T, **changes: Any) -> T:
     return copied
 
 
+def spaced_indices(count: int, number: int) -> NDArray[np.int64]:
+    """Indices of at most ``number`` of ``count`` elements, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(number, count)).astype(np.int64))
+
+
 class Buffers:
     """Arrays of one size after another, each handed out again once nobody else holds it or a view of it.
 

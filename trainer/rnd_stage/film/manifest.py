@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rnd_runtime.capture.capture import Capture, CaptureLight, load_capture, save_capture
 from rnd_runtime.capture.format import Frame
+from rnd_runtime.core.arrays import spaced_indices
 from rnd_runtime.core.errors import flag
 from rnd_runtime.core.files import atomic_path, write_json
 from rnd_runtime.core.images import to_bytes, write_image
@@ -85,7 +86,7 @@ def contact_sheet(folder: Path) -> None:
 
 
 def _evenly(frames: list[Frame]) -> list[Frame]:
-    return [frames[k] for k in sorted({round(x) for x in np.linspace(0, len(frames) - 1, _COLUMNS)})] if frames else []
+    return [frames[k] for k in spaced_indices(len(frames), _COLUMNS)]
 
 
 def _tile(image: NDArray[np.floating] | None) -> NDArray[np.floating]:

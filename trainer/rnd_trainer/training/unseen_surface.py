@@ -16,6 +16,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import cKDTree
 
+from rnd_runtime.core.arrays import spaced_indices
 from rnd_trainer.model.model import APPEARANCE_COLUMNS, AvatarModel, PoseInput
 from rnd_trainer.render.in_sight import in_sight
 
@@ -39,7 +40,7 @@ def evidence(model: AvatarModel, views: Sequence[TrainingView], poses: Sequence[
     """Evidence [N] of every Gaussian, scaled to all of ``views``."""
     count = len(model.points)
     total = np.zeros(count)
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(IMAGES, len(views))).astype(int))
+    chosen = spaced_indices(len(views), IMAGES)
     for index in chosen:
         camera = views[index].camera
         with torch.no_grad():

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rnd_runtime.core.arrays import spaced_indices
 from rnd_trainer.importing.surfaces.masks import bounding_box, dilated, large_parts, mask_height
 
 from .regions import Image
@@ -78,7 +79,7 @@ def _learn_background(frame: Callable[[int], Image], soft: Soft, scale: float) -
         return None
     first = _resized(frame(0), scale)
     count = int(np.clip(_MAX_BYTES // (first.size + 1), _MIN_SEEN, min(_FRAMES, len(soft))))
-    chosen = np.unique(np.linspace(0, len(soft) - 1, count).astype(int))
+    chosen = spaced_indices(len(soft), count)
     images = np.stack([_resized(frame(int(k)), scale) for k in chosen])
     network = [_resized(soft[int(k)], scale) for k in chosen]
     masks, background = [mask > 76 for mask in network], None

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from rnd_runtime.core.arrays import spaced_indices
 from rnd_runtime.core.errors import InputError
 
 from .detection import Detection, Detector
@@ -53,7 +54,7 @@ def find_person(
     Raises:
         InputError: nobody, nobody upright, several people of one size, or no such person.
     """
-    sampled = [numbers[k] for k in np.unique(np.linspace(0, len(numbers) - 1, _SAMPLES).astype(int))]
+    sampled = [numbers[k] for k in spaced_indices(len(numbers), _SAMPLES)]
     seen: dict[int, list[Detection]] = {}
     for done, number in enumerate(sampled):
         image = video.frame(number)

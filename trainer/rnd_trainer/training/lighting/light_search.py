@@ -26,6 +26,7 @@ from rnd_trainer.render.probe import PROBE_SHAPE, natural_sky
 from rnd_trainer.training.data import TrainingView
 
 from .observations import (
+    MIN_OBSERVATIONS,
     POINTS,
     Observations,
     albedo_under,
@@ -67,8 +68,6 @@ SKY_PRIOR = 1.0
 """relative weight of the natural sky"""
 PENALTY = 30.0
 """relative weight of the constraint that fixes the scale of the light"""
-MIN_OBSERVATIONS = 3
-"""observations of a point that is used: with one or two its unknown albedo explains any light"""
 
 
 @dataclass

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rnd_runtime.core.arrays import spaced_indices
 from rnd_runtime.core.images import srgb_to_linear
 from rnd_runtime.shading.light import REC709_LUMINANCE
 from rnd_trainer.model.model import AvatarModel, PoseInput
@@ -29,6 +30,8 @@ FACING = 0.3
 """smallest cosine between normal and view of an observation"""
 OCCLUSION = 0.03
 """distance behind the first surface up to which a point is visible, m"""
+MIN_OBSERVATIONS = 3
+"""observations of a point that is used: with one or two its unknown albedo explains any light"""
 
 
 @dataclass
@@ -63,7 +66,8 @@ def observe(
     nodes = min(POINTS, model.config.nodes)
     spacing = float(model.spacing) * math.sqrt(len(model.points) / nodes)
     of_light = np.array(lights or [0] * len(views))
-    chosen = np.sort(np.concatenate([_evenly(np.flatnonzero(of_light == k)) for k in np.unique(of_light)]))
+    groups = [np.flatnonzero(of_light == k) for k in np.unique(of_light)]
+    chosen = np.sort(np.concatenate([group[spaced_indices(len(group), FRAMES)] for group in groups]))
     point, colour, image, posed_nodes = [], [], [], []
     for k, index in enumerate(chosen):
         view, camera = views[index], views[index].camera
@@ -80,11 +84,6 @@ def observe(
         posed_nodes.append((posed.means[:nodes].cpu(), posed.normals[:nodes].cpu()))
     points, colours, images = np.concatenate(point), np.concatenate(colour), np.concatenate(image)
     return Observations(points, colours, images, posed_nodes, spacing, of_light[chosen].tolist())
-
-
-def _evenly(indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """At most ``FRAMES`` of ``indices``, evenly spaced."""
-    return indices[np.unique(np.linspace(0, len(indices) - 1, min(FRAMES, len(indices))).astype(int))]
 
 
 def transport_of(observations: Observations, directions: Floats, solid_angles: Floats) -> NDArray[np.float32]:

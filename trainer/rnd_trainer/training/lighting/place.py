@@ -16,7 +16,15 @@ from rnd_trainer.model.model import AvatarModel, PoseInput
 from rnd_trainer.render.probe import PROBE_SHAPE
 from rnd_trainer.training.data import TrainingView
 
-from .observations import Observations, albedo_under, observe, point_luminance, transport_of, with_bounce
+from .observations import (
+    MIN_OBSERVATIONS,
+    Observations,
+    albedo_under,
+    observe,
+    point_luminance,
+    transport_of,
+    with_bounce,
+)
 from .skin import likely_gain
 
 Floats = NDArray[np.float64]
@@ -28,8 +36,6 @@ SEARCH_SHAPE = (16, 32)
 FILL = 0.2
 """light from all sides, of the mean, by which reflections brighten the unlit side; without it the yaw of three captures
 is found 5° to 8° nearer the camera than it is, with it 1° to 5°"""
-MIN_OBSERVATIONS = 3
-"""observations of a point that is used: the albedo explains fewer under any light"""
 
 
 def placed_light(
