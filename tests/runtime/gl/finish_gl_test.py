@@ -7,19 +7,15 @@ import functools
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.gaussians import Raster
 from rnd_runtime.gl import finish as finish_gl
 from rnd_runtime.gl.finish import GlFinish
-from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.raster.outline import sharpened
 from rnd_runtime.raster.tone import code_steps, tone_map
-from rnd_runtime.shading.files.load import load_light
 from support import gl_devices
 from support.gl_devices import BACKENDS
-from support.tiny import ASSETS
 
 SIZES = [(64, 48), (1, 1), (5, 3), (511, 37), (6, 2)]  # rows with and without numbers to spare
 ROUNDING = 2e-7  # relative: the device may fuse a product and a sum
@@ -94,9 +90,7 @@ def test_one_size_after_another(device):
 
 
 @pytest.mark.parametrize("raster", ["gl-egl", "gl-osmesa"])
-def test_a_frame_takes_the_devices_codes(raster, monkeypatch):
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
-    motion, sky = load_motion(ASSETS / "walk.npz", avatar.skeleton), load_light(ASSETS / "sky.exr")
+def test_a_frame_takes_the_devices_codes(avatar, motion, sky, raster, monkeypatch):
     camera = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=190, height=256, fov_y=0.65)
     monkeypatch.setattr(finish_gl, "is_software", lambda _: False)  # as on a GPU
     monkeypatch.setattr("rnd_runtime.playback.frame.tone_map", lambda *_: pytest.fail("the CPU tone maps"))

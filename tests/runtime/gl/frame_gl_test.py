@@ -10,13 +10,10 @@ import pytest
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.frame import FrameRenderer, draw_gaussians
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.tone import tone_map
-from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.shader import Shader
-from support.paths import ASSETS
 from support.shading_scenes import ball
 from support.ties import assert_only_ties
 
@@ -29,21 +26,6 @@ MAX_CODES = 2  # of 255: FAILURES G10
 # other way round: at one moment in ten, in one or two pixels of 12 288, by up to 9 codes.
 TIES, TIE_CODES = 2, 12
 MOMENTS = (0.0, 0.3, 0.4)
-
-
-@pytest.fixture(scope="module")
-def avatar():
-    return Avatar.load(ASSETS / "avatar.onnx")
-
-
-@pytest.fixture(scope="module")
-def motion(avatar):
-    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
-
-
-@pytest.fixture(scope="module")
-def sky():
-    return load_light(ASSETS / "sky.exr")
 
 
 @pytest.fixture(scope="module", params=BACKENDS)

@@ -11,11 +11,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.gl.passes import GaussianTexture
 from rnd_runtime.gl.shading import GlShading
 from rnd_runtime.gl.surfaces import SurfaceUpload
-from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, texel_directions
 from rnd_runtime.shading.shader import Shader
@@ -74,9 +72,8 @@ def test_every_mode_is_the_kernels(device, mode, yaw, up, roughness):
 
 
 @pytest.fixture(scope="module")
-def walker():
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
-    return avatar.pose(load_motion(ASSETS / "walk.npz", avatar.skeleton), 0.3)
+def walker(avatar, motion):
+    return avatar.pose(motion, 0.3)
 
 
 def test_two_suns_cast_two_shadows(device, walker):
@@ -127,8 +124,8 @@ def test_egl_and_osmesa_give_the_same_bits(devices, mode):
     np.testing.assert_array_equal(egl, osmesa)
 
 
-def test_what_is_no_number_shadows_nobody(device, walker):
-    shader = Shader(load_light(ASSETS / "sky.exr"))
+def test_what_is_no_number_shadows_nobody(device, walker, sky):
+    shader = Shader(sky)
     whole = np.arange(len(walker.means)) >= 4
     means, normals = walker.means.copy(), walker.normals.copy()
     means[0, 0], means[1, 1], normals[2, 2], normals[3, 0] = np.nan, np.inf, np.nan, -np.inf

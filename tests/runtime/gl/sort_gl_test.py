@@ -9,7 +9,6 @@ import moderngl
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.gl import projection as projection_gl
@@ -20,10 +19,7 @@ from rnd_runtime.gl.passes import GaussianTexture
 from rnd_runtime.gl.projection import GlProjection
 from rnd_runtime.gl.raster import GlRasterizer
 from rnd_runtime.gl.sort import DepthSort
-from rnd_runtime.motion.motion import load_motion
-from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.shader import Shader
-from support.paths import ASSETS
 
 BACKENDS = ("egl", "osmesa")
 CAMERA = Camera.look_at([0.5, 0.3, 3.2], [0, 0, 0], width=96, height=128, fov_y=0.65)  # in the root's frame
@@ -119,10 +115,8 @@ def test_more_and_fewer_leave_nothing_behind(device_order):
 
 @pytest.mark.parametrize("cull", [None, 0.2])
 @pytest.mark.parametrize("mode", ["ao", "table+sun", "brute"])
-def test_pictures_are_the_same_bits_and_only_they_come_back(context, monkeypatch, mode, cull):
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
-    motion = load_motion(ASSETS / "walk.npz", avatar.skeleton)
-    shader = Shader(load_light(ASSETS / "sky.exr"), mode)
+def test_pictures_are_the_same_bits_and_only_they_come_back(avatar, motion, sky, context, monkeypatch, mode, cull):
+    shader = Shader(sky, mode)
     bodies = [avatar.unposed(avatar.encode(motion, time)) for time in (0.0, 0.4)]
     pictures = {}
     for sorting in ("cpu", "device"):

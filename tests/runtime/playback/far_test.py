@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
-from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.far import fine_view
 from rnd_runtime.playback.frame import FrameRenderer
-from rnd_runtime.shading.files.load import load_light
 from support.gl_devices import BACKENDS
-from support.paths import ASSETS
 
 FOCAL, HEIGHT = 4000.0, 1.75  # px, m
 LARGE = 384  # px, where the pixel filter widens by 0.3 %
@@ -27,12 +23,6 @@ def camera_of(pixels: int, offset: float = 0.0, size: int | None = None) -> Came
     return Camera(side, side, K, world_to_camera)
 
 
-@pytest.fixture(scope="module")
-def scene():
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
-    return avatar, load_light(ASSETS / "sky.exr"), load_motion(ASSETS / "walk.npz", avatar.skeleton)
-
-
 def amounts(renderer, motion, pixels, offset=0.0, aovs=()):
     """Coverage and energy per (px of height)²."""
     frame = renderer.render(motion, 0.5, camera_of(pixels, offset), aovs=aovs)
@@ -40,26 +30,23 @@ def amounts(renderer, motion, pixels, offset=0.0, aovs=()):
 
 
 @pytest.mark.parametrize("raster", ["cpu", *(f"gl-{backend}" for backend in BACKENDS)])
-def test_coverage_and_energy_are_kept(scene, raster):
-    avatar, light, motion = scene
-    with FrameRenderer(avatar, light, shade="table", raster=raster) as renderer:
+def test_coverage_and_energy_are_kept(avatar, motion, sky, raster):
+    with FrameRenderer(avatar, sky, shade="table", raster=raster) as renderer:
         near = amounts(renderer, motion, LARGE)
         for pixels in (192, 100, 40, 16, 8):
             far = np.mean([amounts(renderer, motion, pixels, offset) for offset in (0.0, 0.37)], axis=0)
             np.testing.assert_allclose(far, near, rtol=TOLERANCE, err_msg=f"{pixels} px")
 
 
-def test_nothing_shimmers_while_it_recedes(scene):
-    avatar, light, motion = scene
-    with FrameRenderer(avatar, light, shade="table") as renderer:
+def test_nothing_shimmers_while_it_recedes(avatar, motion, sky):
+    with FrameRenderer(avatar, sky, shade="table") as renderer:
         heights = np.geomspace(200, 12, 60)
         covered = [amounts(renderer, motion, pixels)[0] for pixels in heights]
     assert np.abs(np.diff(covered) / covered[0]).max() < 0.02  # the finer grid begins between two of them
 
 
-def test_aovs_recede_with_the_image(scene):
-    avatar, light, motion = scene
-    with FrameRenderer(avatar, light, shade="table") as renderer:
+def test_aovs_recede_with_the_image(avatar, motion, sky):
+    with FrameRenderer(avatar, sky, shade="table") as renderer:
         plain = renderer.render(motion, 0.5, camera_of(24))
         frame = renderer.render(motion, 0.5, camera_of(24), aovs=("albedo", "depth"))
     np.testing.assert_allclose(frame.alpha, plain.alpha, atol=1e-5)

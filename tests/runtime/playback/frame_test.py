@@ -10,7 +10,7 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.images import linear_to_srgb, to_bytes
 from rnd_runtime.core.rotations import axis_angle_to_matrix
-from rnd_runtime.motion.motion import Motion, load_motion
+from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, draw_gaussians, in_root_frame
 from rnd_runtime.playback.rasterizer import make_rasterizer
 from rnd_runtime.raster.cpu import rasterize
@@ -25,21 +25,6 @@ from support.paths import ASSETS
 LEAST = -0.5  # n·v of what is culled in these tests, as the renderer proposes
 CULLED = 45.0  # dB that culling must leave against the whole picture
 CAMERA = Camera.look_at([0.5, 1.2, 3.2], [0, 0.9, 0], width=96, height=128, fov_y=0.65)
-
-
-@pytest.fixture(scope="module")
-def avatar():
-    return Avatar.load(ASSETS / "avatar.onnx")
-
-
-@pytest.fixture(scope="module")
-def motion(avatar):
-    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
-
-
-@pytest.fixture(scope="module")
-def sky():
-    return load_light(ASSETS / "sky.exr")
 
 
 def _taken(motion, place, moved):

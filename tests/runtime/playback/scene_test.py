@@ -7,37 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.ground.shadow import Plane
-from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.playback.far import Extent, depth_groups
 from rnd_runtime.playback.frame import FrameRenderer
 from rnd_runtime.playback.scene import LEVEL_SPACING, Person, SceneRenderer, chosen_levels, frame_people, place_at
 from rnd_runtime.raster.cpu import rasterize
 from rnd_runtime.raster.outline import sharpened
-from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, texel_directions
-from support.paths import ASSETS
 
 TIME = 0.4  # s
 TRIANGLE = np.triu_indices(3)
 CAMERA = Camera.look_at([0.3, 1.4, 5.0], [0, 0.9, 0], width=320, height=370, fov_y=0.5)
-
-
-@pytest.fixture(scope="module")
-def avatar():
-    return Avatar.load(ASSETS / "avatar.onnx")
-
-
-@pytest.fixture(scope="module")
-def motion(avatar):
-    return load_motion(ASSETS / "walk.npz", avatar.skeleton)
-
-
-@pytest.fixture(scope="module")
-def sky():
-    return load_light(ASSETS / "sky.exr")
 
 
 def _sun(*direction: float) -> Light:

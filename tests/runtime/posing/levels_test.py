@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.posing.levels import GROWTH, KEPT, Surface, coarser
-from support.paths import ASSETS
 
 
 @pytest.fixture(scope="module")
-def surface():
-    avatar = Avatar.load(ASSETS / "avatar.onnx")
+def surface(avatar):
     return Surface(avatar._rest, avatar._opacities, avatar._albedo, avatar._roughness)
 
 
