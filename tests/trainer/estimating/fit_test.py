@@ -16,7 +16,6 @@ from rnd_trainer.estimating.fitting.figure import default_figure
 from rnd_trainer.estimating.fitting.kinematics import attached, pose
 from rnd_trainer.estimating.fitting.marks import marks_of
 from rnd_trainer.estimating.fitting.normal_equations import NormalEquations
-from rnd_trainer.estimating.fitting.start import bones_of_points
 from rnd_trainer.estimating.fitting.state import TO_CAMERA
 from rnd_trainer.estimating.lifted import JOINTS, PARENTS, REST_DIRECTIONS, ROLL_AXES, Lifted
 from rnd_trainer.estimating.observations import Masks, Observations
@@ -187,18 +186,6 @@ def test_equations_are_solved_as_dense_ones():
     found_local, found_shared = equations.solve(0.0)
     expected = -np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
     np.testing.assert_allclose(np.concatenate([found_local.ravel(), found_shared]), expected, atol=1e-5)
-
-
-def test_bones_of_a_person_at_rest_are_the_rest_directions():
-    from rnd_trainer.estimating.fitting.start import joint_rotations
-
-    figure = default_figure()
-    marks = marks_of(figure)
-    points = (marks.places[None, :33]) @ TO_CAMERA
-    lifted = bones_of_points(points, np.ones((1, 33), bool))
-    world = TO_CAMERA @ joint_rotations(lifted)
-    angle = np.degrees(np.arccos(np.clip((np.trace(world, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
-    assert angle.max() < 25 and np.median(angle) < 8
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from rnd_bench.lifter.captured import observed
 from rnd_bench.lifter.pose2sim import SCORED, load_cameras, triangulated
 from rnd_runtime.capture.body import posed_vertices
 from rnd_runtime.capture.capture import Capture, load_capture
@@ -24,9 +25,7 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.playback.doctor import machine
 from rnd_trainer.estimating.fit import Estimate, estimate
 from rnd_trainer.estimating.fitting.figure import JOINTS
-from rnd_trainer.estimating.observations import BLAZEPOSE, Observations, load_observations, save_observations
-from rnd_trainer.estimating.observing.observe import Networks, observe
-from rnd_trainer.importing.videos.video_file import VideoFile
+from rnd_trainer.estimating.observations import BLAZEPOSE, Observations
 
 from .video_options import Video
 
@@ -45,7 +44,7 @@ def run(options: Video) -> None:
         output_file(options.json)
     with Progress() as progress:
         progress.phase("rendered person")
-        seen = _observed(options.video, out / "rendered.npz")
+        seen = observed(options.video, out / "rendered.npz")
         rows = list(_rendered(load_capture(options.capture), seen))
         if options.real is not None:
             progress.phase("real cameras")
@@ -57,13 +56,6 @@ def run(options: Video) -> None:
     for row in rows:
         table.add_row(row["video"], row["given"], *(f"{row[f]:.3g}" if row.get(f) is not None else "" for f in figures))
     Console(width=120, soft_wrap=True).print(table)
-
-
-def _observed(file: Path, kept: Path, every: int = 1) -> Observations:
-    if not kept.exists():
-        video = VideoFile(file)
-        save_observations(kept, observe(video, Networks.open(1), numbers=list(video.numbers)[::every]))
-    return load_observations(kept)
 
 
 def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
@@ -100,7 +92,7 @@ def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
 def _real(folder: Path, out: Path) -> Iterator[dict[str, Any]]:
     cameras = load_cameras(folder / "calibration" / "Calib.qca.txt")
     names = sorted(cameras)
-    seen = {name: _observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", 2) for name in names}
+    seen = {name: observed(folder / "videos" / f"{name}.mp4", out / f"{name}.npz", 2) for name in names}
     shared = sorted(set.intersection(*(set(one.frames.tolist()) for one in seen.values())))
     rows = {name: np.searchsorted(seen[name].frames, shared) for name in names}
     rays = np.stack([cameras[n].undistorted(seen[n].keypoints_px[rows[n]].astype(np.float64)) for n in names])

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from rnd_runtime.cli.lock import folder_lock
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import output_folder
-from rnd_runtime.core.npz import save_npz
 from rnd_runtime.core.rotations import slerp_matrices
 from rnd_runtime.motion.motion import Motion
 from rnd_trainer.importing.body_models import load_body_model
@@ -28,6 +27,7 @@ from rnd_trainer.importing.surfaces.estimate import add_normals
 from rnd_trainer.importing.surfaces.files import attach_files
 from rnd_trainer.importing.videos.video_file import VideoFile
 from rnd_trainer.importing.write import write_capture
+from rnd_trainer.training.uncertainty import PoseUncertainty, save_uncertainty
 
 from .film_notes import cut_off, film_notes, refuse_unusable
 from .fit import FOCAL_OF_SIDE, Estimate, estimate
@@ -39,9 +39,6 @@ from .observing.observe import MIN_FRAMES, Networks, observe
 from .overlay import write_overlay
 
 Floats = NDArray[np.float64]
-
-UNCERTAINTY_FILE = "uncertainty.npz"
-"""of a capture whose poses were estimated: deviations of joint rotations and of the root, by motion frame"""
 
 
 def is_own_video(source: Path, options: ImportOptions) -> bool:
@@ -100,7 +97,7 @@ def import_video(
     samples, axes = add_normals(list(dataset.samples), scene, dataset, options)
     with folder_lock(output_folder(out), "rnd-data import"):
         refuse_occupied(out, source, options)
-        _write_uncertainty(out / UNCERTAINTY_FILE, fitted)
+        save_uncertainty(out, _deviations(fitted))
         overlay = output_folder(out / "check") / "overlay.mp4"
         shown = partial(on_progress, "overlay")
         write_overlay(overlay, seen, video.frame, fitted.body, fitted.motion, fitted.camera, left_out, shown)
@@ -222,12 +219,8 @@ def _video_notes(video: Any, numbers: list[int], seen: Observations, left_out: d
     return notes
 
 
-def _write_uncertainty(path: Path, fitted: Estimate) -> None:
-    """Deviations of the motion's frames; those between observed ones take the nearest."""
+def _deviations(fitted: Estimate) -> PoseUncertainty:
+    """Of the motion's frames; those between observed ones take the nearest."""
     every = np.arange(fitted.frames[0], fitted.frames[-1] + 1)
     nearest = np.abs(every[:, None] - fitted.frames).argmin(1)
-    arrays = {
-        "rotation_deviation": fitted.rotation_deviation[nearest].astype(np.float32),
-        "translation_deviation": fitted.translation_deviation[nearest].astype(np.float32),
-    }
-    save_npz(path, arrays)
+    return PoseUncertainty(fitted.rotation_deviation[nearest], fitted.translation_deviation[nearest])

@@ -89,17 +89,6 @@ def open_network(name: str, threads: int | None = None) -> Any:
     return open_session(network_file(name), threads)
 
 
-def missing_networks() -> list[str]:
-    """Names of the networks that ``network_file`` would refuse."""
-    missing = []
-    for network in NETWORKS:
-        try:
-            network_file(network.name)
-        except InputError:
-            missing.append(network.name)
-    return missing
-
-
 def fetch_networks(package: Path | None = None, networks: tuple[Network, ...] = NETWORKS) -> list[Path]:
     """Fetch the package with npm, check and convert its networks; returns the ONNX files.
 
