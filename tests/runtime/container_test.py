@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from support.paths import ASSETS, ROOT
+from support.paths import ROOT
 
 NOBODY = 65534
 LIBRARIES = str(Path(np.__file__).parents[1])
@@ -91,30 +91,6 @@ def test_help_and_doctor_say_where_kernels_are_kept(box, home):
     assert (box / "tmp").stat().st_mode & 0o777 == 0o777
     (folder,) = (box / "tmp").glob("rnd-kernels-*")
     assert folder.stat().st_mode & 0o777 == 0o700
-
-
-@pytest.mark.slow
-def test_a_play_leaves_its_kernels_for_the_next(box):
-    for file in ("avatar.onnx", "walk.npz"):
-        shutil.copy(ASSETS / file, box / "tmp" / file)
-        (box / "tmp" / file).chmod(0o444)
-    words = [
-        "avatar.onnx",
-        "--motion",
-        "walk.npz",
-        "--out",
-        "out",
-        "--frames",
-        "0:2",
-        "--size",
-        "64",
-        "--raster",
-        "cpu",
-    ]
-    done = _run(box, None if os.getuid() == 0 else "/", *words, "--format", "png")
-    assert done.returncode == 0, done.stderr
-    assert len(list((box / "tmp/out/frames").iterdir())) == 2
-    assert list((box / "tmp").glob("rnd-kernels-*/raster_*/*.nbi"))
 
 
 def test_the_images_recipe_copies_what_is_there():

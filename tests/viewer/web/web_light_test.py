@@ -172,7 +172,7 @@ def test_other_channels_do_not_shift_the_colours(tmp_path):
 @pytest.mark.parametrize("order", ["increasingY", "decreasingY"])
 def test_files_cut_anywhere_are_refused(tmp_path, order):
     whole = _exr(tmp_path / "sky.exr", RADIANCE, compression="zip", order=order).read_bytes()
-    for length in (*range(0, 400, 7), 700, 3000, len(whole) - 1):
+    for length in (*range(0, 400, 29), 700, 3000, len(whole) - 1):
         (tmp_path / "cut.exr").write_bytes(whole[:length])
         assert "refused" in _page(tmp_path / "cut.exr"), length
 
@@ -188,7 +188,7 @@ def test_radiance_files_cut_anywhere_are_refused(tmp_path):
     radiance, file = RADIANCE.copy(), tmp_path / "cut.hdr"
     radiance[-1, ::2] = 0.1  # exponents that differ: the last line ends with a literal, not with a run
     whole = _hdr(tmp_path / "sky.hdr", radiance)
-    for length in (*range(0, 200, 7), 3000, len(whole) - 30, len(whole) - 1):
+    for length in (*range(0, 200, 29), 3000, len(whole) - 30, len(whole) - 1):
         file.write_bytes(whole[:length])
         with pytest.raises(InputError):
             load_light(file)

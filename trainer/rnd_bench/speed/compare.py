@@ -27,6 +27,8 @@ MEDIAN_ERROR = 1.25  # standard error of a median over that of a mean, for norma
 RENDER = """
 import json, sys
 from time import perf_counter
+from rnd_runtime.core.kernels import prepare_process
+prepare_process()
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.motion.motion import load_motion
