@@ -14,10 +14,10 @@ from onnx import TensorProto, helper, numpy_helper
 
 from rnd_bench.cli import main
 from rnd_bench.lifter import filming, training
-from rnd_bench.lifter.blazepose import LandmarkGraph, Looks
-from rnd_bench.lifter.figures import Lifts, calibration, figures, of_windows, procrustes
-from rnd_bench.lifter.filming import Films, Places, Scene, Studio, Window, filmed, load_films, save_films
-from rnd_bench.lifter.motions import MIRROR, TEST, VALIDATION, Clips, chained, load_clips, relative, sampled, subject_of
+from rnd_bench.lifter.blazepose import LandmarkGraph
+from rnd_bench.lifter.figures import Lifts, calibration, procrustes
+from rnd_bench.lifter.filming import Films, Places, Studio, Window, filmed, load_films, save_films
+from rnd_bench.lifter.motions import MIRROR, Clips, chained, relative, sampled
 from rnd_bench.lifter.network import export, negative_log_likelihood
 from rnd_bench.lifter.people import Points
 from rnd_bench.lifter.pose2sim import Calibrated, triangulated
@@ -27,7 +27,6 @@ from rnd_runtime.core.rotations import axis_angle_to_matrix
 from rnd_trainer.estimating.lifted import JOINTS, REST_DIRECTIONS, ROLL_AXES
 from rnd_trainer.estimating.lifter import CHANNELS, REACH, run
 from rnd_trainer.estimating.observing.regions import Region
-from support.paths import SHARED
 from support.tiny import body
 
 CPU = torch.device("cpu")
@@ -128,16 +127,6 @@ def test_windows_are_rotations_and_mirror_images_swap_the_sides(clips: Clips) ->
     assert (MIRROR[MIRROR] == np.arange(22)).all() and JOINTS[MIRROR[1]] == "right_hip"
 
 
-def test_subjects_of_the_held_out_parts_are_in_no_other() -> None:
-    if not (SHARED / "data" / "mocap").is_dir():
-        pytest.skip("no motions in ../shared/data/mocap")
-    parts = load_clips(SHARED / "data" / "mocap")
-    subjects = {part: {subject_of(name.split("/")[1]) for name in clips.names} for part, clips in parts.items()}
-    assert subjects["test"] == set(TEST) and subjects["validation"] == set(VALIDATION)
-    assert not subjects["train"] & (subjects["test"] | subjects["validation"])
-    assert sum(len(clips.names) for clips in parts.values()) == 383
-
-
 def test_vectors_of_the_t_pose_are_the_rest_vectors() -> None:
     vectors = vectors_of(np.broadcast_to(np.eye(3, dtype=np.float32), (22, 3, 3)))
     np.testing.assert_allclose(vectors, np.concatenate([REST_DIRECTIONS, ROLL_AXES]), atol=1e-6)
@@ -163,30 +152,6 @@ def test_points_move_as_linear_blend_skinning_says(person: Path) -> None:
     bone = (joints[0, 0, knee] - joints[0, 0, hip]).norm()
     assert float(bone) == pytest.approx(float((points.rest[knee] - points.rest[hip]).norm()), rel=0.02)
     assert normals.shape == placed.shape
-
-
-def test_the_nearest_point_is_drawn_and_nothing_beside_the_person(studio: Studio, person: Path) -> None:
-    points = studio._people[person]
-    shape, eye = points.neutral[None], torch.eye(3)[None]
-    turn = eye * torch.tensor([1.0, -1.0, -1.0])
-    scene = Scene(studio, points, shape, turn, torch.tensor([[0.0, 0.9, 4.0]]), np.random.default_rng(0))
-    scene.noise *= 0
-    rotations = torch.eye(3).expand(1, 1, 24, 3, 3)
-    joints = points.joints(shape, rotations, points.rest[:1][None])
-    placed, normals = points.posed(shape, rotations[:, 0], joints[:, 0])
-    ahead = placed @ turn.mT + scene.shift[:, None]
-    image, mask = scene._drawn(ahead, normals, torch.zeros(1, 2), torch.tensor([0.4]))
-    flat = ((ahead[0, :, :2] / ahead[0, :, 2:] / 0.4 + 1) * filming.CANVAS / 2).long()
-    assert (mask[0, 0, flat[:, 1], flat[:, 0]] == 1).float().mean() > 0.99
-    assert mask.mean() < 0.2
-    assert torch.allclose(image[:, :, 0, 0], 0.2 * scene.behind[:, None], atol=1e-5)
-    inside = torch.full((1, 1, 33, 2), 0.0)
-    inside[..., 0] = torch.linspace(-0.3, 0.3, 33)
-    far = filming._outside(mask, inside, torch.zeros(1, 2), torch.tensor([0.4]))[0, 0]
-    rows, columns = np.nonzero(mask[0, 0].numpy())
-    known = np.stack([columns, rows], -1) / filming.CANVAS * 0.8 - 0.4
-    exact = np.linalg.norm(inside[0, 0, :, None].numpy() - known, axis=-1).min(1)
-    np.testing.assert_allclose(far, exact, atol=0.012)
 
 
 def test_regions_are_those_of_the_observer() -> None:
@@ -271,13 +236,6 @@ def test_the_network_in_torch_is_the_one_in_onnxruntime(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[1].permute(0, 2, 3, 1), expected[1], atol=1e-4)
 
 
-def test_mirrored_looks_name_the_other_side() -> None:
-    outputs = Graph()(torch.zeros(1, 3, 256, 256))
-    outputs[0][0, 5 * 11] = 100.0  # the left shoulder's x
-    plain, other = Looks(outputs, False), Looks(outputs, True)
-    assert plain.points[0, 11, 0] == 100 and other.points[0, 12, 0] == 156
-
-
 @pytest.mark.parametrize("kappa", [0.5, 3.0, 40.0, 2000.0])
 def test_likelihood_integrates_to_one(kappa: float) -> None:
     cosine = 1 - np.logspace(-9, np.log10(2.0), 20001)
@@ -320,11 +278,6 @@ def test_training_lowers_the_loss_and_is_reproducible(trained) -> None:
     first, again = trained[0]
     assert first.curve[-1]["validation"] < first.curve[0]["validation"]
     assert all(torch.equal(a, b) for a, b in zip(first.network.parameters(), again.network.parameters()))
-
-
-def test_figures_of_windows_count_the_frames_seen(clips: Clips, trained) -> None:
-    row = figures(of_windows(_windows(clips, 3, 4), trained[1]))
-    assert row["frames"] == 60 and len(row["bones_deg"]) == 21 and row["limbs_deg_landmarks"] < 6
 
 
 def test_the_file_computes_what_the_network_does(trained) -> None:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from rnd_bench.scenes import avatars
-from rnd_bench.scenes.avatars import Encoders, exported, seeded_checkpoint
+from rnd_bench.scenes.avatars import seeded_checkpoint
 from rnd_bench.scenes.scenes import HARDEST, INSIDE, SQUAT, SUN, USUAL, BenchScene, bench_camera, bench_scene
 from rnd_bench.speed import frame as frames
-from rnd_bench.speed import reference as references
 from rnd_bench.speed.frame import COMPARED, STEP_S, STEP_YAW, Measured, Point
 from rnd_bench.speed.point import Inputs, Setting, measured
 from rnd_bench.speed.reference import MAX_DB, Reference, errors, reference
@@ -151,47 +146,6 @@ def test_a_file_is_measured_beside_its_own_checkpoints_avatar(tiny_checkpoint, t
         measured(usual, dataclasses.replace(inputs, checkpoints=()), file=merged)
 
 
-def test_stored_files_are_found_by_the_content_of_their_sources(tiny_avatar, tmp_path, monkeypatch) -> None:
-    """Another checkpoint, exporter, motion or formula under an old name is not taken for the old one."""
-    made: list[list[str]] = []
-
-    def pretend(line: list[str], **_: object) -> subprocess.CompletedProcess[str]:
-        made.append(line)
-        Path(line[line.index("--out") + 1]).touch()
-        return subprocess.CompletedProcess(line, 0)
-
-    monkeypatch.setattr(avatars.subprocess, "run", pretend)
-    checkpoint, code = tmp_path / "avatar.ckpt", tmp_path / "export.py"
-    monkeypatch.setattr(avatars, "sources", lambda package: [code])
-    for number, (content, program) in enumerate((("one", "old"), ("one", "new"), ("two", "new")), 1):
-        checkpoint.write_text(content)
-        code.write_text(program)
-        assert exported(checkpoint, Encoders(), tmp_path) == exported(checkpoint, Encoders(), tmp_path)
-        assert len(made) == number
-
-    lit: list[Path] = []
-
-    def shine(avatar: Path, scene: BenchScene, with_suns: bool) -> dict[str, np.ndarray]:
-        lit.append(scene.motion)
-        return {"means": np.zeros((0, 0, 3))}
-
-    monkeypatch.setattr(references, "_lit", shine)
-    monkeypatch.setattr(references, "COMPARED", ())
-    motions = [tmp_path / "a.npz", tmp_path / "b.npz"]
-    for motion in motions:
-        motion.write_text(motion.name)
-    for motion in (*motions, motions[0]):
-        reference(tiny_avatar, BenchScene(motion, SKY, USUAL), 8, tmp_path)
-    assert lit == motions
-    monkeypatch.setattr(references, "sources", lambda package: [code])
-    reference(tiny_avatar, BenchScene(motions[0], SKY, USUAL), 8, tmp_path)
-    reference(tiny_avatar, BenchScene(motions[0], SKY, INSIDE), 8, tmp_path)
-    monkeypatch.setattr(references, "STEP_YAW", 0.5)
-    reference(tiny_avatar, BenchScene(motions[0], SKY, USUAL), 8, tmp_path)
-    reference(tiny_avatar, BenchScene(motions[0], SKY, USUAL), 8, tmp_path, with_suns=True)
-    assert len(lit) == 6
-
-
 def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:
     body = Body.load(ASSETS / "body.npz")
     body.save(tmp_path / "body.npz")
@@ -201,20 +155,3 @@ def test_a_seeded_avatar_stands_on_the_body_that_was_given(tmp_path) -> None:
     after = seeded_checkpoint(60, tmp_path / "body.npz", tmp_path)
     heights = [np.ptp(load_checkpoint(file).model.points.numpy()[:, 1]) for file in (before, after)]
     assert heights[1] > 1.2 * heights[0]
-
-
-def test_seeded_avatars_follow_one_formula(tmp_path) -> None:
-    """A larger one looks like a smaller one: the same fields at the same positions, valid and not silent."""
-    small, large = (load_checkpoint(seeded_checkpoint(n, ASSETS / "body.npz", tmp_path)).model for n in (300, 600))
-    looks = []
-    for model in (small, large):
-        with torch.no_grad():
-            static = model.attributes(model.encoded_nodes())
-        looks.append(static.albedo.numpy())
-        assert looks[-1].std() > 0.05 and float(static.opacity.mean()) > 0.9
-        assert float(model.skinning.logits.weight.detach().abs().max()) > 0
-    distances = np.linalg.norm(small.points.numpy()[:, None] - large.points.numpy()[None], axis=-1)
-    near = distances.argmin(1)
-    close = distances.min(1) < 0.01
-    ours, theirs = looks[0][close], looks[1][near[close]]
-    assert close.sum() > 10 and np.median(np.abs(ours - theirs)) < 0.05

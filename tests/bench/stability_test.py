@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -13,14 +12,11 @@ import pytest
 from rnd_bench.scenes.psnr import IDENTICAL_DB, decibels
 from rnd_bench.scenes.subject import Subject
 from rnd_bench.stability import soak
-from rnd_bench.stability.cli import measured_on
 from rnd_bench.stability.figures import Figure, above, below, holds, not_measured, reported
 from rnd_bench.stability.measures import captures, materials, poses, stress
 from rnd_bench.stability.rows import AVATAR
 from rnd_bench.stability.table import line_of, rows_of, store
-from rnd_runtime.capture.capture import Capture
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import write_image
 
 pytestmark = pytest.mark.slow
 
@@ -51,11 +47,6 @@ def test_the_table_holds_other_rows_and_replaces_its_own(tmp_path):
         rows_of(file)
 
 
-def test_only_rows_of_the_avatar_have_its_size(bare):
-    assert {"gaussians", "size", "checkpoint_sha256"} <= set(measured_on(AVATAR, bare))
-    assert set(measured_on("a ball", bare)) == {"on", "threads", "machine"}
-
-
 def test_the_worst_cases_are_timed_and_compared(bare):
     measured = {figure.what: figure.measured for figure in stress.worst_cases(bare).figures}
     for scene in ("an ordinary frame", "camera inside the body", "squat", "light of 1e6"):
@@ -77,13 +68,6 @@ def test_missing_figures_and_nan_never_pass(tmp_path):
     assert line_of("L11", figures[1]) == "✗ L11  pace: nan × < 1  (plain: nan)"
 
 
-def test_a_short_soak_has_no_memory_slope():
-    segment = {"frames": 300, "memory": [1, 2], "seconds": [1.0] * 300, "loads": [], "wrong": 0}
-    figures = soak._figures("playback", [segment], True, ())
-    assert figures[0].what == "playback, 300: memory a frame (too few in one go)" and not figures[0].line
-    assert figures[0].measured is None and len(figures) == 2 and figures[1].passes
-
-
 def test_a_leak_is_growth_and_no_single_allocation():
     """Readings every twenty steps from the 200th on; the second kind begins with step 800."""
     once, leak = [0] * 30 + [10**6] * 60, [2_000 * 20 * k for k in range(90)]
@@ -101,19 +85,8 @@ def test_a_leak_is_growth_and_no_single_allocation():
 def bare(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory) -> Subject:
     """A capture of five images to train on: no other lights or poses, no albedo, no normals."""
     frames = tuple(msgspec.structs.replace(frame, normal=None) for frame in tiny_capture.frames if frame.frame < 5)
-    return _with(tiny_avatar, tiny_checkpoint, tiny_capture, tmp_path_factory.mktemp("bare"), frames)
-
-
-def _with(avatar, checkpoint, capture: Capture, work, frames) -> Subject:
-    return Subject(avatar, checkpoint, dataclasses.replace(capture, frames=frames), work, small=True, size=24)
-
-
-def _linked(capture: Capture, folder: Path) -> Path:
-    """All of ``capture`` but its normals and capture.json."""
-    folder.mkdir()
-    for part in ("images", "masks", "lights", "body.npz", "motion.npz"):
-        (folder / part).symlink_to(capture.folder / part)
-    return folder
+    capture, work = dataclasses.replace(tiny_capture, frames=frames), tmp_path_factory.mktemp("bare")
+    return Subject(tiny_avatar, tiny_checkpoint, capture, work, small=True, size=24)
 
 
 def _missing(figures: tuple[Figure, ...]) -> list[str]:
@@ -131,37 +104,6 @@ def test_what_a_capture_lacks_is_not_measured(bare):
     assert _missing((poses.held_out_poses(bare)[0],)) == ["PSNR over template LBS on held-out poses, mean"]
     assert len(_missing(captures.broken_captures(bare).figures)) == 1
     assert len(_missing(captures.bad_masks(bare).figures)) == 2
-
-
-def test_flipped_normals_need_normals(bare, tiny_capture, tmp_path):
-    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, tiny_capture.frames)
-    assert captures.flipped_normals(subject).passes
-    record = captures._record(tiny_capture.folder)
-    record["frames"] = [{k: v for k, v in f.items() if k != "normal"} for f in record["frames"]]
-    folder = _linked(tiny_capture, tmp_path / "plain")
-    captures._save(folder, record)
-    plain = dataclasses.replace(tiny_capture, folder=folder)
-    subject = _with(bare.avatar_file, bare.checkpoint, plain, tmp_path, plain.frames)
-    assert len(_missing((captures.flipped_normals(subject),))) == 1
-
-
-def test_relighting_without_true_albedo_has_no_scaled_figures(bare, tiny_capture, tmp_path):
-    other = msgspec.structs.replace(tiny_capture.frames[0], split="relight")
-    frames = (*tiny_capture.frames[1:3], other)
-    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, frames)
-    figures = materials.relit_scale(subject).figures
-    assert [figure.measured is None for figure in figures] == [False, True, False, True]
-
-
-def test_frames_without_light_or_person_are_skipped(bare, tiny_capture, tmp_path):
-    camera = tiny_capture.cameras["front"]
-    write_image(tmp_path / "empty.png", np.zeros((camera.height, camera.width, 1), np.uint8))
-    train = msgspec.structs.replace(tiny_capture.frames[0], albedo=tiny_capture.frames[0].image, light=None)
-    empty = msgspec.structs.replace(tiny_capture.frames[1], split="novel_pose", mask=str(tmp_path / "empty.png"))
-    subject = _with(bare.avatar_file, bare.checkpoint, tiny_capture, tmp_path, (train, empty))
-    assert len(_missing(materials.baked_light(subject).figures)) == 1
-    assert len(_missing((materials.lost_to_exact(subject),))) == 1
-    assert len(_missing((poses.held_out_poses(subject)[0],))) == 1
 
 
 def test_an_image_that_is_not_finite_is_not_identical():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 import subprocess
 import sys
@@ -145,31 +144,6 @@ def test_existing_images_are_not_rendered_again(filmed: Path, production) -> Non
     assert len(times) - len(kept) == len(production.views[0].truth_files(False))  # the one view's PNGs and its picture
 
 
-def test_machine_and_cost_stay_where_nothing_was_rendered_since(filmed, production, tmp_path, monkeypatch) -> None:
-    shutil.copytree(filmed, tmp_path / "again")
-    folder, names = tmp_path / "again", ("capture.json", "README.md")
-    assert manifest.write_manifest(production, folder, "scalar_rgb", 1.25)
-    before = {name: (folder / name).read_bytes() for name in names}
-    monkeypatch.setattr(manifest, "machine", lambda: "another one")
-    (folder / "contact.png").unlink()
-    assert manifest.write_manifest(production, folder, "llvm_ad_rgb", None)
-    assert {name: (folder / name).read_bytes() for name in names} == before
-    assert (folder / "contact.png").exists() and b"1.25 s of processor time" in before["README.md"]
-    (folder / "README.md").unlink()
-    assert manifest.write_manifest(production, folder, "llvm_ad_rgb", None)
-    assert "another one" in (folder / "README.md").read_text()
-    assert (folder / "capture.json").read_bytes() == before["capture.json"]
-    assert manifest.write_manifest(production, folder, "llvm_ad_rgb", 0.5)
-    assert json.loads((folder / "capture.json").read_text())["engine"]["variant"] == "llvm_ad_rgb"
-
-
-def test_a_readmes_command_can_be_pasted(production) -> None:
-    production = replace(production, recipe=replace(production.recipe, motion="my walk.npz", hdr=("a'b.exr",)))
-    words = shlex.split(manifest._readme(production, "scalar_rgb", None).split("rnd-stage OUT")[1].split("\n")[0])
-    assert words[words.index("--motion") + 1] == "my walk.npz" and words[words.index("--hdr") + 1] == "a'b.exr"
-    assert words[words.index("--lights") + 1] == "red" and "--no-visibility" not in words
-
-
 def test_a_recipes_files_may_be_elsewhere_and_not_differ(recipe, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "more").mkdir()
@@ -238,14 +212,6 @@ def test_a_recipe_that_is_none_is_refused(recipe, tmp_path: Path, text: str) -> 
 def test_impossible_recipes_are_refused(recipe, change: dict) -> None:
     with pytest.raises(InputError):
         replace(recipe, **change).check()
-
-
-def test_the_captures_name_is_printed_as_it_is(production, monkeypatch, capsys) -> None:
-    monkeypatch.setattr(film, "prepare", lambda recipe, out: production)
-    monkeypatch.setattr(manifest, "write_manifest", lambda *_: True)
-    monkeypatch.setattr(cli, "_film", lambda *_: None)
-    assert cli.main(["out[x]", "--variant", "scalar_rgb"]) == 0
-    assert capsys.readouterr().out.startswith(f"out[x]/capture.json: {production.title}\nnext: rnd-train out[x]")
 
 
 @pytest.mark.parametrize("text", ["1", "2/2", "a/b", "-1/2", "1/0", f"1/{'9' * 5000}"])

@@ -9,26 +9,8 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("skimage")
 mi.set_variant("scalar_rgb")
 
-from rnd_runtime.shading.light import Light, texel_directions  # noqa: E402
-from rnd_stage.film import estimates, lights  # noqa: E402
+from rnd_stage.film import estimates  # noqa: E402
 from rnd_stage.film.cameras import ring_cameras  # noqa: E402
-
-
-def test_there_are_nineteen_modules_eight_colours_and_a_white_light() -> None:
-    assert lights.module_directions().shape == (19, 3)
-    made = lights.stage_lights()
-    assert made[0].name == "white" and len(made) == 9
-    directions = texel_directions(64, 128).reshape(-1, 3)
-    nearest = (directions @ lights.module_directions().T).argmax(0)
-    white = made[0].file_radiance.reshape(-1, 3)
-    assert (white[nearest] > 0.9).all()  # a peak of one at every module
-    for light in made:
-        mean = Light(light.radiance).mean_radiance
-        assert mean.max() == pytest.approx(lights.EXPOSURE, rel=1e-5)
-    colours = np.array([Light(light.radiance).mean_radiance for light in made])
-    apart = np.linalg.norm(colours[:, None] - colours[None], axis=-1) + np.eye(9)
-    patterns = np.array([light.radiance.ravel() / light.radiance.max() for light in made])
-    assert apart.min() > 0.02 and np.abs(np.corrcoef(patterns) - np.eye(9)).max() < 0.99
 
 
 def test_cameras_are_on_three_rings_and_show_the_whole_person() -> None:

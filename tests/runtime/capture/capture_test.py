@@ -172,38 +172,10 @@ def test_motion_columns_follow_the_body_without_names(folder):
     assert_allclose(motion.rotations, axis_angle_to_matrix(axis_angles.reshape(-1, 2, 3)), atol=1e-12)
 
 
-def test_informational_keys_at_the_top_are_welcome(folder):
-    _edit(folder, "render", value={"spp": 128})
-    assert len(load_capture(folder).frames) == 2
-
-
 def test_capture_without_measured_lights(folder):
     _edit(folder, "lights", remove=True)
     _edit(folder, "frames", 0, "light", remove=True)
     assert load_capture(folder).lights == {}
-
-
-@pytest.mark.skipif(not SHARED_DATA.is_dir(), reason="the shared capture is not here; the self-made one above is")
-def test_the_shared_capture():
-    capture = load_capture(SHARED_DATA)
-    counts = {name: len(capture.split(name)) for name in ("train", "novel_view", "novel_pose", "relight")}
-    assert counts == {"train": 100, "novel_view": 32, "novel_pose": 32, "relight": 42}
-    assert capture.motion.frame_count == 694 and capture.fps == 30 and capture.motion.notes == ()
-    assert load_capture(SHARED_DATA, motion_file="motion_noisy.npz").motion.frame_count == 694
-    pictures = capture.load_frame(capture.split("novel_view")[0])
-    inside = pictures.mask > 0.5
-    assert (pictures.normal_gt[inside][:, 2] < 0.05).mean() > 0.99  # visible surfaces look at the camera
-    assert (pictures.image_srgb[pictures.mask == 0] == 0).all()
-    # the posed template lies inside the mask, seen through camera and motion together
-    frame = capture.split("train")[40]
-    mask = capture.load_frame(frame).mask
-    camera, motion = capture.cameras[frame.camera], capture.motion
-    joints = capture.body.skeleton.joint_transforms(motion.rotations[frame.frame], motion.translations[frame.frame])[
-        :, :3, 3
-    ]
-    x, y, z = camera.world_to_camera[:3, :3] @ joints.T + camera.world_to_camera[:3, 3:]
-    pixels = camera.K @ np.stack([x / z, y / z, np.ones_like(z)])
-    assert (mask[pixels[1].astype(int), pixels[0].astype(int)] > 0.5).all()
 
 
 # Refusals

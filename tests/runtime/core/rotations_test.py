@@ -12,7 +12,6 @@ from rnd_runtime.core.rotations import (
     matrix_to_axis_angle,
     matrix_to_quaternion,
     quaternion_to_matrix,
-    rotation_6d,
     slerp_matrices,
 )
 
@@ -25,13 +24,6 @@ def _axes(count: int = 40) -> np.ndarray:
     random = np.random.default_rng(0).normal(size=(count, 3))
     axes = np.concatenate([random, np.eye(3), -np.eye(3)])
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
-
-
-def test_matrix_of_a_quarter_turn_about_each_axis():
-    x, y, z = axis_angle_to_matrix(np.eye(3) * np.pi / 2)
-    assert_allclose(x @ [0, 1, 0], [0, 0, 1], atol=ROUND_OFF)
-    assert_allclose(y @ [0, 0, 1], [1, 0, 0], atol=ROUND_OFF)
-    assert_allclose(z @ [1, 0, 0], [0, 1, 0], atol=ROUND_OFF)
 
 
 def test_axis_angle_agrees_with_scipy():
@@ -110,12 +102,6 @@ def test_slerp_between_equal_rotations_that_files_write_differently():
     b = axis_angle_to_matrix([0, 0, -np.pi + 0.01])
     middle = slerp_matrices(a, b, 0.5)
     assert_allclose(middle, axis_angle_to_matrix([0, 0, np.pi]), atol=1e-14)
-
-
-def test_rotation_6d_is_the_first_two_columns():
-    matrix = np.arange(9.0).reshape(3, 3)
-    assert rotation_6d(matrix).tolist() == [0, 3, 6, 1, 4, 7]
-    assert rotation_6d(np.zeros((4, 5, 3, 3))).shape == (4, 5, 6)
 
 
 @settings(max_examples=60, deadline=None)

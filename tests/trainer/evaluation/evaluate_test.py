@@ -28,7 +28,7 @@ from rnd_trainer.config import ModelConfig
 from rnd_trainer.evaluation.evaluate import Evaluator, albedo_scale, evaluate, flicker
 from rnd_trainer.evaluation.evaluator import Rendered, render_runtime
 from rnd_trainer.evaluation.held_out import playback, score, strip_names
-from rnd_trainer.evaluation.scores import frame_scores, normal_image, outline_length, silhouette, to_srgb8
+from rnd_trainer.evaluation.scores import frame_scores, outline_length, silhouette, to_srgb8
 from rnd_trainer.losses.metrics import psnr, ssim_map
 from rnd_trainer.model.checkpoint import load_checkpoint
 from rnd_trainer.model.model import AvatarModel
@@ -194,12 +194,6 @@ def test_a_sliver_at_the_edge_is_scored_and_an_empty_frame_is_left_out(tiny_run,
     assert evaluate(evaluator, "novel_view").frames == len(tiny_capture.split("novel_view")) - 1
 
 
-def test_normal_images_are_black_without_coverage() -> None:
-    normals = torch.tensor([[[0.0, 0.0, -0.5], [0.0, 0.0, -2.0]]])
-    image = normal_image(normals, torch.tensor([[0.01, 0.5]]))
-    assert torch.equal(image, torch.tensor([[[0.0, 0.0, 0.0], [0.5, 0.5, 0.0]]]))
-
-
 def test_the_silhouette_is_a_band_on_either_side_of_the_edge() -> None:
     mask = torch.zeros(40, 40)
     mask[12:28, 12:28] = 1
@@ -267,43 +261,12 @@ def test_a_refined_run_is_scored_in_its_own_poses(tiny_capture, tiny_config, tmp
     assert str(scored[-1].motion.source) == str(tiny_capture.motion.source)
 
 
-def test_rows_are_written_before_the_table_whose_title_is_the_runs_name(
-    tiny_checkpoint, tiny_capture, tmp_path, monkeypatch, capsys
-) -> None:
-    rows = [{"split": "novel_view", "frames": 1}]
-    monkeypatch.setattr(rnd_trainer.evaluation.held_out, "score", lambda *_, **__: rows)
-    monkeypatch.chdir(tmp_path)
-    Path("r[x]").mkdir()
-    shutil.copy(tiny_checkpoint, "r[x]/avatar.ckpt")
-    evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder))
-    assert "r[x]/avatar.ckpt" in capsys.readouterr().out
-
-    def closed() -> None:
-        raise BrokenPipeError
-
-    monkeypatch.setattr(rnd_trainer.commands.eval, "wide_console", closed)
-    with pytest.raises(BrokenPipeError):
-        evaluate_run(EvalOptions(Path("r[x]"), tiny_capture.folder, json=Path("rows.json")))
-    assert json.loads(Path("rows.json").read_text()) == rows
-
-
 def test_the_scores_are_those_of_the_rendered_frames(tiny_run, tiny_capture) -> None:
     evaluator = Evaluator(load_checkpoint(tiny_run / "avatar.ckpt"), tiny_capture)
     seen = []
     result = evaluate(evaluator, "novel_view", on_frame=lambda frame, rendered, target: seen.append((rendered, target)))
     expected = np.mean([psnr(to_srgb8(rendered.image), target) for rendered, target in seen])
     assert result.scores["psnr"] == pytest.approx(expected, rel=1e-6)
-
-
-def test_flicker_is_zero_for_a_static_motion_and_positive_for_jumps(tiny_run, tiny_capture) -> None:
-    checkpoint = load_checkpoint(tiny_run / "avatar.ckpt")
-    moves = tiny_capture.motion
-    still = dataclasses.replace(moves, rotations=np.repeat(moves.rotations[:1], 6, axis=0))
-    assert flicker(Evaluator(checkpoint, tiny_capture, motion=still), "train") == 0
-    jumping = dataclasses.replace(moves, rotations=moves.rotations[[0, 1, 0, 1, 0, 1]])
-    jumping_flicker = flicker(Evaluator(checkpoint, tiny_capture, motion=jumping), "train")
-    assert jumping_flicker is not None and jumping_flicker > 1
-    assert flicker(Evaluator(checkpoint, tiny_capture), "relight") is None
 
 
 def _shown(values: list[float], mask: np.ndarray) -> SimpleNamespace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import OrderedDict
 from pathlib import Path
 
@@ -246,24 +245,6 @@ def test_dead_features_give_no_nan(nets, tmp_path) -> None:
     assert torch.isfinite(image.grad).all() and float(image.grad.abs().max()) > 0
 
 
-def test_a_features_scale_does_not_matter_and_a_heads_does(nets, tmp_path) -> None:
-    a, b = _image(16, 16), _image(16, 16, seed=1)
-
-    def distance(change) -> float:
-        state = _tensors(nets["alexnet"], "alexnet", 1)
-        change(state)
-        save_file(state, tmp_path / "scaled.safetensors")
-        return float(load_perceptual(tmp_path / "scaled.safetensors").to(dtype=torch.float64)(a, b))
-
-    def scale(*names, by):
-        return lambda state: state.update({name: by * state[name] for name in names})
-
-    plain = distance(lambda state: None)
-    assert distance(scale("features.0.weight", "features.0.bias", by=64.0)) == pytest.approx(plain, rel=1e-8)
-    assert distance(scale("features.0.bias", by=64.0)) != pytest.approx(plain, rel=1e-2)
-    assert distance(scale("lin0.weight", by=2.0)) == pytest.approx(2 * plain, rel=1e-12)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_smallest_is_the_size_at_which_torch_gives_up(name, nets, distances, tmp_path) -> None:
     for layers in range(1, len(TAPS[name]) + 1):
@@ -279,21 +260,6 @@ def test_smallest_is_the_size_at_which_torch_gives_up(name, nets, distances, tmp
             for height, width in ((side - 1, 99), (99, side - 1)):
                 with pytest.raises(InputError, match=rf"at least {side} × {side} pixels, got {width} × {height}"):
                     part.features(torch.zeros(height, width, 3))
-
-
-def test_a_crop_is_an_image_and_its_gradient_stays_inside(distances) -> None:
-    distance = distances["squeezenet1_1"]
-    image, target = _image(60, 50).float().requires_grad_(), _image(60, 50, seed=1).float()
-    rows, columns = slice(7, 37), slice(11, 44)
-    cropped = distance(image[rows, columns], target[rows, columns])
-    assert float(cropped.detach()) == float(
-        distance(image.detach()[rows, columns].contiguous(), target[rows, columns].contiguous())
-    )
-    cropped.backward()
-    assert float(image.grad[rows, columns].abs().max()) > 0
-    outside = torch.ones(60, 50, dtype=torch.bool)
-    outside[rows, columns] = False
-    assert torch.equal(image.grad[outside], torch.zeros_like(image.grad[outside]))
 
 
 @pytest.mark.parametrize(("name", "layers"), [("alexnet", 3), ("squeezenet1_1", 4), ("vgg16", 3)])
@@ -341,16 +307,6 @@ def test_torchvisions_pth_is_read_without_its_classifier(zipped, nets, small, tm
     net = load_perceptual(tmp_path / "alexnet.pth")
     assert torch.equal(net.features(image)[0], load_perceptual(small).features(image)[0])
     assert not net.heads and not net.features(image)[0].requires_grad
-
-
-def test_sha256_is_the_files(small) -> None:
-    assert load_perceptual(small).sha256 == hashlib.sha256(small.read_bytes()).hexdigest()
-
-
-def test_loading_draws_no_random_numbers(small) -> None:
-    before = torch.get_rng_state()
-    load_perceptual(small)
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_files_that_cannot_be_read_are_refused(small, tmp_path) -> None:
@@ -437,10 +393,3 @@ def test_lpips_of_its_own_example(name, far, near) -> None:
     assert lpips.is_lpips and lpips.backbone == name
     assert float(lpips(_example("ref"), _example("p0"))) == pytest.approx(far, abs=PUBLISHED)
     assert float(lpips(_example("ref"), _example("p1"))) == pytest.approx(near, abs=PUBLISHED)
-
-
-@needs_shared
-def test_the_shared_half_of_vgg16_is_not_called_lpips() -> None:
-    part = load_perceptual(SHARED_DATA / "vgg16_first_two_blocks.safetensors")
-    assert (part.backbone, part.is_lpips, part.layers) == ("vgg16[:2]", False, 2)
-    assert float(part(_example("ref"), _example("p0"))) > 0

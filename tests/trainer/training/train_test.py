@@ -25,8 +25,6 @@ from rnd_runtime.capture.capture import CaptureLight, load_capture
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import write_image
 from rnd_trainer.commands.eval import EvalOptions, evaluate_run
-from rnd_trainer.commands.train_options import Learning, TrainOptions
-from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.losses import linear_to_srgb
 from rnd_trainer.losses.perceptual import load_features, load_lpips
 from rnd_trainer.losses.perceptual_nets import BACKBONES
@@ -290,20 +288,6 @@ def _half_of(folder: Path) -> Path:
     return folder / "blocks.safetensors"
 
 
-@pytest.mark.parametrize(
-    ("changes", "motion"),
-    [({}, None), ({"motion": "b.npz"}, "b.npz"), ({"refine_poses": True}, "OUT/refined_motion.npz")],
-)
-def test_a_training_is_scored_in_its_refined_poses(changes, motion, tiny_capture, tmp_path, monkeypatch) -> None:
-    scored: list[EvalOptions] = []
-    monkeypatch.setattr(rnd_trainer.commands.train, "evaluate_run", scored.append)
-    options = TrainOptions(Path("capture"), learning=Learning(**changes))
-    rnd_trainer.commands.train._score_after_training(
-        SimpleNamespace(capture=tiny_capture, config=TrainConfig()), tmp_path, options
-    )
-    assert scored[0].motion == (motion and motion.replace("OUT", str(tmp_path)))
-
-
 def test_a_state_with_other_fields_is_refused(tiny_run, tiny_capture, tiny_config, tmp_path) -> None:
     tensors, header = read_tensors(tiny_run / "training.state", STATE_SCHEMA)
     training = Training(tiny_capture, tiny_config)
@@ -473,18 +457,3 @@ def test_plain_colours_learn_no_visibility(tiny_capture, tiny_config) -> None:
     plain = Training(tiny_capture, dataclasses.replace(tiny_config, light="none"))
     assert "visibility" not in plain.step().terms
     assert "visibility" in Training(tiny_capture, tiny_config).step().terms
-
-
-def test_unseen_poses_start_from_the_corrected_ones(tiny_capture, tiny_config, monkeypatch) -> None:
-    training = Training(tiny_capture, dataclasses.replace(tiny_config, refine_poses=True))
-    assert training.refinement is not None
-    with torch.no_grad():
-        for raw in training.refinement.raw:
-            raw += 0.3
-    training.step_index, given = tiny_config.steps, []
-    monkeypatch.setattr(rnd_trainer.training.training, "PERTURBED_SHARE", 0)
-    monkeypatch.setattr(training, "unseen", lambda model, pose, step: given.append(pose) or {})
-    training._unseen_terms(training.views[0], training.poses[0])
-    expected = training.refinement.bones(training.views[0].frame.frame)
-    assert torch.equal(given[0].bones, expected) and not given[0].bones.requires_grad
-    assert not torch.equal(expected, training.poses[0].bones)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import rnd_viewer.play.play
 from rnd_runtime.avatar.avatar import Avatar
@@ -101,18 +100,6 @@ def test_the_same_run_gives_the_same_bytes(files, tmp_path):
         del report["times"]
         trees.append((tree, report))
     assert trees[0] == trees[1]
-
-
-def test_a_part_of_a_run_has_the_pixels_of_the_whole(files, tmp_path):
-    options = {"camera": "orbit", "orbit_seconds": "0.4", "background": "hdr", "fps": "45", "shade": "table+sun"}
-    assert main(_arguments(files, tmp_path / "whole", **options)) == 0
-    assert main(_arguments(files, tmp_path / "part", frames="3:5", **options)) == 0
-    whole, part = _tree(tmp_path / "whole"), _tree(tmp_path / "part")
-    assert len([name for name in whole if name.startswith("frames/")]) == 8  # 5/30 s at 45 frames/s
-    pictures = {name for name in part if name.startswith("frames/")}
-    assert pictures == {"frames/000003.png", "frames/000004.png"}
-    assert all(part[name] == whole[name] for name in pictures)
-    assert part["frames/000003.png"] != part["frames/000004.png"]
 
 
 @pytest.mark.parametrize(("background", "shade"), [("hdr", "table+sun"), ("none", "ao")])
@@ -336,17 +323,6 @@ def test_kernels_that_are_not_compiled_yet_are_said_before_they_are_needed(files
     assert capsys.readouterr().err.splitlines() == [f"rnd-play: {COMPILING}", "rnd-play: interrupted"]
 
 
-def test_avatar_that_is_not_there(tmp_path, capsys):
-    assert main([str(tmp_path / "a.onnx"), "--motion", "x.npz", "--out", str(tmp_path / "out")]) == 2
-    assert "a.onnx: avatar not found" in capsys.readouterr().err
-
-
-def test_output_folder_that_cannot_be_written(files, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("rnd_runtime.core.files.os.access", lambda path, mode: False)  # root may write everywhere
-    assert main(_arguments(files, tmp_path / "out")) == 2
-    assert "out: output folder cannot be written" in capsys.readouterr().err
-
-
 def test_avatar_out_of_view_is_an_error_that_says_so(files, tmp_path, capsys):
     camera = {"width": 32, "height": 32, "K": [[40, 0, 16], [0, 40, 16], [0, 0, 1]]}
     camera["world_to_camera"] = np.eye(4).tolist()  # at the feet, looking past the body
@@ -398,13 +374,6 @@ def test_a_file_that_runs_write_is_no_input_of_one_beside_it(files, tmp_path, ca
     assert main(_arguments(files, tmp_path / "other", frames="0:1", **changes)) == 0
 
 
-def test_an_empty_out_is_no_folder(files, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(_arguments(files, "", frames="0:1")) == 2
-    assert "--out: expected a path, got nothing" in capsys.readouterr().err
-    assert not (tmp_path / "frames").exists()
-
-
 def test_a_part_without_the_body_is_no_mistake(files, tmp_path, capsys):
     walking = _cameras_that_lose_the_body(tmp_path, seen=2)
     out = tmp_path / "out"
@@ -421,13 +390,6 @@ def test_mp4_of_cameras_of_several_sizes_is_refused(files, tmp_path, capsys):
     walking.write_text(json.dumps(document))
     assert main(_arguments(files, tmp_path / "out", camera=walking, size=None, format="mp4")) == 2
     assert "mp4: expected frames of one size, 48x48, got 64x64" in capsys.readouterr().err
-
-
-def test_a_webp_of_a_fast_run_says_that_it_keeps_fewer_frames(files, tmp_path, capsys):
-    assert main(_arguments(files, tmp_path / "out", format="webp", fps=120, frames="0:3")) == 0
-    assert "warning: the WebP keeps one frame in 2, 60 a second" in capsys.readouterr().err
-    with Image.open(tmp_path / "out" / "play_000000-000003.webp") as clip:
-        assert clip.n_frames == 2
 
 
 def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
@@ -449,15 +411,6 @@ def test_ctrl_c_leaves_whole_files_only(files, tmp_path, monkeypatch, capsys):
     }
     for name in left:
         assert read_image(tmp_path / "out" / name).shape[:2] == (48, 48)
-
-
-def test_help_explains_every_option(capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(["--help"])
-    assert caught.value.code == 0
-    text = capsys.readouterr().out
-    for option in ("--hdr-yaw", "--exposure", "--aov", "--frames", "--shade", "--raster", "--doctor"):
-        assert option in text
 
 
 def test_doctor_needs_no_avatar_and_gives_advice(monkeypatch, capsys):

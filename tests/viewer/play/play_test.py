@@ -178,12 +178,6 @@ def test_srgb_alpha_ignores_the_background():
     assert isinstance(frame, RenderedFrame)
 
 
-def test_options_parse():
-    assert parse_frames(None, 9) == range(9) and parse_frames("2:", 9) == range(2, 9)
-    assert parse_frames(":3", 9) == range(3) and parse_frames("2:5", 9) == range(2, 5)
-    assert parse_aovs("") == () and parse_aovs("depth, albedo,albedo") == ("albedo", "depth")
-
-
 def test_frames_of_a_motion():
     for frames, fps in ((31, 30), (1, 30), (12, 30), (11, 60)):
         motion = fake_motion(frames, fps)

@@ -19,7 +19,6 @@ from rnd_trainer.config import TrainConfig, to_dict
 from rnd_viewer.report import renders
 from rnd_viewer.report.cli import main
 from rnd_viewer.report.html_parts import curve
-from support.browser import CHROMIUM, chromium
 from support.tiny import ASSETS
 
 VOID = {"meta", "img", "input", "link", "br"}
@@ -41,7 +40,6 @@ ROW = {
     "gaussians": 800,
     "machine": "a test",
 }
-OTHER = "0123456789abcdef" * 4  # the checkpoint of somebody else's avatar
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>'
 
 
@@ -163,70 +161,6 @@ def test_charts_come_from_the_run_unless_a_folder_is_named(run, tmp_path):
     assert "of another" in _write(run, "--bench", str(named))[1].text
 
 
-@pytest.mark.parametrize("shown", ["crossed", "grid"])
-def test_one_chart_of_speed_is_shown_and_no_other(run, shown):
-    folder = _bench(run / "bench", None, "grid", "lengths", "speed", *{shown} - {"grid"})
-    (folder / f"{shown}.json").write_text(json.dumps([{"machine": "a"}, {"machine": "b"}, {"machine": "a"}]))
-    _, page = _write(run)
-    charts = [attributes["alt"] for _, attributes in page.tags if attributes.get("class") == "chart"]
-    assert charts == [shown]
-    assert f"{shown}.svg, measured on a; b. The rows do not name the avatar" in page.text
-
-
-@pytest.mark.parametrize(
-    ("checkpoints", "words"),
-    [
-        (("own",), "Measured on this run's avatar. ✓"),
-        ((OTHER,), "Measured on another avatar, not on this run's (its checkpoint: 0123456789ab). ✓"),
-        (("own", OTHER, OTHER), "1 rows measured on this run's avatar, 2 on another"),
-        (("own", None), "Measured on this run's avatar. 1 of 2 rows name no avatar."),
-        ((None,), "The rows do not name the avatar"),
-    ],
-)
-def test_the_stability_table_names_its_avatar(run, checkpoints, words):
-    (run / "avatar.onnx").unlink()
-    (run / "avatar.ckpt").write_bytes(b"trained")
-    own = sha256_of(run / "avatar.ckpt")
-    rows = [
-        {"id": "P1", "what": "edges"} | ({} if name is None else {"checkpoint_sha256": name})
-        for name in (own if name == "own" else name for name in checkpoints)
-    ]
-    (_bench(run / "bench") / "stability.json").write_text(json.dumps(rows))
-    assert words in _write(run)[1].text
-
-
-@pytest.mark.parametrize(
-    ("counts", "words"),
-    [
-        ({"steps": 240, "step": 360}, "· 360 steps, 240 of them with an image ·"),
-        ({"steps": 240, "step": 240}, "· 240 steps ·"),
-        ({"steps": 240, "step": 100}, "· 100 of 240 steps ·"),
-        ({"steps": 240, "step": None}, "· 240 steps ·"),
-        ({"steps": None, "step": 240}, "800 Gaussians · 6.5 minutes"),
-    ],
-)
-def test_the_facts_count_steps_with_and_without_an_image(run, counts, words):
-    (run / "eval.json").write_text(json.dumps([ROW | counts | {"capture": "capture"}]))
-    _, page = _write(run)
-    assert words in page.text
-    assert "trained on capture ·" in page.text and "capture capture" not in page.text
-    assert "flicker 24.09 of 255 (change from frame to frame" in page.text
-
-
-def test_images_of_a_split_equal_to_those_of_another_are_omitted(run, tmp_path):
-    (run / "avatar.onnx").unlink()
-    (run / "eval/novel_view").rename(run / "eval/relight")
-    scaled = run / "eval/relight_albedo_scaled"
-    shutil.copytree(run / "eval/relight", scaled)
-    _, page = _write(run)
-    assert "relight" in page.text and "The same frames" not in page.text
-    assert sum(tag == "img" for tag, _ in page.tags) == 5 * 3
-    write_image(scaled / "a.png", _strip() // 2)
-    _, page = _write(run)
-    assert "The same frames, with the learned albedo brought to the scale of the true one" in page.text
-    assert sum(tag == "img" for tag, _ in page.tags) == 5 * 6
-
-
 def test_what_a_run_lacks_is_named(run):
     for name in ("avatar.onnx", "eval.json", "metrics.jsonl"):
         (run / name).unlink()
@@ -272,15 +206,6 @@ def test_a_probe_made_for_a_z_up_world_is_turned_upright(run, tmp_path):
     images = [_images(_write(run, *sky, "--hdr-up", up)[1], tmp_path)["sky"] for up in "yz"]
     assert (images[0] != images[1]).any()
     assert main([str(run), "--hdr-up", "z"]) == 2
-
-
-def test_as_many_strips_are_shown_as_asked_for(run, tmp_path):
-    (run / "avatar.onnx").unlink()
-    for words, expected in ((("--images", "9"), "abcd"), (("--images", "2"), "ac"), (("--images", "0"), "")):
-        _, page = _write(run, *words)
-        names = [name for name in _images(page, tmp_path) if name.startswith("truth, ")]
-        assert names == [f"truth, {letter}" for letter in expected]
-        assert sum(tag == "img" for tag, _ in page.tags) == 5 * len(expected)
 
 
 def test_a_line_that_was_begun_when_the_training_was_ended_is_left_out(run):
@@ -368,28 +293,3 @@ def test_a_page_that_cannot_be_written_is_refused_before_anything_is_filmed(run,
     before = (run / "config.json").read_bytes()
     assert main([str(run), "--out", str(run / out)]) == 2
     assert message in capsys.readouterr().err and (run / "config.json").read_bytes() == before
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_tables_fit_a_window_and_what_does_not_scrolls_in_its_own_box(run, tmp_path):
-    (run / "avatar.onnx").unlink()
-    scores = json.loads((ASSETS / "bench/capture.json").read_text())
-    (run / "eval.json").write_text(json.dumps(scores))
-    (run / "config.json").write_text(json.dumps(to_dict(TrainConfig(steps=100)) | {"x" * 400: 1}))
-    write_image(run / "eval/novel_view/a.png", np.full((30, 5 * 500, 3), 99, np.uint8))
-    _write(run, "--bench", str(ASSETS / "bench"))
-    with chromium(tmp_path / "profile", size=(1200, 900)) as page:
-        page.open((run / "report.html").as_uri())
-        page.wait("document.readyState === 'complete' && document.querySelector('table')")
-        page.run("const i = document.querySelector('.ab input'); i.value = 20; i.dispatchEvent(new Event('input'))")
-        clip = "getComputedStyle(document.querySelector('.ab').children[1]).clipPath"
-        assert page.run(clip) == "inset(0px 0px 0px 20%)"
-        page.run("document.querySelector('details').open = true")
-        boxes = "[...document.querySelectorAll('table')].map((t) => [t.offsetWidth, t.parentElement.clientWidth])"
-        (quality, box), (stability, _), (options, _) = page.run(boxes)
-        assert max(quality, stability, box) <= 1150 < options
-        assert page.run("document.documentElement.scrollWidth") <= 1200
-        cut = """[...document.querySelectorAll("*")].filter((e) => e.scrollWidth > e.clientWidth + 1
-            && getComputedStyle(e).overflowX === "hidden").length"""
-        assert page.run(cut) == 0
