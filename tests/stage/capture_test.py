@@ -105,17 +105,8 @@ def test_two_processes_render_the_same(filmed: Path, production, tmp_path: Path)
     names = ("motion", "frames", "cameras", "size", "samples", "relight_cameras", "step")
     options = [word for name in names for word in (flag(name), str(getattr(recipe, name)))]
     code = "import sys; from rnd_stage.cli import main; sys.exit(main())"
-    command = [
-        sys.executable,
-        "-c",
-        code,
-        str(tmp_path),
-        "--variant",
-        "scalar_rgb",
-        *options,
-        "--lights",
-        *recipe.lights,
-    ]
+    command = [sys.executable, "-c", code, str(tmp_path), "--variant", "scalar_rgb", *options]
+    command += ["--lights", *recipe.lights]
     shards = [
         subprocess.Popen([*command, "--shard", f"{k}/2"], env=environment(), stderr=subprocess.PIPE) for k in range(2)
     ]

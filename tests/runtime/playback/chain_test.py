@@ -36,23 +36,11 @@ def played(tiny_capture, tmp_path_factory) -> Path:
     """A folder in which the whole chain has run."""
     folder = tmp_path_factory.mktemp("chain")
     words = ["rnd-train", tiny_capture.folder, "--out", folder / "run", "--preset", "quick"]
+    played = ["--motion", WALK, "--hdr", SKY, "--frames", "0:3", "--size", 96]
     for line in (
         [*words, "--steps", 8, "--gaussians", 400],
         ["rnd-export", folder / "run" / "avatar.ckpt"],
-        [
-            "rnd-play",
-            folder / "run" / "avatar.onnx",
-            "--motion",
-            WALK,
-            "--hdr",
-            SKY,
-            "--out",
-            folder / "out",
-            "--frames",
-            "0:3",
-            "--size",
-            96,
-        ],
+        ["rnd-play", folder / "run" / "avatar.onnx", *played, "--out", folder / "out"],
     ):
         done = _command(*line)
         assert done.returncode == 0, done.stderr

@@ -146,19 +146,8 @@ def test_usd_moves_as_the_glb(coarse, converted, tmp_path):
     from pxr import Usd, UsdGeom, UsdSkel
 
     assert pxr
-    line = [
-        "mesh",
-        str(AVATAR),
-        "--body",
-        str(coarse),
-        "--motion",
-        str(WALK),
-        "--out",
-        str(tmp_path),
-        "--texture",
-        "64",
-    ]
-    assert main([*line, "--format", "usd"]) == 0
+    line = ["mesh", str(AVATAR), "--body", str(coarse), "--motion", str(WALK), "--out", str(tmp_path)]
+    assert main([*line, "--texture", "64", "--format", "usd"]) == 0
     stage = Usd.Stage.Open(str(tmp_path / "avatar.usdz"))
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 131, 30)
