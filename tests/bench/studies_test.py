@@ -1,4 +1,4 @@
-"""Studies: every variant trains, runs are done once, earlier runs of another study are refused, gains are means."""
+"""rnd-bench study: every variant trains, runs are done once, those of another study are refused, gains are means."""
 
 from __future__ import annotations
 
