@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,12 @@ def two_workers() -> Iterator[tuple[Any, str]]:
     """A Dask cluster of two processes, and what ``--on`` calls it; skips the test where the extra is missing."""
     distributed = pytest.importorskip("distributed", reason="extra [dask]: distributed is not installed")
     how = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": ONE_THREAD}
-    with distributed.LocalCluster(**how, dashboard_address="127.0.0.1:0") as cluster:
+    cluster = distributed.LocalCluster(**how, dashboard_address="127.0.0.1:0")
+    try:
         yield cluster, cluster.scheduler_address.replace("tcp://", "dask://")
+    finally:
+        with suppress(TimeoutError):  # a busy machine takes longer to end its processes
+            cluster.close()
 
 
 @contextmanager
