@@ -56,6 +56,8 @@ def test_ablations_are_trained_once_and_compared_seed_by_seed(tiny_capture, tiny
     assert go() == rows and (tmp_path / "ours-0" / "avatar.ckpt").stat().st_mtime_ns == written
     with pytest.raises(InputError, match="steps of a run done before: expected 5, got 4"):
         go(config=dataclasses.replace(config, steps=5))
+    with pytest.raises(InputError, match="hold_out of a run done before: expected True, got False"):
+        go(config=dataclasses.replace(config, hold_out=True))
     poses = dataclasses.replace(tiny_capture.motion, source="other.npz")
     with pytest.raises(InputError, match=r"motion of a run done before: expected other\.npz, got motion\.npz"):
         go(capture=dataclasses.replace(tiny_capture, motion=poses))

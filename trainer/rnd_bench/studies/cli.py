@@ -47,7 +47,7 @@ def run_trainings(options: Trainings) -> None:
         )
         output_file(options.json)
     config = resized(preset(options.preset), options.gaussians, options.steps)
-    config = dataclasses.replace(config, image_scale=options.image_scale)
+    config = dataclasses.replace(config, image_scale=options.image_scale, hold_out=options.hold_out)
     check_sizes(config)
     seeds = range(options.seeds)
     if options.on is not None:

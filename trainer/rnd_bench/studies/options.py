@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from rnd_runtime.cli.command import Count, Number, OptionalCount, OptionalFile, option
+from rnd_runtime.cli.command import Count, Flag, Number, OptionalCount, OptionalFile, option
 from rnd_runtime.cli.jobs import On
 from rnd_runtime.core.errors import check_option, flag
 from rnd_stage.film.plan import Recipe
@@ -37,6 +37,8 @@ class Trainings:
     """as of rnd-train"""
     seeds: Count = 3
     """0 to SEEDS − 1"""
+    hold_out: Flag = False
+    """score on every fifth training frame, held out, instead of the test splits: to choose by"""
     shade: Annotated[str, option("MODE")] = "table+sun"
     """as of rnd-eval"""
     motion: Annotated[str | None, option("FILE")] = None

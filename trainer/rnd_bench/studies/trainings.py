@@ -70,6 +70,7 @@ def ablate(
                 "steps": config.steps,
                 "gaussians": config.model.gaussians,
                 "image_scale": config.image_scale,
+                "hold_out": config.hold_out,
                 "shade": mode,
                 "lpips_weights_sha256": None if judge is None else judge.sha256,
                 FEATURES: networks_sha256(consistency or perceptual),

@@ -33,8 +33,9 @@ def save_training(training: Training, folder: Path) -> None:
         parts["poses"] = training.refinement.state_dict()
     if training.unseen is not None:
         parts["teacher"] = training.unseen.teacher.state_dict()
-    for index, values in training.optimizer.state_dict()["state"].items():
-        parts[f"adam.{index}"] = values
+    for name, optimizer in training.optimizers.items():
+        for index, values in optimizer.state_dict()["state"].items():
+            parts[f"{name}.{index}"] = values
     tensors = {
         f"{part}.{name}": torch.as_tensor(value).cpu().contiguous()
         for part, values in parts.items()
@@ -82,11 +83,12 @@ def resume_training(training: Training, path: Path) -> None:
         if teacher:
             training.unseen = UnseenPoses(training.model, training.capture.body.skeleton, training.config)
             training.unseen.teacher.load_state_dict(teacher)
-        moments: dict[int, dict[str, Tensor]] = {}
-        for name, value in saved.part("adam").items():
-            index, key = name.split(".")
-            moments.setdefault(int(index), {})[key] = value
-        training.optimizer.load_state_dict({**training.optimizer.state_dict(), "state": moments})
+        for name, optimizer in training.optimizers.items():
+            states: dict[int, dict[str, Tensor]] = {}
+            for key, value in saved.part(name).items():
+                index, what = key.split(".")
+                states.setdefault(int(index), {})[what] = value
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
         training.generator.set_state(saved.tensors["generator"])
         training.step_index, training.seconds = int(header["step"]), float(header["seconds"])
         training.bad_steps = int(header["bad_steps"])

@@ -6,9 +6,10 @@ import dataclasses
 import gc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,11 +35,14 @@ from .objective import Objective, noisy
 from .pose_refinement import PoseRefinement
 from .sampled_poses import perturbed_pose
 from .schedule import Schedule
+from .soap import Soap
 from .state import learned_sha256
 from .uncertainty import load_uncertainty
 from .unseen import UnseenPoses
 from .unseen_surface import evidence, fill_in
 
+BETAS = (0.9, 0.99)
+"""decay of the running means of gradients and of their squares"""
 MAX_BAD_STEPS = 10
 """consecutive non-finite steps after which training stops"""
 PERTURBED_SHARE = 0.5
@@ -121,18 +125,21 @@ class Training:
         self.objective = Objective(config, self.lights, self.perceptual, self.consistency, self.generator)
         self.unseen: UnseenPoses | None = None
 
-        # optimizer
+        # optimizers
         residuals = [self.model.geometry_residual, self.model.appearance_residual]
         networks = [p for p in self.model.parameters() if all(p is not r for r in residuals)]
-        rates = [
-            (networks, config.rate_networks),
+        matrices = [p for p in networks if p.ndim == 2]
+        rates: list[tuple[Sequence[Tensor], float]] = [
+            ([p for p in networks if p.ndim != 2], config.rate_networks),
             (residuals, config.rate_residuals),
             ([self.lights.probes.raw], config.rate_light),
         ]
         if self.refinement is not None:
             rates.append((list(self.refinement.raw), config.rate_poses))
-        groups = [{"params": params, "lr": rate, "start_rate": rate} for params, rate in rates]
-        self.optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+        self.optimizers = {
+            "adam": torch.optim.Adam(_groups(rates), config.rate_networks, BETAS, eps=1e-15),
+            "soap": Soap(_groups([(matrices, config.rate_matrices)]), config.rate_matrices, BETAS),
+        }
 
         # progress
         self.step_index = 0
@@ -157,7 +164,7 @@ class Training:
         stage = 1 if config.light == "none" else 2
         terms = self.objective(self.model, self.views[0], self.poses[0], step, stage)
         torch.stack(list(terms.values())).sum().backward()
-        self.optimizer.zero_grad(set_to_none=True)
+        self._zero_grad()
         self.generator.set_state(random_state)
         if self._searches_light:
             light_search.warm_up()
@@ -169,7 +176,7 @@ class Training:
         started = time.perf_counter()
         self._start_second_stage()
         stage = self.stage
-        for group in self.optimizer.param_groups:
+        for group in self._groups:
             group["lr"] = group["start_rate"] * self.schedule.decay(self.step_index)
 
         # next view, each once per epoch
@@ -183,15 +190,16 @@ class Training:
         total = values.sum()
 
         # gradient and update
-        self.optimizer.zero_grad(set_to_none=True)
+        self._zero_grad()
         finite = bool(torch.isfinite(total))
         if finite:
             total.backward()
-            parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
+            parameters = [p for group in self._groups for p in group["params"]]
             norm = get_total_norm([p.grad for p in parameters if p.grad is not None])
             finite = bool(torch.isfinite(norm))  # one test of all gradients: each synchronises a GPU
         if finite:
-            self.optimizer.step()
+            for optimizer in self.optimizers.values():
+                optimizer.step()
 
         self.bad_steps = 0 if finite else self.bad_steps + 1
         if self.bad_steps >= MAX_BAD_STEPS:
@@ -205,6 +213,14 @@ class Training:
             fill_in(self.model, evidence(self.model, self.views, poses))
         self.seconds += time.perf_counter() - started
         return done
+
+    @property
+    def _groups(self) -> list[dict[str, Any]]:
+        return [group for optimizer in self.optimizers.values() for group in optimizer.param_groups]
+
+    def _zero_grad(self) -> None:
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
 
     def _image_terms(self, view: TrainingView, pose: PoseInput, stage: int) -> dict[str, Tensor]:
         """Loss terms of the first and second stage."""
@@ -303,3 +319,7 @@ class Training:
         """Digest of the training data, of which a training can only be resumed with the same."""
         digest = learned_sha256(self.views, self.capture, self.config.image_scale, self.given_lights)
         return digest if self.known.card is None else f"{digest} {self.known.card}"
+
+
+def _groups(rates: Sequence[tuple[Sequence[Tensor], float]]) -> list[dict[str, Any]]:
+    return [{"params": params, "lr": rate, "start_rate": rate} for params, rate in rates]
