@@ -53,7 +53,7 @@ class TrainConfig:
     """Schedule, losses and rates; see ``preset``."""
 
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
-    steps: int = 3_000
+    steps: int = 2_400
     """optimisation steps of one image each"""
     stage1_fraction: float = 0.15
     """share of the steps with a plain colour per Gaussian, before albedo and light"""
@@ -166,7 +166,7 @@ def preset(name: str) -> TrainConfig:
     if name == "full":
         return dataclasses.replace(standard, steps=5 * standard.steps, rate_final=0.1, rate_cooled=1.0)
     if name == "quick":
-        quick = resized(standard, 12_000, 1_200)
+        quick = resized(standard, 12_000, 1_000)
         return dataclasses.replace(quick, preview_every=250, save_every=250)
     raise InputError("preset", expected="quick, standard or full", got=name)
 

@@ -19,7 +19,7 @@ class Schedule:
     preset: Literal["quick", "standard", "full"] = "standard"
     """Some seven minutes, half an hour, or hours on two cores."""
     steps: OptionalCount = None
-    """Steps with an image. Default: 3000 (quick: 1200). The third stage adds 3/4 as many short steps."""
+    """Steps with an image. Default: 2400 (quick: 1000). The third stage adds 3/4 as many short steps."""
     gaussians: OptionalCount = None
     """Number of Gaussians. Default: 30000 (quick: 12000)."""
     image_scale: OptionalNumber = None
