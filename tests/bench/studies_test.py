@@ -103,7 +103,13 @@ def study(tiny_capture, tiny_config, tmp_path, monkeypatch):
 
     row = {
         **{"method": "LBS, plain colour", "split": "novel_view", "seed": 0, "psnr": 20.0, "steps": tiny_config.steps},
-        **{"capture": tiny_capture.folder.name, "gaussians": 600, "image_scale": 1.0, "shade": "table+sun"},
+        **{
+            "capture": tiny_capture.folder.name,
+            "gaussians": 600,
+            "image_scale": 1.0,
+            "hold_out": False,
+            "shade": "table+sun",
+        },
         **{"motion": "motion.npz", "capture_sha256": sha256_of(tiny_capture.file)},
     }
     folder = tmp_path / "lbs__plain_colour-0"

@@ -51,7 +51,7 @@ def test_the_chain_leaves_what_it_promises(played) -> None:
     run = played / "run"
     for name in ("avatar.ckpt", "avatar.onnx", "config.json", "metrics.jsonl", "training.state", "eval.json"):
         assert (run / name).stat().st_size > 0, name
-    assert sorted(p.name for p in (run / "previews").iterdir()) == ["step_000012.png"]
+    assert sorted(p.name for p in (run / "previews").iterdir()) == ["step_000014.png"]
     frames = sorted((played / "out" / "frames").iterdir())
     assert [frame.name for frame in frames] == ["000000.png", "000001.png", "000002.png"]
     picture = read_image(frames[0])
