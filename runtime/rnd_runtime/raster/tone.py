@@ -184,11 +184,9 @@ def _tone_map_straight(radiance, alpha, curved, steps, first, image):  # type: i
             a = alpha[y, x]
             if not a > _ZERO:
                 a = _ONE
+            colour = radiance[y, x, 0] / a, radiance[y, x, 1] / a, radiance[y, x, 2] / a
             if curved:
-                toned = _neutral(radiance[y, x, 0] / a, radiance[y, x, 1] / a, radiance[y, x, 2] / a)
-                for c in range(3):
-                    image[y, x, c] = _code(toned[c], steps, first)
-            else:
-                for c in range(3):
-                    image[y, x, c] = _code(radiance[y, x, c] / a, steps, first)
+                colour = _neutral(colour[0], colour[1], colour[2])
+            for c in range(3):
+                image[y, x, c] = _code(colour[c], steps, first)
             image[y, x, 3] = np.uint8(np.floor(min(max(alpha[y, x], _ZERO), _ONE) * np.float32(255) + np.float32(0.5)))

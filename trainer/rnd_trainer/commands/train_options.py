@@ -17,7 +17,7 @@ class Schedule:
     """Schedule and device."""
 
     preset: Literal["quick", "standard", "full"] = "standard"
-    """Some seven minutes, half an hour, or hours on two cores."""
+    """Some four minutes, ten minutes, or an hour on two cores."""
     steps: OptionalCount = None
     """Steps with an image. Default: 2400 (quick: 1000). The third stage adds 3/4 as many short steps."""
     gaussians: OptionalCount = None

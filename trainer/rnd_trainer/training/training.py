@@ -137,8 +137,8 @@ class Training:
         if self.refinement is not None:
             rates.append((list(self.refinement.raw), config.rate_poses))
         self.optimizers = {
-            "adam": torch.optim.Adam(_groups(rates), config.rate_networks, BETAS, eps=1e-15),
-            "soap": Soap(_groups([(matrices, config.rate_matrices)]), config.rate_matrices, BETAS),
+            "adam": torch.optim.Adam(_with_rates(rates), config.rate_networks, BETAS, eps=1e-15),
+            "soap": Soap(_with_rates([(matrices, config.rate_matrices)]), config.rate_matrices, BETAS),
         }
 
         # progress
@@ -321,5 +321,5 @@ class Training:
         return digest if self.known.card is None else f"{digest} {self.known.card}"
 
 
-def _groups(rates: Sequence[tuple[Sequence[Tensor], float]]) -> list[dict[str, Any]]:
+def _with_rates(rates: Sequence[tuple[Sequence[Tensor], float]]) -> list[dict[str, Any]]:
     return [{"params": params, "lr": rate, "start_rate": rate} for params, rate in rates]

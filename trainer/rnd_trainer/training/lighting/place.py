@@ -62,8 +62,7 @@ def placed_light(
     if not (np.bincount(observations.point, minlength=1) >= MIN_OBSERVATIONS).any():
         return None
     irradiance = _irradiance(observations, _at_all_yaws(place, SEARCH_SHAPE))
-    filled = irradiance + FILL * irradiance.mean(0)
-    at, between = divmod(_best_yaw(observations, filled), 1)
+    at, between = divmod(_best_yaw(observations, irradiance), 1)
     radiance, arriving = (
         (1 - between) * values[..., int(at)] + between * values[..., (int(at) + 1) % YAWS]
         for values in (_at_all_yaws(place, PROBE_SHAPE), irradiance)
@@ -111,7 +110,8 @@ def _best_yaw(observations: Observations, irradiance: NDArray[np.float32]) -> fl
     starts = np.flatnonzero(np.diff(point[order], prepend=-1))
     explained = np.zeros(irradiance.shape[-1])
     for channel in range(3):
-        light, colour = irradiance[order, channel], observations.colour[order, channel]
+        light = irradiance[order, channel] + FILL * irradiance[:, channel].mean(0)
+        colour = observations.colour[order, channel]
         along = np.add.reduceat((weight[order] * colour)[:, None] * light, starts, axis=0)
         power = np.add.reduceat(weight[order][:, None] * light.astype(np.float64) ** 2, starts, axis=0)
         explained += (along**2 / np.maximum(power, 1e-30)).sum(0)
