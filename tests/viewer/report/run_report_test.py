@@ -19,6 +19,8 @@ from rnd_trainer.config import TrainConfig, to_dict
 from rnd_viewer.report import renders
 from rnd_viewer.report.cli import main
 from rnd_viewer.report.html_parts import curve
+from support.axe import needs_axe, violations
+from support.browser import chromium
 from support.tiny import ASSETS
 
 VOID = {"meta", "img", "input", "link", "br"}
@@ -141,6 +143,18 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     assert images["truth, a"].shape[:2] == (15 + 16, 6 + 16)  # cropped to the person and a margin
     (clip,) = [attributes["src"] for tag, attributes in page.tags if tag == "video"]
     assert base64.b64decode(clip.partition(",")[2])[4:8] == b"ftyp"
+
+
+@pytest.mark.slow
+@needs_axe
+def test_no_rule_of_accessibility_is_broken_by_day_and_by_night(run, tmp_path):
+    _write(run, "--bench", str(_bench(tmp_path / "bench", {"id": "P2", "what": "edges"}, "grid")))
+    with chromium(tmp_path / "profile", size=(390, 844)) as page:
+        page.open((run / "report.html").as_uri())
+        page.wait("document.readyState === 'complete' && document.querySelector('h2')")
+        for scheme in ("light", "dark"):
+            page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
+            assert violations(page) == []
 
 
 def _bench(folder: Path, row: dict[str, object] | None = None, *charts: str) -> Path:

@@ -16,6 +16,7 @@ from rnd_runtime.core.images import write_image
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.server import serve
 from rnd_viewer.view.training import POINTS, Training
+from support.axe import AXE, violations
 from support.browser import CHROMIUM, chromium
 from support.paths import ASSETS
 
@@ -103,6 +104,7 @@ def test_it_grows_in_a_browser_and_the_avatar_opens_once_it_is_there(run, tmp_pa
             page.wait("document.getElementById('facts')?.textContent.includes('10 of 100')")
             page.wait("document.getElementById('preview').naturalWidth === 4")
             assert page.run("document.querySelectorAll('#curves path').length") == 1
+            assert not AXE.is_file() or violations(page) == []
             with (run / "metrics.jsonl").open("a") as stream:
                 stream.write(_rows(10, 11))
             _status(run, step=12)

@@ -23,6 +23,7 @@ from rnd_viewer.play.cli import main as play
 from rnd_viewer.view.options import SIZES, ViewOptions
 from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.server import serve
+from support.axe import needs_axe, violations
 from support.browser import CHROMIUM, Page, chromium
 from support.paths import ASSETS
 
@@ -213,6 +214,16 @@ def test_ground_truth_stands_beside(page):
     assert not page.run("document.getElementById('hint').hidden")
     assert "of" in page.run("rnd.frame().then(() => document.getElementById('clock').textContent)")
     _set(page, "size", str(SIZE))
+
+
+@needs_axe
+def test_no_rule_of_accessibility_is_broken_on_a_desk_and_on_a_phone(page):
+    for width, height in ((390, 844), (1100, 720)):
+        screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < height}
+        page.call("Emulation.setDeviceMetricsOverride", **screen)
+        for _ in range(2):  # with the ground truth beside, and without
+            page.run("document.getElementById('truth-on').click(); rnd.frame().then(() => 1)")
+            assert violations(page) == []
 
 
 def test_ground_truth_that_the_browser_cannot_decode_is_said_and_leaves_its_pane_blank(

@@ -34,6 +34,7 @@ from rnd_viewer.play.cli import main as play
 from rnd_viewer.view.options import ViewOptions
 from rnd_viewer.view.scene import Scene
 from rnd_viewer.view.state import ViewState
+from support.axe import needs_axe, violations
 from support.browser import CHROMIUM, PATIENCE, Page, chromium
 from support.paths import ASSETS, ROOT
 
@@ -452,6 +453,13 @@ def test_the_time_slider_reaches_the_last_frame_and_is_off_without_a_motion(fres
     """)
     assert fresh.run("rnd.state.time") == pytest.approx(131 / 30, abs=1e-6)
     assert not fresh.run("slider.disabled")
+
+
+@needs_axe
+def test_no_rule_of_accessibility_is_broken_before_and_after_files_come(fresh):
+    assert violations(fresh) == []
+    _drop(fresh, "avatar.onnx", "whole.npz", "sky.exr")
+    assert violations(fresh) == []
 
 
 def test_addresses_name_files_of_any_name(address, tmp_path):

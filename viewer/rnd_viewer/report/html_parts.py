@@ -23,7 +23,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], words: Collecti
     """A table of anything; numbers as of ``number``. The columns ``words`` are left-aligned."""
     titles = _cells("th", head, words)
     body = "".join(f"<tr>{_cells('td', row, words)}</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f'<div class="wide" tabindex="0"><table><thead><tr>{titles}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def _cells(tag: str, row: Sequence[object], words: Collection[int]) -> str:
@@ -103,8 +103,9 @@ def curve(steps: Sequence[int], values: Sequence[float], name: str, mark: int | 
     lines.append(f'<text x="{LEFT}" y="{HEIGHT - 4}">0</text>')
     lines.append(f'<text x="{WIDTH - RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{last + 1} steps</text>')
     path = "".join(f"{'L' if k else 'M'}{x(share):.1f} {y(log):.1f}" for k, (share, log) in enumerate(points))
-    svg = f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(lines)}<path d="{path}"/></svg>'
-    return figure(svg, f"{name}, last {10 ** points[-1][1]:.3g}")
+    caption = f"{name}, last {10 ** points[-1][1]:.3g}"
+    head = f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(caption)}">'
+    return figure(f'{head}{"".join(lines)}<path d="{path}"/></svg>', caption)
 
 
 def _ticks(low: float, high: float) -> list[float]:
