@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
+import urllib.error
+import urllib.request
 
 import msgspec
 import numpy as np
@@ -134,6 +136,17 @@ def test_a_link_holds_what_is_seen(page):
     page.open(address.split("#")[0] + "#%7B%22yaw%22%3A%22x%22%2C%22target%22%3A%5B1%5D%7D")  # of other types
     page.wait("window.rnd && rnd.scene()")
     assert page.run("[rnd.state.yaw, rnd.state.target.length]") == [0, 3]
+
+
+def test_a_link_does_not_hold_the_token(opened):
+    page, url = opened
+    page.open(url + "&encoding=raw")
+    page.wait("location.search.includes('token') && window.rnd && rnd.scene()")
+    _click(page, "#share")
+    address = page.run("location.href")
+    assert "s3cret" in url and "s3cret" not in address and "?encoding=raw#" in address
+    with pytest.raises(urllib.error.HTTPError, match="401"):
+        urllib.request.urlopen(address.split("#")[0], timeout=10)
 
 
 def test_a_path_through_keys_is_rnd_plays_camera(page, tmp_path):

@@ -469,6 +469,9 @@ def test_addresses_name_files_of_any_name(address, tmp_path):
         assert browser.run("rnd.scene().motion.name") == "a #1, 50%.npz"
         assert browser.run("rnd.scene().lights") == ["the avatar's own", "sky.exr", "window.hdr"]
         assert browser.run("rnd.state.light") == 1  # the first that is named, as in rnd-view
+        named = browser.run("location.search")
+        browser.run("document.getElementById('share').click()")
+        assert browser.run("location.hash.length") > 100 and browser.run("location.search") == named
 
 
 def test_an_address_with_missing_files_names_each_and_the_example_opens(address, tmp_path):

@@ -2,9 +2,11 @@
 
 const KEPT = ["azimuth", "elevation", "distance", "target", "fov", "time", "light", "yaw", "exposure", "shade", "output", "background", "tone", "ground", "gaussians"];
 
-/** The page's address with `state` in it; the size is the window's. */
+/** The page's address with `state` in it, without the token of rnd-view; the size is the window's. */
 export function addressWith(state) {
   const address = new URL(location.href);
+  const words = address.search.slice(1).split("&");  // as they are: a list's commas are not to be encoded
+  address.search = words.filter((word) => !word.startsWith("token=")).join("&");
   address.hash = encodeURIComponent(JSON.stringify(Object.fromEntries(KEPT.map((name) => [name, state[name]]))));
   return address.href;
 }
