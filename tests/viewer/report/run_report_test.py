@@ -20,7 +20,7 @@ from rnd_viewer.report import renders
 from rnd_viewer.report.cli import main
 from rnd_viewer.report.html_parts import curve
 from support.axe import needs_axe, violations
-from support.browser import chromium
+from support.browser import CHROMIUM, chromium
 from support.tiny import ASSETS
 
 VOID = {"meta", "img", "input", "link", "br"}
@@ -120,21 +120,26 @@ def test_a_whole_run_is_on_the_page(run, tmp_path):
     text, page = _write(run, "--hdr", sky, "--bench", str(bench), "--motion", str(ASSETS / "walk.npz"))
     for tag, attributes in page.tags:  # nothing is fetched from anywhere
         for name in ("src", "href"):
-            assert (attributes.get(name) or "data:").startswith("data:"), (tag, attributes)
+            assert (attributes.get(name) or "data:").startswith(("data:", "#")), (tag, attributes)
+    identities = [attributes.get("id") for _, attributes in page.tags]
+    assert [attributes["href"][1:] in identities for tag, attributes in page.tags if tag == "a"] == 7 * [True]
     assert "http" not in text and "url(" not in text
     assert "me & <you>" in page.text and "800 Gaussians" in page.text
     assert "27.35" in page.text and "PSNR of normals" in page.text
     assert "LPIPS" not in page.text  # a column nobody measured is no column
     assert "1 steps were not finite" in page.text
     assert "P2" in page.text and "edges, <worst>" in page.text and "0.61" in page.text
-    (chart,) = [attributes["src"] for _, attributes in page.tags if attributes.get("alt") == "grid"]
+    (chart,) = [attributes["src"] for _, attributes in page.tags if (attributes.get("alt") or "").endswith(": grid")]
     assert base64.b64decode(chart.removeprefix("data:image/svg+xml;base64,")).startswith(b"<svg")
     assert "weight_normal" in page.text and "model.gaussians" in page.text
     images = _images(page, tmp_path)
-    assert {"learned light, 0°", "learned light, 270°", "sky", "albedo", "roughness"} <= set(images)
-    assert (images["sky"] != images["learned light, 0°"]).any()
+    lights = ("learned light, 0°", "learned light, 270°", "sky")
+    front = [images[f"the avatar from the front: {name}"] for name in (*lights, "its albedo", "its roughness")]
+    assert (front[2] != front[0]).any() and len({image.shape for image in front}) == 1
+    for edge in (front[0][:9], front[0][-9:], front[0][:, :9], front[0][:, -9:]):
+        assert edge.max() > 8  # cropped to the person
     for seldom in ("back of the head", "left palm", "right sole"):
-        shown = images[seldom].max(-1) > 0
+        shown = images[f"{seldom}: albedo"].max(-1) > 0
         assert shown.mean() > 0.1 and shown[96:128, 96:128].all(), seldom  # the camera looks at it
     strips = [name for name in images if name.startswith("truth, ")]
     assert strips == ["truth, a", "truth, b", "truth, c"]  # three of four, spread
@@ -166,13 +171,36 @@ def _bench(folder: Path, row: dict[str, object] | None = None, *charts: str) -> 
     return folder
 
 
-def test_charts_come_from_the_run_unless_a_folder_is_named(run, tmp_path):
-    assert f"in {run / 'bench'}: --bench FOLDER" in _write(run)[1].text
-    own = _bench(run / "bench", {"id": "P1", "what": "of the run"})
-    _, page = _write(run)
-    assert "of the run" in page.text and f"From {own / 'stability.json'}" in page.text
-    named = _bench(tmp_path / "named", {"id": "P1", "what": "of another"})
-    assert "of another" in _write(run, "--bench", str(named))[1].text
+def test_benchmarks_of_the_software_are_shown_where_they_are_named_alone(run, tmp_path, capsys):
+    bench = _bench(run / "bench", {"id": "P1", "what": "of the software"})
+    assert "of the software" not in _write(run)[1].text
+    assert "of the software" in _write(run, "--bench", str(bench))[1].text
+    (bench / "stability.json").unlink()
+    assert main([str(run), "--bench", str(bench)]) == 2
+    assert "bench: --bench: expected crossed.svg or grid.svg or stability.json, got none" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_the_whole_of_a_training_has_four_screens_of_a_desk(run, tmp_path):
+    """Of the README's capture: four splits of ten frames, thirteen terms of loss."""
+    for split in range(4):
+        for frame in range(10):
+            tiles = np.zeros((5, 256, 256, 3), np.uint8)
+            tiles[:, 20:236, 70 : 190 - 5 * split] = 99 + 10 * split
+            write_image(run / f"eval/split{split}/{frame:03d}.png", np.concatenate(list(tiles), axis=1))
+    terms = {f"term{k}": 0.1 for k in range(12)}
+    rows = [{"step": k, "stage": 1, "image": 1 / (1 + k), **terms} for k in range(9)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (run / "eval.json").write_text(json.dumps([ROW | {"split": f"split {k}"} for k in range(5)]))
+    shutil.rmtree(run / "eval/novel_view")
+    _write(run, "--hdr", str(ASSETS / "sky.exr"))
+    with chromium(tmp_path / "profile", size=(1440, 900)) as page:
+        page.open((run / "report.html").as_uri())
+        page.wait("document.readyState === 'complete' && [...document.images].every(({ complete }) => complete)")
+        assert page.run("document.images.length") > 60
+        assert 3 < page.run("document.documentElement.scrollHeight / 900") <= 4
+        assert page.run("document.documentElement.scrollWidth") == 1440
 
 
 def test_what_a_run_lacks_is_named(run):
@@ -180,7 +208,7 @@ def test_what_a_run_lacks_is_named(run):
         (run / name).unlink()
     shutil.rmtree(run / "eval")
     _, page = _write(run)
-    for words in ("rnd-export", "no eval.json", "--strips RUN/eval", "no metrics.jsonl", "--bench FOLDER"):
+    for words in ("rnd-export", "no eval.json", "--strips RUN/eval", "no metrics.jsonl"):
         assert words in page.text
     assert not any(tag in ("img", "video", "svg") for tag, _ in page.tags)
 
@@ -217,7 +245,8 @@ def test_a_second_stage_is_marked_where_the_rows_begin_it(run):
 
 def test_a_probe_made_for_a_z_up_world_is_turned_upright(run, tmp_path):
     sky = "--hdr", str(ASSETS / "sky.exr")
-    images = [_images(_write(run, *sky, "--hdr-up", up)[1], tmp_path)["sky"] for up in "yz"]
+    front = "the avatar from the front: sky"
+    images = [_images(_write(run, *sky, "--hdr-up", up)[1], tmp_path)[front] for up in "yz"]
     assert (images[0] != images[1]).any()
     assert main([str(run), "--hdr-up", "z"]) == 2
 
@@ -273,9 +302,9 @@ def test_a_curve_goes_through_the_points():
     ],
 )
 def test_a_damaged_run_is_refused_in_one_line(run, name, content, message, capsys):
-    _bench(run / "bench", None, "grid")
+    bench = _bench(run / "bench", None, "grid")
     (run / name).unlink() if content is None else (run / name).write_text(content)
-    assert main([str(run)]) == 2
+    assert main([str(run), "--bench", str(bench)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (run / "report.html").exists()

@@ -7,12 +7,13 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import sha256_of
 
-from .html_parts import data_uri, figure, missing, number, table
+from .html_parts import data_uri, figure, number, table
 from .run_files import read_rows
 
-TITLE = "Speed, accuracy, stability"
+TITLE = "Benchmarks: speed, accuracy, stability"
 CHARTS = ("crossed.svg", "grid.svg")  # the first that exists
 STABILITY = "stability.json"
 HEAD = ("id", "failure", "what was measured", "measured", "limit", "verdict", "baseline")
@@ -28,8 +29,8 @@ def bench_section(folder: Path, run: Path) -> str:
     if (stability := folder / STABILITY).is_file():
         parts.append(_stability(stability, run))
     if not parts:
-        return missing(TITLE, f"neither {' nor '.join((*CHARTS, STABILITY))} in {folder}: --bench FOLDER")
-    return f"<h2>{TITLE}</h2>" + "".join(parts)
+        raise InputError("--bench", expected=f"{' or '.join((*CHARTS, STABILITY))}", got="none of them", file=folder)
+    return "".join(parts)
 
 
 def _chart(file: Path, run: Path) -> str:
@@ -42,7 +43,8 @@ def _chart(file: Path, run: Path) -> str:
     )
     # as an image: inline, its ids could collide with those of the page
     source = data_uri(file.read_bytes(), "image/svg+xml")
-    return figure(f'<img class="chart" alt="{escape(file.stem)}" src="{source}">', caption)
+    alt = f"points of milliseconds a frame against decibels: {file.stem}"
+    return figure(f'<img class="chart" alt="{escape(alt)}" src="{source}">', caption)
 
 
 def _stability(file: Path, run: Path) -> str:

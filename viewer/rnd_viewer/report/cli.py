@@ -34,7 +34,7 @@ class ReportOptions:
     hdr_up: ProbeUp = "y"
     """Up axis of the probes' files."""
     bench: OptionalFolder = None
-    """Folder of rnd-bench with crossed.svg or grid.svg, and stability.json. Default: RUN/bench."""
+    """Folder of rnd-bench with crossed.svg or grid.svg, and stability.json: benchmarks of the software are added."""
     images: Count = 3
     """Images of each held-out split."""
     reading: MotionGroup = field(default_factory=MotionOptions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from html import escape
 
 import numpy as np
@@ -17,6 +17,8 @@ WIDTH, HEIGHT = 320, 150  # of a curve, in its own units
 LEFT, RIGHT, TOP, BOTTOM = 42, 8, 8, 16  # margins for ticks
 POINTS = 300  # of a curve
 LARGEST = 1e300  # value of a curve: ticks and margins stay finite
+MARGIN = 8  # pixels kept around the person
+DARK = 8  # of 255; what is brighter in any image is the person
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]], words: Collection[int] = (0,)) -> str:
@@ -48,6 +50,15 @@ def png(pixels: NDArray[np.uint8], alt: str) -> str:
         return f'<img alt="{escape(alt)}" src="{data_uri(path.read_bytes(), "image/png")}">'
 
 
+def cropped(images: Sequence[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+    """``images`` [H, W, 3] of one size, cut to what any of them shows and a margin."""
+    rows, columns = np.nonzero(np.max([image.max(axis=2) for image in images], axis=0) > DARK)
+    if not len(rows):
+        return list(images)
+    window = tuple(slice(max(int(at.min()) - MARGIN, 0), int(at.max()) + 1 + MARGIN) for at in (rows, columns))
+    return [np.ascontiguousarray(image[window]) for image in images]
+
+
 def data_uri(content: bytes, kind: str) -> str:
     """``content`` inside the page."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
@@ -58,9 +69,17 @@ def figure(content: str, caption: str) -> str:
     return f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>"
 
 
-def missing(title: str, reason: str) -> str:
-    """A missing section, and why."""
-    return f'<h2>{escape(title)}</h2><p class="missing">{escape(reason)}</p>'
+def missing(reason: str) -> str:
+    """What stands in a section whose content is missing."""
+    return f'<p class="missing">{escape(reason)}</p>'
+
+
+def sections(contents: Mapping[str, str]) -> str:
+    """A list of links, then ``contents`` by title; what is empty is left out."""
+    named = {f"s{number}": entry for number, entry in enumerate(contents.items()) if entry[1]}
+    links = "".join(f'<li><a href="#{name}">{escape(title)}</a></li>' for name, (title, _) in named.items())
+    parts = (f'<section id="{name}"><h2>{escape(title)}</h2>{part}</section>' for name, (title, part) in named.items())
+    return f'<nav aria-label="contents"><ul>{links}</ul></nav>\n' + "\n".join(parts)
 
 
 def compare(left: str, right: str, label: str) -> str:

@@ -35,7 +35,8 @@ CLOSE_UPS = {
     "right sole": ("right_ankle", (0, -0.05, 0.05), (0, -1, 0.3)),
 }
 """surfaces that a video seldom shows: a joint in the rest pose, the offset from it in m, the direction to the camera"""
-CLOSE_UP_SIDE, CLOSE_UP_DISTANCE = 224, 0.65  # pixels, m
+CLOSE_UP_SIDE = 224  # pixels
+CLOSE_UP_DISTANCE, HAND_DISTANCE = 0.65, 0.4  # m
 
 
 class AvatarRenders:
@@ -107,7 +108,8 @@ class AvatarRenders:
                 if joint not in skeleton.names:
                     continue
                 target = skeleton.rest_joints[skeleton.names.index(joint)] + offset
-                eye = target + CLOSE_UP_DISTANCE * np.array(direction) / np.linalg.norm(direction)
+                distance = HAND_DISTANCE if joint.endswith("wrist") else CLOSE_UP_DISTANCE
+                eye = target + distance * np.array(direction) / np.linalg.norm(direction)
                 camera = Camera.look_at(eye, target, width=CLOSE_UP_SIDE, height=CLOSE_UP_SIDE, fov_y=fov)
                 frame = renderer.render(at_rest, 0.0, camera, aovs=("albedo",))
                 yield caption, np.ascontiguousarray(aov_image("albedo", frame.aovs["albedo"], frame.alpha))

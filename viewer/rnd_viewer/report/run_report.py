@@ -22,15 +22,14 @@ from rnd_runtime.motion.skeleton import Skeleton
 from rnd_runtime.shading.light import Up
 from rnd_viewer.play.video import INSTALL
 
+from .bench import TITLE as BENCH
 from .bench import bench_section
-from .html_parts import compare, curve, data_uri, figure, missing, png, table
+from .html_parts import compare, cropped, curve, data_uri, figure, missing, png, sections, table
 from .renders import AvatarRenders
 from .run_files import read_config, read_losses, read_scores
 
 Bytes = NDArray[np.uint8]
 TILES = ("truth", "render", "normals", "albedo", "error")  # side by side in rnd-eval's strips
-MARGIN = 8  # pixels kept around the person
-DARK = 8  # of 255; what is brighter in any tile is the person
 # Columns of rnd-eval's rows; FACTS are about the whole run.
 METRICS = {
     "split": ("split", "{}"),
@@ -74,7 +73,7 @@ def write_run_report(
     Args:
         motion: played in the turntable, read for the avatar's skeleton.
         hdrs, hdr_up: relit under these; which axis points up in their files.
-        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; ``run / "bench"`` by default.
+        bench: a folder with ``crossed.svg`` or ``grid.svg``, and ``stability.json``; without it no benchmarks.
         images: shown of each held-out split.
 
     Returns:
@@ -87,17 +86,22 @@ def write_run_report(
     rows = read_scores(run, WORDS, ({"step"} | METRICS.keys() | FACTS.keys()) - {*WORDS})
     name = run.resolve().name
     # before the avatar is rendered: damaged files are found at once
-    read = [_metrics(rows), _comparisons(run / "eval", images), _curves(read_losses(run))]
-    read += [bench_section(bench or run / "bench", run), _configuration(config)]
+    read = {
+        "Held-out quality": _metrics(rows),
+        "Truth and render": _comparisons(run / "eval", images),
+        "Losses": _curves(read_losses(run)),
+        BENCH: bench_section(bench, run) if bench else "",
+        "Configuration": _configuration(config),
+    }
     if why_not := why_no_avatar(run, config):
-        avatar, notes = missing("The avatar", why_not), [why_not]
+        avatar, notes = {"The avatar": missing(why_not)}, [why_not]
     else:
         renders = AvatarRenders(run / "avatar.onnx", motion)
-        avatar, notes = _turntable_and_relights(renders, hdrs, hdr_up), renders.notes
-    sections = [f"<h1>{escape(name)}</h1>", _facts(rows), avatar, *read]
+        avatar, notes = _avatar(renders, hdrs, hdr_up), renders.notes
+    body = f"<h1>{escape(name)}</h1>{_facts(rows)}{sections(avatar | read)}"
     page = Template(files("rnd_viewer.report").joinpath("page.html").read_text(encoding="utf-8"))
     with atomic_path(out) as temporary:
-        text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body="\n".join(sections))
+        text = page.substitute(title=escape(f"{name} · RnD-Avatar"), body=body)
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # names that are not UTF-8
     return notes
 
@@ -128,32 +132,37 @@ def why_no_avatar(run: Path, config: dict[str, Any]) -> str:
     return ""
 
 
-def _turntable_and_relights(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_up: Up) -> str:
-    """The section of the avatar, with the notes that it ends with."""
-    cells = [figure(png(image, caption), caption) for caption, image in renders.relights(hdrs, hdr_up)]
+def _avatar(renders: AvatarRenders, hdrs: tuple[Path, ...], hdr_up: Up) -> dict[str, str]:
+    """Sections by title: lights and materials, with notes, and close-ups."""
+    lit, materials = list(renders.relights(hdrs, hdr_up)), list(renders.materials())
+    words = [caption for caption, _ in lit] + [f"its {caption}" for caption, _ in materials]
+    images = cropped([image for _, image in lit + materials])
+    pictures = [png(image, f"the avatar from the front: {caption}") for caption, image in zip(words, images)]
+    figures = [figure(picture, caption) for picture, (caption, _) in zip(pictures, lit + materials)]
     if importlib.util.find_spec("av"):
-        clip = data_uri(renders.turntable(), "video/mp4")
-        video = f'<video src="{clip}" autoplay loop muted playsinline controls></video>'
-        cells.insert(0, figure(video, "turntable, learned light"))
+        what = "the avatar, around which the camera orbits once"
+        clip = f'aria-label="{what}" src="{data_uri(renders.turntable(), "video/mp4")}"'
+        video = f"<video {clip} autoplay loop muted playsinline controls></video>"
+        turntable = figure(video, "turntable, learned light")
     else:
-        cells.insert(0, f'<p class="missing">The turntable needs PyAV: {escape(INSTALL)}</p>')
-    materials = [figure(png(image, caption), caption) for caption, image in renders.materials()]
-    close_ups = [figure(png(image, caption), caption) for caption, image in renders.close_ups()]
+        turntable = missing(f"The turntable needs PyAV: {INSTALL}")
     html = (
-        f'<h2>The avatar</h2><div class="grid tiles">{"".join(cells)}</div>'
-        f'<h3>Materials</h3><div class="grid tiles">{"".join(materials)}</div>'
-        f'<h3>What videos seldom show: albedo</h3><div class="grid small">{"".join(close_ups)}</div>'
+        f'<div class="row">{turntable}{"".join(figures[: len(lit)])}</div>'
+        f'<h3>Materials</h3><div class="row">{"".join(figures[len(lit) :])}</div>'
     )
-    return html + "".join(f"<p>Note: {escape(note)}</p>" for note in renders.notes)
+    notes = "".join(f"<p>Note: {escape(note)}</p>" for note in renders.notes)
+    close_ups = [figure(png(image, f"{caption}: albedo"), caption) for caption, image in renders.close_ups()]
+    small = f'<p>Albedo, at rest.</p><div class="grid small">{"".join(close_ups)}</div>' if close_ups else ""
+    return {"The avatar": html + notes, "What videos seldom show": small}
 
 
 def _metrics(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
-        return missing("Held-out quality", "no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json")
+        return missing("no eval.json in the run: rnd-eval RUN CAPTURE --json RUN/eval.json")
     names = [name for name in METRICS if any(row.get(name) is not None for row in rows)]
     cells = [["" if row.get(name) is None else METRICS[name][1].format(row[name]) for name in names] for row in rows]
     box = "<p>In the box: in the rectangle around the person.</p>" if "psnr_box" in names else ""
-    return "<h2>Held-out quality</h2>" + table([METRICS[name][0] for name in names], cells) + box
+    return table([METRICS[name][0] for name in names], cells) + box
 
 
 def _comparisons(folder: Path, count: int) -> str:
@@ -161,9 +170,9 @@ def _comparisons(folder: Path, count: int) -> str:
         return ""
     splits = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not splits:
-        return missing("Truth and render", "no images: rnd-eval RUN CAPTURE --strips RUN/eval")
+        return missing("no images: rnd-eval RUN CAPTURE --strips RUN/eval")
     how = "Drag across an image: truth to the left, render to the right; then normals, albedo, error × 4."
-    parts = [f"<h2>Truth and render</h2><p>{how}</p>"]
+    parts = [f"<p>{how}</p>"]
     seen = set()
     for split in splits:
         strips = sorted(split.glob("*.png"))
@@ -187,11 +196,7 @@ def _strip(strip: Path) -> str:
     pixels = read_image(strip)[..., :3]
     if pixels.dtype != np.uint8 or pixels.shape[1] % len(TILES):
         raise InputError("strip of rnd-eval", expected="five 8-bit tiles", got=pixels.shape, file=strip)
-    tiles: list[Bytes] = np.split(pixels.astype(np.uint8), len(TILES), axis=1)
-    rows, columns = np.nonzero(np.max([tile.max(axis=2) for tile in tiles], axis=0) > DARK)
-    if len(rows):
-        window = tuple(slice(max(int(at.min()) - MARGIN, 0), int(at.max()) + 1 + MARGIN) for at in (rows, columns))
-        tiles = [np.ascontiguousarray(tile[window]) for tile in tiles]
+    tiles = cropped(np.split(pixels.astype(np.uint8), len(TILES), axis=1))
     truth, render, *others = (png(tile, f"{what}, {strip.stem}") for what, tile in zip(TILES, tiles))
     pair = compare(truth, render, f"truth or render of {strip.stem}")
     return figure(f'<div class="shot">{pair}{"".join(others)}</div>', strip.stem)
@@ -199,7 +204,7 @@ def _strip(strip: Path) -> str:
 
 def _curves(rows: Sequence[dict[str, Any]]) -> str:
     if not rows:
-        return missing("Losses", "no metrics.jsonl in the run")
+        return missing("no metrics.jsonl in the run")
     terms = dict.fromkeys(name for row in rows for name in row)
     terms = dict.fromkeys(["image", *terms])
     for name in ("step", "stage", "seconds", "skipped"):
@@ -214,7 +219,7 @@ def _curves(rows: Sequence[dict[str, Any]]) -> str:
     note = f" {skipped} steps were not finite and were skipped." if skipped else ""
     dashed = "" if mark is None else "; the dashed line marks the second stage, the light"
     return (
-        f"<h2>Losses</h2><p>Weighted loss terms on a logarithmic scale{dashed}.{note}</p>"
+        f"<p>Weighted loss terms on a logarithmic scale{dashed}.{note}</p>"
         f'<div class="grid curves">{"".join(figures)}</div>'
     )
 
@@ -229,4 +234,4 @@ def _configuration(config: dict[str, Any]) -> str:
     }
     rows = [(key, str(value)) for key, value in (flat | nested).items()]
     content = table(("option", "value"), rows, words=(0, 1))
-    return f"<h2>Configuration</h2><details><summary>{len(rows)} options</summary>{content}</details>"
+    return f"<details><summary>{len(rows)} options</summary>{content}</details>"
