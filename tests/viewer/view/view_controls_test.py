@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="nee
 DRAWN = "rnd.frame().then(() => 1)"
 PANE = "(({ clientWidth, clientHeight }) => [clientWidth, clientHeight])(document.querySelector('.pane'))"
 FINGER = 44  # px
+CORNER = "[...document.getElementById('frame').getContext('2d').getImageData(2, 2, 1, 1).data].slice(0, 3)"
 # mean column of what is as yellow as the sun of the small sphere, also seen through it
 SUN_COLUMN = """(() => {
     const { width, height } = gizmo, { data } = gizmo.getContext("2d").getImageData(0, 0, width, height);
@@ -220,6 +221,34 @@ def test_the_sun_of_the_small_sphere_is_dragged(page):
         assert page.run(SUN_COLUMN) > before + 5 and page.run("[rnd.state.azimuth, rnd.state.distance]") == view
     _click(page, "#undo")
     assert page.run("rnd.state.yaw") == 0
+
+
+def test_the_background_is_of_any_colour(page):
+    change = """(id, value) => {
+        document.getElementById(id).value = value;
+        document.getElementById(id).dispatchEvent(new Event("input"));
+    }"""
+    chooser = "document.getElementById('colour').parentElement.hidden"
+    assert page.run(chooser)
+    page.run(f"({change})('background', 'colour'); ({change})('colour', '#336699'); {DRAWN}")
+    assert page.run(CORNER) == [0x33, 0x66, 0x99] and not page.run(chooser)
+    _click(page, "#share")
+    address = page.run("location.href")
+    page.open("about:blank")
+    page.open(address)
+    page.wait("window.rnd && rnd.scene()")
+    page.run(DRAWN)
+    assert page.run(CORNER) == [0x33, 0x66, 0x99] and not page.run(chooser)
+    page.run(f"({change})('background', '#ffffff'); {DRAWN}")
+    assert page.run(CORNER) == [255, 255, 255] and page.run(chooser)
+
+
+def test_every_mode_says_what_it_is(page):
+    modes = "[...document.querySelectorAll('#output button, .choices button, #shade option, #tone option')]"
+    titles = page.run(f"{modes}.map(({{ title }}) => title)")
+    assert len(titles) == 9 + 6 + 6 + 2 == len({*titles} - {""})
+    page.run("rnd.state.shade = 'brute'; rnd.redraw()")
+    page.wait("document.getElementById('shade').title.startsWith('every texel')")
 
 
 def test_every_control_has_a_name(page):

@@ -217,7 +217,9 @@ def address(site):
 
 def _open(browser: Page, address: str) -> None:
     browser.open(address)
-    browser.wait("window.rnd && document.getElementById('message').textContent.includes('drop')")
+    browser.wait(
+        "window.rnd && !document.getElementById('zone').hidden && !document.getElementById('message').textContent"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -478,10 +480,12 @@ def test_an_address_with_missing_files_names_each_and_the_example_opens(address,
     with chromium(tmp_path, webgl=True) as browser:
         browser.open(f"{address}?avatar=nobody.onnx&motion=walk.npz&hdr=sky.exr,night.hdr")
         browser.wait("document.querySelector('#message.wrong')")
-        said = browser.run("document.getElementById('message').textContent")
-        assert [part.split(":")[0] for part in said.split(" · ")] == ["nobody.onnx", "night.hdr"] and "404" in said
+        said = browser.run("[...document.querySelectorAll('#absent li')].map(({ textContent }) => textContent)")
+        assert [reason.split(":")[0] for reason in said] == ["nobody.onnx", "night.hdr"] and "404" in said[0]
+        assert browser.run("document.getElementById('message').textContent").startswith("2 of the address's files")
         browser.messages.clear()  # Chromium logs the missing files too
-        browser.run("document.querySelector('#files a').click()")
+        at = "(({ left, top, width, height }) => [left + width / 2, top + height / 2])"
+        browser.drag(browser.run(f"{at}(document.querySelector('#zone a').getBoundingClientRect())"), (0, 0))
         browser.wait("window.rnd && rnd.scene()")
         sun = browser.run("rnd.frame().then(({ sun }) => sun)")
         np.testing.assert_allclose(sun, brightest_direction(load_light(ASSETS / "sky.exr")), atol=1e-5)
@@ -597,6 +601,15 @@ def test_a_refused_drop_changes_nothing(fresh):
     fresh.wait("sessions.opened === sessions.released + 1")
     assert _drop(fresh, "walk.npz") == ""
     assert fresh.run("rnd.scene()") == scene
+
+
+def test_the_drop_zone_names_what_it_has_until_there_is_an_avatar(fresh):
+    held = "[...document.querySelectorAll('#held li')].map(({ textContent }) => textContent)"
+    assert [line.split(" ")[:2] for line in fresh.run(held)] == [["no", "avatar"], ["no", "motion"], ["no", "light"]]
+    assert _drop(fresh, "walk.npz", "sky.exr", "window.hdr") == "an avatar (.onnx) is still missing"
+    assert fresh.run(held) == ["no avatar (.onnx) yet", "✓ walk.npz", "✓ sky.exr, window.hdr"]
+    assert _drop(fresh, "avatar.onnx") == "" and fresh.run("document.getElementById('zone').hidden")
+    assert fresh.run("[rnd.scene().motion.name, rnd.scene().lights.length]") == ["walk.npz", 3]
 
 
 def test_another_avatar_has_its_own_motion_and_light_and_the_old_one_is_released(fresh, site):

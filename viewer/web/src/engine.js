@@ -8,8 +8,8 @@ const KEEP_IN_VIEW = " · keep this tab in view";  // browsers limit a hidden ta
 const CLIP_TYPES = ["video/mp4;codecs=avc1.42E028", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp9", "video/webm"];
 
 /**
- * Start the worker. Callbacks `on`: scene, frame, progress, clip and error as from rnd-view, message(text), and
- * refused(text) for unusable files. `load` sends files once they are read and the promise `idle()` is fulfilled.
+ * Start the worker. Callbacks `on`: scene, frame, progress, clip and error as from rnd-view, held({motion, light}, text) while
+ * there is no avatar, missing(reasons) of files in the address, and refused(text) for unusable files. `load` sends files once they are read and the promise `idle()` is fulfilled.
  * Files in the page's address (?avatar=…&motion=…&hdr=…,…) are fetched at once.
  */
 export async function connect(on) {
@@ -26,7 +26,7 @@ export async function connect(on) {
   worker.onmessage = ({ data }) => {
     answered = true;
     if (data.kind === "scene") on.scene(data.scene);
-    else if (data.kind === "message") on.message(data.text);
+    else if (data.kind === "held") on.held(data.held, data.text);
     else if (taken.has(data.number)) settle(taken, data);
     else if (data.kind === "error") (data.number === undefined ? on.refused : on.error)(data.message, false);
     else on.frame(data);
@@ -48,8 +48,8 @@ export async function connect(on) {
     record(renderFrame, state, { fps: Math.min(fps, MAX_CLIP_FPS), turn, duration }, on).catch((error) => on.error(error.message));
 
   const named = addressed();
-  if (named.length) fetchFiles(named).then(load).catch((error) => on.refused(error.message));
-  else on.message("drop an avatar (.onnx), a motion (.npz) and a light (.hdr, .exr) here");
+  on.held({}, named.length ? "loading …" : "");
+  if (named.length) fetchFiles(named).then(load, on.missing);
   return { render, clip, load, truth() {} };
 }
 
@@ -87,7 +87,7 @@ function shownName(address) {
   }
 }
 
-/** All of them, or an error that names each that is missing. */
+/** All of them, or a rejection with the reasons of each that is missing. */
 async function fetchFiles(names) {
   const results = await Promise.allSettled(names.map(async (name) => {
     const address = addressOf(name), answer = await fetch(address).catch((error) => { throw new Error(`${name}: ${error.message}`); });
@@ -95,7 +95,7 @@ async function fetchFiles(names) {
     return new File([await answer.blob()], shownName(address));
   }));
   const missing = results.filter(({ reason }) => reason).map(({ reason }) => reason.message);
-  if (missing.length) throw new Error(missing.join(" · "));
+  if (missing.length) throw missing;
   return results.map(({ value }) => value);
 }
 

@@ -25,7 +25,7 @@ let posed = null, shownSky = null;
 /** Load files [{name, bytes}], all or none, and post the new scene. */
 async function load(files) {
   const before = scene, next = { ...scene }, opened = [];
-  let answer = { kind: "message", text: "drop an avatar (.onnx) too" };
+  let answer = null;
   try {
     for (const file of files) await take(file, next, opened).catch((error) => { throw inFile(error, file.name); });
     if (next.avatar) {
@@ -37,6 +37,8 @@ async function load(files) {
       else if (dropped) light = count - 1;
       answer = { kind: "scene", scene: description(next, light) };
     }
+    const light = next.lights.map(({ name }) => name).join(", ");
+    answer ??= { kind: "held", held: { motion: next.record?.name, light }, text: "an avatar (.onnx) is still missing" };
     scene = next;
     posed = null;
   } finally {

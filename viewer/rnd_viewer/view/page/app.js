@@ -2,6 +2,7 @@
 
 import { fitted } from "./camera.js";
 import { connect } from "./engine.js";
+import { bindFiles, showHeld, showMissing } from "./files.js";
 import { Fit } from "./fit.js";
 import { lightGizmo } from "./gizmo.js";
 import { orbit, wrapped } from "./orbit.js";
@@ -13,7 +14,14 @@ const LONG_MS = 1000;  // time after which a pending frame is announced
 const MAX_CLIP_FPS = 60;
 const RADIANS = Math.PI / 180;
 const PICTURE_QUALITY = 0.95;
-const SHADES = ["ao", "table", "table+sun", "lights:16", "lights:128", "brute"];
+const SHADES = {
+  ao: "ambient occlusion: the fastest, without cast shadows",
+  table: "the whole map, with soft shadows",
+  "table+sun": "the whole map, and a sun with a highlight and a sharp shadow of its own",
+  "lights:16": "16 directional lights in place of the map",
+  "lights:128": "128 directional lights in place of the map",
+  brute: "every texel of the map: as in training, and slow",
+};
 const $ = (id) => document.getElementById(id);
 
 const state = {
@@ -124,9 +132,20 @@ function showState() {
   $("size").value = state.height;
   $("size").nextElementSibling.textContent = String(state.height);
   $("gaussians").nextElementSibling.textContent = String(state.gaussians ?? scene.gaussians);
-  for (const name of ["light", "shade", "background", "tone"]) $(name).value = String(state[name]);
+  for (const name of ["light", "shade", "tone"]) $(name).value = String(state[name]);
+  showBackground();
+  for (const name of ["shade", "tone"]) $(name).title = $(name).selectedOptions[0]?.title ?? "";
   for (const button of $("output").children) button.ariaPressed = String(button.dataset.value === state.output);
   $("play").textContent = playing ? "❚❚" : "▶";
+}
+
+/** A colour is one of the list, or is chosen beside it. */
+function showBackground() {
+  const choosing = $("background").value === "colour" && state.background.startsWith("#");
+  const named = !choosing && [...$("background").options].some(({ value }) => value === state.background);
+  $("background").value = named ? state.background : "colour";
+  $("colour").parentElement.hidden = named;
+  if (!named) $("colour").value = state.background;
 }
 
 function play(on) {
@@ -143,7 +162,7 @@ function say(text, { wrong = false, untilFrame = false } = {}) {
 }
 
 function options(select, entries) {
-  select.replaceChildren(...entries.map(([value, text]) => new Option(text, value)));
+  select.replaceChildren(...entries.map(([value, text, title = ""]) => Object.assign(new Option(text, value), { title })));
 }
 
 function home() {
@@ -165,7 +184,8 @@ function setScene(description) {
   $("title").textContent = scene.avatar;
   $("subtitle").textContent = `${scene.gaussians} Gaussians · ${scene.motion.name} · ${scene.raster}`;
   options($("light"), scene.lights.map((name, index) => [index, name]));
-  options($("shade"), SHADES.map((name) => [name, name]));
+  options($("shade"), Object.entries(SHADES).map(([name, title]) => [name, name, title]));
+  $("zone").hidden = true;
   options($("truth-index"), scene.truths.map((truth, index) => [index, truth.label]));
   $("compare").hidden = scene.truths.length === 0;
   $("ground").parentElement.hidden = !scene.ground;
@@ -297,8 +317,13 @@ function bind() {
   });
   slider("gaussians", setGaussians);
   slider("time", (seconds) => { state.time = Math.min(seconds, scene.motion.duration); play(false); });
-  for (const name of ["shade", "background", "tone"])
+  for (const name of ["shade", "tone"])
     $(name).addEventListener("change", () => { state[name] = $(name).value; redraw(); });
+  for (const name of ["background", "colour"]) $(name).addEventListener("input", () => {
+    const { value } = $("background");
+    state.background = value === "colour" ? $("colour").value : value;
+    redraw();
+  });
   $("light").addEventListener("change", () => { state.light = Number($("light").value); redraw(); });
   $("output").addEventListener("click", (event) => {
     if (!event.target.dataset.value) return;
@@ -330,29 +355,6 @@ function bind() {
   orbit($("stage"), state, redraw);
 }
 
-function bindFiles() {
-  $("files").hidden = false;
-  const load = async (files) => {
-    const list = [...files];  // the browser clears its list when this function awaits
-    if (!list.length) return say("expected files, got something else", { wrong: true });
-    const idle = async () => { while (clipMade) await clipMade.promise; };  // a clip is of one scene
-    if (clipMade) await idle();
-    say(`reading ${list.map((file) => file.name).join(", ")} …`);
-    await engine.load(list, idle);  // another clip may begin while it reads
-  };
-  $("choose").addEventListener("change", () => {
-    load($("choose").files);
-    $("choose").value = "";  // so that a changed file of the same name can be chosen again
-  });
-  document.addEventListener("dragover", (event) => { event.preventDefault(); document.body.classList.add("over"); });
-  document.addEventListener("dragleave", () => document.body.classList.remove("over"));
-  document.addEventListener("drop", (event) => {
-    event.preventDefault();
-    document.body.classList.remove("over");
-    load(event.dataTransfer.files);
-  });
-}
-
 function fail(text, endsClip = true) {
   say(text, { wrong: true, untilFrame: !(endsClip && clipMade) });
   playing = false;  // or every frame would fail
@@ -371,12 +373,15 @@ const handlers = {
   progress: (done, of, note = "") => say(`making a clip: ${done} of ${of}${note}`),
   clip: (blob, name, notes = []) => { endClip(); say(notes.join(" · ")); download(blob, name); },
   refused: (text) => say(text, { wrong: true }),
+  held: (held, text) => { showHeld(held); say(text); },
+  missing: (reasons) => { showMissing(reasons); say(`${reasons.length} of the address's files are missing`, { wrong: true }); },
   error: fail,
 };
 
 bind();
 engine = await connect(handlers);
-if (engine.load) bindFiles();
+const idle = async () => { while (clipMade) await clipMade.promise; };  // a clip is of one scene
+if (engine.load) bindFiles(engine.load, idle, () => clipMade !== null, say);
 requestAnimationFrame(step);
 setInterval(() => {
   if (scene) showTimes();
