@@ -8,7 +8,7 @@ splatted on finer grids, which ``far.depth_groups`` puts in order.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any
@@ -21,7 +21,8 @@ from rnd_runtime.core.arrays import Floats32
 from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.gaussians import Gaussians, Raster
-from rnd_runtime.ground.shadow import Plane, footprint
+from rnd_runtime.ground.shadow import GroundLight, Plane, footprint
+from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.raster.in_view import visible_to
 from rnd_runtime.raster.oracle import NEAR
@@ -89,6 +90,12 @@ def frame_people(people: Sequence[Person]) -> Framing:
     return Framing(joints, (joints.min(axis=0) + joints.max(axis=0)) / 2, padding, facing)
 
 
+def ground_under(people: Sequence[Person]) -> Plane:
+    """The lowest horizontal plane under the feet of anybody."""
+    stands = {(id(each.avatar), id(each.motion)): (each.avatar, each.motion) for each in people}
+    return min((ground_of(*pair) for pair in stands.values()), key=lambda plane: plane.offset)
+
+
 def chosen_levels(pixels_per_metre: Floats, spacings: Sequence[float]) -> NDArray[np.intp]:
     """Level [F] of a body in F consecutive frames, by its size; ``spacings`` are the levels', m.
 
@@ -118,13 +125,13 @@ class SceneRenderer:
             raise InputError("avatar of a scene", expected="a file of rnd-export", got="a graph that poses")
         self._arrays: dict[str, NDArray[Any]] = {}
 
-    def levels(self, count: int, fps: float, camera_at: CameraPath) -> NDArray[np.intp]:
-        """Level of detail [F, N] of each person in the first ``count`` frames; a lone person keeps all Gaussians."""
+    def levels(self, count: int, fps: float, camera_at: CameraPath, *, start: float = 0.0) -> NDArray[np.intp]:
+        """Level of detail [F, N] of each person in ``count`` frames from ``start`` s on; a lone one has the finest."""
         levels = np.zeros((count, len(self.people)), np.intp)
         if len(self.people) == 1:
             return levels
-        times_s = np.arange(count) / fps
-        cameras = [camera_at(frame, frame / fps) for frame in range(count)]
+        times_s = start + np.arange(count) / fps
+        cameras = [camera_at(frame, time_s) for frame, time_s in enumerate(times_s.tolist())]
         axes = np.array([[*camera.world_to_camera[2], max(camera.K[0, 0], camera.K[1, 1])] for camera in cameras])
         for number, person in enumerate(self.people):
             depths = (person.positions(times_s) * axes[:, :3]).sum(axis=1) + axes[:, 3] - MARGIN
@@ -146,15 +153,19 @@ class SceneRenderer:
         srgb: bool = True,
         given: Sequence[Mapping[str, Floats32]] | None = None,
         levels: Sequence[int] | None = None,
+        change: Callable[[Gaussians], Gaussians] | None = None,
+        ground_light: GroundLight | None = None,
     ) -> RenderedFrame:
         """Render what is encoded.
 
         Args:
             aovs, srgb: as of ``FrameRenderer.draw``. given: the same of each person, for all of its Gaussians.
             levels: of detail of each person, of ``levels``, where nothing is ``given``; the finest by default.
+            change: what is shown in place of a body's Gaussians, where nothing is ``given``; the ground's shadow stays.
+            ground_light: the renderer's by default.
         """
         given = given or [{}] * len(bodies)
-        if len(bodies) == 1:
+        if len(bodies) == 1 and change is None:
             return self.renderer.draw(bodies[0], camera, aovs=aovs, srgb=srgb, given=given[0])
         seconds, started = {}, perf_counter()
         frame = bodies[0].root
@@ -163,12 +174,13 @@ class SceneRenderer:
         if levels is not None and not any(given):
             avatars = [avatar.levels[level] if level else avatar for avatar, level in zip(avatars, levels)]
         posed = [avatar.posed(body) for avatar, body in zip(avatars, moved)]
+        shown = posed if change is None else [change(gaussians) for gaussians in posed]
         joints = [avatar.joints(body) for avatar, body in zip(avatars, moved)]
         seconds["posing"], started = perf_counter() - started, perf_counter()
         shader, view = in_root_frame(frame, self.renderer.shader, camera)
-        visible, features = self._shaded(posed, joints, shader, view, aovs, given)
+        visible, features = self._shaded(shown, joints, shader, view, aovs, given)
         seconds["shading"] = perf_counter() - started
-        raster = self._splatted(posed, joints, visible, features, view, "depth" in aovs)
+        raster = self._splatted(shown, joints, visible, features, view, "depth" in aovs)
         for stage, spent in raster.seconds.items():
             seconds[stage] = seconds.get(stage, 0.0) + spent
         layers = aov_layers(aovs, raster, 3, given[0])
@@ -178,7 +190,8 @@ class SceneRenderer:
         ground = None
         if self.renderer.ground is not None:
             started = perf_counter()
-            ground = self._lit_ground(posed, joints, frame, view, self.renderer.ground)
+            plane, light = self.renderer.ground, ground_light or self.renderer.ground_light(self.renderer.ground)
+            ground = self._lit_ground(posed, joints, frame, view, plane, light)
             seconds["ground"] = perf_counter() - started
         return RenderedFrame(
             radiance, raster.alpha, layers, seconds, ground=ground, srgb_on_black=image_srgb, tone=self.renderer.tone
@@ -247,15 +260,21 @@ class SceneRenderer:
         assert result is not None
         return replace(result, seconds=seconds, srgb=None)
 
+    @staticmethod
     def _lit_ground(
-        self, posed: Sequence[Gaussians], joints: Sequence[Floats], frame: Floats, camera: Camera, ground: Plane
+        posed: Sequence[Gaussians],
+        joints: Sequence[Floats],
+        frame: Floats,
+        camera: Camera,
+        ground: Plane,
+        light: GroundLight,
     ) -> Floats32:
         """Share [H, W, 3] of the ground's light that everybody leaves.
 
         Bodies hide different parts of the sky, as if by chance, and the same directional light: shares of the first
         multiply, of the second the least counts.
         """
-        light, plane = self.renderer.ground_light(ground), ground.in_frame(frame)
+        plane = ground.in_frame(frame)
         of_sky = np.maximum(light.sky.sum(axis=0) / np.maximum(light.irradiance, 1e-30), 1e-30).astype(np.float32)
         shape = camera.height, camera.width, 3
         sky, suns = np.ones(shape, np.float32), [np.ones(shape, np.float32) for _ in light.suns]

@@ -9,17 +9,16 @@ from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.motion import load_motion
 from rnd_runtime.shading.brdf import LARGEST_ALBEDO
-from rnd_viewer.inputs.options import PlayOptions, parse_gain
+from rnd_viewer.inputs.cast import load_people
+from rnd_viewer.inputs.options import MotionOptions, PlayOptions, parse_gain
 from rnd_viewer.inputs.scenes import PersonRecord
-from rnd_viewer.play.cast import load_people
 from support.paths import ASSETS
 
 
 def test_the_gain_multiplies_what_play_loads() -> None:
     plain = Avatar.load(ASSETS / "avatar.onnx")
-    options = PlayOptions()
-    gained = PlayOptions(lighting=type(options.lighting)(albedo_gain="1.5,1,0.5"))
-    person = load_people([PersonRecord(ASSETS / "avatar.onnx", ASSETS / "walk.npz")], gained)[0]
+    cast = [PersonRecord(ASSETS / "avatar.onnx", ASSETS / "walk.npz")]
+    person = load_people(cast, MotionOptions(), "1.5,1,0.5")[0]
     motion = load_motion(ASSETS / "walk.npz", plain.skeleton)
     before, after = plain.pose(motion, 0.0).albedo, person.avatar.pose(motion, 0.0).albedo
     assert np.allclose(after, np.minimum(before * [1.5, 1, 0.5], LARGEST_ALBEDO), atol=1e-6)

@@ -19,9 +19,9 @@ from rnd_runtime.core.kernels import COMPILING
 from rnd_runtime.motion.motion import save_motion
 from rnd_runtime.playback.doctor import Finding
 from rnd_runtime.playback.frame import FrameRenderer
+from rnd_viewer.inputs.cast import load_people
 from rnd_viewer.inputs.options import PlayOptions
 from rnd_viewer.inputs.scenes import read_scene
-from rnd_viewer.play.cast import load_people
 from rnd_viewer.play.cli import main
 from support.paths import ROOT
 from support.play_fakes import FakeAvatar, fake_motion
@@ -122,7 +122,7 @@ def test_parts_of_two_processes_make_the_whole_in_one_folder(files, tmp_path):
     assert main(_arguments(files, tmp_path / "whole")) == 0
     code = "import sys; sys.path.insert(0, 'tests'); from support import play_fakes\n"
     code += "import rnd_viewer.play.play, rnd_viewer.play.cli\n"
-    code += "rnd_viewer.play.cast.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
+    code += "rnd_viewer.inputs.cast.Avatar.load = lambda path, **_: play_fakes.FakeAvatar()\n"
     code += "sys.exit(rnd_viewer.play.cli.main(sys.argv[1:]))"
     parts = [_arguments(files, tmp_path / "out", frames=part) for part in (":2", "2:")]
     processes = [subprocess.Popen([sys.executable, "-c", code, *part], cwd=ROOT) for part in parts]
@@ -483,6 +483,6 @@ def test_a_scene_brings_its_motions_and_loads_an_avatar_once(files, tmp_path, ca
     loaded = []
     monkeypatch.setattr(Avatar, "load", lambda path, **_: loaded.append(path) or FakeAvatar())
     options = PlayOptions(avatar=_scene(files, PERSON + "position = [1, 0]\n" + PERSON), out=tmp_path / "out")
-    here, there = load_people(read_scene(options.avatar), options)
+    here, there = load_people(read_scene(options.avatar), options.reading)
     assert len(loaded) == 1 and here.avatar is there.avatar and here.motion is there.motion
     assert here.place[0, 3] == 1 and (there.place == np.eye(4)).all()

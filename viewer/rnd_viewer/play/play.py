@@ -28,21 +28,21 @@ from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.ground.bounce import reflected_share
 from rnd_runtime.ground.shadow import Plane
-from rnd_runtime.ground.standing import UP, ground_of
+from rnd_runtime.ground.standing import UP
 from rnd_runtime.motion.motion import Motion, motion_inputs
 from rnd_runtime.motion.planting import feet_slide
 from rnd_runtime.playback.aov import parse_aovs
 from rnd_runtime.playback.frame import FrameRenderer, RenderedFrame
 from rnd_runtime.playback.framing import CameraOptions, CameraPath, Framing, front_path, orbit_path
-from rnd_runtime.playback.scene import SceneRenderer, frame_people
+from rnd_runtime.playback.scene import SceneRenderer, frame_people, ground_under
 from rnd_runtime.shading.light import light_notes
 from rnd_viewer.inputs.background import Backdrop, Background
 from rnd_viewer.inputs.cameras import file_path, split_camera
+from rnd_viewer.inputs.cast import load_people
 from rnd_viewer.inputs.lights import chosen_light
 from rnd_viewer.inputs.options import OWN_CAMERAS, PlayOptions, parse_frames
 from rnd_viewer.inputs.scenes import PersonRecord, is_scene, read_scene
 
-from .cast import load_people
 from .exr import ExrWriter
 from .given import GivenFeatures
 from .parts import in_parts
@@ -140,7 +140,7 @@ class _Run:
         set_threads(rendering.threads)
         times = StageTimes()
         with times.stage("load"):
-            people = load_people(cast, options, ahead)
+            people = load_people(cast, options.reading, lighting.albedo_gain, rendering.threads, ahead=ahead)
             avatar, motions = people[0].avatar, list(dict.fromkeys(person.motion for person in people))
             if "parts" in aovs and len({person.avatar.skeleton.names for person in people}) > 1:
                 raise InputError("--aov parts", expected="avatars with the same joints", got="different ones")
@@ -166,8 +166,7 @@ class _Run:
             )
             scene = SceneRenderer(people, renderer, cull=rendering.cull)
             if lighting.ground == "auto":
-                stands = {(id(each.avatar), id(each.motion)): (each.avatar, each.motion) for each in people}
-                renderer.ground = min((ground_of(*pair) for pair in stands.values()), key=lambda plane: plane.offset)
+                renderer.ground = ground_under(people)
             elif lighting.ground != "none":
                 renderer.ground = Plane(UP, lighting.ground_height)
             if renderer.ground and (slide := feet_slide(motions[0], avatar.skeleton)) is not None:

@@ -15,6 +15,7 @@ from rnd_runtime.core.kernels import COMPILING, kernels_are_cold
 from rnd_runtime.core.signals import on_signal
 from rnd_runtime.core.threads import set_threads
 from rnd_runtime.playback.start import load_ahead
+from rnd_viewer.inputs.scenes import is_scene
 
 from .access import is_loopback
 from .options import ViewOptions
@@ -32,8 +33,10 @@ def view(options: ViewOptions) -> NoReturn:
         InputError: for whatever cannot be used.
     """
     watching = options.avatar.is_dir()
-    ahead = load_ahead(None if watching else options.avatar, options.threads)
-    from .scene import Scene  # here, so that --help works where a library does not load
+    cast = is_scene(options.avatar) and not watching
+    ahead = load_ahead(None if watching or cast else options.avatar, options.threads)
+    from .cast_scene import CastScene  # here, so that --help works where a library does not load
+    from .scene import Scene
     from .server import load_websockets, serve
     from .training import Training
 
@@ -45,7 +48,7 @@ def view(options: ViewOptions) -> NoReturn:
     else:
         cold = kernels_are_cold()
         with Console(stderr=True, quiet=is_quiet()).status("loading"):
-            shown = Scene(options, ahead)
+            shown = CastScene(options) if cast else Scene(options, ahead)
             if cold:
                 log(COMPILING)
             shown.warm_up()

@@ -19,6 +19,7 @@ from rnd_runtime.cli.command import (
 )
 from rnd_runtime.core.errors import InputError, refuse_changed, refuse_outside
 from rnd_viewer.inputs.options import GAIN, MotionGroup, MotionOptions, ProbeUp, parse_gain
+from rnd_viewer.inputs.scenes import is_scene
 
 SIZES = 64, 2048  # px: the least and the largest side of a frame
 
@@ -30,8 +31,9 @@ class ViewOptions:
     rnd-view avatar.onnx --motion walk.npz --hdr sky.exr
     """
 
-    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx|RUN")]
-    """An avatar of rnd-export, or a folder of rnd-train: its losses and previews while it trains, then its avatar."""
+    avatar: Annotated[tyro.conf.Positional[Path], option("AVATAR.onnx|SCENE.toml|RUN")]
+    """An avatar of rnd-export; several, in a scene file (docs/formats.md); or a folder of rnd-train: its losses and
+    previews while it trains, then its avatar."""
     motion: OptionalFile = None
     """Body poses over time, in any format that rnd-play takes. Default: the capture's, else the rest pose."""
     hdr: Annotated[tuple[Path, ...], option("FILE|FOLDER ...")] = ()
@@ -63,7 +65,10 @@ class ViewOptions:
     def __post_init__(self) -> None:
         if not self.hdr:
             refuse_changed(self, ["hdr_up"], "needs --hdr")
-        if self.motion is None:
+        scene = is_scene(self.avatar)
+        if scene:
+            refuse_changed(self, ["motion", "capture"], "the scene has its motions")
+        if self.motion is None and not scene:
             captured = self.capture is not None
             ours = "the capture's own is read by its rules" if captured else "the rest pose does not move"
             self.reading.refuse_unread(f"needs --motion: {ours}", edited=captured)

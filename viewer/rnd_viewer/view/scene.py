@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rnd_runtime.avatar.avatar import Avatar
 from rnd_runtime.avatar.networks import Networks
 from rnd_runtime.capture.capture import Capture, load_capture
-from rnd_runtime.core.camera import Camera
+from rnd_runtime.core.camera import Camera, Floats
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.files import existing_file
 from rnd_runtime.core.gaussians import Gaussians
@@ -25,8 +25,8 @@ from rnd_runtime.ground.standing import ground_of
 from rnd_runtime.motion.edit import edit_motion
 from rnd_runtime.motion.motion import Motion
 from rnd_runtime.playback.aov import aov_image
-from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, ground_share
-from rnd_runtime.playback.framing import CameraOptions, frame_motion, front_path
+from rnd_runtime.playback.frame import FrameRenderer, PosedAvatar, RenderedFrame, ground_share
+from rnd_runtime.playback.framing import CameraOptions, Framing, frame_motion, front_path
 from rnd_runtime.raster.tone import tone_map
 from rnd_runtime.shading.files.load import load_light
 from rnd_runtime.shading.light import Light, brightest_direction, downsize, light_notes
@@ -69,10 +69,7 @@ class Scene:
     """
 
     def __init__(self, options: ViewOptions, ahead: Future[Networks] | None = None) -> None:
-        self.avatar = Avatar.load(options.avatar, threads=options.threads, ahead=ahead)
-        self.avatar.scale_albedo(parse_gain(options.albedo_gain))
-        self.capture: Capture | None = load_capture(options.capture) if options.capture else None
-        self.motion = self._motion(options)
+        self._load(options, ahead)
         self._files, self._up = _probes(options.hdr), options.hdr_up
         self.name, self.size, self.threads = options.avatar.name, options.width_height, options.threads
         self._fit = options.size is None
@@ -90,17 +87,17 @@ class Scene:
 
     def description(self) -> dict[str, Any]:
         """The description of the scene for a page."""
-        framing = frame_motion(self.avatar.skeleton, self.motion)
+        framing, names = self.framing(), self.avatar.skeleton.names
         view = CameraOptions(*self.size)
         home = front_path(framing, view)(0, 0.0)
         return {
             "avatar": self.name,
-            "gaussians": self.avatar.gaussians,
-            "parents": self.avatar.skeleton.parents.tolist(),
-            "motion": {"name": Path(self.motion.source).name, "duration": self.motion.duration, "fps": self.motion.fps},
+            "gaussians": self.gaussians,
+            "parents": self.parents(),
+            "motion": {"name": self.motion_name, "duration": self.duration, "fps": self.motion.fps},
             "lights": ["the avatar's own", *(file.name for file in self._files)],
             "light": 1 if self._files else 0,
-            "head": self.avatar.skeleton.names.index("head") if "head" in self.avatar.skeleton.names else -1,
+            "head": names.index("head") if "head" in names else -1,
             "fit": self._fit,
             "size": self.size,
             "sizes": SIZES,
@@ -114,8 +111,38 @@ class Scene:
             },
             "truths": self._truths(),
             "ground": True,
-            "notes": list(self.motion.notes),
+            "notes": self.notes(),
         }
+
+    @property
+    def gaussians(self) -> int:
+        """Number of the Gaussians, as of all properties here: of what is played."""
+        return self.avatar.gaussians
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return self.motion.duration
+
+    @property
+    def motion_name(self) -> str:
+        return Path(self.motion.source).name
+
+    def framing(self) -> Framing:
+        """Where the body is in the whole motion."""
+        return frame_motion(self.avatar.skeleton, self.motion)
+
+    def parents(self) -> list[int]:
+        """Of the joints of a ``View``, −1 for none."""
+        return list(self.avatar.skeleton.parents.tolist())
+
+    def notes(self) -> list[str]:
+        """Of the motion's reader."""
+        return list(self.motion.notes)
+
+    def frames_at(self, fps: float) -> int:
+        """Frames of a clip."""
+        return self.motion.frames_at(fps)
 
     def warm_up(self) -> None:
         """Render the first view once: a first run compiles the kernels, up to two minutes."""
@@ -129,24 +156,16 @@ class Scene:
         if state.truth is not None:
             state = structs.replace(state, yaw=0.0, exposure=0.0)
         camera, motion, time_s = self._view(state)
-        body = self._pose(motion, time_s, seconds)
-        gaussians = _fewer(body.gaussians, state.gaussians)
-        if state.output == "light":
-            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
-        lit = state.output in ("lit", "light")
-        aovs = () if lit else (state.output,)
+        lit = not aovs_of(state)
+        background = self._background_radiance(state, camera) if lit or state.output == "albedo" else None
+        grounded = lit and state.ground and state.truth is None and background is not None and bool(background.any())
         self.renderer.shader = self._rotated_shader(state)
-        frame = self.renderer.draw(body._replace(gaussians=gaussians), camera, aovs=aovs, lit=lit, srgb=False)
+        frame = self._draw(state, camera, motion, time_s, grounded, seconds)
         started = perf_counter()
-        if lit or state.output == "albedo":
+        if background is not None:
             radiance = frame.radiance * np.float32(2.0**state.exposure) if lit else frame.aovs["albedo"]
-            background = self._background_radiance(state, camera)
-            seconds |= frame.stage_seconds
-            share = None
-            if lit and state.ground and state.truth is None and background.any():
-                share = self._ground_share(state, motion, body, camera)
-                seconds["ground"], started = perf_counter() - started, perf_counter()
-            srgb = tone_map(radiance, frame.alpha, background, share, tone=state.tone if lit else "srgb")
+            tone = state.tone if lit else "srgb"
+            srgb = tone_map(radiance, frame.alpha, background, frame.ground if grounded else None, tone=tone)
         else:
             shown = aov_image(state.output, frame.aovs[state.output], frame.alpha)
             srgb = np.broadcast_to(shown, (*frame.alpha.shape, 3))
@@ -168,6 +187,13 @@ class Scene:
 
     def close(self) -> None:
         self.renderer.close()
+
+    def _load(self, options: ViewOptions, ahead: Future[Networks] | None) -> None:
+        """Set ``avatar``, ``capture`` and ``motion``."""
+        self.avatar = Avatar.load(options.avatar, threads=options.threads, ahead=ahead)
+        self.avatar.scale_albedo(parse_gain(options.albedo_gain))
+        self.capture: Capture | None = load_capture(options.capture) if options.capture else None
+        self.motion = self._motion(options)
 
     def _motion(self, options: ViewOptions) -> Motion:
         if options.motion:
@@ -203,12 +229,35 @@ class Scene:
 
     def _view(self, state: ViewState) -> tuple[Camera, Motion, float]:
         if state.truth is None:
-            return state.camera(), self.motion, float(np.clip(state.time, 0, self.motion.duration))
+            return state.camera(), self.motion, float(np.clip(state.time, 0, self.duration))
         capture, frame = self._capture_frame(state.truth)
         camera = capture.cameras[frame.camera]
         scale = min(state.width / camera.width, state.height / camera.height)
         size = (max(round(side * scale), 1) for side in (camera.width, camera.height))
         return camera.resized(*size), self._captured_motion, frame.frame / capture.fps
+
+    def _draw(
+        self, state: ViewState, camera: Camera, motion: Motion, time_s: float, grounded: bool, seconds: dict[str, float]
+    ) -> RenderedFrame:
+        """The frame of ``state``, with the ``ground`` where it is ``grounded``; adds to the stages' ``seconds``."""
+        body = self._pose(motion, time_s, seconds)
+        shown = body._replace(gaussians=self._changed(state, body.gaussians))
+        frame = self.renderer.draw(shown, camera, aovs=aovs_of(state), lit=not aovs_of(state), srgb=False)
+        if not grounded:
+            return frame
+        started = perf_counter()
+        share = ground_share(self._ground(motion), self._turned_ground_light(state), body, camera)
+        times = {**frame.stage_seconds, "ground": perf_counter() - started}
+        return replace(frame, ground=share, stage_seconds=times)
+
+    def _changed(self, state: ViewState, gaussians: Gaussians) -> Gaussians:
+        """Fewer, or of one albedo, where ``state`` wants that."""
+        if state.gaussians is not None:
+            share = state.gaussians / self.gaussians
+            gaussians = _fewer(gaussians, max(round(len(gaussians.means) * share), 1))
+        if state.output == "light":
+            gaussians = replace(gaussians, albedo=np.full_like(gaussians.albedo, CLAY))
+        return gaussians
 
     def _pose(self, motion: Motion, time_s: float, seconds: dict[str, float]) -> PosedAvatar:
         """Cached while only camera and light move."""
@@ -246,11 +295,9 @@ class Scene:
         self._light.cache_clear()
         return GroundLight(light).with_yaw(replace(light, radiance=np.zeros((1, 2, 3), np.float32)))
 
-    def _ground_share(self, state: ViewState, motion: Motion, body: PosedAvatar, camera: Camera) -> Floats32:
-        """Share [H, W, 3] of the ground's light that the body leaves."""
+    def _turned_ground_light(self, state: ViewState) -> GroundLight:
         light = self._ground_light(self._light_name(state))
-        turned = light.with_yaw(light.light.with_yaw(light.light.yaw + state.yaw))
-        return ground_share(self._ground(motion), turned, body, camera)
+        return light.with_yaw(light.light.with_yaw(light.light.yaw + state.yaw))
 
     def _load_light(self, name: str | Path | None) -> Light:
         light = self._read_light(name)
@@ -289,16 +336,26 @@ class Scene:
     def _joints(self, motion: Motion, time_s: float, camera: Camera) -> Floats32:
         now = motion.at([time_s])
         world = self.avatar.skeleton.joint_transforms(now.rotations[0], now.translations[0])[:, :3, 3]
-        seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        depth = np.where(np.abs(seen[:, 2:]) > 1e-6, seen[:, 2:], 1e-6)
-        pixels = (seen / depth) @ camera.K.T
-        return np.column_stack([pixels[:, :2], seen[:, 2]]).astype(np.float32)
+        return projected(world, camera)
 
 
-def _fewer(gaussians: Gaussians, count: int | None) -> Gaussians:
+def projected(world: Floats, camera: Camera) -> Floats32:
+    """px, px and z in metres [N, 3] of points [N, 3] m."""
+    seen = world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    depth = np.where(np.abs(seen[:, 2:]) > 1e-6, seen[:, 2:], 1e-6)
+    pixels = (seen / depth) @ camera.K.T
+    return np.column_stack([pixels[:, :2], seen[:, 2]]).astype(np.float32)
+
+
+def aovs_of(state: ViewState) -> tuple[str, ...]:
+    """The material that ``state`` shows, none for light."""
+    return () if state.output in ("lit", "light") else (state.output,)
+
+
+def _fewer(gaussians: Gaussians, count: int) -> Gaussians:
     """``count`` Gaussians at even steps through the file, which is in spatial order, scaled to cover the same area."""
     total = len(gaussians.means)
-    if count is None or count >= total:
+    if count >= total:
         return gaussians
     kept = np.arange(count) * total // count
     fewer = gaussians.only(kept)

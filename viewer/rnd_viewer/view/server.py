@@ -242,8 +242,7 @@ class _Visitor:
             governor.observe(perf_counter() - started)
 
     def _clip(self, socket: Any, scene: Scene, request: ClipRequest) -> None:
-        motion, state = scene.motion, replace(request.state, truth=None)
-        frames = motion.frames_at(request.fps)
+        state, frames = replace(request.state, truth=None), scene.frames_at(request.fps)
         if frames > MAX_CLIP_FRAMES:
             raise InputError("clip", expected=f"at most {MAX_CLIP_FRAMES} frames", got=frames)
         with temporary_folder() as folder:
@@ -255,7 +254,7 @@ class _Visitor:
                     with self._rendering:
                         append(np.ascontiguousarray(scene.render(now).srgb))
                     self._send(socket, {"kind": "progress", "done": number + 1, "of": frames})
-            notes = motion.loop_notes(request.fps)
+            notes = scene.motion.loop_notes(request.fps)
             self._send(socket, {"kind": "clip", "notes": notes}, file.read_bytes())
 
     @staticmethod
