@@ -16,7 +16,7 @@ from .lifter.options import Lifter
 from .options import Compare, Frame, Grid, Ground, Raster, Scenes, Step
 from .stability.cli import Stability
 from .studies.options import Ablations, Agreement, Causes, Lengths, People
-from .studies.video_options import Video
+from .studies.video_options import Filmed, Video
 
 SPEED, STUDY = "rnd_bench.speed.cli", "rnd_bench.studies.cli"
 
@@ -44,6 +44,7 @@ STUDIES: dict[str, tuple[Any, str, str]] = {
     "people": (People, STUDY, "run_people"),
     "agreement": (Agreement, STUDY, "run_agreement"),
     "video": (Video, "rnd_bench.studies.video", "run"),
+    "filmed": (Filmed, "rnd_bench.studies.filmed", "run"),
     "lifter": (Lifter, "rnd_bench.lifter.cli", "run"),
 }
 

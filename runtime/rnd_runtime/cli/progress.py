@@ -91,6 +91,12 @@ class Progress:
             self._next = now + INTERVAL
             log(" · ".join([self._name, *words, *self._left()]))
 
+    def at(self, name: str, done: float, total: float) -> None:
+        """Report that ``done`` of ``total`` steps of the phase ``name`` are done; another name begins a phase."""
+        if name != self._name:
+            self.phase(name, total, done=done)
+        self.update(done)
+
     def _left(self) -> Iterator[str]:
         (before, first), (now, done) = self._seen[0], self._seen[-1]
         if self._total is not None and done > first:

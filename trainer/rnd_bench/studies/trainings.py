@@ -96,7 +96,7 @@ def ablate(
         if not found:
             run_folder = _run_folder(folder, variant, seed)
             seen = _noisy(capture) if variant.noisy else capture
-            extra = _train(seen, config, run_folder, perceptual, consistency, capture, on_share)
+            extra = _pose_errors(train(seen, config, run_folder, perceptual, consistency, on_share), capture)
             checkpoint = load_checkpoint(run_folder / "avatar.ckpt")
             scored = score(checkpoint, capture, method=variant.name, mode=mode, perceptual=judge)
             cost = encoder_cost(checkpoint.model)
@@ -174,18 +174,17 @@ def encoder_cost(model: AvatarModel) -> dict[str, float]:
     return {"encoder_gflop": counter.get_total_flops() / 1e9, "encoder_ms": statistics.median(times)}
 
 
-def _train(
-    seen: Capture,
+def train(
+    capture: Capture,
     config: TrainConfig,
     folder: Path,
     perceptual: Perceptual | None,
-    consistency: Perceptual | None,
-    truth: Capture,
-    on_share: Callable[[float], None],
-) -> dict[str, float]:
-    """Train on ``seen``; return the poses' errors before and after, degrees, where they were not exact."""
+    consistency: Perceptual | None = None,
+    on_share: Callable[[float], None] = lambda share: None,
+) -> Training:
+    """A finished training in ``folder``; one that was begun there is resumed. ``on_share`` gets the share done."""
     folder.mkdir(parents=True, exist_ok=True)
-    training = Training(seen, config, perceptual, consistency=consistency)
+    training = Training(capture, config, perceptual, consistency=consistency)
     if (folder / STATE_FILE).exists():
         resume_training(training, folder / STATE_FILE)
     cost = training.schedule.cost
@@ -195,11 +194,16 @@ def _train(
 
     if run(training, folder, on_step=on_step, on_preview=lambda: None):
         raise KeyboardInterrupt
-    if seen is truth:
+    return training
+
+
+def _pose_errors(training: Training, truth: Capture) -> dict[str, float]:
+    """Errors of the poses before and after a training, degrees; empty where they were the true ones."""
+    if training.capture.motion.source == truth.motion.source:
         return {}
     frames = [view.frame.frame for view in training.views]
     return {
-        "pose_error_before_deg": joint_error_degrees(seen.motion, truth.motion, frames),
+        "pose_error_before_deg": joint_error_degrees(training.capture.motion, truth.motion, frames),
         "pose_error_after_deg": joint_error_degrees(training.motion(), truth.motion, frames),
     }
 

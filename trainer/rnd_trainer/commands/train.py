@@ -243,15 +243,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
     chosen = [k * len(training.views) // PREVIEWS for k in range(PREVIEWS)]
     shown = [training.views[k] for k in dict.fromkeys(chosen)]
     schedule = training.schedule
-    phase, smooth, warned = "", 0.0, False
-
-    def on_phase(name: str, done: float, total: float) -> None:
-        nonlocal phase
-        if name != phase:
-            phase = name
-            progress.phase(name, total, done=done)
-        else:
-            progress.update(done)
+    smooth, warned = 0.0, False
 
     def on_step(step: StepResult) -> None:
         nonlocal smooth, warned
@@ -277,7 +269,7 @@ def _run_with_progress(training: Training, folder: Path) -> bool:
         save_preview(file, training.model, training.lights if lit else None, posed)
 
     with Progress() as progress:
-        return run(training, folder, on_step=on_step, on_preview=on_preview, on_phase=on_phase)
+        return run(training, folder, on_step=on_step, on_preview=on_preview, on_phase=progress.at)
 
 
 def _score_after_training(training: Training, folder: Path, options: TrainOptions) -> None:

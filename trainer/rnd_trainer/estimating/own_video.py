@@ -25,6 +25,7 @@ from rnd_trainer.importing.poses import Poses
 from rnd_trainer.importing.scene import PlacedScene
 from rnd_trainer.importing.surfaces.estimate import add_normals
 from rnd_trainer.importing.surfaces.files import attach_files
+from rnd_trainer.importing.videos.undistorted import undistorted
 from rnd_trainer.importing.videos.video_file import VideoFile
 from rnd_trainer.importing.write import write_capture
 from rnd_trainer.training.uncertainty import PoseUncertainty, save_uncertainty
@@ -78,6 +79,7 @@ def import_video(
     networks = Networks.open()
     video: Any
     video, numbers = _frames(source, options)
+    video = undistorted(video, options.intrinsics, options.distortion)
     on_found(f"{source.name}: {len(numbers)} frames of {video.width} x {video.height}, {video.fps:g} a second")
     try:
         people = [one.region for one in networks.detector(video.frame(numbers[0]))]
@@ -150,7 +152,7 @@ def _placed(
     frames, motion = fitted.frames, fitted.motion
     root = motion.translations + fitted.body.skeleton.rest_joints[0]
     poses = Poses(frames, motion.rotations, lambda _: root, fitted.body.skeleton.names)
-    lenses = {video_layout.CAMERA: Lens(fitted.camera, options.distortion)}
+    lenses = {video_layout.CAMERA: Lens(fitted.camera, (), options.distortion)}
     dataset = ImportedDataset("a video", lenses, [], poses, seen.fps, tuple(notes))
     every = _every_frame(frames, motion)
     scene = PlacedScene(fitted.body, every, {video_layout.CAMERA: fitted.camera}, np.eye(3), notes)
@@ -206,7 +208,9 @@ def _poses_of(poses: Poses, chosen: NDArray[np.bool_]) -> Poses:
 
 def _video_notes(video: Any, numbers: list[int], seen: Observations, left_out: dict[int, str]) -> list[str]:
     notes = list(getattr(video, "notes", ()))
-    inner = video.video if isinstance(video, Steady) else video
+    inner = video
+    while not isinstance(inner, Regular) and hasattr(inner, "video"):
+        inner = inner.video
     if isinstance(inner, Regular):
         notes.append(f"frames of uneven times: taken at {inner.fps:.3g} a second")
     if isinstance(video, Steady) and video.homographies:

@@ -21,18 +21,9 @@ def import_and_report(
 
     ``importer`` is called as ``import_source`` is.
     """
-    phase = ""
     with Progress() as progress:
-
-        def update(name: str, done: int, total: int) -> None:
-            nonlocal phase
-            if name != phase:
-                phase = name
-                progress.phase(name, total)
-            progress.update(done)
-
         on_found = lambda sentence: show(f"found {sentence}")  # noqa: E731
-        scene = importer(source, out, options, on_progress=update, on_found=on_found)
+        scene = importer(source, out, options, on_progress=progress.at, on_found=on_found)
     for note in scene.notes:
         show(f" note {note}")
     return check_and_report(out, out / "check")
