@@ -110,6 +110,7 @@ def _films(options: Filmed, out: Path, progress: Progress) -> Iterator[Film]:
         scored = in_capture_of(truth, capture, ("train",) if options.hold_out else SPLITS)
         yield Film("rendered", capture, scored, exact_poses(truth, capture))
     if options.real is not None:
+        progress.phase("real cameras: landmarks")
         for name, view in other_cameras(options.real, out):
             capture = imported(view.video, name, intrinsics=view.intrinsics, distortion=view.distortion)
             yield Film(name, capture, view.scored(capture, out / name / "seen"))
