@@ -7,7 +7,7 @@ there and taken off.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ _TOWARDS = {
 _SHORTEST = 0.03  # of a leg: shorter bones have no direction
 _X = np.array([1.0, 0, 0])
 
-_SAME_LENGTH = 0.15
+_SAME_SPINE_LENGTH, _SAME_LEG_LENGTH = 0.15, 0.02  # of the avatar's: then the joints are at the same places
 _UPRIGHT = np.cos(np.radians([30.0, 15.0]))  # angle of trunk and thighs: no weight, full weight
 _SAME_SPINE, _SAME_COLLAR, _SAME_FOOT = np.radians(8), np.radians(10), np.radians(4)  # differences that are posture
 _COLLAR_BASE = 0.12  # of the shoulders' width: difference of the collars' distance
@@ -101,7 +101,8 @@ def rest_directions(
     trunk = next((end for end in ("neck", "head", *SPINE[::-1]) if end in points and end in rest), "")
     if trunk:
         neutral, weights = _trunk_line(Bone("hips", trunk), points, rest)
-        for name in () if _same_spine(bones, points, rest, root) else (root, *SPINE, "neck"):
+        same = _same_lengths((root, *SPINE), _SAME_SPINE_LENGTH, bones, points, rest)
+        for name in () if same else (root, *SPINE, "neck"):
             if name not in bones:
                 continue
             tilts = angle_about(neutral @ _X, neutral @ directions[name], bones[name].along(points))
@@ -110,18 +111,25 @@ def rest_directions(
                 directions[name] = about(_X, np.array(tilt)) @ directions[name]
         _correct_collars(directions, bones, points, rest, neutral)
     for side in ("left", "right"):
-        if f"{side}_ankle" in bones:
-            _correct_foot(directions, f"{side}_ankle", bones, points, fps)
+        leg = tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle"))
+        if leg[-1] in bones and not _same_lengths(leg, _SAME_LEG_LENGTH, bones, points, rest):
+            _correct_foot(directions, leg[-1], bones, points, fps)
     return directions
 
 
-def _same_spine(bones: Mapping[str, Bone], points: Mapping[str, Floats], rest: Mapping[str, Floats], root: str) -> bool:
-    """Whether the bones of the trunk are as long as at ``rest``, so that their joints are at the same places."""
+def _same_lengths(
+    names: Iterable[str],
+    tolerance: float,
+    bones: Mapping[str, Bone],
+    points: Mapping[str, Floats],
+    rest: Mapping[str, Floats],
+) -> bool:
+    """Whether the bones of ``names`` are as long as at ``rest``, so that their joints are at the same places."""
     leg, leg_rest = leg_length(points), leg_length(rest)
-    for name in (root, *SPINE):
+    for name in names:
         if name in bones:
             length = float(np.median(np.linalg.norm(bones[name].along(points), axis=-1))) / leg
-            if abs(length / (float(np.linalg.norm(bones[name].along(rest))) / leg_rest) - 1) > _SAME_LENGTH:
+            if abs(length / (float(np.linalg.norm(bones[name].along(rest))) / leg_rest) - 1) > tolerance:
                 return False
     return True
 

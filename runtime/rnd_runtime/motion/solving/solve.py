@@ -3,9 +3,10 @@
 Every joint gets a frame from positions: the pelvis from the hips' axis and the spine above them, the chest from the
 collars' or shoulders' axis, a limb from its bone's direction and from what shows its roll: the axis about which a knee
 or an elbow bends, the toes, the knuckles. Where the recording has rotations too, they carry the frame through time by
-one constant rotation per joint, C_k, fitted over the clip: G_k(t) = Q_k(t) C_k. So neither the zero pose nor the axes
-of the recorded bones matter, and what positions do not show (a wrist's twist, a nod) stays as recorded. Where
-rotations contradict positions, as of programs that solve them for positions alone, positions decide.
+one constant rotation per joint, C_k, fitted over the clip: G_k(t) = Q_k(t) C_k. Its roll is the mean of what hinges,
+feet and the parent show, weighted by their inverse variances. So neither the zero pose nor the axes of the recorded
+bones matter, and what positions do not show (a wrist's twist, a nod) stays as recorded. Where rotations contradict
+positions, as of programs that solve them for positions alone, positions decide.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from .evidence import Complexes, Evidence, Recorded, Tracks, coherence, lateral_
 from .tips import long_enough, tip_at_rest
 
 _SLIGHT = np.sin(np.radians(20)) ** 2  # weight of a hinge; of a slighter bend, the wrong way round is noise
-# Coherences of rolls: of what is shown with rotations that carry it, with neutral ones where it is noise, and what
-# either may be worse by
-_COHERENT, _INCOHERENT, _NOISE = 0.97, 0.6, 0.03
+# Coherences of rolls: of what is shown with rotations that carry it, and where it is noise; and how many times as
+# incoherent as with neutral rolls it may be with those that carry it
+_COHERENT, _INCOHERENT, _NOISE = 0.97, 0.6, 1.5
 _AGREES, _TWISTS = 0.9, 0.5  # of recorded with neutral rolls, where nothing is shown; of a forearm, which twists far
 _NO_ROLL = 0.9995  # of rotations that are the smallest ones from bone to bone
 # Max median deviations of recorded rotations: from the trunk's frames, from a bone with which those of its children
@@ -168,39 +169,41 @@ class _Solver:
         """A joint whose bone has a direction, rolled about it."""
         bone, at_rest, above = unit(self.bones[name].along(self.points)), self.at_rest[name], self.solved[parent]
         neutral = swing(above @ at_rest, bone) @ above
-        prior, shown = self.recorded.prior(name, bone, neutral), list(self.recorded.shown(name, len(bone)))
-        by_position = _rolls(shown, bone, neutral)
+        prior, shown = self.recorded.prior(name, bone, neutral), self.recorded.shown(name)
+        by_position = shown.rolls(bone, neutral)
         constant = self._constant(name, parent, bone)
         if constant is not None:
             recorded = self.rotations[name] @ constant
             base, lateral = swing(recorded @ at_rest, bone) @ recorded, lateral_at_rest(name, at_rest)
-            by_rotation = _rolls(shown, bone, base)
+            by_rotation = shown.rolls(bone, base)
             own = np.exp(1j * angle_about(bone, neutral @ lateral, base @ lateral))
             if self._carries(name, parent, coherence(by_rotation), coherence(by_position), own):
-                roll = self._constant_roll(name, by_rotation, prior.rolls(bone, base), zero_is_rest)
+                roll = self._constant_roll(name, shown, prior, bone, base, zero_is_rest)
                 self.constants[name] = constant @ about(at_rest, roll)
                 self.carried.add(name)
                 carried: Floats = about(bone, np.full(len(bone), roll)) @ base
                 return carried
-        to_prior = prior.rolls(bone, neutral)
-        wrong = (np.abs(by_position) < _SLIGHT) & ((by_position * to_prior.conj()).real < 0)
+        to_prior = np.sum([seen.rolls(bone, neutral) for seen in prior], axis=0)
+        wrong = (shown.size < _SLIGHT) & ((by_position * to_prior.conj()).real < 0)
         rolls = smooth(np.where(wrong, 0, by_position) + to_prior, _SMOOTH * self.fps)
         solved: Floats = about(bone, np.angle(rolls)) @ neutral
         if constant is not None:
             self._fitted(name, solved, _NEARLY)
         return solved
 
-    def _constant_roll(self, name: str, shown: Complexes, prior: Complexes, zero_is_rest: bool) -> float:
-        """The roll from recorded rotations to what is ``shown`` [F] over the clip, or to the ``prior`` [F]."""
-        visible = complex(shown.sum() * np.clip((coherence(shown) - 0.5) / 0.3, 0, 1))
-        size = (np.abs(shown) ** 2).sum() / max(np.abs(shown).sum(), 1e-12)
-        if size < _SLIGHT and (visible * prior.sum().conj()).real < 0:
-            visible = 0
-        if abs(visible) > abs(prior.sum()):
+    def _constant_roll(
+        self, name: str, shown: Evidence, prior: list[Evidence], bone: Floats, base: Floats, zero_is_rest: bool
+    ) -> float:
+        """The roll from ``base``, recorded rotations, to what is ``shown`` over the clip and to the ``prior``."""
+        visible = shown.over_clip(bone, base)
+        expected = complex(sum(seen.over_clip(bone, base) for seen in prior))
+        if shown.mean_size() < _SLIGHT and (visible * expected.conjugate()).real < 0:
+            visible = 0j
+        if abs(visible) > abs(expected):
             self.shown.add(name)
-        elif zero_is_rest and self.recorded.foot_axis(name) is None and abs(np.angle(prior.sum())) > _HELD:
+        elif zero_is_rest and self.recorded.foot_axis(name) is None and abs(np.angle(expected)) > _HELD:
             return 0.0
-        return float(np.angle(visible + prior.sum()))
+        return float(np.angle(visible + expected))
 
     def _carries(self, name: str, parent: str, by_rotation: float, by_position: float, own: Complexes) -> bool:
         """Whether the recorded rolls of joint ``name`` are a body's, not what a program chose for want of knowledge.
@@ -211,14 +214,15 @@ class _Solver:
             own: e^{iφ} [F] of the recorded rolls relative to neutral ones.
         """
         twists = name.endswith(("_elbow", "_wrist"))
-        if by_position < _INCOHERENT:
+        if max(by_rotation, by_position) < _INCOHERENT:
             return (parent in self.constants or not twists) and coherence(own) > (_TWISTS if twists else _AGREES)
         if twists and parent in self.shown and by_rotation > _TWISTS:
             return True
-        if name.endswith(("_elbow", "_knee")) and parent not in self.carried:  # the same hinge
+        hinge = name.endswith(("_elbow", "_knee"))
+        if hinge and parent not in self.carried:  # the same hinge
             return False
-        rolls = len(own) < 3 or coherence(own) < _NO_ROLL
-        return rolls and by_rotation >= min(_COHERENT, by_position - _NOISE)
+        rolls = hinge or len(own) < 3 or coherence(own) < _NO_ROLL
+        return rolls and 1 - by_rotation <= max(1 - _COHERENT, _NOISE * (1 - by_position))
 
     def _constant(self, name: str, parent: str, bone: Floats) -> Floats | None:
         """C with a neutral roll in the zero pose; None where the recorded rotations do not carry the ``bone``."""
@@ -235,7 +239,3 @@ class _Solver:
 
 def _held(name: str) -> float:
     return float(_HELD_HEAD if name == "head" else _HELD)
-
-
-def _rolls(shown: list[Evidence], bone: Floats, base: Floats) -> Complexes:
-    return sum((seen.rolls(bone, base) for seen in shown), np.zeros(len(bone), complex))

@@ -53,6 +53,33 @@ def test_a_known_motion_comes_back_from_any_zero_pose(motion):
         assert_allclose(np.diff(found.translations, axis=0), np.diff(pelvis, axis=0), atol=2e-3)
 
 
+def _knees_of_a_fit(waves: np.ndarray) -> dict[str, np.ndarray]:
+    """Knees that bend about axes 20° aside on average, and as much to either side of it, as in fits of SMPL."""
+    axes, bend, poses = np.radians(20 + 20 * waves), 0.7 + 0.4 * waves[::-1], {}
+    for side, sign in (("left", -1), ("right", 1)):
+        poses[f"{side}_hip"] = np.stack([0.4 * waves - 0.4, 0.15 * waves, 0 * waves], -1)
+        poses[f"{side}_knee"] = bend[:, None] * np.stack([np.cos(axes), 0 * axes, sign * np.sin(axes)], -1)
+    return poses
+
+
+def _arms_that_twist(waves: np.ndarray) -> dict[str, np.ndarray]:
+    """Arms held sideways that twist by ±126°, elbows bent by 17°."""
+    still = np.zeros_like(waves)
+    arms = {f"{side}_shoulder": np.stack([2.2 * waves, still, still], -1) for side in ("left", "right")}
+    return arms | {"left_elbow": np.array([0, -0.3, 0]), "right_elbow": np.array([0, 0.3, 0])}
+
+
+@pytest.mark.parametrize(("pose", "degrees"), [(_knees_of_a_fit, 8), (_arms_that_twist, 5)])
+def test_a_walk_with_other_limbs_comes_back_from_any_zero_pose(pose, degrees):
+    rotations, pelvis, fps = walk()
+    rotations = rotations.copy()
+    for name, vectors in pose(np.sin(np.arange(len(rotations)) * 0.9)).items():
+        rotations[:, SMPL_NAMES.index(name)] = Rotation.from_rotvec(vectors).as_matrix()
+    zero = random_rotations(np.random.default_rng(9), 24)
+    found = retarget(tree(rotations, pelvis, zero, fps=fps), SKELETON, MATCHED)
+    assert_same_poses(found.rotations, rotations, degrees=degrees)
+
+
 @pytest.mark.parametrize("axes", ["xyz", "zxy", "yzx"])
 def test_any_axis_may_be_up(axes):
     """The person stands: the trunk shows it, not the axes."""
