@@ -30,6 +30,7 @@ from rnd_runtime.core.budget import set_max_expanded
 from rnd_runtime.core.errors import InputError, printable, withheld
 from rnd_runtime.core.kernels import prepare_process
 from rnd_runtime.core.signals import handled, received
+from rnd_runtime.core.threads import cores
 
 from .parsing import names, refusal, refuse_unknown, registry
 
@@ -75,6 +76,7 @@ def run_command(name: str, main: Callable[[], int | None]) -> int:
     try:
         try:
             with handled(name):
+                cores()  # refuses what numba would trip over at its import
                 return main() or 0
         finally:
             sys.stdout.flush()  # at exit Python would complain of a closed pipe

@@ -8,9 +8,13 @@ from .errors import InputError
 
 
 def cores() -> int:
-    """Cores that this process may use, at most NUMBA_NUM_THREADS."""
+    """Cores that this process may use, at most NUMBA_NUM_THREADS; ``InputError`` where that is no number of threads."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(count, int(os.environ.get("NUMBA_NUM_THREADS") or count))
+    wanted = os.environ.get("NUMBA_NUM_THREADS", "").strip() or str(count)
+    number = int(wanted[:9]) if wanted.isdecimal() else 0
+    if number < 1:
+        raise InputError("NUMBA_NUM_THREADS", expected="a whole number of at least 1", got=wanted)
+    return min(count, number)
 
 
 def max_threads() -> int:

@@ -50,7 +50,8 @@ def tone_map(
     Args:
         background: linear radiance [3] or [H, W, 3]; black by default.
         share: [H, W, 3] of the background that is seen; all by default.
-        tone: "neutral" applies ``core.images.neutral`` first.
+        tone: "neutral" applies ``core.images.neutral`` first: to the image over a map, to the body alone over one
+            colour, which comes out as it is.
     """
     radiance, alpha = _checked(radiance, alpha)
     backdrop = floats(np.zeros(3) if background is None else background)
@@ -147,11 +148,8 @@ def _tone_map(radiance, alpha, background, share, curved, steps, first, image): 
     height, width = alpha.shape
     one_colour, whole = len(background) == 1, len(share) == 1
     empty = np.empty(3 * width, np.uint8)  # a row of the background colour
-    colour = background[0, 0], background[0, 1], background[0, 2]
-    if curved:
-        colour = _neutral(colour[0], colour[1], colour[2])
     for c in range(3):
-        empty[c::3] = _code(colour[c], steps, first)
+        empty[c::3] = _code(background[0, c], steps, first)
     rows = image.reshape(height, 3 * width)
     for y in prange(height):
         if one_colour:
@@ -161,6 +159,13 @@ def _tone_map(radiance, alpha, background, share, curved, steps, first, image): 
             left = _ONE - alpha[y, x]
             at, seen = 0 if one_colour else y * width + x, 0 if whole else y * width + x
             if one_colour and left == _ONE and min(share[seen, 0], share[seen, 1], share[seen, 2]) == _ONE:
+                continue
+            if curved and one_colour:
+                a = alpha[y, x] if alpha[y, x] > _ZERO else _ONE
+                toned = _neutral(radiance[y, x, 0] / a, radiance[y, x, 1] / a, radiance[y, x, 2] / a)
+                for c in range(3):
+                    behind = background[at, c] * share[seen, c]
+                    image[y, x, c] = _code(a * toned[c] + left * behind, steps, first)
                 continue
             if curved:
                 toned = _neutral(

@@ -27,6 +27,10 @@ def test_the_extra_is_named_where_it_is_missing(monkeypatch):
 def test_a_process_takes_the_threads_that_it_is_given(monkeypatch):
     monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
     assert cores() == 1
+    for wrong in ("0", "-1", "two", "1.5"):
+        monkeypatch.setenv("NUMBA_NUM_THREADS", wrong)
+        with pytest.raises(InputError, match=r"^NUMBA_NUM_THREADS: expected a whole number of at least 1, got "):
+            cores()
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rnd_runtime.core.errors import InputError
-from rnd_runtime.core.images import linear_to_srgb, neutral, to_bytes
+from rnd_runtime.core.images import linear_to_srgb, neutral, srgb_to_linear, to_bytes
 from rnd_runtime.raster.tone import tone_map, tone_map_straight
 
 RNG = np.random.default_rng(0)
@@ -104,16 +104,25 @@ def test_the_neutral_curve_over_any_background(behind):
     radiance *= np.float32(4) ** RNG.uniform(-4, 4, (*alpha.shape, 1)).astype(np.float32)
     if behind == "picture":
         behind = RNG.uniform(0, 2, radiance.shape).astype(np.float32)
-    shown = radiance.astype(np.float64) + (1.0 - alpha)[..., None] * np.asarray([0, 0, 0] if behind is None else behind)
-    opaque = np.where(alpha > 0, alpha, 1)[..., None]
-    straight = to_bytes(linear_to_srgb(neutral(radiance / opaque)))
+    seen = (1.0 - alpha)[..., None] * np.asarray([0, 0, 0] if behind is None else behind)
+    opaque = np.where(alpha > 0, alpha, 1)[..., None].astype(np.float64)
+    straight = neutral(radiance / opaque)
+    over = neutral(radiance + seen) if np.ndim(behind) == 3 else opaque * straight + seen
     for ours, expected in (
-        (tone_map(radiance, alpha, behind, tone="neutral"), to_bytes(linear_to_srgb(neutral(shown)))),
-        (tone_map_straight(radiance, alpha, tone="neutral")[..., :3], straight),
+        (tone_map(radiance, alpha, behind, tone="neutral"), to_bytes(linear_to_srgb(over))),
+        (tone_map_straight(radiance, alpha, tone="neutral")[..., :3], to_bytes(linear_to_srgb(straight))),
     ):
         apart = np.abs(ours.astype(int) - expected)
         assert apart.max() <= 1 and np.count_nonzero(apart) <= apart.size // 1000
         assert (expected < 255).any() and (expected > 250).any()
+
+
+def test_a_colour_behind_the_body_comes_out_as_it_is_under_every_tone():
+    empty = np.zeros((2, 3, 3), np.float32), np.zeros((2, 3), np.float32)
+    for level in range(256):
+        named = np.uint8([level, 255 - level, (37 * level) % 256])
+        for tone in ("srgb", "neutral"):
+            assert (tone_map(*empty, srgb_to_linear(named / 255), tone=tone) == named).all()
 
 
 def test_the_neutral_curve_of_what_is_no_radiance():

@@ -7,7 +7,7 @@ import shutil
 import pytest
 import torch
 
-from rnd_trainer.commands.train import main
+from rnd_trainer.commands.train import _has_finished, main
 from rnd_trainer.model.checkpoint import load_checkpoint
 from support.dask_jobs import in_a_process, two_workers, worker_killed_when
 
@@ -17,6 +17,15 @@ SIZES = ["--steps", "12", "--gaussians", "300", "--preset", "quick", "--save-eve
 def test_captures_of_one_name_are_refused(tmp_path, capsys):
     assert main([str(tmp_path / "a/me"), str(tmp_path / "b/me/capture.json"), "--out", str(tmp_path / "out")]) == 2
     assert "CAPTURE: expected captures of different names" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '"finished"', "\xff", '{"ended": "stopped"}'])
+def test_a_training_whose_status_says_nothing_is_not_finished(tmp_path, text):
+    assert not _has_finished(tmp_path)
+    (tmp_path / "status.json").write_text(text, encoding="latin-1")
+    assert not _has_finished(tmp_path)
+    (tmp_path / "status.json").write_text('{"ended": "finished"}')
+    assert _has_finished(tmp_path)
 
 
 @pytest.mark.slow

@@ -222,14 +222,16 @@ def test_light_options_reach_the_light(files, tmp_path):
 def test_the_neutral_tone_clips_nothing_and_leaves_an_exr_as_it_is(files, tmp_path):
     shown, linear = {}, {}
     for tone in ("srgb", "neutral"):
-        look = {"tone": tone, "exposure": 2, "background": "0,0,0", "frames": ":1", "format": "png,exr"}
+        look = {"tone": tone, "exposure": 2, "frames": ":1", "format": "png,exr"}
         assert main(_arguments(files, tmp_path / tone, **look)) == 0
         shown[tone] = read_image(tmp_path / tone / "frames/000000.png")
         linear[tone] = read_image(tmp_path / tone / "frames_exr/000000.exr")
     assert (linear["srgb"] == linear["neutral"]).all()
-    assert (shown["srgb"] == 255).any() and shown["neutral"].max() < 255
-    expected = to_bytes(linear_to_srgb(neutral(linear["neutral"][..., :3].astype(np.float64))))
-    assert np.abs(shown["neutral"].astype(int) - expected).max() <= 1
+    assert (shown["srgb"][..., :3] == 255).any() and shown["neutral"][..., :3].max() < 255
+    covered = linear["neutral"][..., 3] > 0
+    premultiplied, alpha = np.split(linear["neutral"][covered].astype(np.float64), [3], axis=-1)
+    expected = to_bytes(linear_to_srgb(neutral(premultiplied / alpha)))
+    assert np.abs(shown["neutral"][covered][:, :3].astype(int) - expected).max() <= 1
 
 
 def test_background_colour_fills_the_corner(files, tmp_path):

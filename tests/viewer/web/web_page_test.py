@@ -342,6 +342,7 @@ def test_every_state_has_rnd_views_pixels(loaded, site):
         {"light": 2, "yaw": 2.5, "background": "#c08040", "time": 0.9},
         {"light": 0, "exposure": -1.3, "shade": "table"},
         {"exposure": 2.0, "tone": "neutral", "background": "hdr"},
+        {"exposure": 1.0, "tone": "neutral", "background": "#ffd080"},
         {"output": "albedo", "tone": "neutral", "azimuth": 0.4},
         {"azimuth": 2.0, "elevation": 0.5, "distance": 1.9, "fov": 0.9},
         *({"output": name} for name in ("light", "albedo", "normal", "roughness", "visibility")),

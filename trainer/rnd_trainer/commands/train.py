@@ -84,7 +84,11 @@ def _has_finished(folder: Path) -> bool:
     from rnd_trainer.training.run import STATUS_FILE
 
     file = folder / STATUS_FILE
-    return file.is_file() and json.loads(file.read_text(encoding="utf-8")).get("ended") == "finished"
+    try:
+        status = json.loads(file.read_bytes()) if file.is_file() else None
+    except (ValueError, RecursionError):  # damaged: not finished
+        return False
+    return isinstance(status, dict) and status.get("ended") == "finished"
 
 
 def _refuse_begun(options: TrainOptions) -> None:

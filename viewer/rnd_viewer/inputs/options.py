@@ -142,7 +142,7 @@ class _Lighting:
     """Factors on the albedo, linear: corrects colours that training put into the light."""
     tone: Annotated[Tone, option("srgb|neutral")] = "srgb"
     """Tone curve of 8-bit frames: sRGB's alone, which clips above 1, or Khronos PBR Neutral, which compresses
-    highlights. An .exr stays linear."""
+    highlights. An .exr stays linear, a background of one COLOUR as it is."""
     background: Annotated[str, option("none|hdr|COLOUR")] = "none"
     """none is transparent; hdr is the light itself; a COLOUR is #rgb, #rrggbb or a name such as red (sRGB), or r,g,b
     (linear radiance)."""

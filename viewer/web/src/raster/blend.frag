@@ -90,8 +90,10 @@ void main() {
     vec3 result;
     if (show == 0) {
         vec3 far = background == 1 ? gain * sample_sky(pixel_to_light * vec3(vec2(at) + 0.5, 1.0)) : colour;
+        float a = value.a > 0.0 ? value.a : 1.0;
         vec3 light = value.rgb + (1.0 - value.a) * far;
-        result = srgb(curved == 1 ? neutral(light) : light);
+        if (curved == 1) light = background == 1 ? neutral(light) : a * neutral(value.rgb / a) + (1.0 - value.a) * far;
+        result = srgb(light);
     } else if (value.a < MIN_COVERAGE) {
         result = vec3(0.0);
     } else {
