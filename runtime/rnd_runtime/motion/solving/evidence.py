@@ -21,7 +21,7 @@ Complexes = NDArray[np.complex128]
 _HINGES = {"hip": ("hip", "knee", "ankle"), "shoulder": ("shoulder", "elbow", "wrist")}
 _HINGES |= {"knee": _HINGES["hip"], "elbow": _HINGES["shoulder"]}
 # Errors of what shows a roll, degrees (rms): a hinge bent by 90°, a foot, a palm, and the parent's roll, which is
-# neutral. Of 65 clips of eight mocap sources, but for the palm's.
+# neutral. About what 64 clips of eight mocap sources have, but for the palm's, which is assumed.
 _HINGE, _FOOT, _PALM = 3.0, 8.0, 5.0
 _NEUTRAL, _NEUTRAL_ELSE = {"knee": 3.0, "elbow": 8.0, "hip": 10.0}, 30.0
 _APART = 0.2  # of the hips' distance
