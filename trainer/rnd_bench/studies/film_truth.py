@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 HIPS = ("left_hip", "right_hip")
 EVERY = 2
 """frames of Pose2Sim's videos per frame looked at"""
-INSTANTS = 10
+INSTANTS = 5
 """scored by each camera"""
 
 
@@ -130,7 +130,7 @@ class Filmed:
         known = np.isfinite(self.hips).all(1)
         skeleton, index = imported.body.skeleton, self.seen[self.name].frames[known]
         moved = skeleton.joint_transforms(imported.motion.rotations[index], imported.motion.translations[index])
-        middle = moved[:, [skeleton.names.index(name) for name in HIPS], :3, 3].mean(1)
+        middle = moved[..., :3, 3][:, [skeleton.names.index(name) for name in HIPS]].mean(1)
         found = (middle @ own.world_to_camera[:3, :3].T + own.world_to_camera[:3, 3])[:, 2]
         true = (self.hips[known] @ here.rotation.T + here.translation)[:, 2]
         size = float(np.median(found / true))

@@ -17,9 +17,9 @@ class Schedule:
     """Schedule and device."""
 
     preset: Literal["quick", "standard", "full"] = "standard"
-    """Some four minutes, ten minutes, or an hour on two cores."""
+    """Some two and a half minutes, ten minutes, or an hour on two cores."""
     steps: OptionalCount = None
-    """Steps with an image. Default: 2400 (quick: 1000). The third stage adds 3/4 as many short steps."""
+    """Steps with an image. Default: 2400 (quick: 600). The third stage adds 3/4 as many short steps."""
     gaussians: OptionalCount = None
     """Number of Gaussians. Default: 30000 (quick: 12000)."""
     image_scale: OptionalNumber = None

@@ -13,7 +13,7 @@ from rnd_runtime.capture.format import Split
 from rnd_runtime.motion.motion import Motion
 from rnd_trainer.losses.losses import image_loss, linear_to_srgb
 from rnd_trainer.model.checkpoint import Checkpoint
-from rnd_trainer.model.model import PoseInput
+from rnd_trainer.model.model import PosedGaussians, PoseInput
 from rnd_trainer.render.probe import LightProbes, Texels, sample_texels
 from rnd_trainer.render.render import Splat, shade_visible, splat
 from rnd_trainer.training.data import TrainingView, load_views, pose_input
@@ -61,10 +61,12 @@ def fit_held_out(
         here = [view for view in views if view.frame.frame == frame]
         pose = pose_input(motion, skeleton, frame / motion.fps, config.model)
         optimizer = torch.optim.Adam([refinement.raw[refinement.row[frame]]], lr=RATE, betas=(0.9, 0.99))
+        fields = checkpoint.model.fields(pose)
         for _ in range(steps):
             optimizer.zero_grad()
             moved = replace(pose, bones=refinement.bones(frame))
-            losses = [_difference(checkpoint, view, moved, generator) for view in here]
+            posed = checkpoint.model.placed(fields, moved.bones)
+            losses = [_difference(checkpoint, view, posed, moved, generator) for view in here]
             (config.weight_poses * refinement.prior(frame) + torch.stack(losses).sum()).backward()
             optimizer.step()
         on_frame(done + 1, len(frames))
@@ -73,21 +75,24 @@ def fit_held_out(
     return refinement.apply_to(motion)
 
 
-def _difference(checkpoint: Checkpoint, view: TrainingView, pose: PoseInput, generator: torch.Generator) -> Tensor:
+def _difference(
+    checkpoint: Checkpoint, view: TrainingView, posed: PosedGaussians, pose: PoseInput, generator: torch.Generator
+) -> Tensor:
     """Loss of one image on black: as in training, without the terms of the model alone."""
     config = checkpoint.config
     texels = None
     if config.light != "none":
         maps, probe = LightProbes(), checkpoint.probe_of(view.frame.light)
         texels = sample_texels(probe, maps.directions, maps.solid_angles, config.light_texels, generator)
-    rendered = _rendered(checkpoint, view, pose, texels)
+    rendered = _rendered(checkpoint, view, posed, pose, texels)
     target, mask = view.target(torch.zeros(3))
     image = image_loss(linear_to_srgb(rendered.image), linear_to_srgb(target), config.weight_dssim, config.dssim_scales)
     return image + config.weight_mask * (rendered.alpha - mask).abs().mean()
 
 
-def _rendered(checkpoint: Checkpoint, view: TrainingView, pose: PoseInput, texels: Texels | None) -> Splat:
-    posed = checkpoint.model(pose)
+def _rendered(
+    checkpoint: Checkpoint, view: TrainingView, posed: PosedGaussians, pose: PoseInput, texels: Texels | None
+) -> Splat:
     if texels is None:
         return splat(posed, posed.attributes.colour, view.camera)
     traced = checkpoint.config.traced_texels

@@ -62,6 +62,17 @@ class Attributes:
 
 
 @dataclass
+class PoseFields:
+    """Output of the networks for a pose, at the Gaussians."""
+
+    attributes: Attributes
+    weights: Tensor  # [N, J] skinning weights
+    offset: Tensor  # [N, 3] pose-dependent offset in units of its bound
+    rotation: Tensor  # [N, 3] pose-dependent rotation vectors
+    visibility: Tensor  # [N, 16] SH coefficients in the root's frame
+
+
+@dataclass
 class PosedGaussians:
     """Posed Gaussians in the world frame."""
 
@@ -166,6 +177,10 @@ class AvatarModel(nn.Module):
 
     def forward(self, pose: PoseInput) -> PosedGaussians:
         """Pose the avatar."""
+        return self.placed(self.fields(pose), pose.bones)
+
+    def fields(self, pose: PoseInput) -> PoseFields:
+        """What the networks say of a pose."""
         encoded = self.encoded_nodes()
         nodes = len(encoded)
         static = self.attributes(encoded)
@@ -181,14 +196,17 @@ class AvatarModel(nn.Module):
             [logits, self.offsets(encoded, current), self.visibility(encoded, visibility_pose, node_normals)], dim=-1
         )
         logits, offset, rotation, visibility = self.interpolate(fields).split([logits.shape[1], 3, 3, 16], dim=-1)
-
         weights = torch.softmax(self.log_weights + logits, dim=-1)
-        offset = torch.tanh(offset)
+        return PoseFields(static, weights, torch.tanh(offset), torch.tanh(rotation), visibility)
+
+    def placed(self, fields: PoseFields, bones: Tensor) -> PosedGaussians:
+        """Gaussians of ``fields`` moved by ``bones`` [J, 3, 4], which may differ a little from their pose's."""
+        static = fields.attributes
         means, upper, normals = pose_gaussians(
-            weights,
-            pose.bones,
-            static.points + self.config.max_offset * offset,
-            torch.tanh(rotation),
+            fields.weights,
+            bones,
+            static.points + self.config.max_offset * fields.offset,
+            fields.rotation,
             self.tangents,
             static.rotation,
             static.scales,
@@ -199,9 +217,9 @@ class AvatarModel(nn.Module):
             means=means,
             covariances=upper,
             normals=normals,
-            visibility=visibility,
-            weights=weights,
-            offset=offset,
+            visibility=fields.visibility,
+            weights=fields.weights,
+            offset=fields.offset,
             attributes=static,
         )
 

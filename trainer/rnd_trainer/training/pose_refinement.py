@@ -80,14 +80,11 @@ class PoseRefinement(nn.Module):
         self.raw = nn.ParameterList(torch.zeros(joints + 1, 3) for _ in self.frames)
 
     def bounded(self, frame: int) -> tuple[Tensor, Tensor]:
-        """δ [J, 3] as rotation vectors (rad) and the root's shift [3] m, of a motion frame.
-
-        A step of the optimizer moves a correction in proportion to its bound.
-        """
+        """δ [J, 3] as rotation vectors (rad) and the root's shift [3] m, of a motion frame."""
         row = self.row[frame]
-        raw, bounds = self.raw[row], self.rotation_bounds[row]
-        rotation = bounds * torch.tanh(raw[:-1] / ROTATION_BOUND)
-        return rotation, self.translation_bounds[row] * torch.tanh(raw[-1] / TRANSLATION_BOUND)
+        raw, bounds = self.raw[row], self._bounds(row)
+        rotation, shift = (bound * torch.tanh(part / bound) for part, bound in zip((raw[:-1], raw[-1]), bounds))
+        return rotation, shift
 
     def bones(self, frame: int) -> Tensor:
         """Bone transforms [J, 3, 4] of a motion frame, corrected; differentiable in the correction."""
