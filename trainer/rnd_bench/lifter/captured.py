@@ -13,6 +13,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_runtime.motion.skeleton import bone_transforms
 from rnd_trainer.estimating.lifted import JOINTS
 from rnd_trainer.estimating.observations import Observations, load_observations, save_observations
+from rnd_trainer.estimating.observing.camera_motion import steady
 from rnd_trainer.estimating.observing.observe import Networks, observe
 from rnd_trainer.importing.videos.video_file import VideoFile
 
@@ -21,10 +22,12 @@ from .motions import FPS
 
 
 def observed(file: Path, kept: Path, every: int = 1) -> Observations:
-    """What the networks see of every n-th frame of a video; stored as .npz, and read from there again."""
+    """What the networks see of every n-th frame of a steadied video; stored as .npz, and read from there again."""
     if not kept.exists():
-        video = VideoFile(file)
-        save_observations(kept, observe(video, Networks.open(1), numbers=list(video.numbers)[::every]))
+        video, networks = VideoFile(file), Networks.open(1)
+        numbers = list(video.numbers)[::every]
+        people = [one.region for one in networks.detector(video.frame(numbers[0]))]
+        save_observations(kept, observe(steady(video, numbers, people), networks, numbers=numbers))
     return load_observations(kept)
 
 

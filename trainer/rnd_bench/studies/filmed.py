@@ -37,7 +37,6 @@ FIGURES = ("psnr", "psnr_person", "lpips", "psnr_box", "lpips_box", "outline_px"
 _REFINED = {"refine_poses": True}
 METHODS = (
     StudyRow("ours", "poses refined in training", None, {}, _REFINED),
-    StudyRow("poses as estimated", "not refined", "ours"),
     next(row for row in VARIANTS if row.name == "LBS, plain colour"),
 )
 EXACT = StudyRow("exact poses", "the true poses instead of estimated ones", "ours")

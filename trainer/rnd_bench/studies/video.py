@@ -42,10 +42,14 @@ def run(options: Video) -> None:
     out = output_folder(options.out)
     if options.json is not None:
         output_file(options.json)
+    if len(options.capture) != len(options.video):
+        raise InputError("--video", expected=f"{len(options.capture)}, one of each capture", got=len(options.video))
+    rows: list[dict[str, Any]] = []
     with Progress() as progress:
-        progress.phase("rendered person")
-        seen = observed(options.video, out / "rendered.npz")
-        rows = list(_rendered(load_capture(options.capture), seen))
+        for folder, video in zip(options.capture, options.video):
+            progress.phase(video.stem)
+            seen = observed(video, out / f"{video.stem}.npz")
+            rows += [{"video": video.stem, **row} for row in _rendered(load_capture(folder), seen)]
         if options.real is not None:
             progress.phase("real cameras")
             rows += list(_real(options.real, out))
@@ -77,7 +81,6 @@ def _rendered(capture: Capture, seen: Observations) -> Iterator[dict[str, Any]]:
         every = _scores(joints, truth, found.body.skeleton, skeleton, JOINTS)
         limbs = _scores(joints, truth, found.body.skeleton, skeleton, LIMBS)
         yield {
-            "video": "rendered person",
             "given": given,
             "frames": len(seen),
             **every,

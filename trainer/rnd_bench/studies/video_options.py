@@ -8,22 +8,22 @@ from typing import Annotated
 
 import tyro
 
-from rnd_runtime.cli.command import Count, File, Flag, Number, OptionalFile, option
+from rnd_runtime.cli.command import Count, Flag, Number, OptionalFile, option
 
 
 @dataclass(frozen=True)
 class Video:
-    """Fit a body to a rendered person's video and to real calibrated cameras, each by itself; score against the truth.
+    """Fit a body to rendered people's videos and to real calibrated cameras, each by itself; score against the truth.
 
     rnd-bench study video out/video --capture ../shared/data/capture --video dancer.mp4 --json out/video.json
     """
 
     out: Annotated[Path, tyro.conf.Positional, option("FOLDER")]
     """folder for observations"""
-    capture: Annotated[Path, option("FOLDER")]
-    """capture of a rendered person"""
-    video: File
-    """video of its training frames, one for one"""
+    capture: Annotated[tuple[Path, ...], option("FOLDER ...")]
+    """captures of rendered people"""
+    video: Annotated[tuple[Path, ...], option("FILE ...")]
+    """a video of the training frames of each, one for one"""
     real: Annotated[Path | None, option("FOLDER")] = None
     """Pose2Sim's folder Demo_SinglePerson: adds its cameras 01 and 03"""
     json: OptionalFile = None
