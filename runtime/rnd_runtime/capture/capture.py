@@ -39,7 +39,8 @@ class FrameImages:
         mask: [H, W] coverage.
         normal, normal_gt: [H, W, 3] unit, camera's OpenCV axes (visible means z < 0); zero where there is no
             data. None where the capture has none.
-        albedo_srgb: [H, W, 3] sRGB of the base colour, premultiplied; None where the capture has none.
+        albedo_srgb, albedo_estimate_srgb: [H, W, 3] sRGB of the base colour, true and estimated, premultiplied; None
+            where the capture has none.
     """
 
     image_srgb: Floats32
@@ -47,6 +48,7 @@ class FrameImages:
     normal: Floats32 | None
     normal_gt: Floats32 | None
     albedo_srgb: Floats32 | None
+    albedo_estimate_srgb: Floats32 | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +116,7 @@ class Capture:
                 normal=self._read_normals(frame.normal, mask),
                 normal_gt=self._read_normals(frame.normal_gt, mask),
                 albedo_srgb=read(frame.albedo),
+                albedo_estimate_srgb=read(frame.albedo_estimate),
             )
         except InputError as error:
             raise error.at(frame=frame.frame) from error

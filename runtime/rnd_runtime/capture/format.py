@@ -23,7 +23,7 @@ TRAIN_SHARE = 0.8
 SCHEMA = "rnd-capture/1"
 _Row3 = tuple[float, float, float]
 _Row4 = tuple[float, float, float, float]
-_CHANNELS = {"image": 3, "mask": 1, "normal": 3, "normal_gt": 3, "albedo": 3}
+_CHANNELS = {"image": 3, "mask": 1, "normal": 3, "normal_gt": 3, "albedo": 3, "albedo_estimate": 3}
 _FULL_SCALE = {"uint8": 255.0, "uint16": 65535.0}
 
 
@@ -40,8 +40,9 @@ class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     split: Split
     normal: str | None = None  # (n + 1) / 2 in the camera's OpenCV axes
     normal_gt: str | None = None
-    albedo: str | None = None  # sRGB, premultiplied
+    albedo: str | None = None  # the truth, which only scores see: sRGB, premultiplied
     light: str | None = None  # None where it is unknown
+    albedo_estimate: str | None = None  # as albedo, up to brightness and tint
 
 
 class CaptureLight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

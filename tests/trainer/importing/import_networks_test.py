@@ -1,7 +1,8 @@
-"""--mask-net and --normal-net, from the command to the capture."""
+"""--mask-net, --normal-net and --albedo-net, from the command to the capture."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from rnd_runtime.capture.capture import load_capture
-from rnd_runtime.core.images import to_bytes, write_image
+from rnd_runtime.core.images import linear_to_srgb, read_image, srgb_to_linear, to_bytes, write_image
 from rnd_trainer.checking.silhouette import mask_iou
 from rnd_trainer.commands import data as data_cli
 from support import layouts
@@ -65,7 +66,7 @@ def run(tmp_path, capsys) -> Callable[..., tuple[int, str, Path]]:
         words = ["import", tmp_path / "frames", out, "--body", body, "--poses", write_poses(tmp_path, trans=trans)]
         with pytest.raises(SystemExit) as ended:
             data_cli.main([str(word) for word in (*words, "--intrinsics", *lens, *options)])
-        return int(ended.value.code or 0), capsys.readouterr().out, out
+        return int(ended.value.code or 0), "".join(capsys.readouterr()), out
 
     return command
 
@@ -99,3 +100,48 @@ def test_normals_of_a_network_reach_the_capture(tmp_path, run) -> None:
         assert (normals[~truth.mask] == 0).all() and (np.abs(normals[truth.mask]).max(-1) > 0).all()
         angles.append(np.degrees(np.arccos(np.clip((normals * truth.normals).sum(-1)[truth.mask], -1, 1))))
     assert np.mean(np.concatenate(angles)) < DEGREES
+
+
+def test_albedos_of_a_network_reach_the_capture(tmp_path, run) -> None:
+    """The network halves the image and lifts it by a tenth."""
+    net = _net(tmp_path / "albedo.onnx", 0.5 * np.eye(3), np.full(3, 0.1))
+    code, printed, out = run(0.0, "--masks", tmp_path / "masks", "--albedo-net", net)
+    assert code == 0, printed
+    capture = load_capture(out)
+    for frame in capture.frames:
+        images, person = capture.load_frame(frame), view_of(CAMERA, frame.frame).mask
+        assert frame.albedo is None and images.albedo_srgb is None  # the estimate is no truth
+        estimate, source = images.albedo_estimate_srgb, images.image_srgb
+        assert (estimate[~person] == 0).all()
+        assert np.abs(estimate - (0.5 * source + 0.1))[person].mean() < 2 / 255  # eight bits, resized up and down
+
+
+def test_albedos_of_a_folder_are_premultiplied(tmp_path, run) -> None:
+    for k in range(FRAMES):
+        soft = (200 * (read_image(tmp_path / "masks" / f"{k:05d}.png") > 0)).astype(np.uint8)
+        write_image(tmp_path / "soft" / f"{k:05d}.png", soft)
+        write_image(tmp_path / "albedos" / f"{k:05d}.png", np.full((*soft.shape[:2], 3), 120 + k, np.uint8))
+    code, printed, out = run(0.0, "--masks", tmp_path / "soft", "--albedos", tmp_path / "albedos")
+    assert code == 0, printed
+    capture = load_capture(out)
+    for frame in capture.frames:
+        estimate, covered = capture.load_frame(frame).albedo_estimate_srgb, view_of(CAMERA, frame.frame).mask
+        expected = linear_to_srgb(srgb_to_linear((120 + frame.frame) / 255) * 200 / 255)
+        assert np.abs(estimate[covered] - expected).max() < 1 / 255 and (estimate[~covered] == 0).all()
+
+
+UNUSABLE = {
+    "a normal network": (2 * np.eye(3), np.full(3, -1.0), "network's albedo: expected sRGB in 0 … 1, got -.* to"),
+    "0 to 255": (255 * np.eye(3), np.zeros(3), "network's albedo: expected sRGB in 0 … 1, got"),
+    "one channel": (np.ones((1, 3)), np.zeros(1), "network's output: expected a map of 3 channels, got"),
+    "NaN": (np.eye(3), np.full(3, np.nan), "network's output: expected finite numbers, got NaN or infinity"),
+}
+
+
+@pytest.mark.parametrize(("weights", "bias", "words"), UNUSABLE.values(), ids=UNUSABLE)
+def test_unusable_albedo_networks_are_refused_in_one_line(tmp_path, run, weights, bias, words) -> None:
+    net = _net(tmp_path / "albedo.onnx", weights, bias)
+    code, printed, out = run(0.0, "--masks", tmp_path / "masks", "--albedo-net", net)
+    line = printed.splitlines()[-1]
+    assert code == 2 and re.search(rf"albedo\.onnx: frame 0: {words}", line) and printed.count("expected") == 1, printed
+    assert not (out / "capture.json").exists()

@@ -12,7 +12,7 @@ from rnd_runtime.core.errors import InputError
 from rnd_trainer.checking.check import check_capture
 from rnd_trainer.importing.importer import find_layout
 from rnd_trainer.importing.layouts import instant_avatar, nerfstudio
-from rnd_trainer.importing.options import FrameSelection
+from rnd_trainer.importing.options import FrameSelection, ImportOptions
 from rnd_trainer.importing.surfaces.files import attach_files
 from support import layouts
 from support.imported import EVERYTHING, LAYOUTS, POSITION, assert_posed, assert_the_scene, import_scene
@@ -112,7 +112,7 @@ def test_masks_of_a_split_are_counted_among_all_images(tmp_path) -> None:
     (tmp_path / "masks").mkdir()
     for k in range(len(list((source / "images").iterdir()))):
         (tmp_path / "masks" / f"{k + 1}.npy").hardlink_to(source / "masks" / f"mask_{k % FRAMES:04d}.npy")
-    found = attach_files(instant_avatar.read(source), tmp_path / "masks", None)
+    found = attach_files(instant_avatar.read(source), ImportOptions(masks=tmp_path / "masks"))
     assert "masks are numbered from 1, frames from 0: taken for the same" in found.notes
     for sample in found.samples[::9]:
         assert ((sample.mask() > 127) == see("0", sample.frame % FRAMES).mask).all()

@@ -23,7 +23,7 @@ from rnd_trainer.importing.layouts import video as video_layout
 from rnd_trainer.importing.options import ImportOptions, OnProgress, no_progress
 from rnd_trainer.importing.poses import Poses
 from rnd_trainer.importing.scene import PlacedScene
-from rnd_trainer.importing.surfaces.estimate import add_normals
+from rnd_trainer.importing.surfaces.estimate import add_albedos, add_normals
 from rnd_trainer.importing.surfaces.files import attach_files
 from rnd_trainer.importing.videos.undistorted import undistorted
 from rnd_trainer.importing.videos.video_file import VideoFile
@@ -95,8 +95,9 @@ def import_video(
     notes += film_notes(seen, facing(fitted), video.frame)
     scene, dataset = _placed(seen, fitted, options, notes)
     dataset = _with_samples(dataset, scene, video, seen, left_out, options, on_progress)
-    dataset = attach_files(dataset, options.masks, options.normals)
+    dataset = attach_files(dataset, options)
     samples, axes = add_normals(list(dataset.samples), scene, dataset, options)
+    samples = add_albedos(samples, options.albedo_net)
     with folder_lock(output_folder(out), "rnd-data import"):
         refuse_occupied(out, source, options)
         save_uncertainty(out, _deviations(fitted))

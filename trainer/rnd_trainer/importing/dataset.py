@@ -33,6 +33,7 @@ class Sample:
     image: Callable[[], Bytes]  # [H, W, 3] uint8 sRGB
     mask: Callable[[], Bytes] | None = None  # [H, W] uint8 coverage
     normals: Callable[[], NDArray[np.float32]] | None = None  # [H, W, 3] OpenCV camera axes, zero where unknown
+    albedo: Callable[[], Bytes] | None = None  # [H, W, 3] uint8 sRGB, estimated; black where unknown
     split: Split | None = None  # None: chosen by ``select_samples``
     name: str = ""  # stem of the image file; empty for a video's frame
 
@@ -51,7 +52,7 @@ class ImportedDataset:
 
 
 def undistort_dataset(dataset: ImportedDataset) -> ImportedDataset:
-    """``dataset`` with images, masks and normals undistorted on reading."""
+    """``dataset`` with images, masks, normals and albedos undistorted on reading."""
 
     def undistort(read: Callable[[], NDArray] | None, lens: Lens, what: str) -> Callable[[], NDArray] | None:
         if read is None:
@@ -65,7 +66,8 @@ def undistort_dataset(dataset: ImportedDataset) -> ImportedDataset:
             image = undistort(sample.image, lens, "image")
             assert image is not None
             mask, normals = undistort(sample.mask, lens, "mask"), undistort(sample.normals, lens, "normals")
-            sample = replace(sample, image=image, mask=mask, normals=normals)
+            albedo = undistort(sample.albedo, lens, "albedo")
+            sample = replace(sample, image=image, mask=mask, normals=normals, albedo=albedo)
         samples.append(sample)
     lenses = {name: Lens(lens.camera, (), lens.distortion) for name, lens in dataset.lenses.items()}
     return replace(dataset, lenses=lenses, samples=samples)

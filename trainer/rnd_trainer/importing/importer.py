@@ -26,7 +26,7 @@ from rnd_trainer.importing.layouts import (
     video,
     zju,
 )
-from rnd_trainer.importing.surfaces.estimate import add_masks, add_normals
+from rnd_trainer.importing.surfaces.estimate import add_albedos, add_masks, add_normals
 from rnd_trainer.importing.surfaces.files import attach_files
 
 from .body_models import BodyModel, load_body_model
@@ -54,6 +54,7 @@ LAYOUTS: dict[str, Any] = {
 """modules with ``detect`` and ``read``, in order of detection: specific layouts first"""
 _COEFFICIENTS = (0, 4, 5, 8, 12, 14)
 """possible numbers of OpenCV's distortion coefficients"""
+_FILES_OR_NETWORK = (("masks", "mask_net"), ("normals", "normal_net"), ("albedos", "albedo_net"))
 _EXTERNAL_POSES = ("video", "nerfstudio", "easymocap")
 
 
@@ -118,13 +119,14 @@ def import_source(
     if options.root is not None:
         dataset = replace(dataset, poses=with_convention(dataset.poses, options.root))
     on_found(_summary(dataset))
-    dataset = undistort_dataset(attach_files(dataset, options.masks, options.normals))
+    dataset = undistort_dataset(attach_files(dataset, options))
     if options.fps is not None:
         dataset = replace(dataset, fps=options.fps)
     scene = place_scene(dataset, model, options.up)
     samples = select_samples(dataset, options.selection)
     samples = add_masks(samples, scene, dataset, options.mask_net, on_progress)
     samples, axes = add_normals(samples, scene, dataset, options)
+    samples = add_albedos(samples, options.albedo_net)
     with folder_lock(output_folder(out), "rnd-data import"):
         refuse_occupied(out, source, options)  # by another import meanwhile
         write_capture(out, dataset, scene, samples, on_progress, normal_axes=axes)
@@ -163,8 +165,8 @@ def refuse_occupied(out: Path, source: Path, options: ImportOptions) -> None:
         if (out / name).exists():
             what = "holds a capture already" if name == "capture.json" else f"holds a {name}"
             raise InputError(what, file=out, hint="choose another folder")
-    inputs = {"the source": source, "--masks": options.masks, "--normals": options.normals}
-    for name in ("images", "masks", "normals"):
+    inputs = {"the source": source, **{flag(name): getattr(options, name) for name in ("masks", "normals", "albedos")}}
+    for name in ("images", "masks", "normals", "albedo_estimates"):
         folder = out / name
         for what, given in inputs.items():
             if given is not None and folder.resolve() == given.resolve():
@@ -200,7 +202,7 @@ def check_numbers(options: ImportOptions) -> None:
 
 def _refuse_unused(layout: str, options: ImportOptions) -> None:
     """Refuse options without effect."""
-    for one, other in (("masks", "mask_net"), ("normals", "normal_net")):
+    for one, other in _FILES_OR_NETWORK:
         if getattr(options, one) and getattr(options, other):
             raise InputError(f"{flag(one)} and {flag(other)}", expected="one of them", got="both")
     unused = [] if layout == "video" else ["intrinsics", "distortion"]

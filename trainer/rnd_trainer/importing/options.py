@@ -61,6 +61,10 @@ class ImportOptions:
     """normal network (.onnx) for the normals"""
     normal_axes: Annotated[str | None, option("AXES")] = None
     """the maps' axes that are right, down, forward, such as x,-y,-z. Default: found by the template"""
+    albedos: OptionalFolder = None
+    """estimated base colours (.png, .jpg), named as masks: a soft target of training"""
+    albedo_net: OptionalFile = None
+    """albedo or de-lighting network (.onnx) for the albedos"""
     height: OptionalNumber = None
     """the person's height in metres, of a video without --poses: fixes the scale"""
     intrinsics: Annotated[tuple[float, ...], option("N N N N")] = ()

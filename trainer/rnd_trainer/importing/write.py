@@ -1,4 +1,4 @@
-"""Writing of a placed data set as a capture: images on black, masks, normals."""
+"""Writing of a placed data set as a capture: images on black, masks, normals, albedos."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rnd_runtime.core.files import output_folder
 from rnd_runtime.core.images import linear_to_srgb, srgb_to_linear, to_bytes, write_image
 
 from .dataset import ImportedDataset, Sample
-from .images import check_size
+from .images import Bytes, check_size
 from .options import OnProgress, no_progress
 from .scene import PlacedScene
 
@@ -57,11 +57,13 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
             raise InputError("mask", expected="one for every image", got="none")
         image, mask = check_size(sample.image(), camera, "image"), check_size(sample.mask(), camera, "mask")
         normals = None if sample.normals is None else check_size(sample.normals(), camera, "normals")
+        albedo = None if sample.albedo is None else check_size(sample.albedo(), camera, "albedo")
     except InputError as error:
         raise error.at(frame=sample.frame) from error
-    radiance = _TO_LINEAR[image] * (mask[..., None] / 255.0)
-    write_image(folder / "images" / name, to_bytes(linear_to_srgb(radiance)))
+    write_image(folder / "images" / name, _premultiplied(image, mask))
     write_image(folder / "masks" / name, mask)
+    if albedo is not None:
+        write_image(folder / "albedo_estimates" / name, _premultiplied(albedo, mask))
     if normals is not None:
         length = np.linalg.norm(normals, axis=-1, keepdims=True)
         known = (length > 0.1) & (mask[..., None] > 0)
@@ -69,4 +71,11 @@ def _write_sample(folder: Path, sample: Sample, camera: Camera, frame: int) -> F
         write_image(folder / "normals" / name, np.where(known, to_bytes((unit + 1) / 2), 0).astype(np.uint8))
     assert sample.split is not None
     normal = None if normals is None else f"normals/{name}"
-    return Frame(f"images/{name}", f"masks/{name}", sample.camera, frame, sample.split, normal=normal)
+    estimate = None if albedo is None else f"albedo_estimates/{name}"
+    files = f"images/{name}", f"masks/{name}"
+    return Frame(*files, sample.camera, frame, sample.split, normal=normal, albedo_estimate=estimate)
+
+
+def _premultiplied(image_srgb: Bytes, mask: Bytes) -> Bytes:
+    """``image_srgb`` [H, W, 3] on black, multiplied by the coverage ``mask`` [H, W] in linear space."""
+    return to_bytes(linear_to_srgb(_TO_LINEAR[image_srgb] * (mask[..., None] / 255.0)))

@@ -12,6 +12,10 @@ from .metrics import SSIM_WINDOW, mean_ssim
 
 ALLOWED_STRETCH = 1.7
 """stretch (ratio of lengths) without a penalty"""
+ALBEDO_BLOCKS = 16
+"""blocks along an image's longer side over which albedos are compared, as estimates are blurred"""
+MIN_ALBEDO = 0.004
+"""linear; below, eight bits of sRGB make steps of more than 8 %"""
 
 
 def image_loss(image_srgb: Tensor, target_srgb: Tensor, weight_dssim: float, scales: int = 1) -> Tensor:
@@ -27,15 +31,35 @@ def multiscale_dssim(image_srgb: Tensor, target_srgb: Tensor, scales: int) -> Te
     terms = []
     for scale in range(scales):
         if scale:
-            image_srgb, target_srgb = _halved(image_srgb), _halved(target_srgb)
+            image_srgb, target_srgb = _block_means(image_srgb, 2), _block_means(target_srgb, 2)
             if min(image_srgb.shape[:2]) < SSIM_WINDOW:
                 break
         terms.append(1 - mean_ssim(image_srgb, target_srgb))
     return torch.stack(terms).mean()
 
 
-def _halved(image: Tensor) -> Tensor:
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
+def albedo_loss(albedo: Tensor, estimate: Tensor, known: Tensor) -> Tensor:
+    """L1 of the log ratio of two linear albedos [H, W, 3], less its median per channel, which is not differentiated.
+
+    An estimate is right up to brightness and tint. The median takes both out, and as many ratios lie above it as below:
+    the term leaves the albedo's level alone. Details are the image's: both are averaged over blocks, by their pixels
+    that are ``known`` [H, W]; blocks of which less than half is known do not count.
+    """
+    side = max(1, max(known.shape) // ALBEDO_BLOCKS)
+    share = _block_means(known[..., None].float(), side)
+    counted = share[..., 0] >= 0.5
+    if not counted.any():
+        return albedo.new_zeros(())
+    first, second = (
+        _block_means(torch.where(known[..., None], x, 0), side)[counted].clamp(min=MIN_ALBEDO).log()
+        for x in (albedo, estimate)
+    )
+    ratio = first - second
+    return (ratio - ratio.detach().median(dim=0).values).abs().mean()
+
+
+def _block_means(image: Tensor, side: int) -> Tensor:
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), side).permute(1, 2, 0)
 
 
 def skinning_divergence(weights: Tensor, log_template: Tensor) -> Tensor:

@@ -22,14 +22,16 @@ class Splat:
     image: Tensor  # [H, W, 3] linear
     normals: Tensor  # [H, W, 3] camera axes
     alpha: Tensor  # [H, W]
+    albedo: Tensor | None = None  # [H, W, 3] linear, where asked for
 
 
-def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera) -> Splat:
-    """Rasterise ``radiance`` [N, 3] and the normals of posed Gaussians in one pass."""
+def splat(posed: PosedGaussians, radiance: Tensor, camera: Camera, *, albedo: bool = False) -> Splat:
+    """Rasterise ``radiance`` [N, 3], the normals and on demand the albedo of posed Gaussians in one pass."""
     rotation = torch.as_tensor(camera.world_to_camera[:3, :3], dtype=torch.float32, device=radiance.device)
-    features = torch.cat([radiance, posed.normals @ rotation.T], dim=-1)
-    image, alpha, _ = rasterize(posed.means, posed.covariances, posed.attributes.opacity, features, camera)
-    return Splat(image[..., :3], image[..., 3:], alpha)
+    static = posed.attributes
+    features = torch.cat([radiance, posed.normals @ rotation.T, *([static.albedo] if albedo else [])], dim=-1)
+    image, alpha, _ = rasterize(posed.means, posed.covariances, static.opacity, features, camera)
+    return Splat(image[..., :3], image[..., 3:6], alpha, image[..., 6:] if albedo else None)
 
 
 def shade_visible(

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rnd_runtime.capture.capture import Capture, Frame, Split
+from rnd_runtime.capture.capture import Capture, Frame, FrameImages, Split
 from rnd_runtime.core.camera import Camera
 from rnd_runtime.core.errors import InputError
 from rnd_runtime.core.images import srgb_to_linear
@@ -42,6 +42,7 @@ class TrainingView:
     image: NDArray[np.uint8]  # [h, w, 3] sRGB, premultiplied on black
     mask: NDArray[np.uint8]  # [h, w]
     normal: NDArray[np.uint8] | None  # [h, w, 3] camera axes, (n + 1)/2; black where unknown inside the mask
+    albedo_estimate: NDArray[np.uint8] | None  # [h, w, 3] sRGB, premultiplied; black where unknown
 
     def target(self, background: Tensor) -> tuple[Tensor, Tensor]:
         """Linear image [h, w, 3] over ``background`` [3] (linear), and the mask [h, w] in 0…1."""
@@ -55,6 +56,14 @@ class TrainingView:
         covered = torch.from_numpy(_covered(self.mask))[..., None]
         coded = torch.from_numpy(self.normal)
         return (coded.float() / 127.5 - 1) * covered, (coded > 0).any(-1, keepdim=True) | ~covered
+
+    def estimated_albedo(self) -> tuple[Tensor, Tensor] | None:
+        """Estimated linear albedo [h, w, 3] and where it is known inside the mask [h, w]; or None."""
+        if self.albedo_estimate is None:
+            return None
+        coded, coverage = torch.from_numpy(self.albedo_estimate), torch.from_numpy(self.mask).float() / 255
+        known = (coded > 0).any(-1) & torch.from_numpy(_covered(self.mask))
+        return _TO_LINEAR[coded.int()] / coverage.clamp(min=0.5)[..., None], known
 
 
 def load_views(
@@ -88,7 +97,7 @@ def load_views(
                 file=capture.folder,
                 frame=frame.frame,
             )
-        views.append(_crop(frame, camera, data.image_srgb, data.mask, normal, scale))
+        views.append(_crop(frame, camera, data, normal, scale))
     if len(bad) > MAX_BAD_MASKS * len(frames):
         raise InputError(
             "masks",
@@ -121,41 +130,46 @@ def usable(mask: NDArray[np.floating[Any]]) -> bool:
     return low < float(mask.mean()) < high
 
 
-def _crop(frame: Frame, camera: Camera, image, mask, normal, scale: float) -> TrainingView:
+def _crop(frame: Frame, camera: Camera, data: FrameImages, normal, scale: float) -> TrainingView:
+    image, mask, albedo = data.image_srgb, data.mask, data.albedo_estimate_srgb
     if scale != 1.0:
-        image, mask, normal, camera = _shrink(image, mask, normal, camera, scale)
+        camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        image, albedo = _shrink(image, camera, srgb=True), _shrink(albedo, camera, srgb=True)
+        mask, normal = _shrink(mask, camera), _shrink(normal, camera)
     rows, columns = mask_box(torch.from_numpy(mask > 0), CROP_MARGIN)
     rows, columns = widened(rows, camera.height), widened(columns, camera.width)
     K = camera.K.copy()
     K[0, 2] -= columns.start
     K[1, 2] -= rows.start
     crop = replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
-    coverage = np.round(mask[rows, columns] * 255).astype(np.uint8)
+    coverage = _bytes(mask[rows, columns])
+    estimate = None if albedo is None else _bytes(albedo[rows, columns])
     if normal is not None:
         unknown = _covered(coverage) & ~normal[rows, columns].any(-1)
         normal = np.round((normal[rows, columns] + 1) * 127.5).astype(np.uint8)
         normal[unknown] = 0  # no unit normal
-    return TrainingView(frame, crop, np.round(image[rows, columns] * 255).astype(np.uint8), coverage, normal)
+    return TrainingView(frame, crop, _bytes(image[rows, columns]), coverage, normal, estimate)
+
+
+def _bytes(image: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    return np.round(image * 255).astype(np.uint8)
 
 
 def _covered(mask: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return mask > 127
 
 
-def _shrink(image, mask, normal, camera: Camera, scale: float):
-    """Area averages at ``scale``; colours are averaged in linear space."""
+def _shrink(image, camera: Camera, *, srgb: bool = False):
+    """Area averages of ``image`` for a smaller camera; colours are averaged in linear space."""
+    if image is None:
+        return None
     import cv2
 
     from rnd_runtime.core.images import linear_to_srgb
 
-    small = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-    size = (small.width, small.height)
-
-    def area(x):
-        return cv2.resize(np.ascontiguousarray(x, np.float32), size, interpolation=cv2.INTER_AREA)
-
-    normal = None if normal is None else area(normal)
-    return linear_to_srgb(area(srgb_to_linear(image))), area(mask), normal, small
+    linear = np.ascontiguousarray(srgb_to_linear(image) if srgb else image, np.float32)
+    averaged = cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return linear_to_srgb(averaged) if srgb else averaged
 
 
 def pose_input(motion: Motion, skeleton: Skeleton, time: float, config: ModelConfig) -> PoseInput:

@@ -13,6 +13,7 @@ from rnd_runtime.core.images import srgb_to_linear
 from rnd_trainer.config import TrainConfig
 from rnd_trainer.losses.consistency import POINTS, consistency_loss, covisible, project, virtual_camera
 from rnd_trainer.losses.losses import (
+    albedo_loss,
     chroma_prior,
     geometry_prior,
     image_loss,
@@ -80,7 +81,8 @@ class Objective:
                 chroma = chroma_prior(light, probes.start[index], probes.solid_angles)
                 terms["chroma"] = config.weight_light_chroma * chroma
                 terms["sky"] = config.weight_light_sky * sky_prior(light, probes.directions, probes.solid_angles)
-        rendered = self._render(model, posed, pose, texels, view.camera)
+        guess = view.estimated_albedo() if texels is not None and config.weight_albedo_estimate > 0 else None
+        rendered = self._render(model, posed, pose, texels, view.camera, albedo=guess is not None)
         device = posed.means.device
         background = self._background()
         target, mask = (x.to(device) for x in view.target(background))
@@ -92,6 +94,10 @@ class Objective:
         if estimate is not None:
             normals, known = (x.to(device) for x in estimate)
             terms["normal"] = config.weight_normal * ((rendered.normals - normals).abs() * known).mean()
+        if guess is not None and rendered.albedo is not None:
+            guessed, known = (x.to(device) for x in guess)
+            albedo, inside = rendered.albedo / rendered.alpha.clamp(min=0.5)[..., None], rendered.alpha > 0.5
+            terms["albedo"] = config.weight_albedo_estimate * albedo_loss(albedo, guessed, known & inside)
         due = _due(step, config.weight_consistency, config.consistency_every)
         network = _if_large(self.consistency, target)
         if due and texels is not None and network is not None:
@@ -109,13 +115,21 @@ class Objective:
         return torch.from_numpy(srgb_to_linear(sample[:3].numpy()))
 
     def _render(
-        self, model: AvatarModel, posed: PosedGaussians, pose: PoseInput, texels: Texels | None, camera: Camera
+        self,
+        model: AvatarModel,
+        posed: PosedGaussians,
+        pose: PoseInput,
+        texels: Texels | None,
+        camera: Camera,
+        *,
+        albedo: bool = False,
     ) -> Splat:
         """Posed avatar seen by ``camera``, shaded under ``texels`` or in plain colours."""
         if texels is None:
             return splat(posed, posed.attributes.colour, camera)
         traced = self.config.traced_texels
-        return splat(posed, shade_visible(posed, pose, texels, camera, model, traced), camera)
+        radiance = shade_visible(posed, pose, texels, camera, model, traced)
+        return splat(posed, radiance, camera, albedo=albedo)
 
     def _image_terms(self, image_srgb: Tensor, target_srgb: Tensor, step: int) -> dict[str, Tensor]:
         """L1 and DSSIM; LPIPS if there is a network and the image is large enough for it."""

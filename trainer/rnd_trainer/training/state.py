@@ -100,10 +100,11 @@ def learned_sha256(views: list[TrainingView], capture: Capture, scale: float, li
     for view in views:
         frame = view.frame
         if scale == 1:
-            add(np.array(frame.frame), view.image, view.mask, view.normal)
+            add(np.array(frame.frame), view.image, view.mask, view.normal, view.albedo_estimate)
         else:
             add(np.array(frame.frame))
-            for name in filter(None, (frame.image, frame.mask, frame.normal, frame.normal_gt)):
+            files = (frame.image, frame.mask, frame.normal, frame.normal_gt, frame.albedo_estimate)
+            for name in filter(None, files):
                 digest.update(sha256_of(capture.folder / name).encode())
         add(_rounded(view.camera.K), _rounded(view.camera.world_to_camera))
     motion, body = capture.motion, capture.body

@@ -32,7 +32,7 @@ def _copy(subject: Subject, name: str) -> Path:
     record["frames"] = chosen
     used = {frame.get("light") for frame in chosen}
     record["lights"] = {name: light for name, light in record.get("lights", {}).items() if name in used}
-    kinds = ("image", "mask", "normal", "normal_gt", "albedo")
+    kinds = ("image", "mask", "normal", "normal_gt", "albedo", "albedo_estimate")
     files = {frame[kind] for frame in chosen for kind in kinds if frame.get(kind)}
     files |= {light["file"] for light in record["lights"].values()} | {record["body"], record["motion"]}
     for file in files:

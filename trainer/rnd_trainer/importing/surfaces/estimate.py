@@ -1,4 +1,4 @@
-"""Estimated masks and normals."""
+"""Estimated masks, normals and albedos."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from rnd_trainer.importing.images import Bytes
 from rnd_trainer.importing.options import ImportOptions, OnProgress, no_progress
 from rnd_trainer.importing.scene import PlacedScene
 
+from .albedo import albedo_map, albedo_network
 from .masks import make_masks
 from .networks import ImageNetwork
 from .normals import Normals, fill_holes, find_axes, normal_map, normal_network, to_opencv
@@ -80,7 +81,7 @@ def add_normals(
     """
     if options.normal_net is not None:
         network = normal_network(options.normal_net)
-        samples = [replace(sample, normals=partial(_predict, sample, network)) for sample in samples]
+        samples = [replace(sample, normals=partial(_predict, normal_map, sample, network)) for sample in samples]
     permute: Callable[[Normals], Normals]
     if options.normal_axes is not None:
         matrix = _parse_axes(options.normal_axes)
@@ -105,6 +106,14 @@ def add_normals(
     ], matrix
 
 
+def add_albedos(samples: list[Sample], net: Path | None) -> list[Sample]:
+    """``samples`` with albedos estimated by the network ``net``, if there is one."""
+    if net is None:
+        return samples
+    network = albedo_network(net)
+    return [replace(sample, albedo=partial(_predict, albedo_map, sample, network)) for sample in samples]
+
+
 def _parse_axes(axes: str) -> NDArray[np.float64]:
     try:
         return parse_axes(axes)
@@ -118,6 +127,6 @@ def _maps(samples: list[Sample]) -> Iterator[Normals]:
         yield sample.normals()
 
 
-def _predict(sample: Sample, network: ImageNetwork) -> Normals:
+def _predict(estimator: Callable[..., NDArray[Any]], sample: Sample, network: ImageNetwork) -> NDArray[Any]:
     assert sample.mask is not None
-    return normal_map(network, sample.image(), sample.mask())
+    return estimator(network, sample.image(), sample.mask())

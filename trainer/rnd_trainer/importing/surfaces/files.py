@@ -1,4 +1,4 @@
-"""Masks and normals from the user's folders, matched to images by name or number."""
+"""Masks, normals and albedos from the user's folders, matched to images by name or number."""
 
 from __future__ import annotations
 
@@ -12,17 +12,28 @@ from numpy.typing import NDArray
 
 from rnd_runtime.core.errors import InputError
 from rnd_trainer.importing.dataset import ImportedDataset
-from rnd_trainer.importing.images import count_shift, last_number, list_files, read_mask, read_sized
+from rnd_trainer.importing.images import (
+    IMAGE_SUFFIXES,
+    count_shift,
+    last_number,
+    list_files,
+    read_mask,
+    read_rgb,
+    read_sized,
+)
+from rnd_trainer.importing.options import ImportOptions
 
 from .normals import read_normals
 
 
-def attach_files(dataset: ImportedDataset, masks: Path | None, normals: Path | None) -> ImportedDataset:
-    """``dataset`` with masks and normals of these folders, by the images' names or numbers."""
-    if masks is not None:
-        dataset = _attach(dataset, "mask", masks, (".png", ".npy", ".jpg"), read_mask)
-    if normals is not None:
-        dataset = _attach(dataset, "normals", normals, (".npy", ".png", ".exr"), read_normals)
+def attach_files(dataset: ImportedDataset, options: ImportOptions) -> ImportedDataset:
+    """``dataset`` with masks, normals and albedos of the options' folders, by the images' names or numbers."""
+    if options.masks is not None:
+        dataset = _attach(dataset, "mask", options.masks, (".png", ".npy", ".jpg"), read_mask)
+    if options.normals is not None:
+        dataset = _attach(dataset, "normals", options.normals, (".npy", ".png", ".exr"), read_normals)
+    if options.albedos is not None:
+        dataset = _attach(dataset, "albedo", options.albedos, IMAGE_SUFFIXES, read_rgb)
     return dataset
 
 
@@ -39,8 +50,8 @@ def _attach(
     samples = []
     for sample in dataset.samples:
         file = folders[inner[sample.camera]].find(sample.name, sample.frame)
-        reader = partial(read_sized, read, file, dataset.lenses[sample.camera].camera, what)
-        samples.append(replace(sample, mask=reader) if what == "mask" else replace(sample, normals=reader))
+        reader: Any = partial(read_sized, read, file, dataset.lenses[sample.camera].camera, what)
+        samples.append(replace(sample, **{what: reader}))
     notes = dict.fromkeys(
         f"{folder.name} are numbered from {files.first - files.shift}, frames from {files.first}: taken for the same"
         for files in folders.values()
@@ -50,7 +61,7 @@ def _attach(
 
 
 class _NumberedFiles:
-    """Masks or normals of one folder, by name or number of ``images`` (name, frame).
+    """Masks, normals or albedos of one folder, by name or number of ``images`` (name, frame).
 
     A file's name is the image's, followed by anything but a digit, or has the image's number; for images without a
     number, the frame's, or else the frame's position in the folder. ``shift`` is the numbers' offset

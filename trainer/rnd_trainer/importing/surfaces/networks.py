@@ -61,8 +61,26 @@ class ImageNetwork:
             output = output[:, None] if self._channels_first else output[..., None]
         if output.ndim == 4 and self._channels_first:
             output = output.transpose(0, 2, 3, 1)
-        if output.ndim != 4 or output.shape[3] not in self._outputs or not np.isfinite(output).all():
+        if not np.isfinite(output).all():
+            raise InputError("network's output", expected="finite numbers", got="NaN or infinity", file=self.path)
+        if output.ndim != 4 or output.shape[3] not in self._outputs:
             expected = f"a map of {' or '.join(map(str, self._outputs))} channels"
             raise InputError("network's output", expected=expected, got=list(output.shape), file=self.path)
         resized = cv2.resize(output[0], (width, height), interpolation=cv2.INTER_LINEAR)
         return resized.reshape(height, width, -1)
+
+    def of_person(self, image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """The map [H, W, C] of a crop of the person on grey; zero outside the crop.
+
+        Args:
+            image: [H, W, 3] uint8 sRGB.
+            mask: [H, W] uint8 coverage.
+        """
+        output = np.zeros((*mask.shape, self._outputs[0]), np.float32)
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        if len(rows):
+            margin = (rows[-1] - rows[0]) // 10 + 2
+            box = tuple(slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns))
+            alpha = mask[box][..., None] / np.float32(255)
+            output[box] = self(np.round(image[box] * alpha + 128 * (1 - alpha)).astype(np.uint8))
+        return output

@@ -112,27 +112,11 @@ def normal_network(path: Path) -> ImageNetwork:
 
 
 def normal_map(network: ImageNetwork, image: NDArray[np.uint8], mask: NDArray[np.uint8]) -> Normals:
-    """Map [H, W, 3] of ``network`` in its own axes, zero outside the mask.
-
-    Its input is a crop of the person on grey.
-
-    Args:
-        image: [H, W, 3] uint8 sRGB.
-        mask: [H, W] uint8 coverage.
-    """
-    normals = np.zeros(image.shape, np.float32)
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
-        return normals
-    margin = (rows[-1] - rows[0]) // 10 + 2
-    box = tuple(slice(max(int(side[0]) - margin, 0), int(side[-1]) + 1 + margin) for side in (rows, columns))
-    alpha = mask[box][..., None] / np.float32(255)
-    crop = np.round(image[box] * alpha + 128 * (1 - alpha)).astype(np.uint8)
-    output = network(crop)
+    """Map [H, W, 3] of ``network`` in its own axes, zero outside the mask; see ``ImageNetwork.of_person``."""
+    output = network.of_person(image, mask)
     if output.min() >= 0:  # the network returns (n + 1)/2
         output = 2 * output - 1
-    normals[box] = _unit(output) * (mask[box] > 0)[..., None]
-    return normals
+    return np.where(mask[..., None] > 0, _unit(output), 0).astype(np.float32)
 
 
 def fill_holes(normals: Normals, mask: NDArray[np.uint8]) -> Normals:
