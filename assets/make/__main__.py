@@ -1,4 +1,4 @@
-"""``python -m assets.make [body] [figure] [prior] [walk] [sky] [capture] [contact]``: remakes these.
+"""``python -m assets.make [body] [figure] [prior] [walk] [turn] [sky] [capture] [contact]``: remakes these.
 
 Without names it remakes all but figure and prior.
 """
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rnd_runtime.capture.body import Body
 from rnd_runtime.motion.motion import save_motion
-from rnd_stage.film.dances import walk
+from rnd_stage.film.dances import turn_round, walk
 from rnd_stage.people.template import template_body
 from rnd_trainer.estimating.fitting.figure import TEMPLATE
 from rnd_trainer.estimating.fitting.prior import FILE
@@ -18,7 +18,7 @@ from rnd_trainer.estimating.fitting.prior import FILE
 from . import sky
 
 ASSETS = Path(__file__).parents[1]
-STEPS = ("body", "figure", "prior", "walk", "sky", "capture", "contact")
+STEPS = ("body", "figure", "prior", "walk", "turn", "sky", "capture", "contact")
 
 
 def main(steps: list[str]) -> None:
@@ -40,6 +40,8 @@ def main(steps: list[str]) -> None:
         prior.make_pose_prior(FILE)
     if "walk" in steps:
         save_motion(ASSETS / "walk.npz", walk(body.skeleton))
+    if "turn" in steps:
+        save_motion(ASSETS / "turn.npz", turn_round())
     if "sky" in steps:
         sky.make_light(ASSETS / "sky.exr", sky.noon())
     if {"capture", "contact"} & set(steps):

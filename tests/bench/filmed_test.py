@@ -1,4 +1,4 @@
-"""What avatars of videos are scored on: exact poses and other cameras, in the world of the imported capture."""
+"""What ``rnd-bench study filmed`` scores avatars of videos on: exact poses and other cameras, in the world of the imported capture."""
 
 from __future__ import annotations
 

@@ -139,8 +139,8 @@ def test_the_scripts_make_what_is_here(tmp_path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(ASSETS.parent))
     make = importlib.import_module("assets.make.__main__")
     monkeypatch.setattr(make, "ASSETS", tmp_path)
-    make.main(["body", "walk", "sky"])
-    for name in ("body.npz", "walk.npz"):
+    make.main(["body", "walk", "turn", "sky"])
+    for name in ("body.npz", "walk.npz", "turn.npz"):
         with np.load(tmp_path / name) as made, np.load(ASSETS / name) as kept:
             assert set(made) == set(kept)
             for key in made:

@@ -1,4 +1,4 @@
-"""Two motions from joint-angle curves: a walking loop, and the dance of the capture.
+"""Motions from joint-angle curves: a walking loop, the dance of the capture, and turning round in an A.
 
 Angles are in degrees, given for the left side in anatomical terms and mirrored for the right. The walk's sagittal
 curves are those of normal gait (hip 30° to −10°, knee 18° in stance and 60° in swing, ankle 10° to −18°). The body's
@@ -147,6 +147,23 @@ def dance(skeleton: Skeleton) -> Motion:
     heading = np.radians(turn)
     shift = np.stack([across * np.cos(heading), 0 * across, -across * np.sin(heading)], axis=1)
     return _grounded(skeleton, pose.rotations, shift, periodic=False)
+
+
+def turn_round() -> Motion:
+    """Turning round once in 5 s, arms in an A, with small steps, then on: what users are asked to film; 15 fps."""
+    frames = np.arange(94)
+    sway, step = np.sin(2 * np.pi * frames / 30), np.sin(2 * np.pi * frames / 18)
+    angles, joint = np.zeros((len(frames), len(SMPL_NAMES), 3)), SMPL_NAMES.index  # rad, axis-angle
+    angles[:, joint("pelvis"), 1] = 2 * np.pi * frames / 75
+    for side, sign, lifted in (("left_", 1, np.maximum(step, 0)), ("right_", -1, np.maximum(-step, 0))):
+        angles[:, joint(side + "shoulder"), 2] = 0.04 * sway - sign * 0.85
+        angles[:, joint(side + "elbow"), 1] = -sign * 0.15
+        angles[:, joint(side + "hip"), 0] = -0.25 * lifted
+        angles[:, joint(side + "hip"), 2] = sign * 0.08
+        angles[:, joint(side + "knee"), 0] = 0.45 * lifted
+    angles[:, joint("spine1"), 0] = 0.03 + 0.02 * sway
+    angles[:, joint("head"), 0] = 0.05
+    return Motion(axis_angle_to_matrix(angles), np.zeros((len(frames), 3)), 15.0, SMPL_NAMES)
 
 
 class _Pose:
