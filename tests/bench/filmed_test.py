@@ -1,4 +1,4 @@
-"""What ``rnd-bench study filmed`` scores avatars of videos on: exact poses and other cameras, in the world of the imported capture."""
+"""What ``rnd-bench study filmed`` scores on: exact poses and other cameras, in the imported capture's world."""
 
 from __future__ import annotations
 

@@ -140,10 +140,10 @@ def _rows(
     if film.exact is None:
         scored = replace(film.scored, motion=training.motion())
         fitted = replace(scored, motion=fit_held_out(checkpoint, scored, SPLITS))
-        poses = {"as estimated": scored, "fitted to the images": fitted}
+        poses = {"estimated": scored, "fitted": fitted}
     rows = []
     for which, shown in poses.items():
-        strips = folder / f"strips_{which.replace(' ', '_')}"
+        strips = folder / f"strips_{which}"
         found = score(checkpoint, shown, method=method.name, perceptual=networks[1], strips=strips)
         rows += [{"film": film.name, "poses": which, **row} for row in found]
     write_json(folder / ROWS, rows)

@@ -17,8 +17,8 @@ from .skinning import blend_transforms, tangent_frames, transform_normals
 from .template import WEIGHT_FLOOR, Template
 from .twist import TwistFrames
 
-ALBEDO_RANGE = (0.03, 0.80)
-"""of natural diffuse materials; bounds the albedo–light ambiguity"""
+ALBEDO_RANGE = (0.01, 0.80)
+"""of diffuse materials, with black cloth as phones' tone curves show it; bounds the albedo–light ambiguity"""
 TANGENT_SCALE = (0.25, 2.0)
 """range of the standard deviations along the surface, in units of the spacing"""
 NORMAL_SCALE = (0.05, 0.5)
@@ -166,7 +166,7 @@ class AvatarModel(nn.Module):
             normals=normals,
             points=self.points + offset,
             colour=torch.sigmoid(part["colour"]),
-            albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # initially 0.24
+            albedo=low + (high - low) * torch.sigmoid(part["albedo"] - 1.0),  # initially 0.22
             roughness=glossy + (rough - glossy) * torch.sigmoid(part["roughness"][:, 0] + 0.5),
             raw_geometry_residual=self.geometry_residual,
         )
