@@ -94,7 +94,7 @@ def study(tiny_capture, tiny_config, tmp_path, monkeypatch):
     def train(*_: object) -> None:
         raise AssertionError("trained")
 
-    monkeypatch.setattr(trainings, "_train", train)
+    monkeypatch.setattr(trainings, "train", train)
 
     def go() -> object:
         return ablate(

@@ -18,7 +18,7 @@ def test_rates_stay_high_until_the_last_steps_and_never_rise(name) -> None:
     assert rates[0] == 1 and rates == sorted(rates, reverse=True)
     begun = round((1 - config.cooling_fraction) * steps)
     assert rates[begun] == pytest.approx(config.rate_final ** (begun / steps))
-    assert rates[-1] == pytest.approx(config.rate_final * config.rate_cooled, rel=0.02)
+    assert rates[-1] == pytest.approx(config.rate_final * config.rate_cooled, rel=15 / steps)  # a step before the end
     third = [schedule.decay(step) for step in range(steps, schedule.total)]
     assert third[0] == 1 and third == sorted(third, reverse=True)
     assert third[-1] == pytest.approx(0.1, rel=0.02)
